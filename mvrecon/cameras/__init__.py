@@ -1,0 +1,1 @@
+"""Cameras: one canonical record, the rigs that fill it, conversions to other conventions."""

@@ -1,0 +1,185 @@
+"""The canonical record of a rig of M cameras; every other description (K, R, t, 3x4, frustum) is derived from it.
+
+A pixel (u, v) of camera m and the fraction w of the way from the source to the detector name the point
+
+    central beam    X = S + w (u U + v V + D0 - S)
+    parallel beam   X = S + u U + v V + w (D0 - S)
+
+so with the frame M = [U V D0-S] and q = M^-1 (X - S): w = q_3 and (u, v) = (q_1, q_2) / w for a central beam,
+(q_1, q_2) for a parallel one. That is P = M^-1 [I -S] of Hartley & Zisserman, Multiple View Geometry, ch. 6.
+
+Convention: right-handed, as OpenCV: u to the right, v downwards, looking towards the object. A pinhole's detector
+stands behind it, so its object points have w < 0 and its image is turned by 180 degrees with no code of its own.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid, pixel_centres
+
+Extent = Literal["segment", "behind", "ahead", "line"]
+
+#: Which fractions w of a ray count. X-ray, and a parallel beam between two stated planes: "segment". A pinhole with
+#: its detector behind it: "behind". A vision camera: "ahead". A parallel beam without end: "line".
+EXTENTS: dict[str, tuple[float, float]] = {
+    "segment": (0.0, 1.0),
+    "behind": (-torch.inf, 0.0),
+    "ahead": (0.0, torch.inf),
+    "line": (-torch.inf, torch.inf),
+}
+
+
+VECTORS = ("source", "origin", "u", "v")
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """M cameras with detectors of one size.
+
+    Args:
+        source: source or pinhole S in world mm; for a parallel beam, the start of the ray of pixel (0, 0).
+        origin: centre D0 of pixel (0, 0) in world mm.
+        u: step from one column to the next, in mm.
+        v: step from one row to the next, in mm.
+        shape: detector pixels (rows, columns).
+        parallel: rays share the direction D0 - S instead of the point S.
+        extent: the part of a ray's line that counts; see `EXTENTS`.
+
+    Raises:
+        ValueError: shapes that do not agree, values that are not finite, a flat or left-handed camera.
+    """
+
+    source: Float[Tensor, "m 3"]
+    origin: Float[Tensor, "m 3"]
+    u: Float[Tensor, "m 3"]
+    v: Float[Tensor, "m 3"]
+    shape: tuple[int, int]
+    parallel: bool = False
+    extent: Extent = "segment"
+
+    def __post_init__(self) -> None:
+        for name in VECTORS:
+            vector = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            object.__setattr__(self, name, vector)
+            expected = (len(self.source) if self.source.ndim == 2 else "m", 3)
+            if vector.ndim != 2 or vector.shape != expected or not len(vector):
+                raise ValueError(
+                    f"Cameras need {name} as [{expected[0]} 3], one row a camera, got {list(vector.shape)}"
+                )
+            if vector.device != self.source.device:
+                raise ValueError(
+                    f"Cameras need one device, got {name} on {vector.device}, source on {self.source.device}"
+                )
+            if not vector.isfinite().all():
+                raise ValueError(f"Cameras need finite mm, got {name} = {vector.tolist()}")
+        if len(self.shape) != 2 or any(int(n) != n or n < 1 for n in self.shape):
+            raise ValueError(f"A detector's shape must be (rows, columns), both positive integers, got {self.shape}")
+        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
+        if self.extent not in EXTENTS:
+            raise ValueError(f"Unknown extent {self.extent!r}. Known: {', '.join(EXTENTS)}")
+        self._check_handedness()
+
+    def _check_handedness(self) -> None:
+        axes = torch.nn.functional.normalize(self.frame.detach(), dim=-2)
+        look = torch.linalg.det(axes) * (-1 if self.extent == "behind" else 1)
+        if not (look.abs() > 1e-9).all():
+            flat = int(look.abs().argmin())
+            raise ValueError(
+                f"Cameras must not be flat, but u, v and origin - source of camera {flat} lie in one plane"
+            )
+        if not (look > 0).all():
+            raise ValueError(
+                f"Cameras must be right-handed (u right, v down, looking at the object), but camera {int(look.argmin())} "
+                "is left-handed; reverse u or v, and take origin at the other end of that axis"
+            )
+
+    def __len__(self) -> int:
+        return self.source.shape[0]
+
+    def __getitem__(self, index: int | slice | list[int] | Tensor) -> "Cameras":
+        """A rig of the chosen cameras, in the given order."""
+        return self._map(lambda vector: vector[index].reshape(-1, 3))
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> "Cameras":
+        return replace(self, **{name: change(getattr(self, name)) for name in VECTORS})
+
+    def to(self, device: torch.device | str) -> "Cameras":
+        """The same rig on a device; geometry stays in float64."""
+        return self._map(lambda vector: vector.to(device))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The fractions w of a ray between which it counts."""
+        return EXTENTS[self.extent]
+
+    @property
+    def frame(self) -> Float[Tensor, "m 3 3"]:
+        """M = [U V D0-S], columns in mm."""
+        return torch.stack([self.u, self.v, self.origin - self.source], dim=-1)
+
+    @property
+    def distance(self) -> Float[Tensor, " m"]:
+        """Distance from the source to the detector's plane in mm (SDD; the collimator length of a pinhole)."""
+        normal = torch.nn.functional.normalize(torch.linalg.cross(self.u, self.v), dim=-1)
+        return (normal * (self.origin - self.source)).sum(-1).abs()
+
+    @property
+    def matrix(self) -> Float[Tensor, "m 3 4"]:
+        """P with P (X, 1) = w (u, v, 1); its last row is (0, 0, 0, 1) for a parallel beam."""
+        inverse = torch.linalg.inv(self.frame)
+        P = torch.cat([inverse, -inverse @ self.source[..., None]], dim=-1)
+        if self.parallel:
+            P = torch.cat([P[:, :2], P.new_tensor([0, 0, 0, 1]).expand(len(self), 1, 4)], dim=1)
+        return P
+
+    def project(self, xyz: Float[Tensor, "*n 3"]) -> Float[Tensor, "m *n 3"]:
+        """Pixel coordinates and depth (u, v, z) of world points, z in mm along the detector's normal.
+
+        z has the sign of w: negative for points on the far side of a pinhole from its detector. A point in the plane
+        of a central source has no image: its u and v are not finite.
+        """
+        flat = (xyz.reshape(1, -1, 3).to(self.source) - self.source[:, None]) @ torch.linalg.inv(self.frame).mT
+        w = flat[..., 2:]
+        uv = flat[..., :2] if self.parallel else flat[..., :2] / w
+        uvz = torch.cat([uv, w * self.distance[:, None, None]], dim=-1)
+        return uvz.reshape(len(self), *xyz.shape[:-1], 3).to(xyz.dtype)
+
+    def unproject(self, uvz: Float[Tensor, "m *n 3"]) -> Float[Tensor, "m *n 3"]:
+        """World points in mm of pixel coordinates and depth; the inverse of `project`."""
+        flat = uvz.reshape(len(self), -1, 3).to(self.source)
+        w = flat[..., 2:] / self.distance[:, None, None]
+        across = flat[..., :2] if self.parallel else flat[..., :2] * w
+        xyz = torch.cat([across, w], dim=-1) @ self.frame.mT + self.source[:, None]
+        return xyz.reshape(uvz.shape).to(uvz.dtype)
+
+    def rays(self) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
+        """Where each pixel's ray has w = 0 and where it has w = 1, in world mm."""
+        pixels = pixel_centres(self.shape).to(self.source)
+        across = torch.einsum("vuk,mkx->mvux", pixels, torch.stack([self.u, self.v], dim=1))
+        start = self.source[:, None, None] + (across if self.parallel else torch.zeros_like(across))
+        return start, self.origin[:, None, None] + across
+
+    def depth_range(self, grid: Grid) -> Float[Tensor, "m 2"]:
+        """The least and the greatest depth z in mm of a grid's box, for each camera."""
+        z = self.project(grid.corners().to(self.source))[..., 2]
+        return torch.stack(z.aminmax(dim=-1), dim=-1)
+
+    def binned(self, factor: int) -> "Cameras":
+        """The same detectors with `factor` x `factor` pixels joined into one."""
+        if factor < 1 or any(n % factor for n in self.shape):
+            raise ValueError(f"Binning by {factor} needs a positive factor that divides the detector, got {self.shape}")
+        shift = (self.u + self.v) * (factor - 1) / 2
+        shape = (self.shape[0] // factor, self.shape[1] // factor)
+        source = self.source + shift if self.parallel else self.source
+        u, v = self.u * factor, self.v * factor
+        return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
+
+    def moved(self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> "Cameras":
+        """The rig after the rigid motion X -> R X + t of the world."""
+        R, t = rotation.to(self.source), translation.to(self.source)
+        return replace(self, source=self.source @ R.T + t, origin=self.origin @ R.T + t, u=self.u @ R.T, v=self.v @ R.T)

@@ -1,0 +1,176 @@
+"""Settings: where they live, how they are composed, and what may be built from them. The one door to Hydra.
+
+Below this door everything is a plain dict of names and numbers, so that checkpoints load with torch's defaults
+and no loop pays for a config object. Importing this file imports neither torch nor Lightning.
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from mvrecon.registry import installed, locate
+
+ALLOWED = ("lightning.pytorch", "torch.optim", "mvrecon.engine")
+VERSION_BASE = "1.3"
+
+
+@dataclass
+class Settings:
+    """Every top-level key, so that a mistyped one is an error instead of a silent extra."""
+
+    name: str = MISSING
+    seed: int = 0
+    grid: Any = None
+    scene: Any = None
+    test_scene: Any = None
+    camera: Any = None
+    projector: Any = None
+    model: Any = None
+    compare: Any = field(default_factory=dict)
+    loss: Any = field(default_factory=dict)
+    optimizer: Any = None
+    data: Any = None
+    trainer: Any = None
+    callbacks: Any = None
+    logger: Any = None
+    plugins: Any = field(default_factory=list)
+    resume: str | None = None
+    checkpoint: str | None = MISSING
+    device: str = "auto"
+    save: bool = False
+
+
+class PluginConf(SearchPathPlugin):
+    """Adds the config folders of installed plugins to Hydra's search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in plugin_conf_dirs():
+            search_path.append(provider="mvrecon plugin", path=f"file://{folder}")
+
+
+def conf_dir() -> Path:
+    """Where the YAML files are: beside the code in a wheel, one level up in a checkout."""
+    here = Path(__file__).resolve().parent
+    return here / "conf" if (here / "conf").is_dir() else here.parent / "conf"
+
+
+def plugin_conf_dirs() -> list[Path]:
+    """The config folders that installed plugins declare (entry points named "conf.*"), found without an import."""
+    packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
+    return [Path(folder) for package in packages if package for folder in package.submodule_search_locations or ()]
+
+
+def prepare_hydra() -> None:
+    """Make the schema and the plugins' config groups known to Hydra, in this process only."""
+    ConfigStore.instance().store(name="schema", node=Settings)
+    Plugins.instance().register(PluginConf)
+
+
+def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
+    """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once."""
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        sys.stdout.write(help_text(config_name))
+        return
+    prepare_hydra()
+    hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(task)()
+
+
+def help_text(config_name: str) -> str:
+    """What an app can be told: every group with its choices, and the settings with their comments."""
+    choices: dict[str, set[str]] = {}
+    for folder in (conf_dir(), *plugin_conf_dirs()):
+        for file in folder.glob("*/*.yaml"):
+            choices.setdefault(file.parent.name, set()).add(file.stem)
+    groups = "\n".join(f"  {group:<12}{', '.join(sorted(names))}" for group, names in sorted(choices.items()))
+    settings = (conf_dir() / f"{config_name}.yaml").read_text(encoding="utf-8")
+    return (
+        f"Usage: mvrecon-{config_name} [group=choice ...] [key=value ...]\n\nGroups and their choices:\n{groups}\n\n"
+        f"{settings}\n"
+        "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of your own\n"
+        "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's options.\n"
+    )
+
+
+def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
+    """The plain settings that a command line with these overrides would run with.
+
+    Raises:
+        RuntimeError: another program in this process is using Hydra; it is left alone.
+    """
+    if GlobalHydra.instance().is_initialized():
+        raise RuntimeError("Hydra is in use already in this process: compose() must be called outside a Hydra app")
+    prepare_hydra()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+        return to_plain(hydra.compose(config_name, list(overrides)))
+
+
+def to_plain(config: DictConfig) -> dict[str, Any]:
+    """A composed config as plain dicts, lists, strings and numbers, all references resolved.
+
+    Raises:
+        LookupError: a setting marked `???` was not given.
+    """
+    if missing := OmegaConf.missing_keys(config):
+        raise LookupError(f"These settings must be given: {', '.join(f'{key}=...' for key in sorted(missing))}")
+    plain = OmegaConf.to_container(config, resolve=True)
+    if not isinstance(plain, dict):
+        raise TypeError(f"Settings must be a mapping, got {type(plain).__name__}")
+    return {str(key): value for key, value in plain.items()}
+
+
+def import_plugins(modules: Iterable[str]) -> None:
+    """Import the modules that the setting `plugins` names; they add parts by `@REGISTRY.register`.
+
+    Raises:
+        ImportError: a module does not import; the message names it.
+    """
+    for module in modules:
+        try:
+            import_module(module)
+        except Exception as error:  # whatever a plugin's import raises must name the plugin
+            raise ImportError(f"The plugin module {module!r} (setting 'plugins') does not import: {error}") from error
+
+
+def instantiate(node: Mapping[str, Any], **given: Any) -> Any:
+    """Build the object of another library that a node's `_target_` names.
+
+    Raises:
+        PermissionError: the target, or one nested in it, is not defined below one of `ALLOWED`.
+    """
+    for target in _targets(node):
+        _check(target)
+    own_policy = hasattr(hydra.utils, "execution_whitelist")  # Hydra 1.4 and later
+    policy = {"_execution_whitelist_": [f"{prefix}.*" for prefix in ALLOWED]} if own_policy else {}
+    return hydra.utils.instantiate(node, _convert_="all", **given, **policy)
+
+
+def _targets(node: Any) -> Iterator[str]:
+    if isinstance(node, Mapping):
+        if "_target_" in node:
+            yield str(node["_target_"])
+        node = list(node.values())
+    if isinstance(node, list | tuple):
+        for child in node:
+            yield from _targets(child)
+
+
+def _check(target: str) -> None:
+    """A name below an allowed module may still lead out of it (`a.b.os.system`): ask where it was defined."""
+    inside = _below(target) and _below(str(getattr(hydra.utils.get_object(target), "__module__", "")))
+    if not inside:
+        raise PermissionError(f"_target_ {target!r} is not allowed; expected something from {', '.join(ALLOWED)}")
+
+
+def _below(name: str) -> bool:
+    return any(name.startswith(f"{prefix}.") for prefix in ALLOWED)

@@ -1,0 +1,154 @@
+"""What happens beside the training: time and memory, and the pictures on the board."""
+
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+
+from mvrecon.engine.record import versions
+from mvrecon.models.output import Reconstruction
+from mvrecon.parts import MODELS
+from mvrecon.viz import montage
+from mvrecon.viz.planes import Image
+
+
+def peak_megabytes() -> float:
+    """The most memory in use so far: the GPU's where there is one, else this process's."""
+    if torch.cuda.is_available():
+        return torch.cuda.max_memory_allocated() / 2**20
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+class Clock(L.Callback):
+    """Logs `time/*`: milliseconds per step, volumes per second, seconds of training so far, peak memory.
+
+    Validation and pictures do not count. The seconds go into the checkpoint, so a resumed run adds to them.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._mark = 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.seconds = state_dict["seconds"]
+
+    def on_train_start(self, *_: Any) -> None:
+        """Start."""
+        if torch.cuda.is_available():
+            torch.cuda.reset_peak_memory_stats()  # one process trains several methods
+        self._mark = time.perf_counter()
+
+    def on_validation_end(self, *_: Any) -> None:
+        """Leave the validation out."""
+        self._mark = time.perf_counter()
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """One step, its data included."""
+        now = time.perf_counter()
+        step, self._mark = now - self._mark, now
+        self.seconds += step
+        count = len(batch["views"])
+        figures = {"step_ms": 1e3 * step, "volumes_per_s": count / step, "seconds": self.seconds}
+        figures["peak_mb"] = peak_megabytes()
+        self.log_dict({f"time/{name}": value for name, value in figures.items()}, batch_size=count)
+
+
+class CompileModel(L.Callback):
+    """Compiles the network before training. Never the LightningModule, whose logging must not be traced."""
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Compile in place; names of parameters stay."""
+        if stage == "fit":
+            pl_module.model.compile()
+
+
+class BoardReview(L.Callback):
+    """The same few validation scenes at every review, as pictures on the board and in `review/`.
+
+    Args:
+        every: of how many validations one is pictured.
+        cases: how many of the first batch's scenes are shown, one above the other.
+        baselines: training-free models shown beside ours.
+    """
+
+    def __init__(self, every: int = 1, cases: int = 2, baselines: Sequence[str] = ("backprojection", "sirt")):
+        self.every, self.cases, self.baselines = every, cases, tuple(baselines)
+        self.seen = 0
+        self._fixed: dict[str, Tensor] = {}
+        self._shown: tuple[Any, Reconstruction] | None = None
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Write down what runs."""
+        for board in _boards(trainer):
+            lines = [f"    {name} {version}" for name, version in versions().items()]
+            board.add_text("text/run", "\n".join([f"    {' '.join(sys.argv)}", "", *lines]), trainer.global_step)
+
+    def on_validation_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
+    ) -> None:
+        """Keep the first batch and its reconstruction."""
+        if batch_idx == 0 and not trainer.sanity_checking:
+            self._shown = batch, outputs["out"]
+
+    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Draw, at every `every`-th validation."""
+        if self._shown is None or trainer.sanity_checking:
+            return
+        (batch, out), self._shown = self._shown, None
+        self.seen += 1
+        if (self.seen - 1) % self.every:
+            return
+        cases = [self._pictures(pl_module, batch, out, case) for case in range(min(self.cases, len(out.volume)))]
+        for name in cases[0]:
+            image = montage.tiled([[pictures[name]] for pictures in cases])
+            montage.save_png(Path(trainer.default_root_dir) / "review" / f"{name}.png", image)
+            for board in _boards(trainer):
+                board.add_image(f"review/{name}", image, trainer.global_step, dataformats="HWC")
+
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Error against run time, once: what the board's HParams tab compares runs by."""
+        known = {"psnr": "val/psnr", "seconds": "time/seconds", "peak_mb": "time/peak_mb"}
+        found = trainer.callback_metrics
+        figures = {f"hp/{name}": float(found[key]) for name, key in known.items() if key in found}
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                logger.log_hyperparams(dict(pl_module.hparams), figures)
+
+    def _pictures(self, module: Any, batch: Any, out: Reconstruction, case: int) -> dict[str, Image]:
+        truth, top = batch["volume"][case, 0], module.hparams["data_range"]
+        volumes = {module.hparams["model"]["name"]: out.volume[case, 0]}
+        volumes |= {name: v[case, 0] for name, v in self._baselines(module, batch["views"]).items()}
+        predicted = module.projector(out.volume[case][None])[0, 0]
+        shown = {
+            "planes": montage.planes(truth, volumes, top),
+            "mip": montage.projections(truth, volumes, top),
+            "views": montage.views(batch["views"][case, 0], predicted),
+        }
+        if out.opinions is not None:
+            shown["opinions"] = montage.opinions(out.opinions[case, :, 0], top)
+        if out.weights is not None:
+            shown["weights"] = montage.weights(out.weights[case, :, 0])
+        return shown
+
+    def _baselines(self, module: Any, views: Tensor) -> dict[str, Tensor]:
+        if not self._fixed:  # the scenes are the same at every review, so once is enough
+            models = {name: MODELS.build(name, projector=module.projector).to(views.device) for name in self.baselines}
+            self._fixed = {name: model(views).volume for name, model in models.items()}
+        return self._fixed
+
+
+def _boards(trainer: L.Trainer) -> list[Any]:
+    return [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]

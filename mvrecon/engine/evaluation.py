@@ -1,0 +1,138 @@
+"""The result table: every method on the same unseen scenes."""
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mvrecon.data.module import SceneData
+from mvrecon.engine.checkpoints import Trained, finished, load
+from mvrecon.engine.fit import build_module, methods, trainable
+from mvrecon.engine.module import Settings
+from mvrecon.metrics import UNITS, view_metrics, volume_metrics
+from mvrecon.projectors.base import Projector
+
+Scores = dict[str, list[dict[str, float]]]
+See = Callable[[dict[str, Any], dict[str, Tensor]], None]
+
+@torch.inference_mode()
+def evaluate(
+    models: Mapping[str, nn.Module],
+    batches: Iterable[dict[str, Any]],
+    A: Projector,
+    data_range: float,
+    device: str = "cpu",
+    see: See | None = None,
+) -> Scores:
+    """Figures of merit, and milliseconds of one reconstruction ("ms"), of each model on each scene.
+
+    Args:
+        models: by label, all for the grid and the rig of `A`.
+        batches: test scenes, in batches of any size; the models get them one by one.
+        A: re-projects the volumes for the error of the views.
+        data_range: for PSNR and SSIM.
+        device: where the models run.
+        see: called with every scene and its reconstructions by label.
+    """
+    A = A.to(device)
+    ready = {label: model.to(device).eval() for label, model in models.items()}
+    scores: Scores = {label: [] for label in models}
+    for scene in (case for batch in batches for case in _singly(batch, device)):
+        volumes = {}
+        for label, model in ready.items():
+            if not scores[label]:
+                model(scene["views"])  # the first call compiles and fills caches
+            milliseconds, volume = _timed(model, scene["views"])
+            figures = volume_metrics(volume[0], scene["volume"][0], scene["inside"][0], data_range)
+            figures |= view_metrics(A(volume), scene["views"])
+            scores[label].append({**figures, "ms": milliseconds})
+            volumes[label] = volume
+        if see is not None:
+            see(scene, volumes)
+    return scores
+
+
+def mean_and_spread(values: list[float]) -> dict[str, Any]:
+    """Mean, sample standard deviation, and the values; nan (a scene without an object) counts in neither."""
+    known = [value for value in values if not math.isnan(value)]
+    if not known:
+        return {"mean": math.nan, "std": math.nan, "values": values}
+    mean = sum(known) / len(known)
+    spread = statistics.stdev(known) if len(known) > 1 and math.isfinite(mean) else 0.0
+    return {"mean": mean, "std": spread, "values": values}
+
+
+def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[str, Trained]:
+    """Every method of a run: from its checkpoint, or just built where there is nothing to learn.
+
+    Raises:
+        FileNotFoundError: a method whose training has not ended.
+    """
+    found = {}
+    for label, model in methods(settings).items():
+        path = finished(folder, label)
+        fresh = None if path.exists() else build_module(settings, model, data_range)
+        found[label] = load(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
+    return found
+
+
+def results(
+    settings: Settings, folder: Path, data: SceneData, device: str = "cpu", see: See | None = None
+) -> dict[str, Any]:
+    """Everything that the table of a run tells, evaluated on the test scenes of `data` from the run's checkpoints."""
+    found = load_methods(settings, folder, data.data_range)
+    models: dict[str, nn.Module] = {label: method.module.model for label, method in found.items()}
+    A = next(iter(found.values())).module.projector
+    names: list[str] = []
+
+    def watch(scene: dict[str, Any], volumes: dict[str, Tensor]) -> None:
+        names.extend(scene["name"])
+        if see is not None:
+            see(scene, volumes)
+
+    data.setup("test")
+    scores = evaluate(models, data.test_dataloader(), A, data.data_range, device, watch)
+    table = {}
+    for label, method in found.items():
+        figures = {name: mean_and_spread([score[name] for score in scores[label]]) for name in UNITS}
+        table[label] = {
+            "parameters": sum(p.numel() for p in method.module.model.parameters() if p.requires_grad),
+            "train_steps": method.steps,
+            "train_seconds": method.seconds,
+            "ms_per_volume": statistics.median([score["ms"] for score in scores[label]]),
+            **figures,
+        }
+    return {
+        "name": settings["name"],
+        "seed": settings["seed"],
+        "scenes": names,
+        "data_range": data.data_range,
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "units": {**UNITS, "ms_per_volume": "ms", "train_seconds": "s", "data_range": data.unit},
+        "methods": table,
+    }
+
+
+def device_of(accelerator: str) -> str:
+    """The device that evaluation runs on, for Lightning's name of an accelerator."""
+    return "cuda" if accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available() else "cpu"
+
+
+def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:
+    for i in range(len(batch["views"])):
+        alone = {key: value[i : i + 1] for key, value in batch.items()}
+        yield {key: value.to(device) if isinstance(value, Tensor) else value for key, value in alone.items()}
+
+
+def _timed(model: nn.Module, views: Tensor) -> tuple[float, Tensor]:
+    start = time.perf_counter()
+    volume = model(views).volume
+    if volume.is_cuda:
+        torch.cuda.synchronize()
+    return 1e3 * (time.perf_counter() - start), volume

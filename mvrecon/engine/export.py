@@ -1,0 +1,39 @@
+"""A reconstructed case as files: volumes as NIfTI, views and planes as images."""
+
+import re
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.viz import montage
+
+
+def save_case(
+    folder: Path, scene: Mapping[str, Any], volumes: Mapping[str, Tensor], grid: Grid, data_range: float
+) -> Path:
+    """Write one scene: `views.png`, `planes.png`, and with nibabel `truth.nii.gz` and one for each method.
+
+    Returns the scene's own folder in `folder`.
+    """
+    case = folder / re.sub(r"[^\w.-]+", "_", scene["name"][0])
+    truth = scene["volume"][0, 0]
+    shown = {label: volume[0, 0] for label, volume in volumes.items()}
+    montage.save_png(case / "views.png", montage.gallery(scene["views"][0, 0]))
+    montage.save_png(case / "planes.png", montage.planes(truth, shown, data_range))
+    if find_spec("nibabel"):
+        for label, volume in {"truth": truth, **shown}.items():
+            save_nifti(case / f"{label}.nii.gz", volume, grid)
+    return case
+
+
+def save_nifti(path: Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
+    """Write a volume as NIfTI, whose first axis is x: the grid's affine goes with it unchanged."""
+    import nibabel
+
+    values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
+    nibabel.save(nibabel.Nifti1Image(values, grid.affine.numpy()), path)

@@ -1,0 +1,81 @@
+"""One run: its data, its methods, and the training of each that has something to learn."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from mvrecon.config import instantiate
+from mvrecon.data.module import SceneData
+from mvrecon.engine.callbacks import Clock
+from mvrecon.engine.checkpoints import finished, unfinished
+from mvrecon.engine.module import ReconstructionModule, Settings
+
+
+def methods(settings: Settings) -> dict[str, Settings]:
+    """The models of a run's result table by label: the main one first, then those of `compare` that are not null.
+
+    Raises:
+        ValueError: the main model's label is taken twice.
+    """
+    main = settings["model"]
+    others = {label: model for label, model in settings["compare"].items() if model}
+    if main["name"] in others:
+        raise ValueError(f"compare holds {main['name']!r}, which is the main model's own label; give it another")
+    return {main["name"]: main, **others}
+
+
+def build_data(settings: Settings) -> SceneData:
+    """The training, validation and test scenes of a run."""
+    scenes = {"train": settings["scene"], "test": settings["test_scene"] or settings["scene"]}
+    where = {key: settings[key] for key in ("grid", "camera", "seed")}
+    return SceneData(scenes=scenes, **where, **settings["data"])
+
+
+def build_module(settings: Settings, model: Settings, data_range: float) -> ReconstructionModule:
+    """A method of a run, with fresh weights."""
+    geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
+    return ReconstructionModule(geometry, model, settings["loss"], settings["optimizer"], data_range)
+
+
+def trainable(module: L.LightningModule) -> bool:
+    """Whether there is anything to learn."""
+    return any(p.requires_grad for p in module.parameters())
+
+
+def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
+    """Train one method of a run and leave `checkpoints/<method>.ckpt`, unless it is there or nothing can be learnt.
+
+    Goes on from the method's last checkpoint where there is one. Every method starts from the same seed and sees the
+    same scenes in the same order.
+
+    Raises:
+        FloatingPointError: a loss that is not finite.
+    """
+    done, last = finished(folder, method), unfinished(folder, method)
+    models = methods(settings)
+    if done.exists():
+        return
+    L.seed_everything(settings["seed"], workers=True, verbose=False)
+    module = build_module(settings, models[method], data.data_range)
+    if not trainable(module):
+        return
+    L.seed_everything(settings["seed"], workers=True, verbose=False)  # initial weights have used up random numbers
+    board = folder if method == next(iter(models)) else folder / method
+    trainer = build_trainer(settings, board, last)
+    trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.exists() else None)
+    trainer.save_checkpoint(done)
+    shutil.rmtree(last.parent, ignore_errors=True)
+
+
+def build_trainer(settings: Settings, board: Path, last: Path) -> L.Trainer:
+    """Lightning's trainer, its logs and pictures flat in `board`, its last checkpoint at every validation in `last`."""
+    board.mkdir(parents=True, exist_ok=True)
+    callbacks: list[Any] = [instantiate(node) for node in (settings["callbacks"] or {}).values() if node]
+    keep = ModelCheckpoint(last.parent, last.stem, save_top_k=1, enable_version_counter=False)
+    loggers = [instantiate(node, save_dir=str(board)) for node in (settings["logger"] or {}).values() if node]
+    return L.Trainer(
+        **settings["trainer"], callbacks=[*callbacks, Clock(), keep], logger=loggers, default_root_dir=board
+    )

@@ -1,0 +1,91 @@
+"""One model in training: what Lightning needs to know of it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from torch import Tensor
+
+from mvrecon.engine.schedule import build_optimizer, build_schedule
+from mvrecon.geometry.grid import Grid
+from mvrecon.losses import ReconstructionLoss
+from mvrecon.metrics import view_metrics, volume_metrics
+from mvrecon.models.output import Reconstruction
+from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
+from mvrecon.projectors.base import Projector
+
+Settings = dict[str, Any]
+
+
+def build_projector(grid: Mapping[str, Any], camera: Mapping[str, Any], projector: Mapping[str, Any]) -> Projector:
+    """The projector of a grid (options of `Grid.centred`) and a rig (name and options)."""
+    return PROJECTORS.from_config(projector, grid=Grid.centred(**grid), cameras=CAMERAS.from_config(camera))
+
+
+class ReconstructionModule(L.LightningModule):
+    """A model, its loss and its optimiser, all from plain dicts of names and numbers.
+
+    So a checkpoint loads with torch's defaults, and `load_from_checkpoint(path)` needs nothing else.
+
+    Args:
+        geometry: `grid`, `camera` and `projector`.
+        model: name and options of the model.
+        loss: weights of `ReconstructionLoss`.
+        optimizer: name and options, and `schedule` with its `warmup`.
+        data_range: value range of the volumes, in their unit.
+    """
+
+    def __init__(
+        self, geometry: Settings, model: Settings, loss: Settings, optimizer: Settings, data_range: float
+    ):
+        super().__init__()
+        self.save_hyperparameters(logger=False)
+        self.projector = build_projector(**geometry)
+        self.model = MODELS.from_config(model, projector=self.projector)
+        self.loss = ReconstructionLoss(data_range, **loss)
+
+    def forward(self, views: Tensor) -> Reconstruction:
+        """Reconstruct; see the model."""
+        return self.model(views)
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
+        """The loss of one batch.
+
+        Raises:
+            FloatingPointError: a loss that is not finite.
+        """
+        terms = self.loss(self.model(batch["views"]), batch)
+        if not terms["total"].isfinite():
+            shown = ", ".join(f"{name} {value.item():.4g}" for name, value in terms.items())
+            raise FloatingPointError(
+                f"The loss of {self.hparams['model']['name']} is not finite at step {self.global_step}: {shown}. "
+                "Lower optimizer.lr, set trainer.gradient_clip_val, or look for bad values in the data"
+            )
+        for name, value in terms.items():
+            self.log(f"loss/{name}", value.detach(), prog_bar=name == "total", batch_size=len(batch["views"]))
+        return terms["total"]
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
+        """Log the loss and the figures of merit; hand the reconstruction on to the board."""
+        out = self.model(batch["views"])
+        terms = {f"loss_{name}": value for name, value in self.loss(out, batch).items()}
+        predicted = self.projector(out.volume)
+        figures = [
+            volume_metrics(volume, truth, inside, self.hparams["data_range"]) | view_metrics(view, measured)
+            for volume, truth, inside, view, measured in zip(
+                out.volume, batch["volume"], batch["inside"], predicted, batch["views"], strict=True
+            )
+        ]
+        means = {name: torch.tensor([f[name] for f in figures]).nanmean() for name in figures[0]}
+        for name, value in (terms | means).items():
+            self.log(f"val/{name}", value, prog_bar=name == "psnr", batch_size=len(predicted))
+        return {"out": out}
+
+    def configure_optimizers(self) -> Any:
+        """The optimiser, and its schedule over the whole number of steps, moved on at every step."""
+        options = dict(self.hparams["optimizer"])
+        schedule, warmup = options.pop("schedule", "cosine"), options.pop("warmup", 0.0)
+        optimizer = build_optimizer((p for p in self.parameters() if p.requires_grad), **options)
+        scheduler = build_schedule(optimizer, schedule, self.trainer.estimated_stepping_batches, warmup)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

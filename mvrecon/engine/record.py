@@ -1,0 +1,68 @@
+"""What a run folder tells: settings, versions and results, each file written whole or not at all."""
+
+import json
+import math
+import os
+import platform
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mvrecon import __version__
+
+PACKAGES = ("torch", "lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
+SETTINGS, VERSIONS, RESULTS = "config.yaml", "versions.txt", "results.json"
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, of mvrecon and of what its numbers depend on."""
+    found = {"mvrecon": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def start(folder: Path, settings: dict[str, Any]) -> None:
+    """Write down a run's settings, plain and resolved, and the versions it runs with."""
+    write(folder / SETTINGS, yaml.safe_dump(settings, sort_keys=False))
+    write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """The settings that a run was started with.
+
+    Raises:
+        FileNotFoundError: the folder is no run folder.
+    """
+    path = folder / SETTINGS
+    if not path.is_file():
+        raise FileNotFoundError(f"Expected a run folder with {SETTINGS} in it, got {folder}")
+    return yaml.safe_load(path.read_text())
+
+
+def write_results(folder: Path, results: dict[str, Any]) -> None:
+    """Write `results.json` with the command and the versions; figures that are not finite become null."""
+    whole = {**results, "command": sys.argv, "versions": versions()}
+    write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file; one of that name is replaced whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    part.write_text(text)
+    part.replace(path)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,67 @@
+"""`mvrecon-eval`: the result table of a run again, from its checkpoints, on its own test scenes or on others."""
+
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from mvrecon.config import VERSION_BASE, conf_dir, import_plugins, prepare_hydra, to_plain
+
+
+def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Evaluate a run's methods and write `results.json` (with `save`, the cases too) into a folder.
+
+    Args:
+        given: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the run: `test_scene`,
+            `data`, further `compare`; `device` and `save`.
+        folder: where the results go.
+
+    Raises:
+        FileNotFoundError: no checkpoint or no run is there.
+    """
+    import_plugins(given["plugins"])
+    from mvrecon.engine import checkpoints, evaluation, export, fit, record
+
+    run = checkpoints.run_folder(given["checkpoint"])
+    settings = merged(record.read_settings(run), given)
+    import_plugins(settings["plugins"])
+    data = fit.build_data(settings)
+
+    def save(scene: dict[str, Any], volumes: dict[str, Any]) -> None:
+        export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
+
+    see = save if given["save"] else None
+    found = evaluation.results(settings, run, data, evaluation.device_of(given["device"]), see)
+    found["checkpoint"] = str(run)
+    record.write_results(folder, found)
+    return found
+
+
+def merged(run: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """A run's settings with the test scene, the data options and the compared methods that an evaluation gives."""
+    data = {**run["data"], **(given["data"] or {})}
+    data["sizes"] = {**run["data"]["sizes"], **(data["sizes"] or {})}
+    scene = given["test_scene"] or run["test_scene"]
+    return {**run, "test_scene": scene, "data": data, "compare": {**run["compare"], **given["compare"]}}
+
+
+def task(config: DictConfig) -> float:
+    """One run of the app; returns the main method's mean PSNR in dB."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    found = evaluate(to_plain(config), folder)
+    from mvrecon.engine.report import show
+
+    show(found, folder)
+    return next(iter(found["methods"].values()))["psnr"]["mean"]
+
+
+def main() -> None:
+    """Entry point of `mvrecon-eval`."""
+    prepare_hydra()
+    hydra.main(config_path=str(conf_dir()), config_name="eval", version_base=VERSION_BASE)(task)()
+
+
+if __name__ == "__main__":
+    main()

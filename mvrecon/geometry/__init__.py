@@ -1,0 +1,1 @@
+"""Pure geometry: rigid motions, grids, sampling, camera frusta."""

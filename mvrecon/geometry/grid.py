@@ -1,0 +1,120 @@
+"""Voxel and pixel grids. No other file makes one.
+
+Convention: a volume tensor is [b c d h w] = (z, y, x); points are (x, y, z) in mm. Voxel and pixel indices are
+integer at centres: pixel (0, 0) is centred at (0, 0), so the principal point of W columns is (W - 1) / 2.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Where a volume's voxels lie.
+
+    Args:
+        shape: voxels along (z, y, x).
+        affine: maps a voxel index (x, y, z, 1) to world mm, as in NIfTI; float64.
+
+    Raises:
+        ValueError: an empty shape, or an affine that is not finite, not 4x4, left-handed or singular.
+    """
+
+    shape: tuple[int, int, int]
+    affine: Float[Tensor, "4 4"]
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3 or min(self.shape) < 1:
+            raise ValueError(f"A grid's shape must be three positive sizes (z, y, x), got {tuple(self.shape)}")
+        affine = torch.as_tensor(self.affine, dtype=torch.float64).cpu()
+        if affine.shape != (4, 4) or not affine.isfinite().all():
+            raise ValueError(f"A grid's affine must be a finite 4x4 matrix, got {self.affine}")
+        volume = torch.linalg.det(affine[:3, :3] / affine[:3, :3].norm(dim=0)).item()
+        if not volume > 1e-6:
+            raise ValueError(
+                f"A grid must be right-handed and not flat, got voxel axes with determinant {volume:.3g}; "
+                "flip the volume along one axis and its affine with it"
+            )
+        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
+        object.__setattr__(self, "affine", affine)
+
+    @classmethod
+    def centred(
+        cls,
+        shape: Sequence[int],
+        spacing: float | Sequence[float],
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> "Grid":
+        """An axis-aligned grid about a point.
+
+        Args:
+            shape: voxels along (z, y, x).
+            spacing: mm along (x, y, z), or one number for all.
+            centre: world position of the grid's centre in mm (x, y, z).
+
+        Raises:
+            ValueError: a spacing that is not positive.
+        """
+        steps = torch.as_tensor(spacing, dtype=torch.float64).expand(3).clone()
+        if not (steps > 0).all():
+            raise ValueError(f"A grid's spacing must be positive mm, got {spacing}")
+        affine = torch.diag(torch.cat([steps, steps.new_ones(1)]))
+        counts = torch.tensor(list(shape)[::-1], dtype=torch.float64)
+        affine[:3, 3] = torch.as_tensor(centre, dtype=torch.float64) - steps * (counts - 1) / 2
+        return cls(tuple(shape), affine)  # type: ignore[arg-type]
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """Voxel size in mm along (x, y, z)."""
+        return tuple(self.affine[:3, :3].norm(dim=0).tolist())  # type: ignore[return-value]
+
+    @property
+    def centre_index(self) -> Float[Tensor, "3"]:
+        """The volume's centre as a voxel index (x, y, z)."""
+        return (torch.tensor(self.shape[::-1], dtype=torch.float64) - 1) / 2
+
+    @property
+    def centre(self) -> Float[Tensor, "3"]:
+        """The volume's centre in world mm."""
+        return self.to_world(self.centre_index)
+
+    def to_world(self, index: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """World mm of voxel indices (x, y, z)."""
+        affine = self.affine.to(index)
+        return index @ affine[:3, :3].T + affine[:3, 3]
+
+    def to_index(self, xyz: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Voxel indices (x, y, z) of world points in mm."""
+        inverse = torch.linalg.inv(self.affine).to(xyz)
+        return xyz @ inverse[:3, :3].T + inverse[:3, 3]
+
+    def corners(self) -> Float[Tensor, "8 3"]:
+        """World positions of the outer corners of the grid's box, in mm."""
+        sizes = torch.tensor(self.shape[::-1], dtype=torch.float64)
+        ends = torch.cartesian_prod(*[torch.tensor([-0.5, n - 0.5], dtype=torch.float64) for n in sizes.tolist()])
+        return self.to_world(ends)
+
+    def refined(self, factor: int) -> "Grid":
+        """The same box cut into `factor` times as many voxels along each axis."""
+        affine = self.affine.clone()
+        affine[:3, :3] /= factor
+        first = torch.full((3,), (1 - factor) / (2 * factor), dtype=torch.float64)
+        affine[:3, 3] = self.to_world(first)
+        return Grid(tuple(n * factor for n in self.shape), affine)  # type: ignore[arg-type]
+
+
+def voxel_centres(grid: Grid, dtype: torch.dtype = torch.float64) -> Float[Tensor, "d h w 3"]:
+    """World position (x, y, z) in mm of every voxel's centre."""
+    axes = [torch.arange(n, dtype=torch.float64) for n in grid.shape]
+    z, y, x = torch.meshgrid(*axes, indexing="ij")
+    return grid.to_world(torch.stack([x, y, z], dim=-1)).to(dtype)
+
+
+def pixel_centres(shape: Sequence[int], dtype: torch.dtype = torch.float64) -> Float[Tensor, "v u 2"]:
+    """Pixel coordinates (u, v) = (column, row) of every pixel's centre of a detector of `shape` (rows, columns)."""
+    v, u = torch.meshgrid(*[torch.arange(n, dtype=dtype) for n in shape], indexing="ij")
+    return torch.stack([u, v], dim=-1)

@@ -1,0 +1,1 @@
+"""The arithmetic of one ray: a torch oracle and its compiled twin."""

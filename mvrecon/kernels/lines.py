@@ -1,0 +1,45 @@
+"""The rays of a rig as lines in voxel space, linear in the pixel.
+
+A pixel (u, v) has p = (u - uc, v - vc, 1), counted from the detector's centre. Its ray is the Pluecker line with
+direction D(p) and moment M(p) = start(p) x D(p) about the volume's centre, in voxel indices; both are linear in p, for
+central and for parallel beams alike. Along the main axis a (the greatest |D_a|) the ray stands in slab s at
+
+    y_b(s) = (start_b D_a - start_a D_b + s D_b) / D_a = (h_b + s D_b) / D_a
+
+in each other axis b. h_b is a component of the moment up to sign, formed in float64 without the difference of two great
+numbers, so a far source and a far world origin lose no digits (Pluecker coordinates: Hartley & Zisserman, ch. 3.2).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+
+#: The four linear maps of a view in `lines_of`.
+DIRECTION, MOMENT, START, WORLD = range(4)
+
+
+def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
+    """The rays of every view: the matrices that take p to (direction, moment, start, direction in world mm).
+
+    The first three are in voxel indices (x, y, z) about the volume's centre; float64, differentiable in the cameras.
+    """
+    rows, columns = cameras.shape
+    voxel = torch.linalg.inv(grid.affine[:3, :3])
+    middle = cameras.u * ((columns - 1) / 2) + cameras.v * ((rows - 1) / 2)
+    look = cameras.origin - cameras.source + (0 if cameras.parallel else middle)
+    source = (cameras.source - grid.centre + (middle if cameras.parallel else 0)) @ voxel.T
+    U, V, axis = cameras.u @ voxel.T, cameras.v @ voxel.T, look @ voxel.T
+    none = torch.zeros_like(U)
+    if cameras.parallel:
+        world, direction, start = (none, none, look), (none, none, axis), (U, V, source)
+        moment = tuple(torch.linalg.cross(each, axis) for each in start)
+    else:
+        # source x (detector - source) = source x detector
+        detector = (cameras.origin - grid.centre + middle) @ voxel.T
+        world, direction, start = (cameras.u, cameras.v, look), (U, V, axis), (none, none, source)
+        moment = tuple(torch.linalg.cross(source, each) for each in (U, V, detector))
+    maps = [torch.stack(columns, dim=-1) for columns in (direction, moment, start, world)]
+    return torch.stack(maps, dim=1)

@@ -1,0 +1,120 @@
+"""The arithmetic of one ray, written once: where it runs, what it sums, what it spreads, how its sum changes.
+
+A volume comes padded (one voxel before, two behind, along every axis) and flat, so that no loop tests a bound: every
+ray is first clipped to the slabs in which it can touch the volume. Slabs are counted along the ray's main axis; the
+other two axes b, c follow it cyclically. All functions are scalar and know no CPU; a GPU back end compiles the same.
+
+numba's disk cache does not see an edit of this file: change `cpu.py` with it, or clear the cache.
+"""
+
+from collections import namedtuple
+from math import ceil, floor, sqrt
+
+import numpy as np
+from numba import njit
+
+JOSEPH, SIDDON = 0, 1
+#: Voxels of padding before and behind the volume along every axis.
+PAD = (1, 2)
+#: Ties between axes go to the first, in every back end.
+TIE = 1 + 1e-12
+#: What may be reordered: sums and products, but NaN and infinity keep their meaning.
+FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
+
+scalar = njit(fastmath=FASTMATH, error_model="numpy")
+
+#: One ray: main axis; transverse padded coordinates at the centre slab and their slopes; mm per slab; where it begins
+#: and ends (slab coordinate about the centre); first slab and the one behind the last; the centre's slab coordinate.
+Ray = namedtuple("Ray", ["axis", "b", "slope_b", "c", "slope_c", "length", "begin", "end", "first", "last", "centre"])
+
+
+@scalar
+def at(line, kind, axis, u, v):
+    """Component `axis` of one of a view's four linear maps, at the pixel (u, v) counted from the detector's centre."""
+    return line[kind, axis, 0] * u + line[kind, axis, 1] * v + line[kind, axis, 2]
+
+
+@scalar
+def main_axis(line, u, v):
+    """The axis along which the ray runs fastest."""
+    x, y, z = abs(at(line, 0, 0, u, v)), abs(at(line, 0, 1, u, v)), abs(at(line, 0, 2, u, v))
+    if x * TIE >= y and x * TIE >= z:
+        return 0
+    return 1 if y * TIE >= z else 2
+
+
+@scalar
+def transverse(value, slope, half, lower, upper):
+    """The part of (lower, upper) in which |value + s slope| < half."""
+    if slope == 0:
+        return (lower, upper) if abs(value) < half else (0.0, -1.0)
+    one, two = (-half - value) / slope, (half - value) / slope
+    return max(lower, min(one, two)), min(upper, max(one, two))
+
+
+@scalar
+def trace(line, axis, u, v, window, sizes, method):
+    """Where the ray of a pixel runs; `first >= last` says that it misses. All in float64.
+
+    Args:
+        line: the view's maps [4 3 3], see `lines.py`.
+        axis: the ray's main axis.
+        u, v: the pixel, counted from the detector's centre.
+        window: the part of the ray that counts, as fractions of its direction.
+        sizes: voxels along (x, y, z).
+        method: JOSEPH or SIDDON.
+    """
+    b, c = (axis + 1) % 3, (axis + 2) % 3
+    per = 1.0 / at(line, 0, axis, u, v)
+    slope_b, slope_c = at(line, 0, b, u, v) * per, at(line, 0, c, u, v) * per
+    value_b, value_c = -at(line, 1, c, u, v) * per, at(line, 1, b, u, v) * per
+    world = at(line, 3, 0, u, v) ** 2 + at(line, 3, 1, u, v) ** 2 + at(line, 3, 2, u, v) ** 2
+    one = at(line, 2, axis, u, v) + window[0] / per
+    two = at(line, 2, axis, u, v) + window[1] / per
+    half = sizes[axis] / 2.0
+    begin, end = max(-half, min(one, two)), min(half, max(one, two))
+    # hat functions reach one voxel from the outermost centres, cells half a voxel
+    reach, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5)
+    lower, upper = transverse(value_b, slope_b, sizes[b] / 2.0 + reach, begin - 0.5 + margin, end + 0.5 - margin)
+    lower, upper = transverse(value_c, slope_c, sizes[c] / 2.0 + reach, lower, upper)
+    centre = (sizes[axis] - 1) / 2.0
+    first, last = 0, 0
+    if begin < end and lower <= upper:
+        first = max(0, int(ceil(lower + centre - margin)))
+        last = min(sizes[axis], int(floor(upper + centre + margin)) + 1)
+    b0, c0 = value_b + (sizes[b] - 1) / 2.0 + 1, value_c + (sizes[c] - 1) / 2.0 + 1
+    return Ray(axis, b0, slope_b, c0, slope_c, sqrt(world) * abs(per), begin, end, first, last, centre)
+
+
+@scalar
+def joseph_cells(ray, strides, at, y, z, share):
+    """The bilinear cell of each slab of a ray: its flat index, the weights towards b and c, the slab's part that counts."""
+    real, whole = y.dtype.type, at.dtype.type
+    b, slope_b, c, slope_c = real(ray.b), real(ray.slope_b), real(ray.c), real(ray.slope_c)
+    begin, end, half = real(ray.begin), real(ray.end), real(0.5)
+    start = real(ray.first - ray.centre)
+    first = whole(ray.first + 1)
+    along, across, up = strides[ray.axis], strides[(ray.axis + 1) % 3], strides[(ray.axis + 2) % 3]
+    for i in range(np.uint32(ray.last - ray.first)):
+        k = whole(i)
+        s = real(k) + start
+        share[i] = min(end, s + half) - max(begin, s - half)
+        py, pz = b + s * slope_b, c + s * slope_c
+        iy, iz = np.int32(py), np.int32(pz)
+        y[i], z[i] = py - real(iy), pz - real(iz)
+        at[i] = whole(whole(whole(first + k) * along) + whole(whole(whole(iy) * across) + whole(whole(iz) * up)))
+
+
+@scalar
+def joseph_sum(flat, across, up, count, at, y, z, share):
+    """The sum of the volume along a ray, bilinear in each slab, in voxels of the main axis."""
+    whole = at.dtype.type
+    total = flat.dtype.type(0)
+    for i in range(np.uint32(count)):
+        k = at[i]
+        f00, f10 = flat[np.uint64(k)], flat[np.uint64(whole(k + across))]
+        f01, f11 = flat[np.uint64(whole(k + up))], flat[np.uint64(whole(k + whole(across + up)))]
+        low = f00 + y[i] * (f10 - f00)
+        high = f01 + y[i] * (f11 - f01)
+        total += share[i] * (low + z[i] * (high - low))
+    return total

@@ -1,0 +1,25 @@
+"""What every model returns."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass
+class Reconstruction:
+    """A reconstructed volume, and how it came about where the model can tell.
+
+    Args:
+        volume: in the unit of (views / mm).
+        opinions: each camera's own volume.
+        visible: which voxels each camera's frustum holds.
+        weights: how much each camera counts at each voxel; they sum to one over the cameras that see it.
+        cross_views: opinion m projected into camera n, in the unit of the views.
+    """
+
+    volume: Float[Tensor, "b 1 d h w"]
+    opinions: Float[Tensor, "b m 1 d h w"] | None = None
+    visible: Bool[Tensor, "m 1 d h w"] | None = None
+    weights: Float[Tensor, "b m 1 d h w"] | None = None
+    cross_views: Float[Tensor, "b m n v u"] | None = None

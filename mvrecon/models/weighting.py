@@ -1,0 +1,41 @@
+"""Fusion: how much each camera's opinion counts at each voxel."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvrecon.models.unet3d import UNet3d
+
+
+def fuse(
+    volumes: Float[Tensor, "b m 1 d h w"], logits: Float[Tensor, "b m 1 d h w"], visible: Tensor
+) -> tuple[Float[Tensor, "b 1 d h w"], Float[Tensor, "b m 1 d h w"]]:
+    """The weighted mean over the cameras that see a voxel, and its weights; zero where none does.
+
+    Zero logits give the plain mean. The result is equivariant to a permutation of the cameras.
+    """
+    # Finite, not -inf: a voxel that no camera sees must not turn into NaN.
+    weights = torch.where(visible, logits, -1e4).softmax(dim=1) * visible
+    return (weights * volumes).sum(dim=1), weights
+
+
+class Weighting(nn.Module):
+    """A U-Net that gives one logit per voxel and camera from the features of that camera, the same for all cameras.
+
+    It works at half the grid's resolution: confidence varies more slowly than density, and at full resolution it would
+    cost as much as everything else together.
+
+    Args:
+        inputs: feature channels of one camera.
+        width: channels of the finest level.
+    """
+
+    def __init__(self, inputs: int, width: int = 8):
+        super().__init__()
+        self.net = UNet3d(inputs, 1, width, levels=2, zero=True)
+
+    def forward(self, features: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m 1 d h w"]:
+        b, m = features.shape[:2]
+        coarse = nn.functional.avg_pool3d(features.flatten(0, 1), 2, ceil_mode=True)
+        logits = nn.functional.interpolate(self.net(coarse), size=features.shape[-3:], mode="trilinear")
+        return logits.unflatten(0, (b, m))

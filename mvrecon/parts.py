@@ -1,0 +1,43 @@
+"""mvrecon's own parts, as strings, so that listing them imports nothing."""
+
+from mvrecon.registry import Registry
+
+SCENES = Registry(
+    "scene",
+    ellipsoids="mvrecon.scenes.ellipsoids:RandomEllipsoids",
+    derenzo="mvrecon.scenes.derenzo:RandomDerenzo",
+    shepp_logan="mvrecon.scenes.shepp_logan:SheppLogan",
+    mixture="mvrecon.scenes.mixture:Mixture",
+    hdf5="mvrecon.data.volumes:Hdf5Volumes",
+    nifti="mvrecon.data.volumes:NiftiVolume",
+)
+CAMERAS = Registry(
+    "camera",
+    circular="mvrecon.cameras.rigs:circular",
+    arc="mvrecon.cameras.rigs:arc",
+    dome="mvrecon.cameras.rigs:dome",
+    parallel="mvrecon.cameras.rigs:parallel",
+    from_file="mvrecon.cameras.files:from_file",
+    dcspect80="mvrecon.cameras.dcspect80:dcspect80",
+)
+PROJECTORS = Registry(
+    "projector",
+    drr="mvrecon.projectors.drr:Drr",
+    radon="mvrecon.projectors.radon:Radon",
+)
+HEADS = Registry(
+    "head",
+    softmax_depth="mvrecon.models.heads:SoftmaxDepth",
+    density="mvrecon.models.heads:Density",
+)
+MODELS = Registry(
+    "model",
+    cross_view="mvrecon.models.model:CrossView",
+    mean_fusion="mvrecon.models.baselines:MeanFusion",
+    backprojection_unet="mvrecon.models.baselines:BackprojectionUNet",
+    geometry_free="mvrecon.models.baselines:GeometryFree",
+    backprojection="mvrecon.models.baselines:Backprojection",
+    sirt="mvrecon.models.baselines:Sirt",
+)
+
+REGISTRIES = {r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, MODELS)}

@@ -1,0 +1,1 @@
+"""Linear operators between a volume and its views."""

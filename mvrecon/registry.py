@@ -1,0 +1,139 @@
+"""Names for the parts that a user can replace. Nothing is imported before it is asked for.
+
+A part comes from one of three places: mvrecon's own tables (`parts.py`), the decorator `register`
+(notebooks, scripts), or an installed plugin that declares an entry point in the group
+`mvrecon.plugins`, the kind leading its name::
+
+    [project.entry-points."mvrecon.plugins"]
+    "projector.spect" = "mvrecon_spect.projector:Spect"
+"""
+
+import difflib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from importlib import import_module
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from typing import Any
+
+GROUP = "mvrecon.plugins"
+
+
+@cache
+def installed() -> tuple[EntryPoint, ...]:
+    """Every entry point that an installed plugin declares for mvrecon."""
+    return tuple(entry_points(group=GROUP))
+
+
+def locate(module: str) -> ModuleSpec | None:
+    """Where a module is, as importlib's find_spec tells, but without importing its parent packages."""
+    top, *rest = module.split(".")
+    spec = find_spec(top)
+    for depth in range(1, len(rest) + 1):
+        if spec is None or spec.submodule_search_locations is None:
+            return None
+        spec = PathFinder.find_spec(".".join([top, *rest[:depth]]), spec.submodule_search_locations)
+    return spec
+
+
+def hint(name: str, known: Iterable[str]) -> str:
+    """The end of an error message: the nearest known name, then all of them."""
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    nearest = f"; did you mean {close[0]!r}?" if close else "."
+    return f"{nearest} Known: {', '.join(names)}"
+
+
+class Registry:
+    """Parts of one kind by name.
+
+    Args:
+        kind: what the parts are, in the singular ("projector"); plugins use it in entry-point names.
+        builtin: mvrecon's own parts, name -> "module:attribute".
+    """
+
+    def __init__(self, kind: str, **builtin: str):
+        self.kind = kind
+        self._parts: dict[str, str | Callable[..., Any]] = dict(builtin)
+
+    def _plugins(self) -> list[tuple[str, str]]:
+        prefix = f"{self.kind}."
+        return [(p.name.removeprefix(prefix), p.value) for p in installed() if p.name.startswith(prefix)]
+
+    def names(self) -> list[str]:
+        """Every known name, without importing any part."""
+        return sorted({*self._parts, *(name for name, _ in self._plugins())})
+
+    def origin(self, name: str) -> str:
+        """Where a part comes from, as "module:attribute", without importing it.
+
+        Raises:
+            LookupError: the name is unknown, or two parts claim it.
+        """
+        claims = {where for plugin, where in self._plugins() if plugin == name}
+        if name in self._parts:
+            claims.add(_where(self._parts[name]))
+        if len(claims) > 1:
+            raise LookupError(
+                f"{len(claims)} parts of kind {self.kind!r} are named {name!r}: {', '.join(sorted(claims))}"
+            )
+        if not claims:
+            raise LookupError(f"No {self.kind} is named {name!r}{hint(name, self.names())}")
+        return claims.pop()
+
+    def register(self, name: str) -> Callable[[Any], Any]:
+        """Decorator that adds a class or a factory under a name that is still free."""
+        if name in self.names():
+            raise LookupError(f"The {self.kind} {name!r} exists already: {self.origin(name)}")
+
+        def add(part: Any) -> Any:
+            self._parts[name] = part
+            return part
+
+        return add
+
+    def get(self, name: str) -> Callable[..., Any]:
+        """Import and return one part.
+
+        Raises:
+            LookupError: the name is unknown; the message gives the nearest name and all names.
+            ImportError: the part's module does not import; the message names the part.
+        """
+        where = self.origin(name)
+        part = self._parts.get(name)
+        if callable(part):
+            return part
+        module, _, attribute = where.partition(":")
+        try:
+            return getattr(import_module(module), attribute)
+        except Exception as error:  # whatever a plugin's import raises must name the plugin
+            raise ImportError(f"The {self.kind} {name!r} ({where}) does not import: {error}") from error
+
+    def build(self, name: str, /, *args: Any, **options: Any) -> Any:
+        """Construct one part.
+
+        Raises:
+            TypeError: an option that the part does not have; the message names the nearest.
+        """
+        part = self.get(name)
+        parameters = inspect.signature(part).parameters
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            for option in options:
+                if option not in parameters:
+                    raise TypeError(f"The {self.kind} {name!r} has no option {option!r}{hint(option, parameters)}")
+        return part(*args, **options)
+
+    def from_config(self, config: Mapping[str, Any], *args: Any, **given: Any) -> Any:
+        """Construct the part that a mapping `{"name": ..., **options}` describes."""
+        if "name" not in config:
+            raise TypeError(
+                f"A {self.kind} needs a 'name', got only {sorted(config)}. Known: {', '.join(self.names())}"
+            )
+        options = {key: value for key, value in config.items() if key != "name"}
+        return self.build(config["name"], *args, **given, **options)
+
+
+def _where(part: Any) -> str:
+    return part if isinstance(part, str) else f"{part.__module__}:{part.__qualname__}"

@@ -1,0 +1,1 @@
+"""Phantoms with closed-form line integrals."""

@@ -1,0 +1,101 @@
+"""Scenes of analytic phantoms: exact views, supersampled truth, and random numbers that depend on the case alone."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.scenes.sample import Rays, Sample
+from mvrecon.scenes.solids import Phantom
+from mvrecon.scenes.voxelise import voxelise
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnalyticScene(ABC):
+    """Cases of one kind of phantom.
+
+    Args:
+        field: radius of the sphere about the grid's centre that holds the object, as a fraction of the grid's
+            shortest edge.
+        value: the greatest value; all lie between 0 and it.
+        unit: of the value.
+
+    Raises:
+        ValueError: a field that is not in (0, 0.5], or a value that is not positive.
+    """
+
+    field: float = 0.42
+    value: float = 1.0
+    unit: str = "1/mm"
+
+    kind: ClassVar[str]
+    length: ClassVar[int | None] = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.field <= 0.5:
+            raise ValueError(f"The field must be a fraction in (0, 0.5] of the grid's shortest edge, got {self.field}")
+        if not self.value > 0:
+            raise ValueError(f"The greatest value of a scene must be positive, got {self.value}")
+
+    @property
+    def data_range(self) -> float:
+        """The fixed range of values that PSNR and SSIM refer to."""
+        return self.value
+
+    @abstractmethod
+    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """A phantom in the field of `grid`."""
+
+    def radius(self, grid: Grid) -> float:
+        """Radius of the field in mm."""
+        return self.field * min(n * step for n, step in zip(grid.shape[::-1], grid.spacing, strict=True))
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
+        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`.
+
+        Raises:
+            IndexError: the scene has no such case.
+        """
+        if self.length is not None and not index < self.length:
+            raise IndexError(f"The scene {self.kind!r} has {self.length} case(s), got index {index}")
+        return render(self.phantom(generator(seed, index), grid), grid, cameras, f"{self.kind}-{seed}-{index}")
+
+
+def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int = 4) -> Sample:
+    """Exact views of a phantom, and its truth as the mean over factor^3 points of each voxel."""
+    start, end = cameras.rays()
+    views = phantom.integrals(start.detach().cpu(), end.detach().cpu(), cameras.limits)
+    volume = voxelise(phantom, grid, factor)
+    inside = volume > 0
+    if any((part.values < 0).any() for part in phantom.parts):  # values may cancel inside the object
+        inside |= voxelise(phantom.support(), grid, factor) > 0
+    return Sample(views[None].to(torch.float32), volume[None], inside[None], name)
+
+
+def generator(seed: int, index: int) -> torch.Generator:
+    """The random numbers of one case.
+
+    Torch's CPU generator takes 32 bits of seed: here the murmur3 finaliser, a bijection, of seed * 2^32 / phi + index.
+    No two indices of a series share a stream, nor do any two of the series 0 to 999 below index 10^6.
+
+    Raises:
+        ValueError: a negative seed or index.
+    """
+    if seed < 0 or index < 0:
+        raise ValueError(f"A case needs a seed and an index of at least 0, got seed {seed}, index {index}")
+    return torch.Generator().manual_seed(mixed(seed, index))
+
+
+def mixed(seed: int, index: int) -> int:
+    """The 32 bits that seed the case `index` of the series `seed`."""
+    h = (seed * 0x9E3779B9 + index) & 0xFFFFFFFF
+    h = ((h ^ h >> 16) * 0x85EBCA6B) & 0xFFFFFFFF
+    h = ((h ^ h >> 13) * 0xC2B2AE35) & 0xFFFFFFFF
+    return h ^ h >> 16
+
+
+def uniform(rng: torch.Generator, low: float, high: float) -> float:
+    """A number uniform between two others."""
+    return low + (high - low) * torch.rand((), generator=rng, dtype=torch.float64).item()

@@ -1,0 +1,42 @@
+"""Several scenes taken in turn."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import SCENES
+from mvrecon.scenes.sample import Rays, Sample, Scene
+
+
+class Mixture:
+    """Cases of several scenes in turn: case i comes from scene i mod n. A scene that ends starts again.
+
+    Args:
+        scenes: the configuration `{name: ..., **options}` of each scene.
+
+    Raises:
+        ValueError: no scenes, or scenes whose data range or unit differ.
+    """
+
+    def __init__(self, scenes: Sequence[Mapping[str, Any]]):
+        if not scenes:
+            raise ValueError("A mixture needs at least one scene, got none")
+        self.scenes: list[Scene] = [SCENES.from_config(scene) for scene in scenes]
+        kinds = sorted({(scene.data_range, scene.unit) for scene in self.scenes})
+        if len(kinds) > 1:
+            raise ValueError(f"The scenes of a mixture must share their data range and unit, got {kinds}")
+        ((self.data_range, self.unit),) = kinds
+
+    @property
+    def length(self) -> int | None:
+        """Cases until every scene has been seen whole; None as soon as one is endless."""
+        lengths = [scene.length for scene in self.scenes]
+        finite = [n for n in lengths if n is not None]
+        return len(lengths) * max(finite) if len(finite) == len(lengths) else None
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
+        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
+        turn, which = divmod(index, len(self.scenes))
+        scene = self.scenes[which]
+        case = index if scene.length is None else turn % scene.length
+        return scene.sample(case, seed, grid, cameras)

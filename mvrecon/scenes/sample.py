@@ -1,0 +1,62 @@
+"""What a scene is, and what it gives: the measured views of a case and the truth behind them."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+
+
+class Rays(Protocol):
+    """The part of a camera rig that a scene looks at."""
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The fractions w of a ray between which it counts."""
+        ...
+
+    def rays(self) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
+        """Where each pixel's ray has w = 0 and where it has w = 1, in world mm."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One case.
+
+    Args:
+        views: measured line integrals in value * mm, float32.
+        volume: truth on the grid, float32.
+        inside: the voxels that the object touches.
+        name: of the case, the same for the same (seed, index).
+    """
+
+    views: Float[Tensor, "1 m v u"]
+    volume: Float[Tensor, "1 d h w"]
+    inside: Bool[Tensor, "1 d h w"]
+    name: str
+
+
+class Scene(Protocol):
+    """A source of cases; each is a pure function of (seed, index), in any order and from any process."""
+
+    @property
+    def data_range(self) -> float:
+        """The fixed range of values that PSNR and SSIM refer to."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Unit of the volume's values."""
+        ...
+
+    @property
+    def length(self) -> int | None:
+        """How many cases there are; None: endless."""
+        ...
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
+        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
+        ...

@@ -1,0 +1,171 @@
+"""Solids whose line integrals are known in closed form: ellipsoids, finite elliptic cylinders, boxes.
+
+In its own frame, p = diag(1/a) R^T (X - c), every solid is a unit ball in its first k axes times a slab |p| < 1 in each
+of the others: an ellipsoid has k = 3, a cylinder k = 2, a box k = 0. A ray p = o + t q meets the ball between the roots
+of |q|^2 t^2 + 2 (o.q) t + |o|^2 - 1, whose discriminant is written without cancellation as |q|^2 - |o x q|^2, and each
+slab between its two planes. Values of overlapping solids add up.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+#: How many of a solid's axes are round; along the others it is a slab.
+ROUND_AXES = {"ellipsoid": 3, "cylinder": 2, "box": 0}
+#: Pairs of ray and solid at a time: the working arrays stay in the cache.
+PAIRS = 2**16
+
+
+@dataclass(frozen=True, eq=False)
+class Solids:
+    """Solids of one kind.
+
+    Args:
+        kind: "ellipsoid", "cylinder" (its axis is the solid's z), or "box".
+        centres: in world mm.
+        rotations: each solid's axes in the world, as columns.
+        semi_axes: half lengths in mm along the solid's own x, y, z.
+        values: what each solid adds to the points inside it.
+
+    Raises:
+        ValueError: an unknown kind, shapes that do not agree, values that are not finite, sizes that are not positive,
+            or matrices that are not rotations.
+    """
+
+    kind: str
+    centres: Float[Tensor, "n 3"]
+    rotations: Float[Tensor, "n 3 3"]
+    semi_axes: Float[Tensor, "n 3"]
+    values: Float[Tensor, " n"]
+
+    def __post_init__(self) -> None:
+        if self.kind not in ROUND_AXES:
+            raise ValueError(f"Unknown kind of solid {self.kind!r}. Known: {', '.join(ROUND_AXES)}")
+        n = len(torch.as_tensor(self.values))
+        for name, shape in (("centres", (n, 3)), ("rotations", (n, 3, 3)), ("semi_axes", (n, 3)), ("values", (n,))):
+            value = torch.as_tensor(getattr(self, name)).to(torch.float64)
+            if value.shape != shape or not value.isfinite().all():
+                raise ValueError(f"{n} solids need finite {name} of shape {shape}, got {value.tolist()}")
+            object.__setattr__(self, name, value)
+        if not (self.semi_axes > 0).all():
+            raise ValueError(f"Solids need positive semi-axes in mm, got {self.semi_axes.tolist()}")
+        unit = torch.eye(3, dtype=torch.float64)
+        if not torch.allclose(self.rotations.mT @ self.rotations, unit.expand(n, 3, 3), atol=1e-6):
+            raise ValueError(f"Solids need rotations with orthonormal columns, got {self.rotations.tolist()}")
+
+    @property
+    def round_axes(self) -> int:
+        """How many axes are round: 3 of an ellipsoid, 2 of a cylinder, 0 of a box."""
+        return ROUND_AXES[self.kind]
+
+    @property
+    def to_unit(self) -> Float[Tensor, "n 3 3"]:
+        """diag(1/a) R^T: from the world's directions to the unit solid's frame."""
+        return self.rotations.mT / self.semi_axes[..., None]
+
+    def integrals(
+        self, start: Float[Tensor, "r 3"], step: Float[Tensor, "r 3"], extent: tuple[float, float]
+    ) -> Float[Tensor, " r"]:
+        """Integral of the values over X = start + t step, t in `extent`, in value * mm; float64."""
+        A = self.to_unit.to(start.device)
+        offset = (A @ self.centres.to(start.device)[..., None])[..., 0]
+        k = self.round_axes
+        o = A[:, :k].transpose(0, 1) @ start.T - offset.T[:k, :, None]
+        q = A[:, :k].transpose(0, 1) @ step.T
+        solid, ray, enter, leave = _ball(o, q, extent)
+        o = (A[solid, k:] @ start[ray, :, None])[..., 0] - offset[solid, k:]
+        q = (A[solid, k:] @ step[ray, :, None])[..., 0]
+        enter, leave = _slabs(o, q, enter, leave)
+        chord = torch.where(leave > enter, leave - enter, 0.0) * step.norm(dim=-1)[ray]
+        return start.new_zeros(len(start)).index_add(0, ray, chord * self.values.to(start.device)[solid])
+
+    def sums(self, xyz: Float[Tensor, "r 3"]) -> Float[Tensor, " r"]:
+        """Sum of the values of the solids around each point; float64."""
+        p = torch.einsum("nij,rnj->irn", self.to_unit.to(xyz), xyz[:, None] - self.centres.to(xyz))
+        return contains(p, self.round_axes).to(xyz) @ self.values.to(xyz)
+
+    def moved(self, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]) -> "Solids":
+        """The solids after the motion X -> R X + t."""
+        R, t = R.to(self.centres), t.to(self.centres)
+        return replace(self, centres=self.centres @ R.T + t, rotations=R @ self.rotations)
+
+
+def contains(p: Float[Tensor, "3 ..."], round_axes: int) -> Bool[Tensor, "..."]:
+    """Which points lie in the unit solid with so many round axes."""
+    inside = p[:round_axes].square().sum(dim=0) <= 1
+    return inside & (p[round_axes:].abs() <= 1).all(dim=0)
+
+
+def _ball(
+    o: Float[Tensor, "k n r"], q: Float[Tensor, "k n r"], extent: tuple[float, float]
+) -> tuple[Int[Tensor, " h"], Int[Tensor, " h"], Float[Tensor, " h"], Float[Tensor, " h"]]:
+    """Solid and ray of every pair that meets in the round axes, and where in `extent` it enters and leaves the ball."""
+    qq = q.square().sum(dim=0)
+    crosses = (o[i] * q[j] - o[j] * q[i] for i, j in combinations(range(len(o)), 2))
+    disc = sum((-cross.square() for cross in crosses), start=qq)
+    along = qq == 0  # along a cylinder's axis, or a box: the ball is not crossed, but stayed in or missed
+    hit = (disc > 0) | (along & (o.square().sum(dim=0) < 1)) if along.any() else disc > 0
+    solid, ray = hit.nonzero(as_tuple=True)
+    o, q, qq, disc, along = o[:, hit], q[:, hit], qq[hit], disc[hit], along[hit]
+    middle = torch.where(along, 0.0, -(o * q).sum(dim=0) / qq)
+    half = torch.where(along, torch.inf, disc.sqrt() / qq)
+    low, high = extent
+    return solid, ray, (middle - half).clamp(min=low), (middle + half).clamp(max=high)
+
+
+def _slabs(
+    o: Float[Tensor, "h s"], q: Float[Tensor, "h s"], enter: Float[Tensor, " h"], leave: Float[Tensor, " h"]
+) -> tuple[Float[Tensor, " h"], Float[Tensor, " h"]]:
+    """The part between `enter` and `leave` that lies in the slabs |o + t q| < 1 of the other axes."""
+    for a, b in zip(((-1 - o) / q).unbind(dim=-1), ((1 - o) / q).unbind(dim=-1), strict=True):
+        enter, leave = torch.maximum(enter, torch.minimum(a, b)), torch.minimum(leave, torch.maximum(a, b))
+    return enter, leave
+
+
+@dataclass(frozen=True, eq=False)
+class Phantom:
+    """An object made of solids, whose values add up where they overlap.
+
+    Args:
+        parts: batches of solids, each of one kind.
+    """
+
+    parts: tuple[Solids, ...]
+
+    def integrals(
+        self, start: Float[Tensor, "*n 3"], end: Float[Tensor, "*n 3"], extent: tuple[float, float] = (0.0, 1.0)
+    ) -> Float[Tensor, "*n"]:
+        """Exact line integrals in value * mm over X = start + w (end - start), w in `extent` (which may be infinite).
+
+        Computed in float64, returned in the dtype of `start`. A ray that only touches a solid has none of it.
+        """
+        first, last = (x.reshape(-1, 3).to(torch.float64) for x in torch.broadcast_tensors(start, end))
+        total = first.new_zeros(len(first))
+        for part, rays in self._chunks(len(first)):
+            total[rays] += part.integrals(first[rays], last[rays] - first[rays], extent)
+        return total.reshape(torch.broadcast_shapes(start.shape, end.shape)[:-1]).to(start.dtype)
+
+    def values(self, xyz: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
+        """Value at world points in mm, in the dtype of `xyz`."""
+        points = xyz.reshape(-1, 3).to(torch.float64)
+        total = points.new_zeros(len(points))
+        for part, chunk in self._chunks(len(points)):
+            total[chunk] += part.sums(points[chunk])
+        return total.reshape(xyz.shape[:-1]).to(xyz.dtype)
+
+    def moved(self, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]) -> "Phantom":
+        """The phantom after the rigid motion X -> R X + t of the world."""
+        return Phantom(tuple(part.moved(R, t) for part in self.parts))
+
+    def support(self) -> "Phantom":
+        """The same solids, each of value one: positive wherever there is any of them."""
+        return Phantom(tuple(replace(part, values=torch.ones_like(part.values)) for part in self.parts))
+
+    def _chunks(self, count: int) -> Iterator[tuple[Solids, slice]]:
+        for part in self.parts:
+            size = max(1, PAIRS // max(1, len(part.values)))
+            yield from ((part, slice(first, first + size)) for first in range(0, count, size))

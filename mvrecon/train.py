@@ -1,0 +1,72 @@
+"""`mvrecon-train`: train a method and those it is compared with, then print the table of unseen scenes.
+
+Torch is imported inside the task, so that `--help` and typing mistakes are answered at once.
+"""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from mvrecon.config import VERSION_BASE, conf_dir, import_plugins, prepare_hydra, to_plain
+
+
+def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Train every method of `settings` in a run folder, go on where it was left, and return its results.
+
+    The folder then holds `config.yaml`, `versions.txt`, logs, `checkpoints/`, `review/` and `results.json`.
+    """
+    import_plugins(settings["plugins"])
+    from mvrecon.engine import evaluation, fit, record
+
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    record.start(folder, settings)
+    data = fit.build_data(settings)
+    for method in fit.methods(settings):
+        fit.fit(method, settings, data, folder)
+    device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
+    found = evaluation.results(settings, folder, data, device)
+    record.write_results(folder, found)
+    return found
+
+
+def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
+    """The settings and the folder of a run that goes on.
+
+    Raises:
+        ValueError: other options were given, which a resumed run could not honour.
+        FileNotFoundError: no run folder is there.
+    """
+    from mvrecon.engine import checkpoints, record
+
+    if others:
+        raise ValueError(f"resume goes on with the run's own settings; but got also {' '.join(others)}")
+    run = checkpoints.run_folder(folder)
+    return record.read_settings(run), run
+
+
+def task(config: DictConfig) -> float:
+    """One run of the app; returns the main method's mean PSNR in dB, for sweepers."""
+    settings = to_plain(config)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    if settings["resume"]:
+        given = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        settings, folder = resumed(settings["resume"], given)
+    found = train(settings, folder)
+    from mvrecon.engine.report import show
+
+    show(found, folder)
+    return next(iter(found["methods"].values()))["psnr"]["mean"]
+
+
+def main() -> None:
+    """Entry point of `mvrecon-train`."""
+    prepare_hydra()
+    hydra.main(config_path=str(conf_dir()), config_name="train", version_base=VERSION_BASE)(task)()
+
+
+if __name__ == "__main__":
+    main()

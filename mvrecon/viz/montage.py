@@ -1,0 +1,130 @@
+"""Pictures for review: labelled tiles of planes, views, opinions and weights, with one fixed window of values each."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.viz.planes import Image, brightest, grey, middle_planes, signed
+
+GAP = 2
+LABEL = 14
+EDGE = 96
+
+
+def enlarged(image: Image, edge: int = EDGE) -> Image:
+    """The image with each pixel repeated so often that its longer edge just stays within `edge` (at least once)."""
+    factor = max(1, edge // max(image.shape[:2]))
+    return image.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def labelled(image: Image, text: str) -> Image:
+    """The image under a strip that carries a text."""
+    from PIL import Image as Pillow
+    from PIL import ImageDraw
+
+    strip = Pillow.new("RGB", (image.shape[1], LABEL))
+    ImageDraw.Draw(strip).text((1, 1), text, fill=(255, 255, 255))
+    return np.concatenate([np.asarray(strip), image])
+
+
+def tiled(rows: Sequence[Sequence[Image]]) -> Image:
+    """Images in rows and columns on black, each column as wide as its widest image.
+
+    Raises:
+        ValueError: no image, or rows of different length.
+    """
+    if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
+        raise ValueError(f"A montage needs rows of equal length, got lengths {[len(row) for row in rows]}")
+    heights = [max(image.shape[0] for image in row) for row in rows]
+    widths = [max(image.shape[1] for image in column) for column in zip(*rows, strict=True)]
+    canvas = np.zeros((sum(heights) + GAP * (len(heights) - 1), sum(widths) + GAP * (len(widths) - 1), 3), np.uint8)
+    top = 0
+    for row, height in zip(rows, heights, strict=True):
+        left = 0
+        for image, width in zip(row, widths, strict=True):
+            canvas[top : top + image.shape[0], left : left + image.shape[1]] = image
+            left += width + GAP
+        top += height + GAP
+    return canvas
+
+
+def planes(
+    truth: Float[Tensor, "d h w"], volumes: Mapping[str, Float[Tensor, "d h w"]], data_range: float
+) -> Image:
+    """Three middle planes (rows) of the truth, of every volume, and of the first volume's error (columns).
+
+    Values from 0 to data_range; the error from -data_range / 2 (blue) to data_range / 2 (red).
+    """
+    ours = next(iter(volumes.values()))
+    shown = {"truth": truth, **volumes}
+    columns = [_column(name, [grey(p, (0, data_range)) for p in middle_planes(v)]) for name, v in shown.items()]
+    columns.append(_column("error", [signed(p, data_range / 2) for p in middle_planes(ours - truth)]))
+    return tiled(list(zip(*columns, strict=True)))
+
+
+def projections(
+    truth: Float[Tensor, "d h w"], volumes: Mapping[str, Float[Tensor, "d h w"]], data_range: float
+) -> Image:
+    """Maximum-intensity projections along three axes (rows) of the truth and of every volume (columns)."""
+    shown = {"truth": truth, **volumes}
+    columns = [_column(name, [grey(p, (0, data_range)) for p in brightest(v)]) for name, v in shown.items()]
+    return tiled(list(zip(*columns, strict=True)))
+
+
+def views(measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"]) -> Image:
+    """Measured and predicted views and their difference (rows) of all cameras (columns).
+
+    Values from 0 to the greatest measured value; the difference to a fourth of it.
+    """
+    top = max(measured.amax().item(), torch.finfo(torch.float32).tiny)
+    columns = [
+        _column(f"camera {m}", [grey(y, (0, top)), grey(p, (0, top)), signed(p - y, top / 4)])
+        for m, (y, p) in enumerate(zip(measured, predicted, strict=True))
+    ]
+    return tiled(list(zip(*columns, strict=True)))
+
+
+def gallery(each: Float[Tensor, "m v u"], edge: int = 256) -> Image:
+    """The views of all cameras in rows of at most four; values from 0 to the greatest."""
+    top = max(each.amax().item(), torch.finfo(torch.float32).tiny)
+    images = [labelled(enlarged(grey(view, (0, top)), edge), f"camera {m}") for m, view in enumerate(each)]
+    images += [np.zeros_like(images[0])] * (-len(images) % min(4, len(images)))
+    return tiled([images[i : i + 4] for i in range(0, len(images), 4)])
+
+
+def opinions(each: Float[Tensor, "m d h w"], data_range: float) -> Image:
+    """Three middle planes (rows) of every camera's own volume (columns); values from 0 to data_range."""
+    return _per_camera(each, data_range)
+
+
+def weights(each: Float[Tensor, "m d h w"]) -> Image:
+    """Three middle planes (rows) of every camera's weight (columns).
+
+    Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
+    """
+    return _per_camera(each, 3 / len(each))
+
+
+def save_png(path: Path, image: Image) -> None:
+    """Write an image; a file of that name is replaced whole or not at all."""
+    from PIL import Image as Pillow
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    Pillow.fromarray(image).save(part, format="PNG")
+    part.replace(path)
+
+
+def _per_camera(each: Float[Tensor, "m d h w"], top: float) -> Image:
+    columns = [_column(f"camera {m}", [grey(p, (0, top)) for p in middle_planes(v)]) for m, v in enumerate(each)]
+    return tiled(list(zip(*columns, strict=True)))
+
+
+def _column(name: str, images: Sequence[Image]) -> list[Image]:
+    first, *rest = [enlarged(image) for image in images]
+    return [labelled(first, name), *rest]

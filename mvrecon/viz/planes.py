@@ -1,0 +1,54 @@
+"""Grey and coloured images of volumes: middle planes and maximum-intensity projections.
+
+Convention: an image's rows run downwards; planes that hold the z axis are shown with +z up.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+Image = UInt8[np.ndarray, "h w 3"]
+Window = tuple[float, float]
+
+
+def middle_planes(volume: Float[Tensor, "d h w"]) -> list[Float[Tensor, "r c"]]:
+    """The three planes through the volume's centre: across z, across y, across x."""
+    d, h, w = (n // 2 for n in volume.shape)
+    return [volume[d], volume[:, h].flip(0), volume[:, :, w].flip(0)]
+
+
+def brightest(volume: Float[Tensor, "d h w"]) -> list[Float[Tensor, "r c"]]:
+    """Maximum-intensity projections along z, y and x."""
+    along_z, along_y, along_x = (volume.amax(dim=axis) for axis in range(3))
+    return [along_z, along_y.flip(0), along_x.flip(0)]
+
+
+def grey(image: Float[Tensor, "h w"], window: Window) -> Image:
+    """A grey image: black at the window's lower end, white at its upper; values that are not finite are red.
+
+    Raises:
+        ValueError: a window whose ends are not in order.
+    """
+    low, high = window
+    if not low < high:
+        raise ValueError(f"A window of values needs its lower end below its upper, got {window}")
+    values = image.detach().cpu().double()
+    level = ((values - low) / (high - low)).clamp(0, 1).nan_to_num(0)
+    colours = (level[..., None] * 255).round().to(torch.uint8).expand(-1, -1, 3).clone()
+    colours[~values.isfinite()] = torch.tensor([255, 0, 0], dtype=torch.uint8)
+    return colours.numpy()
+
+
+def signed(image: Float[Tensor, "h w"], limit: float) -> Image:
+    """A signed image: white at 0, red towards +limit, blue towards -limit.
+
+    Raises:
+        ValueError: a limit that is not positive.
+    """
+    if not limit > 0:
+        raise ValueError(f"A signed image needs a positive limit, got {limit}")
+    level = (image.detach().cpu().double() / limit).clamp(-1, 1).nan_to_num(0)
+    red, blue = 1 - (-level).clamp(min=0), 1 - level.clamp(min=0)
+    colours = torch.stack([red, 1 - level.abs(), blue], dim=-1)
+    return (colours * 255).round().to(torch.uint8).numpy()

@@ -1,0 +1,1 @@
+"""Multi-pinhole SPECT as a plugin of mvrecon."""

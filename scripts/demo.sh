@@ -1,0 +1,13 @@
+#!/usr/bin/env bash
+# Trains the quickstart, prints its table of results, and says how to look at the run. Arguments go to mvrecon-train.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+bash scripts/setup.sh
+
+.venv/bin/mvrecon-train experiment=quickstart "$@"
+
+cat <<'TEXT'
+
+Look at the runs:  .venv/bin/tensorboard --logdir outputs --samples_per_plugin images=200
+and open http://localhost:6006 in a browser.
+TEXT

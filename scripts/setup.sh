@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Makes .venv with the versions of constraints.txt: `bash scripts/setup.sh [extras]`, extras such as "io" or "dev".
+# A second run with nothing changed returns at once.
+set -euo pipefail
+shopt -s nullglob
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+extras=${1:-io}
+state=$(cat <(pwd) pyproject.toml constraints.txt scripts/setup.sh plugins/*/pyproject.toml | cksum)
+for stamp in ".venv/installed-$extras" .venv/installed-dev; do
+    if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$state" ]; then exit 0; fi
+done
+
+supported='import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
+for python in python3.11 python3.12 python3.13 python3 none; do
+    if "$python" -c "$supported" 2>/dev/null; then break; fi
+done
+if [ "$python" = none ]; then
+    echo "mvrecon needs Python 3.11, 3.12 or 3.13 with its venv module; found $(python3 --version 2>&1 || true)." >&2
+    exit 1
+fi
+
+echo "Setting up .venv with $("$python" --version), once; this takes some minutes ..."
+rm -f .venv/installed-*
+"$python" -m venv .venv
+install() { .venv/bin/python -m pip --disable-pip-version-check --no-input install --quiet -c constraints.txt "$@"; }
+
+# torch first and alone. Without a GPU its small CPU build is taken where pip's settings lead to one.
+torch=$(grep '^torch==' constraints.txt)
+if command -v nvidia-smi >/dev/null || ! install "$torch+cpu" 2>/dev/null; then install "$torch"; fi
+install -e ".[$extras]"
+if [ "$extras" = dev ]; then
+    for plugin in plugins/*/pyproject.toml; do install --no-deps -e "$(dirname "$plugin")"; done
+fi
+echo "$state" >".venv/installed-$extras"

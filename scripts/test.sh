@@ -1,0 +1,10 @@
+#!/usr/bin/env bash
+# Every check of the project: style, types, layers, tests. Arguments go to pytest.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+bash scripts/setup.sh dev
+
+export PATH="$PWD/.venv/bin:$PATH" OMP_NUM_THREADS=1
+ruff check .
+ruff format --check .
+python -m pytest -n 2 --dist=worksteal "$@"

@@ -1,0 +1,102 @@
+"""The result table against models whose answers are known."""
+
+import io
+import math
+
+import pytest
+import torch
+from rich.console import Console
+from torch import nn
+
+from mvrecon.engine.evaluation import evaluate, mean_and_spread
+from mvrecon.engine.export import save_case
+from mvrecon.engine.report import table
+from mvrecon.geometry.grid import Grid
+from mvrecon.metrics import UNITS
+from mvrecon.models.output import Reconstruction
+
+SHAPE = (8, 8, 8)
+
+
+class Shadow(nn.Module):
+    """The sum along z, seen by two equal cameras."""
+
+    def forward(self, volume):
+        return volume.sum(dim=2)[:, :, None].expand(-1, -1, 2, -1, -1)
+
+
+class Scaled(nn.Module):
+    """The views spread evenly along z, times a factor."""
+
+    def __init__(self, factor):
+        super().__init__()
+        self.factor = factor
+
+    def forward(self, views):
+        volume = views[:, :, :1].expand(-1, -1, SHAPE[0], -1, -1) / SHAPE[0]
+        return Reconstruction(volume=self.factor * volume)
+
+
+def batches():
+    flat = 0.1 + torch.rand(3, 1, 1, 8, 8, generator=torch.Generator().manual_seed(0))
+    volume = flat.expand(-1, -1, 8, -1, -1)
+    inside = torch.zeros(volume.shape, dtype=torch.bool)
+    inside[..., 2:6] = True
+    views = Shadow()(volume)
+    yield {"views": views[:2], "volume": volume[:2], "inside": inside[:2], "name": ["a", "b"]}
+    yield {"views": views[2:], "volume": volume[2:], "inside": inside[2:], "name": ["c"]}
+
+
+def scores(see=None):
+    return evaluate({"exact": Scaled(1.0), "low": Scaled(0.75)}, batches(), Shadow(), 1.0, see=see)
+
+
+def test_every_scene_counts_once_whatever_the_batches():
+    found = scores()
+    assert {label: len(each) for label, each in found.items()} == {"exact": 3, "low": 3}
+    for score in found["low"]:
+        assert score["nrmse"] == pytest.approx(0.25, abs=1e-5)
+        assert score["nrmse_inside"] == pytest.approx(0.25, abs=1e-5)
+        assert score["view_nrmse"] == pytest.approx(0.25, abs=1e-5)
+    assert all(score["nrmse"] < 1e-6 and score["ssim"] > 0.9999 for score in found["exact"])
+    assert all(score["ms"] > 0 for each in found.values() for score in each)
+
+
+def test_each_scene_is_shown_with_all_reconstructions():
+    seen = []
+    scores(lambda scene, volumes: seen.append((scene["name"], sorted(volumes), tuple(scene["views"].shape))))
+    assert seen == [([name], ["exact", "low"], (1, 1, 2, 8, 8)) for name in "abc"]
+
+
+def test_mean_and_spread():
+    assert mean_and_spread([1.0, 2.0, 3.0]) == {"mean": 2.0, "std": 1.0, "values": [1.0, 2.0, 3.0]}
+    assert mean_and_spread([5.0])["std"] == 0
+    assert mean_and_spread([1.0, math.nan, 3.0])["mean"] == 2
+    assert mean_and_spread([math.inf, 3.0])["mean"] == math.inf
+    assert math.isnan(mean_and_spread([math.nan])["mean"])
+
+
+def test_the_table_tells_every_method_and_both_moments():
+    row = {name: {"mean": 0.5, "std": 0.125, "values": [0.5]} for name in UNITS}
+    row |= {"parameters": 12345, "ms_per_volume": 1.25, "train_seconds": 61.0, "train_steps": 7}
+    sharp = {**row, "psnr": {"mean": math.inf, "std": 0.0, "values": []}, "train_steps": 0}
+    text = io.StringIO()
+    found = {"name": "trial", "scenes": ["a"], "methods": {"cross_view": row, "sirt": sharp}}
+    Console(file=text, width=120).print(table(found))
+    for piece in ("trial", "cross_view", "sirt", "12,345", "0.500", "± 0.125", "± 0.12", "inf", "61", "…"):
+        assert (piece in text.getvalue()) == (piece != "…"), piece
+
+
+def test_a_saved_case_keeps_axes_and_affine(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    grid = Grid.centred((6, 7, 8), (1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
+    volume = torch.zeros(1, 1, 6, 7, 8)
+    volume[0, 0, 5, 4, 3] = 1.0
+    scene = {"views": torch.rand(1, 1, 2, 4, 4), "volume": volume, "name": ["pat/1 a"]}
+    case = save_case(tmp_path, scene, {"sirt": volume * 2}, grid, 1.0)
+    assert sorted(p.name for p in case.iterdir()) == ["planes.png", "sirt.nii.gz", "truth.nii.gz", "views.png"]
+    image = nibabel.load(case / "sirt.nii.gz")
+    assert image.shape == (8, 7, 6) and image.get_fdata()[3, 4, 5] == 2
+    world = image.affine @ [3, 4, 5, 1]
+    assert world[:3] == pytest.approx(grid.to_world(torch.tensor([3.0, 4.0, 5.0])).tolist())
+

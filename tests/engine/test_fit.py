@@ -1,0 +1,133 @@
+"""Training: what a checkpoint holds, that it resumes, and that seeds decide everything."""
+
+import copy
+
+import pytest
+import torch
+
+from mvrecon.config import compose
+from mvrecon.engine import checkpoints, fit
+from mvrecon.engine.module import ReconstructionModule
+
+PLAIN = (dict, list, tuple, str, int, float, bool, type(None), torch.Tensor)
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return compose("experiment=smoke")
+
+
+@pytest.fixture(scope="module")
+def data(settings):
+    return fit.build_data(settings)
+
+
+@pytest.fixture(scope="module")
+def run(settings, data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    fit.fit("cross_view", settings, data, folder)
+    return folder
+
+
+def all_plain(value):
+    if isinstance(value, dict):
+        return all(all_plain(key) and all_plain(item) for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return all(all_plain(item) for item in value)
+    return isinstance(value, PLAIN)
+
+
+def test_a_checkpoint_loads_with_torch_defaults_and_is_plain(run, settings):
+    state = torch.load(checkpoints.finished(run, "cross_view"))
+    assert state["global_step"] == settings["trainer"]["max_steps"]
+    assert state["hyper_parameters"]["model"] == settings["model"]
+    assert all_plain(state["hyper_parameters"]) and all_plain(state["callbacks"])
+
+
+def test_a_module_comes_back_from_its_checkpoint_alone(run, data):
+    path = checkpoints.finished(run, "cross_view")
+    module = ReconstructionModule.load_from_checkpoint(path)
+    again = checkpoints.load(path)
+    data.setup("test")
+    views = next(iter(data.test_dataloader()))["views"]
+    with torch.no_grad():
+        assert torch.equal(module.eval()(views).volume, again.module(views).volume)
+    assert again.steps == 3 and again.seconds > 0
+
+
+def test_only_the_finished_checkpoint_stays(run):
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["cross_view.ckpt"]
+
+
+def test_training_changes_the_weights_and_equal_seeds_give_equal_weights(run, settings, data, tmp_path):
+    fit.fit("cross_view", settings, data, tmp_path)
+    first, second = (checkpoints.load(checkpoints.finished(f, "cross_view")).module for f in (run, tmp_path))
+    torch.manual_seed(settings["seed"])
+    other = copy.deepcopy(settings)
+    other["seed"] = 1
+    fit.fit("cross_view", other, data, tmp_path / "other")
+    third = checkpoints.load(checkpoints.finished(tmp_path / "other", "cross_view")).module
+    weights = [torch.cat([p.flatten() for p in m.parameters()]) for m in (first, second, third)]
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.allclose(weights[0], weights[2])
+
+
+def test_a_broken_run_goes_on_at_its_last_checkpoint(settings, data, tmp_path, monkeypatch):
+    step, seen = ReconstructionModule.training_step, []
+
+    def breaking(self, batch, batch_idx):
+        if self.global_step == 2 and len(seen) == 2:
+            seen.append("broken")
+            raise RuntimeError("power cut")
+        seen.append(self.global_step)
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(ReconstructionModule, "training_step", breaking)
+    with pytest.raises(RuntimeError, match="power cut"):
+        fit.fit("cross_view", settings, data, tmp_path)
+    assert checkpoints.unfinished(tmp_path, "cross_view").exists()
+    before = torch.load(checkpoints.unfinished(tmp_path, "cross_view"))
+    fit.fit("cross_view", settings, data, tmp_path)
+    after = checkpoints.load(checkpoints.finished(tmp_path, "cross_view"))
+    assert seen == [0, 1, "broken", 2]
+    assert before["global_step"] == 2 and after.steps == 3
+    assert after.seconds > before["callbacks"]["Clock"]["seconds"] > 0
+    fit.fit("cross_view", settings, data, tmp_path)
+    assert seen[-1] == 2, "a finished method is not trained again"
+
+
+def test_a_loss_that_is_not_finite_stops_with_a_remedy(settings, data, tmp_path):
+    wild = copy.deepcopy(settings)
+    wild["optimizer"] |= {"lr": 1e30, "schedule": "constant", "warmup": 0.0}
+    with pytest.raises(FloatingPointError, match=r"cross_view is not finite at step [12]: .*optimizer.lr"):
+        fit.fit("cross_view", wild, data, tmp_path)
+    assert not checkpoints.finished(tmp_path, "cross_view").exists()
+
+
+def test_methods_without_weights_are_not_trained(settings, data, tmp_path):
+    fit.fit("sirt", settings, data, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_label_is_used_once(settings):
+    twice = {**settings, "compare": {"cross_view": {"name": "sirt"}}}
+    with pytest.raises(ValueError, match="'cross_view'.*own label"):
+        fit.methods(twice)
+    assert list(fit.methods({**settings, "compare": {"sirt": None}})) == ["cross_view"]
+
+
+def test_an_unfinished_method_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"mine.ckpt: did the training of 'mine' end\?"):
+        checkpoints.load(checkpoints.finished(tmp_path, "mine"))
+
+
+def test_a_run_folder_is_found_from_anything_in_it(tmp_path):
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "run" / "config.yaml").write_text("name: run\n")
+    file = tmp_path / "run" / "checkpoints" / "a.ckpt"
+    file.touch()
+    assert {checkpoints.run_folder(p) for p in (file, file.parent, tmp_path / "run")} == {tmp_path / "run"}
+    with pytest.raises(FileNotFoundError, match="No checkpoint or run folder is at .*nowhere"):
+        checkpoints.run_folder(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="with config.yaml"):
+        checkpoints.run_folder(tmp_path)

@@ -1,0 +1,48 @@
+"""The files of a run folder."""
+
+import csv
+import json
+import math
+
+import pytest
+
+from mvrecon.engine import record
+from mvrecon.engine.loggers import MetricsFile
+
+
+def test_settings_come_back_plain_and_in_order(tmp_path):
+    settings = {"name": "a", "seed": 3, "grid": {"shape": [1, 2, 3], "spacing": 0.5}, "resume": None}
+    record.start(tmp_path / "run", settings)
+    assert record.read_settings(tmp_path / "run") == settings
+    assert list(record.read_settings(tmp_path / "run")) == list(settings)
+    assert "torch 2." in (tmp_path / "run" / "versions.txt").read_text()
+
+
+def test_results_are_strict_json_with_versions(tmp_path):
+    record.write_results(tmp_path, {"psnr": math.inf, "values": [math.nan, 1.5], "deep": {"x": -math.inf}})
+    found = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
+    assert found["psnr"] is None and found["values"] == [None, 1.5] and found["deep"] == {"x": None}
+    assert found["versions"]["mvrecon"] and found["command"]
+
+
+def test_a_failed_write_keeps_the_old_file(tmp_path):
+    record.write(tmp_path / "a.txt", "old")
+    with pytest.raises(UnicodeEncodeError):
+        record.write(tmp_path / "a.txt", "new \udcff")
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_a_folder_that_is_no_run_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"config.yaml in it, got .*elsewhere"):
+        record.read_settings(tmp_path / "elsewhere")
+
+
+def test_a_second_logger_adds_to_the_table(tmp_path):
+    for step, figures in ((1, {"loss": 0.5}), (2, {"loss": 0.25, "psnr": 30.0})):
+        logger = MetricsFile(str(tmp_path))
+        logger.log_metrics(figures, step)
+        logger.finalize("success")
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["step"], row["loss"], row["psnr"]) for row in rows] == [("1", "0.5", ""), ("2", "0.25", "30.0")]
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]

@@ -1,0 +1,71 @@
+import pytest
+import torch
+
+from mvrecon.geometry.grid import Grid, pixel_centres, voxel_centres
+from mvrecon.geometry.sample import inside, normalised, sample
+
+
+def test_voxel_centres_surround_the_grid_centre():
+    grid = Grid.centred((4, 6, 8), (1.0, 2.0, 3.0), centre=(10.0, 20.0, 30.0))
+    xyz = voxel_centres(grid)
+    assert xyz.shape == (4, 6, 8, 3)
+    assert torch.allclose(xyz.mean(dim=(0, 1, 2)), torch.tensor([10.0, 20.0, 30.0], dtype=torch.float64))
+    assert torch.allclose(xyz[1, 2, 3] - xyz[0, 1, 2], torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+
+
+def test_index_and_world_are_inverse_on_an_oblique_grid():
+    affine = torch.eye(4, dtype=torch.float64)
+    affine[:3, :3] += 0.2 * torch.rand(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    affine[:3, 3] = torch.tensor([100.0, -50.0, 7.0])
+    grid = Grid((3, 4, 5), affine)
+    xyz = torch.randn(20, 3, dtype=torch.float64)
+    assert torch.allclose(grid.to_world(grid.to_index(xyz)), xyz)
+
+
+def test_refined_grid_fills_the_same_box():
+    grid = Grid.centred((4, 6, 8), (1.0, 2.0, 3.0))
+    assert torch.allclose(grid.refined(3).corners(), grid.corners())
+    coarse = voxel_centres(grid.refined(3)).unflatten(0, (4, 3)).unflatten(2, (6, 3)).unflatten(4, (8, 3))
+    assert torch.allclose(coarse.mean(dim=(1, 3, 5)), voxel_centres(grid))
+
+
+@pytest.mark.parametrize("spacing", [-1.0, 0.0, (1.0, -2.0, 1.0), float("nan")])
+def test_spacing_must_be_positive(spacing):
+    with pytest.raises(ValueError, match="positive"):
+        Grid.centred((2, 2, 2), spacing)
+
+
+@pytest.mark.parametrize("shape", [(0, 2, 2), (2, 2), (2, 2, 2, 2)])
+def test_shape_must_be_three_positive_sizes(shape):
+    with pytest.raises(ValueError, match="three positive sizes"):
+        Grid(shape, torch.eye(4))
+
+
+def test_left_handed_and_flat_grids_are_refused():
+    for diagonal in ([-1.0, 1, 1, 1], [0.0, 1, 1, 1]):
+        with pytest.raises(ValueError, match="right-handed"):
+            Grid((2, 2, 2), torch.diag(torch.tensor(diagonal)))
+
+
+def test_pixel_zero_is_centred_at_zero():
+    assert pixel_centres((2, 3))[1, 2].tolist() == [2.0, 1.0]
+
+
+def test_sampling_at_voxel_centres_is_exact_and_axes_are_xyz():
+    volume = torch.randn(1, 1, 3, 4, 5)
+    index = torch.tensor([[[[[4.0, 1.0, 2.0]]]]])  # x = 4, y = 1, z = 2
+    assert sample(volume, normalised(index, (3, 4, 5))).item() == pytest.approx(volume[0, 0, 2, 1, 4].item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30])
+def test_points_that_are_nowhere_sample_to_zero(bad):
+    points = normalised(torch.full((1, 1, 1, 1, 3), bad), (3, 4, 5))
+    assert not inside(points).any()
+    assert sample(torch.ones(1, 1, 3, 4, 5), points).item() == 0
+
+
+def test_half_precision_volumes_are_sampled_with_float32_coordinates():
+    volume = torch.randn(1, 1, 64, 2, 2)
+    points = normalised(torch.tensor([[[[[0.25, 0.5, 40.37]]]]]), (64, 2, 2))
+    exact = sample(volume.bfloat16().float(), points)
+    assert sample(volume.bfloat16(), points).item() == exact.bfloat16().item()

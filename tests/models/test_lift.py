@@ -1,0 +1,77 @@
+import pytest
+import torch
+
+from mvrecon.geometry.frustum import depth_centres, depth_edges, depth_index
+from mvrecon.geometry.grid import voxel_centres
+from mvrecon.models.lift import Frusta
+from mvrecon.parts import CAMERAS
+from tests.models.rig import small_rig
+
+
+@pytest.mark.parametrize("spacing", ["z", "k"])
+def test_depth_bins_tile_the_range_and_index_is_its_inverse(spacing):
+    z_range = torch.tensor([[80.0, 120.0], [-120.0, -80.0]], dtype=torch.float64)
+    edges = depth_edges(z_range, 10, spacing)
+    assert torch.allclose(edges[:, [0, -1]], z_range)
+    expected = torch.arange(10, dtype=torch.float64).expand(2, 10)
+    assert torch.allclose(depth_index(depth_centres(edges, spacing), edges, spacing), expected)
+
+
+def test_uniform_k_is_refused_across_the_source():
+    with pytest.raises(ValueError, match="without z = 0"):
+        depth_edges(torch.tensor([[-1.0, 1.0]]), 4, "k")
+
+
+@pytest.mark.parametrize("spacing", ["z", "k"])
+def test_lift_conserves_every_ray_integral(spacing):
+    grid, cameras = small_rig()
+    frusta = Frusta(grid, cameras, 12, spacing)
+    views = torch.rand(2, 3, len(cameras), *cameras.shape)
+    sees = frusta.chord.reshape(1, 1, len(cameras), *cameras.shape) > 0
+    assert torch.allclose(frusta.integrate(frusta.spread(views)), views * sees, rtol=1e-5)
+    assert sees.any() and not sees.all()
+
+
+def test_frustum_chord_is_the_length_of_the_ray_in_the_box():
+    grid, cameras = small_rig(views=1, size=12, pixels=13)
+    chord = Frusta(grid, cameras, 240).chord[0, 0, 0]
+    assert chord[6, 6].item() == pytest.approx(24.0, rel=1e-3)  # the central ray crosses 12 voxels of 2 mm
+
+
+def test_warp_of_a_linear_field_is_exact_where_seen():
+    """Trilinear sampling reproduces a linear function of position; here of the position in the frustum."""
+    grid, cameras = small_rig()
+    frusta = Frusta(grid, cameras, 12)
+    depth, v, u = frusta.shape
+    ramp = torch.arange(depth, dtype=torch.float32)[:, None, None].expand(depth, v, u)
+    world = frusta.to_world(ramp.expand(1, len(cameras), 1, -1, -1, -1))
+    uvz = cameras.project(voxel_centres(grid))
+    edges = depth_edges(cameras.depth_range(grid), depth)
+    expected = depth_index(uvz[..., 2], edges).float()
+    inner = frusta.visible[:, 0] & (expected > 0) & (expected < depth - 1)
+    inner &= (uvz[..., 0] > 0) & (uvz[..., 0] < u - 1) & (uvz[..., 1] > 0) & (uvz[..., 1] < v - 1)
+    assert inner.any()
+    assert torch.allclose(world[0, :, 0][inner], expected[inner], atol=2e-4)
+
+
+def test_world_to_frustum_to_world_converges_to_second_order():
+    errors = []
+    for size in (8, 16, 32):
+        grid, cameras = small_rig(views=3, size=size, pixels=2 * size)
+        frusta = Frusta(grid, cameras, 2 * size)
+        r2 = voxel_centres(grid).float().square().sum(-1)
+        blob = torch.exp(-r2 / (2 * (0.3 * size) ** 2))[None, None, None]
+        back = frusta.to_world(frusta.to_frusta(blob))[:, :, :, 1:-1, 1:-1, 1:-1]
+        errors.append((back - blob[..., 1:-1, 1:-1, 1:-1]).abs().max().item())
+    assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3
+
+
+def test_pinholes_behind_their_detectors_lift_like_any_other():
+    grid, _ = small_rig()
+    cameras = CAMERAS.build(
+        "dome", views=3, radius=100.0, focal=40.0, aperture_degrees=60.0, detector={"pixels": [9, 9], "pixel_mm": 2.0}
+    )
+    frusta = Frusta(grid, cameras, 8)
+    views = torch.rand(1, 1, 3, 9, 9) * (frusta.chord.reshape(1, 1, 3, 9, 9) > 0)
+    assert (frusta.step > 0).all() and views.any()
+    assert torch.allclose(frusta.integrate(frusta.spread(views)), views, rtol=1e-5)

@@ -1,0 +1,142 @@
+import pytest
+import torch
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.losses import ReconstructionLoss
+from mvrecon.models.output import Reconstruction
+from mvrecon.parts import MODELS, PROJECTORS
+from tests.models.rig import small_projector, small_rig
+
+HEAD = {"name": "softmax_depth"}
+OPTIONS = {"cross_view": {"head": HEAD}, "mean_fusion": {"head": HEAD}}
+
+
+def _build(name: str, projector: torch.nn.Module, **options) -> torch.nn.Module:
+    torch.manual_seed(0)
+    return MODELS.build(name, projector, **OPTIONS.get(name, {}), **options)
+
+
+def _blob_views(projector: torch.nn.Module) -> tuple[torch.Tensor, torch.Tensor]:
+    torch.manual_seed(1)
+    volume = torch.zeros(2, 1, *projector.grid.shape)
+    volume[..., 3:9, 4:8, 3:8] = torch.rand(2, 1, 6, 4, 5)
+    return volume, projector(volume)
+
+
+def _stir(model: torch.nn.Module) -> None:
+    """Random weights everywhere, so that layers which start at zero take part."""
+    torch.manual_seed(2)
+    for parameter in model.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+
+
+@pytest.mark.parametrize("name", MODELS.names())
+def test_every_model_returns_a_finite_volume_and_scales_with_its_input(name):
+    projector = small_projector()
+    model = _build(name, projector)
+    _stir(model)
+    _, views = _blob_views(projector)
+    out = model(views)
+    assert isinstance(out, Reconstruction) and out.volume.shape == (2, 1, 12, 12, 12)
+    assert out.volume.isfinite().all()
+    for a in (1e-3, 1e3):
+        assert torch.allclose(model(a * views).volume, a * out.volume, rtol=1e-3, atol=1e-4 * a * out.volume.abs().max())
+
+
+@pytest.mark.parametrize("name", MODELS.names())
+def test_views_of_nothing_give_a_finite_volume(name):
+    projector = small_projector()
+    assert _build(name, projector)(torch.zeros(1, 1, 4, 12, 12)).volume.isfinite().all()
+
+
+@pytest.mark.parametrize("name", MODELS.names())
+def test_bad_views_are_refused(name):
+    model = _build(name, small_projector())
+    views = torch.zeros(1, 1, 4, 12, 12)
+    for bad in (views[0], views[:, :, :3], views[..., :11], torch.full_like(views, torch.nan)):
+        with pytest.raises(ValueError, match="views"):
+            model(bad)
+
+
+def test_a_batch_is_its_samples():
+    projector = small_projector()
+    model = _build("cross_view", projector)
+    _stir(model)
+    _, views = _blob_views(projector)
+    single = torch.cat([model(views[:1]).volume, model(views[1:]).volume])
+    assert torch.allclose(model(views).volume, single, atol=1e-5 * single.abs().max())
+
+
+def test_opinions_reproduce_their_own_views():
+    projector = small_projector()
+    opinions = _build("cross_view", projector).opinions
+    _stir(opinions)
+    _, views = _blob_views(projector)
+    seen = []
+    head, opinions.head = opinions.head, lambda *given: seen.append(head(*given)) or seen[0]
+    opinions(views, torch.rand(2, 1, 12, 12, 12), torch.zeros_like(views))
+    sees = opinions.fine.chord.reshape(1, 1, 4, 12, 12) > 0
+    assert torch.allclose(opinions.fine.integrate(seen[0]), views * sees, atol=1e-5 * views.max())
+
+
+def test_permuting_the_cameras_changes_nothing():
+    grid, cameras = small_rig()
+    order = [2, 0, 3, 1]
+    volumes = []
+    for rig, index in ((cameras, [0, 1, 2, 3]), (cameras[order], order)):
+        projector = PROJECTORS.build("drr", grid=grid, cameras=rig)
+        model = _build("cross_view", projector)
+        _stir(model)
+        _, views = _blob_views(PROJECTORS.build("drr", grid=grid, cameras=cameras))
+        volumes.append(model(views[:, :, index]).volume)
+    assert torch.allclose(*volumes, atol=1e-4 * volumes[0].abs().max())
+
+
+def test_cross_views_are_the_projected_opinions():
+    projector = small_projector()
+    out = _build("cross_view", projector)(_blob_views(projector)[1])
+    expected = projector(out.opinions[:, 1])[:, 0, 3]
+    assert torch.allclose(out.cross_views[:, 1, 3], expected, rtol=1e-4, atol=1e-4 * expected.max())
+
+
+def test_consistency_steps_bring_the_volume_towards_the_views():
+    projector = small_projector()
+    volume, views = _blob_views(projector)
+    consistency = _build("backprojection_unet", projector, consistency=5).consistency
+    before = volume * 0.5
+    misfit = [(projector(x) - views).norm() for x in (before, consistency(before, views))]
+    assert misfit[1] < 0.5 * misfit[0]
+
+
+def test_separate_networks_for_every_camera():
+    projector = small_projector()
+    shared = _build("cross_view", projector)
+    separate = _build("cross_view", projector, opinion={"shared": False})
+    count = [sum(p.numel() for p in m.opinions.nets.parameters()) for m in (shared, separate)]
+    assert count[1] == 4 * count[0]
+    assert separate(_blob_views(projector)[1]).volume.isfinite().all()
+
+
+def test_every_parameter_of_cross_view_learns():
+    projector = small_projector()
+    model = _build("cross_view", projector)
+    _stir(model)
+    volume, views = _blob_views(projector)
+    loss = ReconstructionLoss(1.0, edges=0.1)(model(views), {"volume": volume, "views": views})
+    loss["total"].backward()
+    idle = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
+    assert not idle and set(loss) == {"volume", "edges", "opinions", "cross_view", "total"}
+
+
+@pytest.mark.parametrize("options", [{"fusion": "median"}, {"opinion": {"prior": "learnt"}}])
+def test_unknown_options_are_refused(options):
+    with pytest.raises(ValueError, match="got"):
+        _build("cross_view", small_projector(), **options)
+
+
+def test_cameras_may_be_few():
+    grid, cameras = small_rig()
+    assert isinstance(cameras[[0]], Cameras)
+    projector = PROJECTORS.build("drr", grid=grid, cameras=cameras[[0]])
+    model = _build("cross_view", projector)
+    assert model(_blob_views(projector)[1]).volume.isfinite().all()

@@ -1,0 +1,80 @@
+import math
+import time
+
+import pytest
+import torch
+
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.rigid import random_rotation
+from mvrecon.scenes.derenzo import derenzo
+from mvrecon.scenes.solids import ROUND_AXES, Phantom, Solids
+from mvrecon.scenes.voxelise import voxelise
+
+UNIT_VOLUMES = {"ellipsoid": 4 / 3 * math.pi, "cylinder": 2 * math.pi, "box": 8.0}
+
+
+def solids(kind, n=3, seed=0, spread=20.0):
+    rng = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.rand(*shape, generator=rng, dtype=torch.float64)  # noqa: E731
+    return Solids(kind, spread * (2 * draw(n, 3) - 1), random_rotation(rng, n), 6 + 10 * draw(n, 3), draw(n) + 0.2)
+
+
+def skew_grid():
+    grid = Grid.centred((9, 11, 14), (6.0, 8.0, 9.0), centre=(3, -4, 5))
+    affine = grid.affine.clone()
+    affine[:3, :3] = random_rotation(torch.Generator().manual_seed(2)) @ affine[:3, :3]
+    return Grid(grid.shape, affine)
+
+
+@pytest.mark.parametrize("kind", ROUND_AXES)
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_it_is_the_mean_over_the_finer_grid(kind, factor):
+    grid, phantom = skew_grid(), Phantom((solids(kind, spread=40.0),))
+    fine = phantom.values(voxel_centres(grid.refined(factor)))
+    d, h, w = grid.shape
+    mean = fine.reshape(d, factor, h, factor, w, factor).mean(dim=(1, 3, 5))
+    assert mean.max() > 0
+    torch.testing.assert_close(voxelise(phantom, grid, factor), mean.float())
+
+
+@pytest.mark.parametrize("kind", ROUND_AXES)
+def test_it_keeps_the_mass_and_converges(kind):
+    grid, part = Grid.centred((24, 24, 24), 4.0), solids(kind)
+    mass = (part.values * part.semi_axes.prod(dim=1)).sum().item() * UNIT_VOLUMES[kind]
+    error = [abs(voxelise(Phantom((part,)), grid, f).double().sum().item() * 64 / mass - 1) for f in (1, 4, 12)]
+    assert error[1] < 0.01 and error[2] < 1e-3 and error[2] < error[0]
+
+
+def test_voxels_converge_to_the_share_that_is_covered():
+    grid, phantom = Grid.centred((12, 12, 12), 8.0), Phantom((solids("ellipsoid"),))
+    truth = voxelise(phantom, grid, 16)
+    errors = [(voxelise(phantom, grid, f) - truth).norm().item() for f in (1, 2, 4, 8)]
+    assert all(finer < 0.6 * coarser for coarser, finer in zip(errors, errors[1:], strict=False))
+
+
+def test_solids_that_leave_the_grid_are_cut():
+    big = Phantom(
+        (Solids("box", torch.zeros(1, 3), torch.eye(3)[None], torch.full((1, 3), 500.0), torch.tensor([2.0])),)
+    )
+    assert (voxelise(big, Grid.centred((4, 5, 6), 3.0)) == 2).all()
+    assert (voxelise(big, Grid.centred((4, 5, 6), 3.0, centre=(900, 0, 0))) == 0).all()
+
+
+def test_chunks_change_nothing(monkeypatch):
+    grid, phantom = skew_grid(), Phantom((solids("cylinder"),))
+    whole = voxelise(phantom, grid)
+    monkeypatch.setattr("mvrecon.scenes.voxelise.POINTS", 200)
+    assert torch.equal(voxelise(phantom, grid), whole)
+
+
+def test_a_derenzo_phantom_is_quick():
+    phantom, grid = derenzo(height=48, euler_degrees=(20, 50, 10)), Grid.centred((32, 32, 32), 4.0)
+    voxelise(phantom, grid)
+    start = time.process_time()
+    voxelise(phantom, grid)
+    assert time.process_time() - start < 0.3
+
+
+def test_a_factor_below_one_is_refused():
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        voxelise(derenzo(), Grid.centred((4, 4, 4), 10.0), 0)

@@ -1,0 +1,136 @@
+"""The two apps as a user calls them, on the smoke experiment: seconds, every layer once."""
+
+import csv
+import json
+import sys
+
+import pytest
+import torch
+import yaml
+
+import mvrecon.eval
+import mvrecon.train
+from mvrecon.engine import record
+
+FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside", "view_nrmse")
+
+
+def call(app, folder, *options):
+    """Run an app's entry point with a command line; its folder and what it wrote."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(sys, "argv", [app.__name__, *options, f"hydra.run.dir={folder}", "hydra/job_logging=none"])
+    try:
+        app.main()
+    finally:
+        patch.undo()
+    return json.loads((folder / "results.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "smoke"
+    return folder, call(
+        mvrecon.train,
+        folder,
+        "experiment=smoke",
+        "seed=3",
+        "logger=default",
+        "callbacks=default",
+        "~callbacks.progress",
+    )
+
+
+def test_a_run_folder_holds_what_it_should(run):
+    folder, _ = run
+    names = {p.name for p in folder.iterdir()}
+    assert {"config.yaml", "versions.txt", "metrics.csv", "results.json", "checkpoints", "review"} <= names
+    assert any(name.startswith("events.") for name in names)
+    settings = yaml.safe_load((folder / "config.yaml").read_text())
+    assert settings["name"] == "smoke" and settings["seed"] == 3 and "hydra" not in settings
+    assert {"planes.png", "mip.png", "views.png", "opinions.png", "weights.png"} <= {
+        p.name for p in (folder / "review").iterdir()
+    }
+
+
+def test_the_log_tells_losses_figures_and_times(run):
+    folder, _ = run
+    with open(folder / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = {name for row in rows for name, value in row.items() if value}
+    wanted = {"loss/total", "loss/volume", "val/psnr", "val/ssim", "val/nrmse", "val/view_nrmse"}
+    assert wanted | {"time/step_ms", "time/volumes_per_s", "time/seconds", "time/peak_mb"} <= names
+
+
+def test_the_board_holds_pictures_text_and_hyper_parameters(run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    board = EventAccumulator(str(run[0])).Reload()
+    tags = board.Tags()
+    assert {f"review/{name}" for name in ("planes", "mip", "views", "opinions", "weights")} <= set(tags["images"])
+    assert {"loss/total", "val/psnr", "time/step_ms", "hp/psnr", "hp/seconds", "hp/peak_mb"} <= set(tags["scalars"])
+    assert any("text/run" in tag for tag in tags["tensors"])
+    assert "hp_metric" not in tags["scalars"]
+
+
+def test_results_hold_every_figure_with_units_seed_and_versions(run):
+    _, found = run
+    assert found["seed"] == 3 and found["versions"]["torch"] == torch.__version__
+    assert len(found["scenes"]) == 3 and found["units"]["psnr"] == "dB" and found["units"]["ms_per_volume"] == "ms"
+    assert list(found["methods"]) == ["cross_view", "sirt"]
+    for row in found["methods"].values():
+        for figure in FIGURES:
+            assert len(row[figure]["values"]) == 3
+            assert row[figure]["mean"] == pytest.approx(sum(row[figure]["values"]) / 3)
+        assert row["ms_per_volume"] > 0
+    assert found["methods"]["cross_view"]["train_steps"] == 3 and found["methods"]["cross_view"]["parameters"] > 0
+    assert found["methods"]["sirt"]["train_steps"] == 0 and found["methods"]["sirt"]["parameters"] == 0
+
+
+@pytest.mark.parametrize("part", ["", "checkpoints", "checkpoints/cross_view.ckpt"])
+def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
+    folder, first = run
+    again = call(mvrecon.eval, tmp_path / "eval", f"checkpoint={folder / part}")
+    assert again["scenes"] == first["scenes"]
+    for method, row in first["methods"].items():
+        for figure in FIGURES:
+            assert again["methods"][method][figure]["values"] == pytest.approx(row[figure]["values"], abs=1e-6)
+        assert again["methods"][method]["train_seconds"] == row["train_seconds"]
+    printed = capsys.readouterr().out
+    assert "cross_view" in printed and f"{first['methods']['sirt']['psnr']['mean']:.2f}" in printed
+
+
+def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
+    options = ("test_scene=shepp_logan", "+data.sizes.test=1", "save=true")
+    found = call(mvrecon.eval, tmp_path / "eval", f"checkpoint={run[0]}", *options)
+    assert len(found["scenes"]) == 1 and found["scenes"] != run[1]["scenes"][:1]
+    case = next((tmp_path / "eval" / "cases").iterdir())
+    assert {"views.png", "planes.png", "truth.nii.gz", "cross_view.nii.gz"} <= {p.name for p in case.iterdir()}
+
+
+def test_resume_goes_on_in_the_same_folder(run, tmp_path):
+    folder, first = run
+    found, where = mvrecon.train.resumed(str(folder), []), folder
+    assert found == (record.read_settings(folder), where)
+    again = mvrecon.train.train(*found)
+    assert again["methods"]["cross_view"]["psnr"]["values"] == pytest.approx(
+        first["methods"]["cross_view"]["psnr"]["values"], abs=1e-6
+    )
+    with pytest.raises(ValueError, match="but got also trainer.max_steps=9"):
+        mvrecon.train.resumed(str(folder), ["trainer.max_steps=9"])
+
+
+@pytest.mark.parametrize(
+    ("app", "options", "message"),
+    [
+        (mvrecon.eval, ["checkpoint=nowhere.ckpt"], "No checkpoint or run folder is at"),
+        (mvrecon.train, ["experiment=smoke", "optimizer.lr=1e30"], "is not finite at step"),
+        (mvrecon.train, ["experiment=smoke", "model.name=cros_view"], "did you mean 'cross_view'"),
+        (mvrecon.train, ["experiment=smoke", "resume=nowhere"], "but got also"),
+        (mvrecon.train, ["resume=nowhere"], "No checkpoint or run folder is at"),
+    ],
+)
+def test_what_goes_wrong_is_said_and_the_exit_is_not_zero(app, options, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        call(app, tmp_path, *options)
+    assert stopped.value.code != 0
+    assert message in capsys.readouterr().err

@@ -1,0 +1,151 @@
+"""Every experiment composes; a typing mistake is an error; only allowed classes are built from a config."""
+
+import re
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import hydra
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import ConfigCompositionException, MissingConfigException
+
+from mvrecon import config
+from mvrecon.config import compose, conf_dir, help_text, import_plugins, instantiate
+from mvrecon.registry import GROUP
+
+EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))
+EVALUATIONS = {"chest_ct"}  # experiments of mvrecon-eval
+
+
+def plain(node: object) -> bool:
+    if isinstance(node, dict):
+        return all(type(key) is str and plain(value) for key, value in node.items())
+    if isinstance(node, list):
+        return all(map(plain, node))
+    return node is None or type(node) in (str, int, float, bool)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_composes_to_plain_values(name: str):
+    app = ("checkpoint=x", "eval") if name in EVALUATIONS else ("resume=null", "train")
+    settings = compose(f"experiment={name}", app[0], config_name=app[1])
+    assert settings["name"] == name
+    assert plain(settings)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_file_is_short(name: str):
+    assert len((conf_dir() / "experiment" / f"{name}.yaml").read_text().splitlines()) <= 25
+
+
+@pytest.mark.parametrize("group", ["scene", "camera", "projector", "model", "head"])
+def test_every_option_of_a_group_names_a_part_and_composes(group: str):
+    from mvrecon.parts import REGISTRIES
+
+    files = sorted((conf_dir() / group).glob("*.yaml"))
+    assert files
+    for file in files:
+        key = "head@model.head" if group == "head" else group
+        node = compose(f"{key}={file.stem}")
+        part = node["model"]["head"] if group == "head" else node[group]
+        assert part["name"] in REGISTRIES[group].names()
+
+
+def test_the_head_is_chosen_on_the_command_line():
+    assert compose("head@model.head=density")["model"]["head"]["name"] == "density"
+
+
+@pytest.fixture
+def user_conf(tmp_path: Path):
+    """A user's own experiment beside ours, as `--config-dir` finds it."""
+
+    def write(text: str) -> list[str]:
+        (tmp_path / "experiment").mkdir(exist_ok=True)
+        (tmp_path / "experiment" / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
+        return [f"hydra.searchpath=[file://{tmp_path}]", "experiment=mine"]
+
+    return write
+
+
+def test_a_mistyped_key_in_an_experiment_is_an_error(user_conf):
+    with pytest.raises(ConfigCompositionException) as error:
+        compose(*user_conf("name: mine\nprojectr: {name: drr}"))
+    assert "experiment/mine" in str(error.value)
+    assert "Key 'projectr' not in 'Settings'" in f"{error.value}{error.value.__cause__}"
+
+
+def test_a_mistyped_choice_in_an_experiment_lists_what_there_is(user_conf):
+    with pytest.raises(MissingConfigException, match=r"Could not find 'projector/dr'(.|\n)*drr(.|\n)*radon"):
+        compose(*user_conf("defaults:\n  - override /projector: dr\nname: mine"))
+
+
+def test_an_experiment_may_add_compared_models(user_conf):
+    settings = compose(*user_conf("defaults:\n  - /model@compare.sirt: sirt\nname: mine\nseed: 4"))
+    assert settings["seed"] == 4
+    assert settings["compare"]["sirt"]["name"] == "sirt"
+
+
+def test_a_setting_that_must_be_given_is_named():
+    with pytest.raises(LookupError, match="must be given: checkpoint=..."):
+        compose(config_name="eval")
+
+
+def test_a_running_hydra_is_left_alone():
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        with pytest.raises(RuntimeError, match="in use already"):
+            compose()
+        assert GlobalHydra.instance().is_initialized()
+    assert not GlobalHydra.instance().is_initialized()
+
+
+def test_a_plugin_brings_its_own_choices_even_if_its_code_is_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "a_plugin" / "conf"
+    (folder / "projector").mkdir(parents=True)
+    for package in (folder, folder.parent):
+        (package / "__init__.py").touch()
+    (folder / "projector" / "mine.yaml").write_text("name: mine\nwidth: 2\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (folder.parent / "__init__.py").write_text("raise OSError('this plugin is broken')\n")
+    points = (EntryPoint("conf.mine", "a_plugin.conf", GROUP), EntryPoint("conf.gone", "no_such_plugin.conf", GROUP))
+    monkeypatch.setattr(config, "installed", lambda: points)
+    assert compose("projector=mine")["projector"] == {"name": "mine", "width": 2}
+    assert re.search(r"^  projector +drr, mine, radon", help_text("train"), re.MULTILINE)
+
+
+def test_the_help_shows_every_choice_and_setting():
+    for app in ("train", "eval"):
+        text = help_text(app)
+        assert f"mvrecon-{app} [group=choice ...]" in text
+        assert all(file.stem in text for file in conf_dir().glob("*/*.yaml"))
+        assert (conf_dir() / f"{app}.yaml").read_text() in text
+
+
+def test_the_app_answers_help_itself(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "argv", ["mvrecon-train", "experiment=quickstart", "--help"])
+    config.launch(lambda settings: pytest.fail("the task must not run"), "train")
+    assert capsys.readouterr().out == help_text("train")
+
+
+def test_plugin_modules_are_imported_and_a_broken_one_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "good_plugin_module.py").write_text("made = 1\n")
+    (tmp_path / "bad_plugin_module.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import_plugins(["good_plugin_module"])
+    assert sys.modules["good_plugin_module"].made == 1
+    with pytest.raises(ImportError, match="'bad_plugin_module'.*division by zero"):
+        import_plugins(["bad_plugin_module"])
+
+
+def test_a_target_of_an_allowed_library_is_built():
+    timer = instantiate({"_target_": "lightning.pytorch.callbacks.Timer", "duration": "00:00:01:00"}, interval="epoch")
+    assert timer.time_remaining() == 60.0
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["os.system", "mvrecon.registry.import_module", "lightning.pytorch.trainer.trainer.os.system", "builtins.eval"],
+)
+def test_a_target_outside_the_allowed_libraries_is_refused(target: str):
+    with pytest.raises(PermissionError, match=f"{target}.*expected something from lightning.pytorch, torch.optim"):
+        instantiate({"_target_": "lightning.pytorch.Trainer", "callbacks": [{"_target_": target}]})

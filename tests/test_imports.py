@@ -1,0 +1,47 @@
+"""Start-up: nothing heavy is imported before it is needed, and importing says nothing."""
+
+import pytest
+
+HEAVY = "{'torch', 'lightning', 'kornia', 'torchmetrics', 'numba', 'h5py', 'tensorboard', 'matplotlib'}"
+REPORT = f"import atexit, sys; atexit.register(lambda: print('HEAVY', sorted({HEAVY} & set(sys.modules))));"
+COMMANDS = {
+    "train --help": "train",
+    "eval --help": "eval",
+    "list": "listing",
+    "list --help": "listing",
+    "train --cfg job": "train",
+    "train projectr=drr": "train",
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_quick_answer_imports_nothing_heavy(run_python, command: str):
+    argv = [f"mvrecon-{command.split()[0]}", *command.split()[1:]]
+    code = f"{REPORT} sys.argv = {argv!r}; from mvrecon.{COMMANDS[command]} import main; sys.exit(main())"
+    done = run_python("-c", code)
+    assert "HEAVY []" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == ("projectr" in command), done.stderr
+
+
+def test_importing_says_nothing_and_imports_nothing_heavy(run_python):
+    modules = "mvrecon, mvrecon.registry, mvrecon.parts, mvrecon.config, mvrecon.train, mvrecon.eval, mvrecon.listing"
+    done = run_python("-W", "error", "-c", f"{REPORT} import {modules}")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "HEAVY []\n"
+    assert done.stderr == ""
+
+
+def test_importing_every_module_changes_no_global_setting(run_python, root):
+    files = sorted((root / "mvrecon").rglob("*.py"))
+    names = [".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__") for f in files]
+    code = (
+        "import torch, warnings, importlib, lightning, torchmetrics, kornia\n"
+        "def state(): return (torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_num_threads(),"
+        " torch.random.get_rng_state().sum().item(), len(warnings.filters))\n"
+        "before = state()\n"
+        f"for name in {names}: importlib.import_module(name)\n"
+        "assert state() == before, (state(), before)\n"
+    )
+    done = run_python("-c", code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""

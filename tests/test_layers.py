@@ -1,0 +1,37 @@
+"""Imports run downward only, and each outside library is known where it should be (contracts in pyproject.toml)."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+
+def test_the_layers_hold(run_python):
+    code = "from importlinter.cli import lint_imports; import sys; sys.exit(lint_imports(no_cache=True))"
+    done = run_python("-c", code)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 broken" in done.stdout
+
+
+def imported(file: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return names
+
+
+@pytest.mark.parametrize(
+    ("name", "home"),
+    [("torch.utils.tensorboard", "engine/callbacks.py"), ("torch.nn.functional.grid_sample", "geometry/sample.py")],
+)
+def test_a_part_of_torch_is_imported_in_one_place(root: Path, name: str, home: str):
+    users = {f for f in (root / "mvrecon").rglob("*.py") if name in imported(f)}
+    assert users <= {root / "mvrecon" / home}
+
+
+def test_grid_sample_is_called_in_one_place(root: Path):
+    users = {f for f in (root / "mvrecon").rglob("*.py") if "grid_sample(" in f.read_text()}
+    assert users == {root / "mvrecon" / "geometry" / "sample.py"}

@@ -1,0 +1,70 @@
+"""mvrecon-list reads sources: names, first lines and options are those that an import would give."""
+
+import inspect
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from mvrecon import listing, registry
+from mvrecon.listing import describe, main
+from mvrecon.parts import REGISTRIES
+
+CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.names()]
+
+
+@pytest.mark.parametrize(("kind", "name"), PARTS)
+def test_what_is_read_is_what_an_import_gives(kind: str, name: str):
+    part = describe(kind, name)
+    imported = REGISTRIES[kind].get(name)
+    assert not part.error
+    parameters = {n: p for n, p in inspect.signature(imported).parameters.items() if p.kind not in CATCH_ALL}
+    assert set(part.options) == set(parameters) - listing.GIVEN
+    needed = {n for n, p in parameters.items() if p.default is p.empty}
+    assert {n for n, default in part.options.items() if not default} == needed - listing.GIVEN
+    assert part.summary
+    assert " ".join(inspect.getdoc(imported).split()).startswith(part.summary)
+
+
+def test_every_part_and_origin_is_printed(capsys: pytest.CaptureFixture[str]):
+    assert main([]) == 0
+    text = capsys.readouterr().out
+    for kind, name in PARTS:
+        assert name in text
+        assert REGISTRIES[kind].origin(name) in text
+
+
+def test_one_kind_is_printed_alone(capsys: pytest.CaptureFixture[str]):
+    assert main(["head"]) == 0
+    text = capsys.readouterr().out
+    assert "softmax_depth" in text
+    assert "joseph" not in text
+    with pytest.raises(SystemExit):
+        main(["haed"])
+    assert "choose from" in capsys.readouterr().err
+
+
+def test_a_plugin_that_breaks_at_import_is_named_when_checked(tmp_path, monkeypatch, capsys):
+    (tmp_path / "broken_head_plugin.py").write_text(
+        'class Head:\n    """Fine to read."""\n\nraise OSError("no licence")\n'
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    point = EntryPoint("head.broken", "broken_head_plugin:Head", registry.GROUP)
+    monkeypatch.setattr(registry, "installed", lambda: (point,))
+    assert main(["head"]) == 0
+    assert "Fine to read." in capsys.readouterr().out
+    assert main(["head", "--check"]) == 1
+    text = " ".join(capsys.readouterr().out.split())
+    assert "broken: The head 'broken' (broken_head_plugin:Head) does not import: no licence" in text
+    assert "softmax_depth" in text
+
+
+def test_sources_that_are_missing_or_wrong_are_said(tmp_path, monkeypatch):
+    (tmp_path / "half_plugin.py").write_text("def f(:\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    points = {"gone": "no_such_package.at.all:Head", "half": "half_plugin:Head", "hollow": "json:Nothing"}
+    found = tuple(EntryPoint(f"head.{name}", value, registry.GROUP) for name, value in points.items())
+    monkeypatch.setattr(registry, "installed", lambda: found)
+    assert "No source found for module 'no_such_package.at.all'" in describe("head", "gone").error
+    assert "invalid syntax" in describe("head", "half").error
+    assert "json defines no class or function 'Nothing'" in describe("head", "hollow").error

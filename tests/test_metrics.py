@@ -1,0 +1,114 @@
+"""Figures of merit against values computed by hand."""
+
+import math
+
+import pytest
+import torch
+
+from mvrecon.metrics import view_metrics, volume_metrics
+
+
+def case(shape=(1, 8, 9, 10)):
+    truth = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    inside = torch.zeros(shape, dtype=torch.bool)
+    inside[:, 2:6, 3:7, 2:9] = True
+    return truth, inside
+
+
+def test_psnr_of_a_constant_offset_is_twenty_decibels_per_decade():
+    truth, inside = case()
+    found = volume_metrics(truth + 0.2, truth, inside, data_range=2.0)
+    assert found["psnr"] == pytest.approx(20.0, abs=1e-4)
+    assert found["psnr_inside"] == pytest.approx(20.0, abs=1e-4)
+
+
+def test_the_data_range_is_the_given_one():
+    truth, inside = case()
+    narrow = volume_metrics(truth + 0.2, truth, inside, data_range=2.0)["psnr"]
+    wide = volume_metrics(truth + 0.2, truth, inside, data_range=20.0)["psnr"]
+    assert wide - narrow == pytest.approx(20.0, abs=1e-6)
+
+
+def test_nrmse_is_the_relative_norm_of_the_error():
+    truth, inside = case()
+    assert volume_metrics(0.75 * truth, truth, inside, 1.0)["nrmse"] == pytest.approx(0.25, abs=1e-6)
+
+
+def test_inside_figures_see_the_object_only():
+    truth, inside = case()
+    outside = torch.where(inside, truth, truth + 10)
+    found = volume_metrics(outside, truth, inside, 1.0)
+    assert found["nrmse_inside"] == 0 and math.isinf(found["psnr_inside"])
+    assert found["nrmse"] > 1
+    within = torch.where(inside, truth + 0.1, truth)
+    share = inside.float().mean().item()
+    found = volume_metrics(within, truth, inside, 1.0)
+    assert found["psnr_inside"] == pytest.approx(20, abs=1e-4)
+    assert found["psnr"] == pytest.approx(20 - 10 * math.log10(share), abs=1e-4)
+
+
+def test_ssim_of_two_constants_is_its_luminance_term():
+    a, b, c1 = 0.3, 0.7, 0.01**2
+    shape = (1, 12, 12, 12)
+    expected = (2 * a * b + c1) / (a * a + b * b + c1)
+    found = volume_metrics(torch.full(shape, a), torch.full(shape, b), torch.ones(shape, dtype=torch.bool), 1.0)
+    assert found["ssim"] == pytest.approx(expected, abs=1e-6)
+    assert found["ssim_inside"] == pytest.approx(expected, abs=1e-6)
+
+
+def test_ssim_inside_is_the_mean_of_the_map_over_the_object():
+    truth, _ = case((1, 24, 12, 12))
+    near = torch.zeros(truth.shape, dtype=torch.bool)
+    near[:, :6] = True
+    changed = truth.clone()
+    changed[:, 18:] = 0  # farther from `near` than the window reaches
+    found = volume_metrics(changed, truth, near, 1.0)
+    assert found["ssim_inside"] == pytest.approx(1.0, abs=1e-9)
+    assert found["ssim"] < 0.9
+    halves = [volume_metrics(changed, truth, mask, 1.0)["ssim_inside"] for mask in (near, ~near)]
+    assert 0.25 * halves[0] + 0.75 * halves[1] == pytest.approx(found["ssim"], abs=1e-9)
+
+
+def test_equal_volumes_are_perfect():
+    truth, inside = case()
+    found = volume_metrics(truth, truth, inside, 1.0)
+    assert found["psnr"] == math.inf and found["nrmse"] == 0 and found["ssim"] == pytest.approx(1.0)
+
+
+def test_an_empty_truth_and_an_empty_mask_are_no_accident():
+    truth, inside = case()
+    zero, nowhere = torch.zeros_like(truth), torch.zeros_like(inside)
+    assert volume_metrics(truth, zero, inside, 1.0)["nrmse"] == math.inf
+    assert volume_metrics(zero, zero, inside, 1.0)["nrmse"] == 0
+    assert math.isnan(volume_metrics(truth, truth, nowhere, 1.0)["psnr_inside"])
+
+
+def test_view_error_is_relative_over_all_cameras():
+    measured = torch.zeros(1, 2, 4, 4)
+    measured[0, 0], measured[0, 1] = 3.0, 4.0
+    predicted = measured.clone()
+    predicted[0, 0] = 0.0
+    assert view_metrics(predicted, measured)["view_nrmse"] == pytest.approx(3 / 5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"volume": torch.rand(1, 8, 9, 9)}, r"one shape"),
+        ({"data_range": 0.0}, r"positive, got 0"),
+        ({"data_range": float("nan")}, r"positive, got nan"),
+    ],
+)
+def test_bad_input_says_what_was_got(change, message):
+    truth, inside = case()
+    given = {"volume": truth, "truth": truth, "inside": inside, "data_range": 1.0} | change
+    with pytest.raises(ValueError, match=message):
+        volume_metrics(**given)
+
+
+def test_small_volumes_and_unequal_views_are_refused():
+    small = torch.rand(1, 5, 8, 8)
+    with pytest.raises(ValueError, match="at least 6"):
+        volume_metrics(small, small, small > 0, 1.0)
+    with pytest.raises(ValueError, match="measured"):
+        view_metrics(torch.rand(1, 2, 4, 4), torch.rand(1, 3, 4, 4))

@@ -1,0 +1,83 @@
+"""What `pip install .` installs: the code, the configs, the data files, the console scripts, the licence."""
+
+import configparser
+import subprocess
+import sys
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """The wheel of this checkout, built without any download."""
+    root, out = Path(__file__).parents[1], tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(root)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return zipfile.ZipFile(next(out.glob("*.whl")))
+
+
+def test_the_wheel_holds_all_code_configs_and_data(wheel: zipfile.ZipFile, root: Path):
+    def wanted(folder: str) -> set[str]:
+        found = (f for f in (root / folder).rglob("*") if f.is_file() and "__pycache__" not in f.parts)
+        return {str(f.relative_to(root)) for f in found}
+
+    held = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert held == wanted("mvrecon") | {f"mvrecon/{name}" for name in wanted("conf")}
+    assert {"mvrecon/py.typed", "mvrecon/conf/train.yaml", "mvrecon/conf/experiment/quickstart.yaml"} <= held
+    assert any(name.endswith(".csv") for name in held), "the dcspect80 geometry is missing"
+
+
+def test_no_file_of_the_package_is_hidden_from_git(root: Path):
+    if not (root / ".git").exists():
+        pytest.skip("not a git checkout")
+    command = ["git", "status", "--short", "--ignored", "--untracked-files=all", "mvrecon", "conf"]
+    status = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert not [line for line in status if line.startswith("!!") and "__pycache__" not in line]
+
+
+def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
+    import mvrecon
+
+    folder = f"mvrecon-{mvrecon.__version__}.dist-info"
+    metadata = Parser().parsestr(wheel.read(f"{folder}/METADATA").decode())
+    assert metadata["License-Expression"] == "Apache-2.0"
+    assert set(metadata["Requires-Python"].split(",")) == {">=3.11", "<3.14"}
+    assert f"{folder}/licenses/LICENSE" in wheel.namelist()
+    scripts = configparser.ConfigParser()
+    scripts.read_string(wheel.read(f"{folder}/entry_points.txt").decode())
+    assert dict(scripts["console_scripts"]) == {
+        "mvrecon-train": "mvrecon.train:main",
+        "mvrecon-eval": "mvrecon.eval:main",
+        "mvrecon-list": "mvrecon.listing:main",
+    }
+
+
+def test_an_unpacked_wheel_finds_its_own_configs(wheel: zipfile.ZipFile, tmp_path: Path):
+    wheel.extractall(tmp_path)
+    code = "from mvrecon.config import compose, conf_dir; print(conf_dir()); compose('experiment=quickstart')"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()) == tmp_path / "mvrecon" / "conf"
+
+
+def test_every_dependency_is_pinned(root: Path):
+    import tomllib
+
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    pins = {}
+    for line in (root / "constraints.txt").read_text().splitlines():
+        if line and not line.startswith("#"):
+            pin = Requirement(line)
+            pins[canonicalize_name(pin.name)] = next(iter(pin.specifier)).version
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
+    for requirement in map(Requirement, wanted):
+        if requirement.name != "mvrecon":
+            assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), requirement

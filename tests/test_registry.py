@@ -1,0 +1,103 @@
+"""The registry says what is wrong, and a broken plugin disturbs only whoever asks for it."""
+
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from mvrecon import registry
+from mvrecon.parts import REGISTRIES
+from mvrecon.registry import Registry
+
+
+def ring(views: int = 8, radius: float = 400.0) -> tuple[int, float]:
+    return views, radius
+
+
+def dome(**anything: float) -> dict[str, float]:
+    return anything
+
+
+@pytest.fixture
+def cameras() -> Registry:
+    cameras = Registry("camera", text="json:dumps")
+    cameras.register("ring")(ring)
+    cameras.register("dome")(dome)
+    return cameras
+
+
+@pytest.fixture
+def plugins(monkeypatch: pytest.MonkeyPatch):
+    """Declares entry points as installed plugins would."""
+
+    def declare(**points: str) -> None:
+        found = tuple(EntryPoint(k.replace("__", "."), v, registry.GROUP) for k, v in points.items())
+        monkeypatch.setattr(registry, "installed", lambda: found)
+
+    return declare
+
+
+def test_a_part_is_built_from_its_name_and_options(cameras: Registry):
+    assert cameras.build("ring", views=3) == (3, 400.0)
+    assert cameras.from_config({"name": "ring", "radius": 5.0}, views=2) == (2, 5.0)
+    assert cameras.build("dome", a=1.0) == {"a": 1.0}
+    assert cameras.get("text")([1]) == "[1]"
+
+
+def test_an_unknown_name_gives_the_nearest_and_all(cameras: Registry):
+    with pytest.raises(LookupError, match=r"No camera is named 'rng'; did you mean 'ring'\? Known: dome, ring, text"):
+        cameras.build("rng")
+    with pytest.raises(LookupError, match=r"No camera is named 'xyzzy'\. Known: dome, ring, text"):
+        cameras.origin("xyzzy")
+
+
+def test_an_unknown_option_gives_the_nearest_and_all(cameras: Registry):
+    with pytest.raises(TypeError, match=r"'ring' has no option 'view'; did you mean 'views'\? Known: radius, views"):
+        cameras.build("ring", view=3)
+
+
+def test_a_config_without_a_name_says_so(cameras: Registry):
+    with pytest.raises(TypeError, match=r"A camera needs a 'name', got only \['views'\]"):
+        cameras.from_config({"views": 3})
+
+
+def test_a_taken_name_is_refused(cameras: Registry, plugins):
+    with pytest.raises(LookupError, match="exists already: test_registry:ring|exists already: .*ring"):
+        cameras.register("ring")
+    plugins(camera__ring="other.module:Ring")
+    with pytest.raises(LookupError, match="2 parts of kind 'camera' are named 'ring'.*other.module:Ring"):
+        cameras.get("ring")
+
+
+def test_two_plugins_with_one_name_are_refused_but_one_seen_twice_is_not(cameras: Registry, monkeypatch):
+    first, second = (EntryPoint("camera.spect", f"json:{name}", registry.GROUP) for name in ("dumps", "loads"))
+    monkeypatch.setattr(registry, "installed", lambda: (first, second))
+    with pytest.raises(LookupError, match="named 'spect': json:dumps, json:loads"):
+        cameras.get("spect")
+    monkeypatch.setattr(registry, "installed", lambda: (first, first))
+    assert cameras.get("spect")(1) == "1"
+
+
+def test_a_plugin_is_found_under_its_kind_alone(cameras: Registry, plugins):
+    plugins(camera__json="json:dumps", projector__other="json:loads", conf__x="json")
+    assert cameras.names() == ["dome", "json", "ring", "text"]
+    assert cameras.build("json", [1]) == "[1]"
+
+
+def test_a_broken_plugin_disturbs_only_whoever_asks(cameras: Registry, plugins):
+    plugins(camera__broken="no_such_module_anywhere:Camera", camera__hollow="json:NoSuchClass")
+    assert "broken" in cameras.names()
+    assert cameras.build("ring") == (8, 400.0)
+    assert cameras.origin("broken") == "no_such_module_anywhere:Camera"
+    with pytest.raises(
+        ImportError, match=r"camera 'broken' \(no_such_module_anywhere:Camera\) does not import: No mod"
+    ):
+        cameras.get("broken")
+    with pytest.raises(ImportError, match="camera 'hollow' .* has no attribute 'NoSuchClass'"):
+        cameras.get("hollow")
+
+
+@pytest.mark.parametrize(("kind", "name"), [(k, n) for k, r in REGISTRIES.items() for n in r.names()])
+def test_every_part_imports_and_is_documented(kind: str, name: str):
+    part = REGISTRIES[kind].get(name)
+    assert callable(part)
+    assert (part.__doc__ or "").strip()
