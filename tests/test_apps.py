@@ -36,7 +36,6 @@ def run(tmp_path_factory):
         "seed=3",
         "logger=default",
         "callbacks=default",
-        "~callbacks.progress",
     )
 
 
@@ -44,7 +43,7 @@ def test_a_run_folder_holds_what_it_should(run):
     folder, _ = run
     names = {p.name for p in folder.iterdir()}
     assert {"config.yaml", "versions.txt", "metrics.csv", "results.json", "checkpoints", "review"} <= names
-    assert any(name.startswith("events.") for name in names)
+    assert any(name.startswith("events.") for name in names) and "hparams.yaml" not in names
     settings = yaml.safe_load((folder / "config.yaml").read_text())
     assert settings["name"] == "smoke" and settings["seed"] == 3 and "hydra" not in settings
     assert {"planes.png", "mip.png", "views.png", "opinions.png", "weights.png"} <= {
@@ -100,7 +99,7 @@ def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
 
 
 def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
-    options = ("test_scene=shepp_logan", "+data.sizes.test=1", "save=true")
+    options = ("scene@test_scene=shepp_logan", "+data.sizes.test=1", "save=true")
     found = call(mvrecon.eval, tmp_path / "eval", f"checkpoint={run[0]}", *options)
     assert len(found["scenes"]) == 1 and found["scenes"] != run[1]["scenes"][:1]
     case = next((tmp_path / "eval" / "cases").iterdir())
@@ -125,6 +124,7 @@ def test_resume_goes_on_in_the_same_folder(run, tmp_path):
         (mvrecon.eval, ["checkpoint=nowhere.ckpt"], "No checkpoint or run folder is at"),
         (mvrecon.train, ["experiment=smoke", "optimizer.lr=1e30"], "is not finite at step"),
         (mvrecon.train, ["experiment=smoke", "model.name=cros_view"], "did you mean 'cross_view'"),
+        (mvrecon.train, ["experiment=smoke", "test_scene=ellipsoids"], "by scene@test_scene=ellipsoids"),
         (mvrecon.train, ["experiment=smoke", "resume=nowhere"], "but got also"),
         (mvrecon.train, ["resume=nowhere"], "No checkpoint or run folder is at"),
     ],

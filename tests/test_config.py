@@ -7,6 +7,7 @@ from pathlib import Path
 
 import hydra
 import pytest
+import yaml
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
@@ -47,7 +48,8 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
     assert files
     for file in files:
         key = "head@model.head" if group == "head" else group
-        node = compose(f"{key}={file.stem}")
+        needed = [name for name, value in yaml.safe_load(file.read_text()).items() if value == "???"]
+        node = compose(f"{key}={file.stem}", *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed))
         part = node["model"]["head"] if group == "head" else node[group]
         assert part["name"] in REGISTRIES[group].names()
 

@@ -12,7 +12,7 @@ Convention: right-handed, as OpenCV: u to the right, v downwards, looking toward
 stands behind it, so its object points have w < 0 and its image is turned by 180 degrees with no code of its own.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -94,8 +94,8 @@ class Cameras:
             )
         if not (look > 0).all():
             raise ValueError(
-                f"Cameras must be right-handed (u right, v down, looking at the object), but camera {int(look.argmin())} "
-                "is left-handed; reverse u or v, and take origin at the other end of that axis"
+                "Cameras must be right-handed (u right, v down, looking at the object), but camera "
+                f"{int(look.argmin())} is left-handed; reverse u or v, and take origin at the other end of that axis"
             )
 
     def __len__(self) -> int:
@@ -104,6 +104,10 @@ class Cameras:
     def __getitem__(self, index: int | slice | list[int] | Tensor) -> "Cameras":
         """A rig of the chosen cameras, in the given order."""
         return self._map(lambda vector: vector[index].reshape(-1, 3))
+
+    def __iter__(self) -> Iterator["Cameras"]:
+        """Rigs of one camera each."""
+        return (self[m] for m in range(len(self)))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> "Cameras":
         return replace(self, **{name: change(getattr(self, name)) for name in VECTORS})

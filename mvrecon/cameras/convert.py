@@ -108,9 +108,8 @@ def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
 def frustum_jacobian(cameras: Cameras, xyz: Float[Tensor, "*n 3"], f: float = 1.0) -> Float[Tensor, "m *n"]:
     """Volume in (u, v, k) per mm^3 at world points, |det H| / w^4; a density that keeps its counts is divided by it."""
     H = to_frustum(cameras, f)
-    flat = xyz.reshape(-1, 3).to(H)
-    w = flat @ H[:, 3, :3].mT[None].squeeze(0) + H[:, 3, 3]
-    return homography_jacobian(H[:, None], w.mT).reshape(len(cameras), *xyz.shape[:-1])
+    w = H[:, 3, :3] @ xyz.reshape(-1, 3).to(H).T + H[:, 3, 3:]
+    return homography_jacobian(H[:, None], w).reshape(len(cameras), *xyz.shape[:-1])
 
 
 def to_astra(cameras: Cameras) -> Float[Tensor, "m 12"]:

@@ -81,7 +81,7 @@ def _cameras(record: Any) -> Cameras:
 
 def _vector(row: Any, name: str, m: int) -> list[float]:
     vector = row.get(name) if isinstance(row, dict) else None
-    numbers = isinstance(vector, list) and all(type(x) in (int, float) and math.isfinite(x) for x in vector)
-    if not numbers or len(vector) != 3:  # type: ignore[arg-type]
-        raise ValueError(f"expected {name!r} of camera {m} as three finite mm, got {vector!r}")
-    return vector
+    if isinstance(vector, list) and len(vector) == 3 and all(type(x) in (int, float) for x in vector):
+        if all(math.isfinite(x) for x in vector):
+            return vector
+    raise ValueError(f"expected {name!r} of camera {m} as three finite mm, got {vector!r}")

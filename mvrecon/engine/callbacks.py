@@ -63,13 +63,13 @@ class Clock(L.Callback):
         count = len(batch["views"])
         figures = {"step_ms": 1e3 * step, "volumes_per_s": count / step, "seconds": self.seconds}
         figures["peak_mb"] = peak_megabytes()
-        self.log_dict({f"time/{name}": value for name, value in figures.items()}, batch_size=count)
+        pl_module.log_dict({f"time/{name}": value for name, value in figures.items()}, batch_size=count)
 
 
 class CompileModel(L.Callback):
     """Compiles the network before training. Never the LightningModule, whose logging must not be traced."""
 
-    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+    def setup(self, trainer: L.Trainer, pl_module: Any, stage: str) -> None:
         """Compile in place; names of parameters stay."""
         if stage == "fit":
             pl_module.model.compile()

@@ -57,6 +57,6 @@ def load(path: Path) -> Trained:
     """
     if not path.is_file():
         raise FileNotFoundError(f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it")
-    state = torch.load(path, map_location="cpu")
-    module = ReconstructionModule.load_from_checkpoint(path, map_location="cpu").eval()
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    module = ReconstructionModule.load_from_checkpoint(path, map_location="cpu", weights_only=True).eval()
     return Trained(module, state["callbacks"].get("Clock", {}).get("seconds", 0.0), state["global_step"])

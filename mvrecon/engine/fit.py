@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 
 from mvrecon.config import instantiate
 from mvrecon.data.module import SceneData
@@ -28,8 +28,14 @@ def methods(settings: Settings) -> dict[str, Settings]:
 
 
 def build_data(settings: Settings) -> SceneData:
-    """The training, validation and test scenes of a run."""
+    """The training, validation and test scenes of a run.
+
+    Raises:
+        TypeError: a test scene that is a bare word, as from `test_scene=<name>` on a command line.
+    """
     scenes = {"train": settings["scene"], "test": settings["test_scene"] or settings["scene"]}
+    if isinstance(scenes["test"], str):
+        raise TypeError(f"test_scene holds a scene's settings; choose a file by scene@test_scene={scenes['test']}")
     where = {key: settings[key] for key in ("grid", "camera", "seed")}
     return SceneData(scenes=scenes, **where, **settings["data"])
 
@@ -65,7 +71,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     L.seed_everything(settings["seed"], workers=True, verbose=False)  # initial weights have used up random numbers
     board = folder if method == next(iter(models)) else folder / method
     trainer = build_trainer(settings, board, last)
-    trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.exists() else None)
+    trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.exists() else None, weights_only=True)
     trainer.save_checkpoint(done)
     shutil.rmtree(last.parent, ignore_errors=True)
 
@@ -76,6 +82,5 @@ def build_trainer(settings: Settings, board: Path, last: Path) -> L.Trainer:
     callbacks: list[Any] = [instantiate(node) for node in (settings["callbacks"] or {}).values() if node]
     keep = ModelCheckpoint(last.parent, last.stem, save_top_k=1, enable_version_counter=False)
     loggers = [instantiate(node, save_dir=str(board)) for node in (settings["logger"] or {}).values() if node]
-    return L.Trainer(
-        **settings["trainer"], callbacks=[*callbacks, Clock(), keep], logger=loggers, default_root_dir=board
-    )
+    options = {"enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks), **settings["trainer"]}
+    return L.Trainer(**options, callbacks=[*callbacks, Clock(), keep], logger=loggers, default_root_dir=board)

@@ -1,12 +1,13 @@
-"""The table of logged numbers in the run folder."""
+"""Logs flat in the run folder: a table of numbers, and the board."""
 
 import csv
 import os
 from typing import Any
 
-from lightning.pytorch.loggers import CSVLogger
+from lightning.fabric.loggers.logger import rank_zero_experiment
+from lightning.fabric.loggers.tensorboard import TensorBoardLogger as FabricBoard
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
-from lightning.pytorch.loggers.logger import rank_zero_experiment
 
 
 class _Continuing(ExperimentWriter):
@@ -36,3 +37,18 @@ class MetricsFile(CSVLogger):
         if self._experiment is None:
             self._experiment = _Continuing(log_dir=self.log_dir)
         return self._experiment
+
+
+class Board(TensorBoardLogger):
+    """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has them.
+
+    Args:
+        save_dir: the folder.
+    """
+
+    def __init__(self, save_dir: str):
+        super().__init__(save_dir, name="", version="", default_hp_metric=False)
+
+    def save(self) -> None:
+        """Write what is waiting."""
+        FabricBoard.save(self)

@@ -19,6 +19,8 @@ from mvrecon.geometry.grid import Grid
 
 #: The four linear maps of a view in `lines_of`.
 DIRECTION, MOMENT, START, WORLD = range(4)
+#: Axes whose components differ by less than this part tie; the first of them is the main axis, in every back end.
+TIE = 1e-12
 
 
 def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:

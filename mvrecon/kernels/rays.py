@@ -1,23 +1,18 @@
-"""The arithmetic of one ray, written once: where it runs, what it sums, what it spreads, how its sum changes.
+"""Where one ray runs through the volume, for every compiled kernel.
 
-A volume comes padded (one voxel before, two behind, along every axis) and flat, so that no loop tests a bound: every
-ray is first clipped to the slabs in which it can touch the volume. Slabs are counted along the ray's main axis; the
-other two axes b, c follow it cyclically. All functions are scalar and know no CPU; a GPU back end compiles the same.
-
-numba's disk cache does not see an edit of this file: change `cpu.py` with it, or clear the cache.
+A ray is first clipped to the slabs in which it can touch the volume, so that no later loop tests a bound. Slabs are
+counted along its main axis; the other two axes b, c follow cyclically. `joseph.py` and `siddon.py` go on from here.
+Everything is scalar and knows no CPU, so that a GPU back end can compile the same source.
 """
 
 from collections import namedtuple
 from math import ceil, floor, sqrt
 
-import numpy as np
 from numba import njit
 
+from mvrecon.kernels.lines import TIE
+
 JOSEPH, SIDDON = 0, 1
-#: Voxels of padding before and behind the volume along every axis.
-PAD = (1, 2)
-#: Ties between axes go to the first, in every back end.
-TIE = 1 + 1e-12
 #: What may be reordered: sums and products, but NaN and infinity keep their meaning.
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
@@ -38,9 +33,9 @@ def at(line, kind, axis, u, v):
 def main_axis(line, u, v):
     """The axis along which the ray runs fastest."""
     x, y, z = abs(at(line, 0, 0, u, v)), abs(at(line, 0, 1, u, v)), abs(at(line, 0, 2, u, v))
-    if x * TIE >= y and x * TIE >= z:
+    if x * (1 + TIE) >= y and x * (1 + 2 * TIE) >= z:
         return 0
-    return 1 if y * TIE >= z else 2
+    return 1 if y * (1 + TIE) >= z else 2
 
 
 @scalar
@@ -87,34 +82,9 @@ def trace(line, axis, u, v, window, sizes, method):
 
 
 @scalar
-def joseph_cells(ray, strides, at, y, z, share):
-    """The bilinear cell of each slab of a ray: its flat index, the weights towards b and c, the slab's part that counts."""
-    real, whole = y.dtype.type, at.dtype.type
-    b, slope_b, c, slope_c = real(ray.b), real(ray.slope_b), real(ray.c), real(ray.slope_c)
-    begin, end, half = real(ray.begin), real(ray.end), real(0.5)
-    start = real(ray.first - ray.centre)
-    first = whole(ray.first + 1)
-    along, across, up = strides[ray.axis], strides[(ray.axis + 1) % 3], strides[(ray.axis + 2) % 3]
-    for i in range(np.uint32(ray.last - ray.first)):
-        k = whole(i)
-        s = real(k) + start
-        share[i] = min(end, s + half) - max(begin, s - half)
-        py, pz = b + s * slope_b, c + s * slope_c
-        iy, iz = np.int32(py), np.int32(pz)
-        y[i], z[i] = py - real(iy), pz - real(iz)
-        at[i] = whole(whole(whole(first + k) * along) + whole(whole(whole(iy) * across) + whole(whole(iz) * up)))
-
-
-@scalar
-def joseph_sum(flat, across, up, count, at, y, z, share):
-    """The sum of the volume along a ray, bilinear in each slab, in voxels of the main axis."""
-    whole = at.dtype.type
-    total = flat.dtype.type(0)
-    for i in range(np.uint32(count)):
-        k = at[i]
-        f00, f10 = flat[np.uint64(k)], flat[np.uint64(whole(k + across))]
-        f01, f11 = flat[np.uint64(whole(k + up))], flat[np.uint64(whole(k + whole(across + up)))]
-        low = f00 + y[i] * (f10 - f00)
-        high = f01 + y[i] * (f11 - f01)
-        total += share[i] * (low + z[i] * (high - low))
-    return total
+def within(ray, low, high):
+    """The slabs of a ray that lie in [low, high)."""
+    first, last = max(ray.first, low), min(ray.last, high)
+    return Ray(
+        ray.axis, ray.b, ray.slope_b, ray.c, ray.slope_c, ray.length, ray.begin, ray.end, first, last, ray.centre
+    )

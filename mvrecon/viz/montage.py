@@ -13,7 +13,9 @@ from mvrecon.viz.planes import Image, brightest, grey, middle_planes, signed
 
 GAP = 2
 LABEL = 14
+CAPTION = 60
 EDGE = 96
+PLANES = ("across z", "across y", "across x")
 
 
 def enlarged(image: Image, edge: int = EDGE) -> Image:
@@ -60,11 +62,11 @@ def planes(
 
     Values from 0 to data_range; the error from -data_range / 2 (blue) to data_range / 2 (red).
     """
-    ours = next(iter(volumes.values()))
+    error = next(iter(volumes.values())) - truth
     shown = {"truth": truth, **volumes}
-    columns = [_column(name, [grey(p, (0, data_range)) for p in middle_planes(v)]) for name, v in shown.items()]
-    columns.append(_column("error", [signed(p, data_range / 2) for p in middle_planes(ours - truth)]))
-    return tiled(list(zip(*columns, strict=True)))
+    columns = {name: [grey(p, (0, data_range)) for p in middle_planes(v)] for name, v in shown.items()}
+    columns["error"] = [signed(p, data_range / 2) for p in middle_planes(error)]
+    return _captioned(columns, PLANES)
 
 
 def projections(
@@ -72,8 +74,8 @@ def projections(
 ) -> Image:
     """Maximum-intensity projections along three axes (rows) of the truth and of every volume (columns)."""
     shown = {"truth": truth, **volumes}
-    columns = [_column(name, [grey(p, (0, data_range)) for p in brightest(v)]) for name, v in shown.items()]
-    return tiled(list(zip(*columns, strict=True)))
+    columns = {name: [grey(p, (0, data_range)) for p in brightest(v)] for name, v in shown.items()}
+    return _captioned(columns, ("along z", "along y", "along x"))
 
 
 def views(measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"]) -> Image:
@@ -82,11 +84,11 @@ def views(measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"]) -
     Values from 0 to the greatest measured value; the difference to a fourth of it.
     """
     top = max(measured.amax().item(), torch.finfo(torch.float32).tiny)
-    columns = [
-        _column(f"camera {m}", [grey(y, (0, top)), grey(p, (0, top)), signed(p - y, top / 4)])
+    columns = {
+        f"camera {m}": [grey(y, (0, top)), grey(p, (0, top)), signed(p - y, top / 4)]
         for m, (y, p) in enumerate(zip(measured, predicted, strict=True))
-    ]
-    return tiled(list(zip(*columns, strict=True)))
+    }
+    return _captioned(columns, ("measured", "predicted", "difference"))
 
 
 def gallery(each: Float[Tensor, "m v u"], edge: int = 256) -> Image:
@@ -121,10 +123,15 @@ def save_png(path: Path, image: Image) -> None:
 
 
 def _per_camera(each: Float[Tensor, "m d h w"], top: float) -> Image:
-    columns = [_column(f"camera {m}", [grey(p, (0, top)) for p in middle_planes(v)]) for m, v in enumerate(each)]
-    return tiled(list(zip(*columns, strict=True)))
+    columns = {f"camera {m}": [grey(p, (0, top)) for p in middle_planes(v)] for m, v in enumerate(each)}
+    return _captioned(columns, PLANES)
 
 
-def _column(name: str, images: Sequence[Image]) -> list[Image]:
-    first, *rest = [enlarged(image) for image in images]
-    return [labelled(first, name), *rest]
+def _captioned(columns: Mapping[str, Sequence[Image]], rows: Sequence[str]) -> Image:
+    """Columns of images with their names above and the rows' names on the left."""
+    large = {name: [enlarged(image) for image in images] for name, images in columns.items()}
+    names = [np.zeros((next(iter(large.values()))[r].shape[0] - LABEL, CAPTION, 3), np.uint8) for r in range(len(rows))]
+    left = [labelled(blank, row) for blank, row in zip(names, rows, strict=True)]
+    left[0] = labelled(left[0], "")
+    named = [[labelled(first, name), *rest] for name, (first, *rest) in large.items()]
+    return tiled(list(zip(left, *named, strict=True)))

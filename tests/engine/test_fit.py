@@ -104,6 +104,17 @@ def test_a_loss_that_is_not_finite_stops_with_a_remedy(settings, data, tmp_path)
     assert not checkpoints.finished(tmp_path, "cross_view").exists()
 
 
+def test_averaged_weights_are_what_a_checkpoint_holds(settings, data, tmp_path):
+    averaging = {"_target_": "lightning.pytorch.callbacks.EMAWeightAveraging", "decay": 0.5, "use_buffers": False}
+    fit.fit("cross_view", {**settings, "callbacks": {"ema": averaging}}, data, tmp_path)
+    path = checkpoints.finished(tmp_path, "cross_view")
+    state, loaded = torch.load(path), checkpoints.load(path).module.state_dict()
+    last = state["current_model_state"]
+    assert all(torch.equal(loaded[name], state["state_dict"][name]) for name in loaded)
+    assert all_plain(state["averaging_state"])
+    assert any(not torch.equal(state["state_dict"][name], last[name]) for name in last)
+
+
 def test_methods_without_weights_are_not_trained(settings, data, tmp_path):
     fit.fit("sirt", settings, data, tmp_path)
     assert not list(tmp_path.iterdir())

@@ -6,7 +6,9 @@ import torch
 from PIL import Image as Pillow
 
 from mvrecon.viz import montage
-from mvrecon.viz.montage import GAP, LABEL
+from mvrecon.viz.montage import CAPTION, GAP, LABEL
+
+LEFT = CAPTION + GAP
 
 
 def flat(level, shape=(2, 3)):
@@ -42,30 +44,37 @@ def test_planes_show_truth_ours_baseline_and_signed_error():
     truth = torch.full((96, 96, 96), 0.5)
     image = montage.planes(truth, {"ours": truth + 0.5, "sirt": truth - 0.5}, data_range=1.0)
     side = 96 + GAP
-    middle = image[LABEL + 48, 48::side]
+    middle = image[LABEL + 48, LEFT + 48 :: side]
     assert middle.tolist() == [[128] * 3, [255] * 3, [0] * 3, [255, 0, 0]]
-    assert image.shape == (LABEL + 3 * 96 + 2 * GAP, 4 * 96 + 3 * GAP, 3)
+    assert image.shape == (LABEL + 3 * 96 + 2 * GAP, LEFT + 4 * 96 + 3 * GAP, 3)
 
 
 def test_views_of_all_cameras_share_one_window():
     measured = torch.stack([torch.full((96, 96), 1.0), torch.full((96, 96), 2.0)])
     image = montage.views(measured, torch.zeros_like(measured))
     rows = [LABEL + 48, LABEL + 48 + 98, LABEL + 48 + 196]
-    assert [image[r, 48, 0] for r in rows] == [128, 0, 0]
-    assert [image[r, 48 + 98, 0] for r in rows] == [255, 0, 0]
-    assert image[rows[2], 48].tolist() == [0, 0, 255]
+    assert [image[r, LEFT + 48, 0] for r in rows] == [128, 0, 0]
+    assert [image[r, LEFT + 48 + 98, 0] for r in rows] == [255, 0, 0]
+    assert image[rows[2], LEFT + 48].tolist() == [0, 0, 255]
 
 
 def test_equal_weights_are_one_third_grey_for_any_number_of_cameras():
     for count in (2, 5):
         image = montage.weights(torch.full((count, 96, 96, 96), 1 / count))
-        assert set(image[LABEL + 48, 48::98, 0].tolist()) == {85}
+        assert set(image[LABEL + 48, LEFT + 48 :: 98, 0].tolist()) == {85}
 
 
 def test_opinions_and_projections_have_a_column_each():
     volumes = torch.rand(5, 8, 8, 8)
-    assert montage.opinions(volumes, 1.0).shape[1] == 5 * 96 + 4 * GAP
-    assert montage.projections(volumes[0], {"ours": volumes[1]}, 1.0).shape[1] == 2 * 96 + GAP
+    assert montage.opinions(volumes, 1.0).shape[1] == LEFT + 5 * 96 + 4 * GAP
+    assert montage.projections(volumes[0], {"ours": volumes[1]}, 1.0).shape[1] == LEFT + 2 * 96 + GAP
+
+
+def test_a_gallery_has_rows_of_four_in_order():
+    image = montage.gallery(torch.arange(1.0, 7.0)[:, None, None].expand(6, 64, 64), edge=64)
+    assert image.shape == (2 * (64 + LABEL) + GAP, 4 * 64 + 3 * GAP, 3)
+    middle = image[LABEL + 32 :: 64 + LABEL + GAP, 32 :: 64 + GAP, 0]
+    assert middle.tolist() == [[42, 85, 128, 170], [212, 255, 0, 0]]
 
 
 def test_a_saved_image_comes_back_and_leaves_nothing_behind(tmp_path):

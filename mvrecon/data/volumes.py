@@ -1,0 +1,204 @@
+"""Scenes of CT volumes from files: HU to attenuation, the patient centred in the grid, views from a finer grid.
+
+The grid is the field of view: what lies outside of its box is cut off in the truth and in the views alike.
+"""
+
+import os
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.data.attenuation import WATER, attenuation
+from mvrecon.data.body import body, centre, enclosed
+from mvrecon.data.hdf5 import VolumeFile
+from mvrecon.data.nifti import read_nifti
+from mvrecon.data.resample import resample
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import euler_rotation
+from mvrecon.parts import PROJECTORS
+from mvrecon.scenes.analytic import generator, uniform
+from mvrecon.scenes.sample import Sample
+
+#: Tissue begins at -400 HU where the patient is looked for, and at a quarter of water where voxels are judged.
+SKIN, TISSUE = 0.6 * WATER, 0.25 * WATER
+#: How far a varied copy departs from its case: degrees about each axis, part of the size, mm along each axis.
+TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
+Crop = Literal["body", "none"]
+
+
+@dataclass(kw_only=True)
+class FileScene(ABC):
+    """CT volumes as cases, in their true size.
+
+    Args:
+        path: of the file.
+        crop: "body" puts the centre of the patient's box at the grid's centre, "none" leaves the volume where its
+            file says it is (about the origin, if the file does not say).
+        fine: views are projected from a grid this many times finer than the truth's; at least 2.
+        rays: a pixel measures the mean over rays x rays lines of sight.
+        vary: beyond the last case, count on with copies that are mirrored left to right, turned, scaled and shifted
+            at random, others every time round.
+        data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to 1000 HU.
+
+    Raises:
+        ValueError: an unknown crop, or numbers that are too small.
+    """
+
+    path: str
+    crop: Crop = "body"
+    fine: int = 2
+    rays: int = 2
+    vary: bool = False
+    data_range: float = 0.04
+    unit: str = field(default="1/mm", init=False)
+
+    def __post_init__(self) -> None:
+        if self.crop not in ("body", "none"):
+            raise ValueError(f"crop must be 'body' or 'none', got {self.crop!r}")
+        if self.fine < 2 or self.rays < 1 or not self.data_range > 0:
+            got = f"fine {self.fine}, rays {self.rays}, data_range {self.data_range}"
+            raise ValueError(f"A scene from a file needs fine >= 2, rays >= 1 and a positive data_range, got {got}")
+        self._operator: tuple[Grid, Cameras, Any] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_operator": None}
+
+    @property
+    @abstractmethod
+    def length(self) -> int:
+        """How many cases the file holds."""
+
+    @abstractmethod
+    def case(self, index: int) -> tuple[str, Float[Tensor, "d h w"], Grid]:
+        """Name, Hounsfield units and grid of a case as it lies in the file."""
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Sample:
+        """A case, seen by `cameras`, with its truth on `grid`.
+
+        Raises:
+            IndexError: the file has no such case.
+            ValueError: values that are not finite, or no patient in the volume.
+        """
+        name, fine = self.finely(index, seed, grid)
+        truth = F.avg_pool3d(fine[None], self.fine)
+        inside = enclosed(body(truth[0], TISSUE))
+        return Sample(self._views(fine, grid, cameras), truth, inside[None], name)
+
+    def finely(self, index: int, seed: int, grid: Grid) -> tuple[str, Float[Tensor, "e i j"]]:
+        """Name of a case, and its attenuation in 1/mm on `grid.refined(fine)`."""
+        turn, case = divmod(index, self.length)
+        if index < 0 or (turn and not self.vary):
+            raise IndexError(f"{self.path} has {self.length} case(s), got index {index}; `vary: true` adds varied ones")
+        name, hu, source = self.case(case)
+        if not hu.isfinite().all():
+            raise ValueError(f"{self.path}: {name} has {int((~hu.isfinite()).sum())} values that are not finite HU")
+        mu = attenuation(hu)
+        rng = generator(seed, index) if turn else None
+        if rng is not None and uniform(rng, 0, 1) < 0.5:
+            mu = mu.flip(-1)
+        patient = body(mu, SKIN) if self.crop == "body" or rng is not None else None
+        if patient is not None and not patient.any():
+            raise ValueError(f"{self.path}: {name} shows no patient: expected values above -400 HU, all are below")
+        pivot = grid.centre if patient is None else centre(patient, source)
+        target = grid.centre if self.crop == "body" else pivot
+        placed = moved(source, pivot, target, rng)
+        return f"{name}-{seed}-{turn}" if turn else name, resample(mu, placed, grid.refined(self.fine))
+
+    @torch.no_grad()
+    def _views(self, fine: Float[Tensor, "e i j"], grid: Grid, cameras: Cameras) -> Float[Tensor, "1 m v u"]:
+        if self._operator is None or self._operator[0] is not grid or self._operator[1] is not cameras:
+            geometry = {"grid": grid.refined(self.fine), "cameras": split_pixels(cameras, self.rays)}
+            A = PROJECTORS.build("radon" if cameras.parallel else "drr", **geometry, method="siddon")
+            self._operator = (grid, cameras, A)
+        return F.avg_pool2d(self._operator[2](fine[None, None])[0], self.rays)
+
+
+def split_pixels(cameras: Cameras, factor: int) -> Cameras:
+    """The same detectors with each pixel cut into `factor` x `factor`; the inverse of `Cameras.binned`."""
+    u, v = cameras.u / factor, cameras.v / factor
+    shift = (u + v) * (1 - factor) / 2
+    shape = (cameras.shape[0] * factor, cameras.shape[1] * factor)
+    source = cameras.source + shift if cameras.parallel else cameras.source
+    return replace(cameras, source=source, origin=cameras.origin + shift, u=u, v=v, shape=shape)
+
+
+def moved(grid: Grid, pivot: Float[Tensor, "3"], target: Float[Tensor, "3"], rng: torch.Generator | None) -> Grid:
+    """A grid carried from one point to another, with `rng` also turned, scaled and shifted about it at random."""
+    linear = torch.eye(3, dtype=torch.float64)
+    if rng is not None:
+        angles = [uniform(rng, -TURN, TURN) for _ in range(3)]
+        linear = uniform(rng, 1 - SCALE, 1 + SCALE) * euler_rotation(angles, "xyz")
+        target = target + torch.tensor([uniform(rng, -SHIFT, SHIFT) for _ in range(3)], dtype=torch.float64)
+    affine = grid.affine.clone()
+    affine[:3, :3] = linear @ affine[:3, :3]
+    affine[:3, 3] = linear @ (affine[:3, 3] - pivot) + target
+    return Grid(grid.shape, affine)
+
+
+@dataclass(kw_only=True)
+class Hdf5Volumes(FileScene):
+    """The volumes of an HDF5 file (`mvrecon.data.hdf5` tells its layout).
+
+    Args:
+        orientation: towards which sides of the patient the file's axes x, y, z run, as three letters: L or R, P or A,
+            I or S. The world is RAS as in NIfTI. None: as the file says, or RAS. Others: see `FileScene`.
+
+    Raises:
+        ValueError: an orientation that is not such letters.
+    """
+
+    orientation: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._file = VolumeFile(self.path)
+        if self.orientation is not None:
+            reversed_axes(self.orientation)
+
+    @property
+    def length(self) -> int:
+        """How many volumes the file holds."""
+        return len(self._file)
+
+    def case(self, index: int) -> tuple[str, Float[Tensor, "d h w"], Grid]:
+        """Name, Hounsfield units and grid of a volume, centred on the origin, its axes running to RAS."""
+        stored = self._file.read(index)
+        hu = torch.from_numpy(stored.ct.astype("float32"))
+        axes = reversed_axes(self.orientation or self._file.orientation or "RAS")
+        return stored.name, hu.flip(axes), Grid.centred(hu.shape, stored.spacing[::-1])
+
+
+def reversed_axes(orientation: str) -> list[int]:
+    """Which axes of a volume [z y x] must be reversed so that x, y, z run to R, A, S.
+
+    Raises:
+        ValueError: letters that are not L or R, P or A, I or S, in this order.
+    """
+    if len(orientation) != 3 or any(a not in pair for a, pair in zip(orientation, ("LR", "PA", "IS"), strict=True)):
+        raise ValueError(f"An orientation is L or R, then P or A, then I or S, such as 'LPI'; got {orientation!r}")
+    return [2 - i for i, letter in enumerate(orientation) if letter in "LPI"]
+
+
+@dataclass(kw_only=True)
+class NiftiVolume(FileScene):
+    """One NIfTI volume in Hounsfield units, in world mm (RAS) by its affine. Options: see `FileScene`."""
+
+    @property
+    def length(self) -> int:
+        """One."""
+        return 1
+
+    @cached_property
+    def _case(self) -> tuple[str, Float[Tensor, "d h w"], Grid]:
+        return os.path.basename(self.path).split(".nii")[0], *read_nifti(self.path)
+
+    def case(self, index: int) -> tuple[str, Float[Tensor, "d h w"], Grid]:
+        """Name, Hounsfield units and grid of the volume, its axes running roughly to RAS."""
+        return self._case

@@ -1,0 +1,150 @@
+"""The oracle: the same operators in plain torch. Any device, any float type, derivatives of any order by torch itself.
+
+It shares no arithmetic with the compiled kernels. All rays advance together, slab by slab of their own main axis.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mvrecon.geometry.grid import pixel_centres
+from mvrecon.kernels.lines import DIRECTION, MOMENT, START, TIE, WORLD
+
+
+@dataclass(frozen=True)
+class Rays:
+    """All rays of all views, flat: main axis first, then the two that follow it cyclically."""
+
+    value: Float[Tensor, "2 r"]
+    slope: Float[Tensor, "2 r"]
+    length: Float[Tensor, " r"]
+    begin: Float[Tensor, " r"]
+    end: Float[Tensor, " r"]
+    sizes: Int[Tensor, "3 r"]
+    strides: Int[Tensor, "3 r"]
+
+
+def rays_of(
+    lines: Tensor, window: Sequence[float], detector: Sequence[int], shape: Sequence[int], like: Tensor
+) -> Rays:
+    """Where every ray runs; formed in float64, then cast to the volume's type."""
+    centre = lines.new_tensor([(detector[1] - 1) / 2, (detector[0] - 1) / 2])
+    uv = pixel_centres(detector).to(lines) - centre
+    p = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1).reshape(-1, 3)
+    maps = torch.einsum("mkxc,rc->kxmr", lines, p).flatten(2)
+    direction, moment = maps[DIRECTION], maps[MOMENT]
+    preference = 1 + TIE * torch.arange(2, -1, -1, device=lines.device, dtype=lines.dtype)
+    main = (direction.detach().abs() * preference[:, None]).argmax(dim=0)
+    order = torch.stack([main, (main + 1) % 3, (main + 2) % 3])
+    D = direction.gather(0, order)
+    M = moment.gather(0, order)
+    start = maps[START].gather(0, order[:1])[0]
+    sizes = torch.tensor(shape[::-1], device=lines.device)
+    half = sizes[main] / 2
+    ends = [_end(start, D[0], w) for w in window]
+    steps = torch.tensor([1, shape[2] + 2, (shape[2] + 2) * (shape[1] + 2)], device=lines.device)
+    value = torch.stack([-M[2], M[1]]) / D[0]
+    return Rays(
+        value=value.to(like.dtype),
+        slope=(D[1:] / D[0]).to(like.dtype),
+        length=(maps[WORLD].norm(dim=0) / D[0].abs()).to(like.dtype),
+        begin=torch.maximum(torch.minimum(*ends), -half).to(like.dtype),
+        end=torch.minimum(torch.maximum(*ends), half).to(like.dtype),
+        sizes=sizes[order],
+        strides=steps[order],
+    )
+
+
+def _end(start: Tensor, D: Tensor, w: float) -> Tensor:
+    """Where a ray ends along its main axis; infinity carries no derivative."""
+    return start + w * D if abs(w) < torch.inf else w * D.detach().sign()
+
+
+def _joseph(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Flat indices and weights of slab k: bilinear, the volume padded by one voxel of nothing."""
+    share = (torch.minimum(rays.end, s + 0.5) - torch.maximum(rays.begin, s - 0.5)).clamp_min(0)
+    sizes = rays.sizes[1:]
+    place = rays.value + s * rays.slope + (sizes - 1) / 2
+    place = torch.minimum(place.clamp_min(-1), sizes.to(s.dtype))
+    cell = torch.minimum(place.detach().floor().long(), sizes - 1)
+    part = place - cell
+    base = (k + 1) * rays.strides[0] + ((cell + 1) * rays.strides[1:]).sum(dim=0)
+    for b, weight_b in enumerate((1 - part[0], part[0])):
+        for c, weight_c in enumerate((1 - part[1], part[1])):
+            yield base + b * rays.strides[1] + c * rays.strides[2], share * weight_b * weight_c
+
+
+def _siddon(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Flat indices and lengths of the at most three cells that a ray crosses in slab k."""
+    near, far = torch.maximum(rays.begin, s - 0.5), torch.minimum(rays.end, s + 0.5)
+    length = (far - near).clamp_min(0)
+    sizes = rays.sizes[1:]
+    offset = rays.value + sizes / 2
+    one, two = offset + near * rays.slope, offset + far * rays.slope
+    low, high = one.detach().floor(), two.detach().floor()
+    crosses = low != high
+    safe = torch.where(crosses, rays.slope, torch.ones_like(rays.slope))
+    to = torch.where(crosses, ((torch.maximum(low, high) - one) / safe).clamp_min(0), length)
+    to = torch.minimum(to, length)
+    b_first = to[0] < to[1]
+    middle = torch.stack([torch.where(b_first, high[0], low[0]), torch.where(b_first, low[1], high[1])])
+    lengths = (torch.minimum(*to), torch.maximum(*to) - torch.minimum(*to), length - torch.maximum(*to))
+    for cell, weight in zip((low, middle, high), lengths, strict=True):
+        inside = torch.minimum(cell.clamp_min(-1), sizes.to(s.dtype)).long()
+        yield (k + 1) * rays.strides[0] + ((inside + 1) * rays.strides[1:]).sum(dim=0), weight
+
+
+def _weights(
+    lines: Tensor, window: Sequence[float], detector: Sequence[int], shape: Sequence[int], like: Tensor, method: str
+):
+    """Every flat index and weight, in mm, of all rays: the rows of the system matrix, slab by slab."""
+    rays = rays_of(lines, window, detector, shape, like)
+    cells = {"joseph": _joseph, "siddon": _siddon}[method]
+    for slab in range(max(shape)):
+        k = torch.minimum(torch.tensor(slab, device=lines.device), rays.sizes[0] - 1)
+        s = k.to(like.dtype) - (rays.sizes[0] - 1) / 2
+        counts = (rays.sizes[0] > slab) * rays.length
+        for index, weight in cells(rays, k, s.to(like.dtype)):
+            yield index, weight * counts
+
+
+def project(
+    volume: Float[Tensor, "n d h w"],
+    lines: Float[Tensor, "m 4 3 3"],
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+) -> Float[Tensor, "n m v u"]:
+    """Line integrals of volumes, in mm times their unit.
+
+    Args:
+        volume: values on the grid.
+        lines: the views' rays, from `lines_of`.
+        window: the part of each ray that counts, as fractions of the way from source to pixel.
+        detector: pixels (rows, columns).
+        method: "joseph" (second order in the voxel size for smooth volumes) or "siddon" (exact for constant voxels).
+    """
+    flat = F.pad(volume, (1, 1) * 3).flatten(1)
+    total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1])
+    for index, weight in _weights(lines, window, detector, volume.shape[1:], volume, method):
+        total = total + weight * flat[:, index]
+    return total.reshape(len(volume), len(lines), *detector)
+
+
+def backproject(
+    views: Float[Tensor, "n m v u"],
+    lines: Float[Tensor, "m 4 3 3"],
+    window: Sequence[float],
+    shape: Sequence[int],
+    method: str,
+) -> Float[Tensor, "n d h w"]:
+    """The exact transpose of `project`."""
+    d, h, w = shape
+    flat, values = views.new_zeros(len(views), (d + 2) * (h + 2) * (w + 2)), views.flatten(1)
+    for index, weight in _weights(lines, window, views.shape[2:], shape, views, method):
+        flat = flat.index_add(1, index, weight * values)
+    return flat.reshape(len(views), d + 2, h + 2, w + 2)[:, 1:-1, 1:-1, 1:-1]
