@@ -3,11 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.config import VERSION_BASE, conf_dir, import_plugins, prepare_hydra, to_plain
+from mvrecon.config import import_plugins, launch, to_plain
 
 
 def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -49,18 +48,18 @@ def merged(run: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's mean PSNR in dB."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    found = evaluate(to_plain(config), folder)
+    from mvrecon.engine.record import anchored
     from mvrecon.engine.report import show
 
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    found = evaluate(anchored(to_plain(config)), folder)
     show(found, folder)
     return next(iter(found["methods"].values()))["psnr"]["mean"]
 
 
 def main() -> None:
     """Entry point of `mvrecon-eval`."""
-    prepare_hydra()
-    hydra.main(config_path=str(conf_dir()), config_name="eval", version_base=VERSION_BASE)(task)()
+    launch(task, "eval")
 
 
 if __name__ == "__main__":

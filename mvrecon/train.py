@@ -7,11 +7,10 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.config import VERSION_BASE, conf_dir, import_plugins, prepare_hydra, to_plain
+from mvrecon.config import import_plugins, launch, to_plain
 
 
 def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -50,22 +49,22 @@ def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's mean PSNR in dB, for sweepers."""
-    settings = to_plain(config)
+    from mvrecon.engine.record import anchored
+    from mvrecon.engine.report import show
+
+    settings = anchored(to_plain(config))
     folder = Path(HydraConfig.get().runtime.output_dir)
     if settings["resume"]:
         given = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
         settings, folder = resumed(settings["resume"], given)
     found = train(settings, folder)
-    from mvrecon.engine.report import show
-
     show(found, folder)
     return next(iter(found["methods"].values()))["psnr"]["mean"]
 
 
 def main() -> None:
     """Entry point of `mvrecon-train`."""
-    prepare_hydra()
-    hydra.main(config_path=str(conf_dir()), config_name="train", version_base=VERSION_BASE)(task)()
+    launch(task, "train")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Between Hounsfield units and linear attenuation in 1/mm, at about 70 keV.
 
-By definition HU = 1000 (mu - mu_water) / mu_water; that line serves up to water. Above, a second line leads to bone, whose
-photoelectric share is larger: the bilinear form of CT-based attenuation correction (Carney et al., Med. Phys. 33 (2006)
-976), here with the constants of the DRR renderer nanodrr.
+By definition HU = 1000 (mu - mu_water) / mu_water; that line serves up to water. Above, a second line leads to bone,
+whose photoelectric share is larger: the bilinear form of CT-based attenuation correction (Carney et al., Med. Phys. 33
+(2006) 976), here with the constants of the DRR renderer nanodrr.
 """
 
 from jaxtyping import Float

@@ -27,6 +27,7 @@ def read_nifti(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
     """
     try:
         import nibabel
+        from nibabel.filebasedimages import ImageFileError
     except ImportError as error:
         raise ImportError(f"{path}: NIfTI needs nibabel: pip install 'mvrecon[io]'") from error
     if not Path(path).is_file():
@@ -45,5 +46,5 @@ def read_nifti(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
         affine = torch.from_numpy(image.affine).double().clone()
         affine[:3] *= MILLIMETRES[image.header.get_xyzt_units()[0]]
         return values.permute(2, 1, 0).contiguous(), Grid(tuple(values.shape[::-1]), affine)  # type: ignore[arg-type]
-    except (OSError, EOFError, zlib.error, nibabel.filebasedimages.ImageFileError) as error:
+    except (OSError, EOFError, zlib.error, ImageFileError) as error:
         raise ValueError(f"{path}: cannot be read ({error}); is it cut short? Expected {EXPECTED}") from error

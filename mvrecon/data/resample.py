@@ -1,6 +1,5 @@
 """A volume on another grid, without aliasing."""
 
-import math
 from collections.abc import Sequence
 
 import torch

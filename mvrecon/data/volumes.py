@@ -3,10 +3,9 @@
 The grid is the field of view: what lies outside of its box is cut off in the truth and in the views alike.
 """
 
-import os
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -195,10 +194,6 @@ class NiftiVolume(FileScene):
         """One."""
         return 1
 
-    @cached_property
-    def _case(self) -> tuple[str, Float[Tensor, "d h w"], Grid]:
-        return os.path.basename(self.path).split(".nii")[0], *read_nifti(self.path)
-
     def case(self, index: int) -> tuple[str, Float[Tensor, "d h w"], Grid]:
         """Name, Hounsfield units and grid of the volume, its axes running roughly to RAS."""
-        return self._case
+        return Path(self.path).name.split(".nii")[0], *read_nifti(self.path)

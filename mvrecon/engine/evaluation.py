@@ -20,6 +20,7 @@ from mvrecon.projectors.base import Projector
 Scores = dict[str, list[dict[str, float]]]
 See = Callable[[dict[str, Any], dict[str, Tensor]], None]
 
+
 @torch.inference_mode()
 def evaluate(
     models: Mapping[str, nn.Module],

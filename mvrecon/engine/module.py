@@ -36,9 +36,7 @@ class ReconstructionModule(L.LightningModule):
         data_range: value range of the volumes, in their unit.
     """
 
-    def __init__(
-        self, geometry: Settings, model: Settings, loss: Settings, optimizer: Settings, data_range: float
-    ):
+    def __init__(self, geometry: Settings, model: Settings, loss: Settings, optimizer: Settings, data_range: float):
         super().__init__()
         self.save_hyperparameters(logger=False)
         self.projector = build_projector(**geometry)

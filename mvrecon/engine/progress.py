@@ -39,7 +39,9 @@ class StepProgress(ProgressBar):
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         """Move on by a step."""
         if self._lines is not None:
-            shown = "  ".join(f"{SHORT.get(name, name)} {value:.4g}" for name, value in trainer.progress_bar_metrics.items())
+            shown = "  ".join(
+                f"{SHORT.get(name, name)} {value:.4g}" for name, value in trainer.progress_bar_metrics.items()
+            )
             self._lines.update(self._lines.task_ids[0], completed=trainer.global_step, figures=shown)
 
     def on_train_end(self, *_: Any) -> None:

@@ -46,6 +46,13 @@ def read_settings(folder: Path) -> dict[str, Any]:
     return yaml.safe_load(path.read_text())
 
 
+def anchored(value: Any) -> Any:
+    """Settings with every `path` in them made absolute, so that they mean the same from any other folder."""
+    if isinstance(value, dict):
+        return {key: _absolute(item) if key == "path" else anchored(item) for key, item in value.items()}
+    return [anchored(item) for item in value] if isinstance(value, list) else value
+
+
 def write_results(folder: Path, results: dict[str, Any]) -> None:
     """Write `results.json` with the command and the versions; figures that are not finite become null."""
     whole = {**results, "command": sys.argv, "versions": versions()}
@@ -58,6 +65,10 @@ def write(path: Path, text: str) -> None:
     part = path.with_name(f".{path.name}.{os.getpid()}")
     part.write_text(text)
     part.replace(path)
+
+
+def _absolute(path: Any) -> Any:
+    return str(Path(path).expanduser().absolute()) if isinstance(path, str) else path
 
 
 def _finite(value: Any) -> Any:

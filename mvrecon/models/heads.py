@@ -55,4 +55,5 @@ class Density(nn.Module):
         lifted = frusta.spread(views)
         scale = lifted.abs().mean(dim=(1, 2, 3, 4, 5), keepdim=True).clamp_min(torch.finfo(prior.dtype).tiny)
         start = (prior / scale).clamp_min(FLOOR)
-        return nn.functional.softplus(logits + start.expm1().log()) * scale * frusta.occupied
+        inverse = start + (-(-start).expm1()).log()  # of softplus, written so that it overflows for no prior
+        return nn.functional.softplus(logits + inverse) * scale * frusta.occupied

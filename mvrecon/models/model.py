@@ -82,9 +82,7 @@ class CrossView(nn.Module):
 
     def cross(self, opinions: Float[Tensor, "b m 1 d h w"]) -> Float[Tensor, "b m n v u"]:
         """Every camera's opinion as every camera would have seen it."""
-        return self.projector(opinions.transpose(1, 2).flatten(0, 1).flatten(0, 1)[:, None]).squeeze(1).unflatten(
-            0, opinions.shape[:2]
-        )
+        return self.projector(opinions.flatten(0, 1)).squeeze(1).unflatten(0, opinions.shape[:2])
 
     def _compare(self, opinions: Tensor, x0: Tensor, y: Tensor, cross_views: Tensor) -> Float[Tensor, "b m 5 d h w"]:
         """What the weighting sees: own opinion, pooled mean and spread, own disagreement with the views, the start."""
@@ -98,8 +96,9 @@ class CrossView(nn.Module):
     ) -> Float[Tensor, "b c d h w"]:
         """What the refinement sees: the fused volume, its residual, the spread, the start, the cameras' features."""
         mean, variance = pooled(opinions, self.opinions.fine.visible)
+        wrong = self.consistency.residual(fused, y)
         said = (weights * features).sum(dim=1)
-        return torch.cat([fused, self.consistency.residual(fused, y), mean[:, 0], _root(variance)[:, 0], x0, said], dim=1)
+        return torch.cat([fused, wrong, mean[:, 0], _root(variance)[:, 0], x0, said], dim=1)
 
 
 def _root(variance: Tensor) -> Tensor:

@@ -51,12 +51,13 @@ class Opinions(nn.Module):
         self.coarse = Frusta(grid, cameras.binned(binning), depth // 2)
         self.head = HEADS.from_config(head)
         self.learned = prior == "learned"
-        self.features = features
-        self.pixels = nn.Conv2d(2, width, binning, stride=binning)
-        nets = 1 if shared else len(cameras)
-        self.nets = nn.ModuleList(UNet3d(width + 6, 1 + features, width) for _ in range(nets))
-        for net in self.nets:
-            nn.init.zeros_(net.last.weight[:1])  # start from the prior
+        self.features = features if self.learned else 0
+        if self.learned:
+            self.pixels = nn.Conv2d(2, width, binning, stride=binning)
+            nets = [UNet3d(width + 6, 1 + features, width) for _ in range(1 if shared else len(cameras))]
+            for net in nets:
+                nn.init.zeros_(net.last.weight[:1])  # start from the prior
+            self.nets = nn.ModuleList(nets)
 
     def forward(
         self, views: Float[Tensor, "b 1 m v u"], start: Float[Tensor, "b 1 d h w"], residual: Float[Tensor, "b 1 m v u"]
@@ -70,8 +71,9 @@ class Opinions(nn.Module):
         """
         prior = self.fine.to_frusta(start[:, None])
         if not self.learned:
-            logits = torch.zeros_like(prior)
-            return self.fine.to_world(self.head(logits, torch.ones_like(prior), views, self.fine)), prior[:, :, :0]
+            density = self.head(torch.zeros_like(prior), torch.ones_like(prior), views, self.fine)
+            opinions = self.fine.to_world(density)
+            return opinions, opinions[:, :, :0]
         answer = self._listen(views, start, residual)  # [b m 1+f D v u], coarse
         logits = nn.functional.interpolate(answer[:, :, :1].flatten(0, 1), size=self.fine.shape, mode="trilinear")
         density = self.head(logits.unflatten(0, answer.shape[:2]), prior, views, self.fine)
@@ -85,7 +87,8 @@ class Opinions(nn.Module):
         lifted = self.coarse.spread(binned)
         world = self.coarse.to_world(lifted)
         mean, variance, _ = leave_one_out(world, self.coarse.visible)
-        others = self.coarse.to_frusta(torch.cat([mean, variance.sqrt(), start[:, None].expand(-1, m, -1, -1, -1, -1)], 2))
+        ours = start[:, None].expand(-1, m, -1, -1, -1, -1)
+        others = self.coarse.to_frusta(torch.cat([mean, variance.sqrt(), ours], dim=2))
         where = self.coarse.occupied.expand(b, -1, -1, -1, -1, -1).to(views.dtype)
         ramp = torch.linspace(-1, 1, where.shape[3], device=views.device, dtype=views.dtype)
         depth = where * ramp[:, None, None]

@@ -55,9 +55,7 @@ def tiled(rows: Sequence[Sequence[Image]]) -> Image:
     return canvas
 
 
-def planes(
-    truth: Float[Tensor, "d h w"], volumes: Mapping[str, Float[Tensor, "d h w"]], data_range: float
-) -> Image:
+def planes(truth: Float[Tensor, "d h w"], volumes: Mapping[str, Float[Tensor, "d h w"]], data_range: float) -> Image:
     """Three middle planes (rows) of the truth, of every volume, and of the first volume's error (columns).
 
     Values from 0 to data_range; the error from -data_range / 2 (blue) to data_range / 2 (red).

@@ -99,4 +99,3 @@ def test_a_saved_case_keeps_axes_and_affine(tmp_path):
     assert image.shape == (8, 7, 6) and image.get_fdata()[3, 4, 5] == 2
     world = image.affine @ [3, 4, 5, 1]
     assert world[:3] == pytest.approx(grid.to_world(torch.tensor([3.0, 4.0, 5.0])).tolist())
-

@@ -72,7 +72,7 @@ def test_training_changes_the_weights_and_equal_seeds_give_equal_weights(run, se
     assert not torch.allclose(weights[0], weights[2])
 
 
-def test_a_broken_run_goes_on_at_its_last_checkpoint(settings, data, tmp_path, monkeypatch):
+def test_a_broken_run_goes_on_as_if_it_had_not_broken(run, settings, data, tmp_path, monkeypatch):
     step, seen = ReconstructionModule.training_step, []
 
     def breaking(self, batch, batch_idx):
@@ -92,6 +92,8 @@ def test_a_broken_run_goes_on_at_its_last_checkpoint(settings, data, tmp_path, m
     assert seen == [0, 1, "broken", 2]
     assert before["global_step"] == 2 and after.steps == 3
     assert after.seconds > before["callbacks"]["Clock"]["seconds"] > 0
+    unbroken = checkpoints.load(checkpoints.finished(run, "cross_view")).module.state_dict()
+    assert all(torch.equal(value, unbroken[name]) for name, value in after.module.state_dict().items())
     fit.fit("cross_view", settings, data, tmp_path)
     assert seen[-1] == 2, "a finished method is not trained again"
 
@@ -104,15 +106,15 @@ def test_a_loss_that_is_not_finite_stops_with_a_remedy(settings, data, tmp_path)
     assert not checkpoints.finished(tmp_path, "cross_view").exists()
 
 
-def test_averaged_weights_are_what_a_checkpoint_holds(settings, data, tmp_path):
+def test_averaged_weights_are_what_a_checkpoint_holds(run, settings, data, tmp_path):
     averaging = {"_target_": "lightning.pytorch.callbacks.EMAWeightAveraging", "decay": 0.5, "use_buffers": False}
     fit.fit("cross_view", {**settings, "callbacks": {"ema": averaging}}, data, tmp_path)
     path = checkpoints.finished(tmp_path, "cross_view")
     state, loaded = torch.load(path), checkpoints.load(path).module.state_dict()
-    last = state["current_model_state"]
-    assert all(torch.equal(loaded[name], state["state_dict"][name]) for name in loaded)
+    plain = checkpoints.load(checkpoints.finished(run, "cross_view")).module.state_dict()
     assert all_plain(state["averaging_state"])
-    assert any(not torch.equal(state["state_dict"][name], last[name]) for name in last)
+    assert all(torch.equal(loaded[name], state["state_dict"][name]) for name in loaded)
+    assert any(not torch.equal(loaded[name], plain[name]) for name in loaded)
 
 
 def test_methods_without_weights_are_not_trained(settings, data, tmp_path):

@@ -18,6 +18,14 @@ def test_settings_come_back_plain_and_in_order(tmp_path):
     assert "torch 2." in (tmp_path / "run" / "versions.txt").read_text()
 
 
+def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = {"scene": {"path": "a.h5", "scenes": [{"path": "/b.h5"}, {"path": None}]}, "name": "path"}
+    found = record.anchored(given)
+    assert found["scene"] == {"path": str(tmp_path / "a.h5"), "scenes": [{"path": "/b.h5"}, {"path": None}]}
+    assert found["name"] == "path" and record.anchored(found) == found
+
+
 def test_results_are_strict_json_with_versions(tmp_path):
     record.write_results(tmp_path, {"psnr": math.inf, "values": [math.nan, 1.5], "deep": {"x": -math.inf}})
     found = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)

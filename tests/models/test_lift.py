@@ -56,14 +56,14 @@ def test_warp_of_a_linear_field_is_exact_where_seen():
 
 def test_world_to_frustum_to_world_converges_to_second_order():
     errors = []
-    for size in (8, 16, 32):
+    for size in (12, 24, 48):
         grid, cameras = small_rig(views=3, size=size, pixels=2 * size)
         frusta = Frusta(grid, cameras, 2 * size)
         r2 = voxel_centres(grid).float().square().sum(-1)
         blob = torch.exp(-r2 / (2 * (0.3 * size) ** 2))[None, None, None]
         back = frusta.to_world(frusta.to_frusta(blob))[:, :, :, 1:-1, 1:-1, 1:-1]
         errors.append((back - blob[..., 1:-1, 1:-1, 1:-1]).abs().max().item())
-    assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3
+    assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3.5
 
 
 def test_pinholes_behind_their_detectors_lift_like_any_other():

@@ -1,0 +1,100 @@
+"""Cases of a scene as training samples, and the order in which they are seen."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import track
+from torch.utils.data import Dataset, Sampler
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.scenes.analytic import generator
+from mvrecon.scenes.sample import Sample, Scene
+
+TENSORS = ("views", "volume", "inside")
+
+
+class SceneDataset(Dataset[dict[str, Any]]):
+    """Cases of one scene; each item is a pure function of its index, whichever process asks for it.
+
+    An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name".
+
+    Args:
+        scene: where the cases come from.
+        grid: of the truth.
+        cameras: that see it.
+        indices: of the cases.
+        seed: the series of cases.
+        cache: keep every case in memory once it was made; `prepare` makes them all.
+
+    Raises:
+        ValueError: a case whose views or volume are not finite.
+    """
+
+    def __init__(
+        self, scene: Scene, grid: Grid, cameras: Cameras, indices: Sequence[int], seed: int, cache: bool = True
+    ):
+        self.scene, self.grid, self.cameras = scene, grid, cameras
+        self.indices, self.seed, self.cache = tuple(indices), seed, cache
+        self._ready: dict[str, Any] | None = None
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, item: int) -> dict[str, Any]:
+        if not 0 <= item < len(self):
+            raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
+        if self.cache:
+            return {key: values[item] for key, values in self.prepare().items()}
+        return self._made(item)
+
+    def prepare(self, what: str = "cases") -> dict[str, Any]:
+        """Make every case, once; stacked, so that worker processes share a few blocks of memory and not thousands."""
+        if self._ready is None:
+            console = Console(stderr=True)
+            steps = track(range(len(self)), f"Preparing {what}", transient=True, console=console)
+            items = [self._made(item) for item in steps]
+            self._ready = {key: torch.stack([i[key] for i in items]) for key in TENSORS if items}
+            self._ready["name"] = [i["name"] for i in items]
+        return self._ready
+
+    def _made(self, item: int) -> dict[str, Any]:
+        sample: Sample = self.scene.sample(self.indices[item], self.seed, self.grid, self.cameras)
+        made = {key: getattr(sample, key) for key in TENSORS}
+        for key in ("views", "volume"):
+            if not made[key].isfinite().all():
+                raise ValueError(
+                    f"{sample.name}: expected finite {key}, got {int((~made[key].isfinite()).sum())} others"
+                )
+        return {**made, "name": sample.name}
+
+
+class EpochOrder(Sampler[int]):
+    """A random order of `count` items that depends on (seed, epoch) alone, so that a resumed run sees what it missed.
+
+    Args:
+        count: of items.
+        seed: of the orders.
+    """
+
+    def __init__(self, count: int, seed: int):
+        self.count, self.seed = count, seed
+        self.epoch, self.resumed = 0, (0, 0)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __iter__(self) -> Iterator[int]:
+        epoch, seen = self.resumed
+        order = torch.randperm(self.count, generator=generator(self.seed, self.epoch)).tolist()
+        return iter(order[seen:] if self.epoch == epoch else order)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Which epoch the next order is for; Lightning calls it."""
+        self.epoch = epoch
+
+    def resume(self, epoch: int, seen: int) -> None:
+        """Leave out the first `seen` items of one epoch: the run had them before it broke off."""
+        self.resumed = (epoch, seen)

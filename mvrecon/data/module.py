@@ -1,0 +1,157 @@
+"""Training, validation and test scenes of a run."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from torch.utils.data import DataLoader
+
+from mvrecon.data.dataset import EpochOrder, SceneDataset
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, SCENES
+from mvrecon.scenes.sample import Scene
+
+#: Series of random cases. Every run is judged on the same ones; its own seed makes the cases that it trains on.
+TEST, VAL, TRAIN = 0, 1, 2
+#: Which parts of the data each stage of Lightning needs.
+STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
+
+
+class SceneData(L.LightningDataModule):
+    """The data of a run, from plain dicts of names and numbers.
+
+    Random scenes draw training, validation and test cases from different series. A scene from a file validates on its
+    last `val` cases and trains on those before; the test cases are the test scene's, or the first fifth where that is
+    the same file. So no case is in two sets.
+
+    Args:
+        scenes: name and options of the scenes "train" and "test".
+        grid: options of `Grid.centred`.
+        camera: name and options of the rig.
+        sizes: the number of cases for "train", "val" and "test"; a file may hold fewer.
+        batch_size: cases in a batch.
+        workers: processes that load batches; cases are made once, so 0 is as fast for all but huge sets.
+        seed: of the training cases and their order.
+
+    Raises:
+        ValueError: sizes that leave nothing to train on, scenes of different data range, a number that is too small.
+    """
+
+    def __init__(
+        self,
+        scenes: Mapping[str, Mapping[str, Any]],
+        grid: Mapping[str, Any],
+        camera: Mapping[str, Any],
+        sizes: Mapping[str, int],
+        batch_size: int = 1,
+        workers: int = 0,
+        seed: int = 0,
+    ):
+        super().__init__()
+        if missing := {"train", "val", "test"} ^ set(sizes):
+            raise ValueError(f"sizes must give train, val and test; missing or unknown: {', '.join(sorted(missing))}")
+        if min(sizes.values()) < 0 or batch_size < 1 or workers < 0 or seed < 0:
+            got = f"sizes {dict(sizes)}, batch_size {batch_size}, workers {workers}, seed {seed}"
+            raise ValueError(
+                f"Expected sizes, workers and seed of at least 0 and a batch_size of at least 1, got {got}"
+            )
+        self.grid = Grid.centred(**grid)
+        self.cameras = CAMERAS.from_config(camera)
+        self.sizes, self.batch_size, self.workers, self.seed = dict(sizes), batch_size, workers, seed
+        self.scenes: dict[str, Scene] = {key: SCENES.from_config(scenes[key]) for key in ("train", "test")}
+        ranges = {key: scene.data_range for key, scene in self.scenes.items()}
+        if ranges["train"] != ranges["test"]:
+            raise ValueError(f"The training and the test scene must share their data_range, got {ranges}")
+        self.shared = same_cases(scenes["train"], scenes["test"])
+        self.sets: dict[str, SceneDataset] = {}
+        self._order: EpochOrder | None = None
+
+    @property
+    def data_range(self) -> float:
+        """The fixed range of values that PSNR and SSIM refer to."""
+        return self.scenes["test"].data_range
+
+    @property
+    def unit(self) -> str:
+        """Unit of the volumes' values."""
+        return self.scenes["test"].unit
+
+    def indices(self, part: str) -> list[int]:
+        """The cases of "train", "val" or "test".
+
+        Raises:
+            ValueError: a file with too few cases for the sizes.
+        """
+        scene, size = self.scenes["test" if part == "test" else "train"], self.sizes[part]
+        if scene.length is None:
+            return list(range(size))
+        if part == "test" and not self.shared:
+            return list(range(min(size, scene.length)))
+        kept = scene.length // 5 if self.sizes["train"] else scene.length  # whatever `test` is: a model may be older
+        first, last = kept * self.shared, scene.length - self.sizes["val"]
+        if last < first or (size and not {"train": last - first, "val": size, "test": first}[part]):
+            raise ValueError(f"A scene with {scene.length} case(s) cannot be split into the sizes {self.sizes}")
+        if part == "test":
+            return list(range(min(size, first)))
+        if part == "val":
+            return list(range(last, scene.length))
+        turns = range(size if getattr(scene, "vary", False) else min(size, last - first))
+        return [i // (last - first) * scene.length + first + i % (last - first) for i in turns]
+
+    def setup(self, stage: str | None = None) -> None:
+        """Make the cases of a stage, unless they are there."""
+        series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}
+        for part in STAGES[stage] if stage else ("train", "val", "test"):
+            if part not in self.sets:
+                scene = self.scenes["test" if part == "test" else "train"]
+                made = SceneDataset(scene, self.grid, self.cameras, self.indices(part), series[part])
+                made.prepare(f"{part} cases")
+                self.sets[part] = made
+        if "train" in self.sets:
+            self._order = EpochOrder(len(self.sets["train"]), self.seed)
+
+    def train_dataloader(self) -> DataLoader[dict[str, Any]]:
+        """Training batches, in an order of their own in every epoch."""
+        return self._loader("train", self._order)
+
+    def val_dataloader(self) -> DataLoader[dict[str, Any]]:
+        """Validation batches."""
+        return self._loader("val")
+
+    def test_dataloader(self) -> DataLoader[dict[str, Any]]:
+        """Test batches."""
+        return self._loader("test")
+
+    predict_dataloader = test_dataloader
+
+    def _loader(self, part: str, order: EpochOrder | None = None) -> DataLoader[dict[str, Any]]:
+        return DataLoader(
+            self.sets[part],
+            self.batch_size,
+            sampler=order,
+            num_workers=self.workers,
+            persistent_workers=self.workers > 0,
+            pin_memory=torch.cuda.is_available(),
+            generator=torch.Generator().manual_seed(self.seed),  # or every epoch would draw from the global one
+        )
+
+    def state_dict(self) -> dict[str, int]:
+        """How far the training has come, for a checkpoint."""
+        loop = self.trainer.fit_loop if self.trainer else None
+        if loop is None or self._order is None:
+            return {}
+        done = loop.epoch_loop.batch_progress.current.completed
+        return {"epoch": self._order.epoch, "seen": min(done * self.batch_size, len(self._order))}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Go on from a checkpoint with the cases that the broken epoch has not seen."""
+        if self._order is not None and state_dict:
+            self._order.resume(**state_dict)
+
+
+def same_cases(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+    """Whether two scenes draw on the same cases: they are equal, or read one file."""
+    paths = [Path(scene["path"]).resolve() for scene in (first, second) if "path" in scene]
+    return dict(first) == dict(second) or (len(paths) == 2 and paths[0] == paths[1])

@@ -1,0 +1,5 @@
+"""The contract of each kind of part, for mvrecon and for the authors of plugins."""
+
+from mvrecon.testing.camera import check_camera as check_camera
+from mvrecon.testing.head import check_head as check_head
+from mvrecon.testing.projector import check_projector as check_projector

@@ -1,0 +1,74 @@
+"""The contract of a projector."""
+
+import torch
+from torch import Tensor
+
+from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import random_rotation
+from mvrecon.parts import PROJECTORS
+
+#: Relative to |A x| |y|.
+TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
+
+
+def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, gradients: bool = True, **options) -> None:
+    """Raise AssertionError unless the named projector keeps its promises on this grid and rig.
+
+    Views and volumes of the right shape; A.T the transpose of A in float32 and float64; linear, nothing from nothing;
+    the same views when grid and cameras move together; gradients in volume and pose that differences confirm (on a small
+    grid and rig in a generic pose; `gradients=False` leaves them out), and second ones in volume and views.
+    """
+    torch.manual_seed(seed)
+    A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)
+    for dtype, tolerance in TOLERANCE.items():
+        x = torch.randn(2, 1, *grid.shape, dtype=dtype)
+        views = A(x)
+        expected = (2, 1, len(cameras), *cameras.shape)
+        assert views.shape == expected, f"views are {tuple(views.shape)}, expected {expected}"
+        y = torch.randn_like(views)
+        volume = A.T(y)
+        assert volume.shape == x.shape, f"the adjoint gives {tuple(volume.shape)}, expected {tuple(x.shape)}"
+        gap = (_dot(views, y) - _dot(x, volume)).abs() / (views.double().norm() * y.double().norm())
+        assert gap < tolerance, f"<A x, y> and <x, A.T y> differ by {gap:.2g} in {dtype}"
+        other = torch.randn_like(x)
+        assert _close(A(2 * x - other), 2 * views - A(other), tolerance), f"not linear in {dtype}"
+        assert not A(torch.zeros_like(x)).any(), "views of nothing"
+    _check_motion(name, grid, cameras, **options)
+    if gradients:
+        _check_gradients(name, grid, cameras, **options)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a.double() * b.double()).sum()
+
+
+def _close(a: Tensor, b: Tensor, tolerance: float) -> bool:
+    return bool((a - b).norm() <= tolerance * b.norm())
+
+
+def _check_motion(name: str, grid: Grid, cameras: Cameras, **options) -> None:
+    """Moving the object shows what un-moving the cameras shows."""
+    R, t = random_rotation(torch.Generator().manual_seed(0)), torch.tensor([30.0, -20.0, 10.0], dtype=torch.float64)
+    affine = grid.affine.clone()
+    affine[:3] = R @ affine[:3]
+    affine[:3, 3] += t
+    x = torch.rand(1, 1, *grid.shape, dtype=torch.float64)
+    moved = PROJECTORS.build(name, grid=Grid(grid.shape, affine), cameras=cameras, **options)(x)
+    back = PROJECTORS.build(name, grid=grid, cameras=cameras.moved(R.mT, -R.mT @ t), **options)(x)
+    assert _close(moved, back, 1e-9), "moving the object is not un-moving the cameras"
+
+
+def _check_gradients(name: str, grid: Grid, cameras: Cameras, **options) -> None:
+    x = torch.rand(1, 1, *grid.shape, dtype=torch.float64, requires_grad=True)
+    vectors = [getattr(cameras, vector).clone().requires_grad_() for vector in VECTORS]
+
+    def project(x: Tensor, *vectors: Tensor) -> Tensor:
+        rig = Cameras(*vectors, cameras.shape, cameras.parallel, cameras.extent)
+        return PROJECTORS.build(name, grid=grid, cameras=rig, **options)(x)
+
+    torch.autograd.gradcheck(project, (x, *vectors), eps=1e-6, atol=1e-5)
+    A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)
+    y = torch.rand(1, 1, len(cameras), *cameras.shape, dtype=torch.float64, requires_grad=True)
+    torch.autograd.gradcheck(A.T, (y,))
+    torch.autograd.gradgradcheck(lambda x, y: (A(x) * y).sum(), (x, y))

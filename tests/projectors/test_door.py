@@ -1,0 +1,89 @@
+"""What a projector refuses, and what it does with unusual input."""
+
+import pytest
+import torch
+
+from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.base import check_views
+from tests.projectors.rigs import CONE, GRID, PARALLEL
+
+
+@pytest.fixture
+def A():
+    return PROJECTORS.build("drr", grid=GRID, cameras=CONE)
+
+
+@pytest.mark.parametrize("shape", [(5, 6, 7), (1, 5, 6, 7), (1, 1, 7, 6, 5)])
+def test_a_volume_of_the_wrong_shape_is_refused(A, shape):
+    with pytest.raises(ValueError, match=r"volume .*\(5, 6, 7\), got"):
+        A(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("shape", [(4, 5, 6), (1, 1, 4, 6, 5), (1, 1, 3, 5, 6)])
+def test_views_of_the_wrong_shape_are_refused(A, shape):
+    with pytest.raises(ValueError, match=r"views .*\(4, 5, 6\), got"):
+        A.T(torch.zeros(shape))
+    with pytest.raises(ValueError, match=r"views .*\(4, 5, 6\), got"):
+        check_views(torch.zeros(shape), CONE)
+
+
+def test_views_that_are_not_numbers_are_refused():
+    views = torch.zeros(1, 1, 4, 5, 6)
+    check_views(views, CONE)
+    views[0, 0, 1, 2, 3] = torch.nan
+    with pytest.raises(ValueError, match="1 of 120 values"):
+        check_views(views, CONE)
+
+
+def test_another_device_is_refused(A):
+    with pytest.raises(ValueError, match="on cpu, where the projector is, got meta"):
+        A(torch.zeros(1, 1, *GRID.shape, device="meta"))
+
+
+def test_a_grid_and_a_rig_on_different_devices_are_refused():
+    elsewhere = CONE[:]
+    object.__setattr__(elsewhere, "source", elsewhere.source.to("meta"))
+    with pytest.raises(ValueError, match="one device, got cpu and meta"):
+        PROJECTORS.build("drr", grid=GRID, cameras=elsewhere)
+
+
+def test_a_rig_of_the_other_kind_names_the_projector_for_it():
+    with pytest.raises(ValueError, match="radon"):
+        PROJECTORS.build("drr", grid=GRID, cameras=PARALLEL)
+    with pytest.raises(ValueError, match="drr"):
+        PROJECTORS.build("radon", grid=GRID, cameras=CONE)
+
+
+@pytest.mark.parametrize("option", ["method", "backend"])
+def test_an_unknown_option_is_refused(option):
+    with pytest.raises(ValueError, match=f"Unknown {option} 'fast'. Known"):
+        PROJECTORS.build("drr", grid=GRID, cameras=CONE, **{option: "fast"})
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_volumes_are_accumulated_in_float32(A, dtype):
+    x = torch.rand(1, 1, *GRID.shape).to(dtype).requires_grad_()
+    y = A(x)
+    y.sum().backward()
+    assert y.dtype == torch.float32 and x.grad is not None and x.grad.dtype == dtype
+    assert torch.equal(y, A(x.float()))
+
+
+def test_casting_the_module_leaves_its_geometry_exact(A):
+    before = A.lines.clone()
+    assert torch.equal(A.half().lines, before) and not A.state_dict()
+
+
+def test_memory_layout_does_not_matter(A):
+    x = torch.rand(2, 3, *GRID.shape)
+    y = A(x)
+    assert torch.equal(A(x.to(memory_format=torch.channels_last_3d)), y)
+    swapped = x.transpose(0, 1).contiguous().transpose(0, 1)
+    assert torch.equal(A(swapped), y) and torch.equal(A(x[:, 1:2]), y[:, 1:2])
+    spread = torch.rand(1, 1, 4, 5, 1).expand(2, 3, 4, 5, 6)
+    assert torch.equal(A.T(spread), A.T(spread.contiguous()))
+
+
+def test_no_volumes_give_no_views(A):
+    assert A(torch.zeros(0, 1, *GRID.shape)).shape == (0, 1, 4, 5, 6)
+    assert A.T(torch.zeros(2, 0, 4, 5, 6)).shape == (2, 0, *GRID.shape)
