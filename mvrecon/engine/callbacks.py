@@ -12,6 +12,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
+from mvrecon.engine.export import save_png
 from mvrecon.engine.record import versions
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
@@ -114,7 +115,7 @@ class BoardReview(L.Callback):
         cases = [self._pictures(pl_module, batch, out, case) for case in range(min(self.cases, len(out.volume)))]
         for name in cases[0]:
             image = montage.tiled([[pictures[name]] for pictures in cases])
-            montage.save_png(Path(trainer.default_root_dir) / "review" / f"{name}.png", image)
+            save_png(Path(trainer.default_root_dir) / "review" / f"{name}.png", image)
             for board in _boards(trainer):
                 board.add_image(f"review/{name}", image, trainer.global_step, dataformats="HWC")
 

@@ -9,8 +9,10 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.data.hdf5 import written_whole
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz import montage
+from mvrecon.viz.planes import Image
 
 
 def save_case(
@@ -23,12 +25,20 @@ def save_case(
     case = folder / re.sub(r"[^\w.-]+", "_", scene["name"][0])
     truth = scene["volume"][0, 0]
     shown = {label: volume[0, 0] for label, volume in volumes.items()}
-    montage.save_png(case / "views.png", montage.gallery(scene["views"][0, 0]))
-    montage.save_png(case / "planes.png", montage.planes(truth, shown, data_range))
+    save_png(case / "views.png", montage.gallery(scene["views"][0, 0]))
+    save_png(case / "planes.png", montage.planes(truth, shown, data_range))
     if find_spec("nibabel"):
         for label, volume in {"truth": truth, **shown}.items():
             save_nifti(case / f"{label}.nii.gz", volume, grid)
     return case
+
+
+def save_png(path: Path, image: Image) -> None:
+    """Write an image; a file of that name is replaced whole or not at all."""
+    from PIL import Image as Pillow
+
+    with written_whole(path) as part:
+        Pillow.fromarray(image).save(part, format="PNG")
 
 
 def save_nifti(path: Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import platform
 import sys
 from importlib import metadata
@@ -12,6 +11,7 @@ from typing import Any
 import yaml
 
 from mvrecon import __version__
+from mvrecon.data.hdf5 import written_whole
 
 PACKAGES = ("torch", "lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 SETTINGS, VERSIONS, RESULTS = "config.yaml", "versions.txt", "results.json"
@@ -43,7 +43,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     path = folder / SETTINGS
     if not path.is_file():
         raise FileNotFoundError(f"Expected a run folder with {SETTINGS} in it, got {folder}")
-    return yaml.safe_load(path.read_text())
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
 def anchored(value: Any) -> Any:
@@ -61,10 +61,8 @@ def write_results(folder: Path, results: dict[str, Any]) -> None:
 
 def write(path: Path, text: str) -> None:
     """Write a text file; one of that name is replaced whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    part.write_text(text)
-    part.replace(path)
+    with written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def _absolute(path: Any) -> Any:

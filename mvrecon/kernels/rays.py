@@ -40,9 +40,9 @@ def main_axis(line, u, v):
 
 @scalar
 def transverse(value, slope, half, lower, upper):
-    """The part of (lower, upper) in which |value + s slope| < half."""
+    """The part of (lower, upper) in which -half <= value + s slope < half."""
     if slope == 0:
-        return (lower, upper) if abs(value) < half else (0.0, -1.0)
+        return (lower, upper) if -half <= value < half else (0.0, -1.0)
     one, two = (-half - value) / slope, (half - value) / slope
     return max(lower, min(one, two)), min(upper, max(one, two))
 

@@ -67,7 +67,9 @@ def _values(rng: torch.Generator, places: Float[Tensor, "n 3"], axes: Float[Tens
     values[0] = uniform(rng, 0.2, 0.4)
     for n in range(1, len(values)):
         earlier = values[:n][meet[n, :n]]
-        below, above = earlier[0] + earlier.clamp(max=0).sum(), 1 - earlier.clamp(min=0).sum()
+        # neighbours of n that do not meet each other may leave no room together
+        below = (earlier[0] + earlier.clamp(max=0).sum()).clamp(min=0)
+        above = (1 - earlier.clamp(min=0).sum()).clamp(min=0)
         up = uniform(rng, 0, 1) < 0.6
         values[n] = uniform(rng, 0.3, 1.0) * above if up else -uniform(rng, 0.3, 0.9) * below
     return values

@@ -1,8 +1,6 @@
 """Pictures for review: labelled tiles of planes, views, opinions and weights, with one fixed window of values each."""
 
-import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -108,16 +106,6 @@ def weights(each: Float[Tensor, "m d h w"]) -> Image:
     Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
     """
     return _per_camera(each, 3 / len(each))
-
-
-def save_png(path: Path, image: Image) -> None:
-    """Write an image; a file of that name is replaced whole or not at all."""
-    from PIL import Image as Pillow
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    Pillow.fromarray(image).save(part, format="PNG")
-    part.replace(path)
 
 
 def _per_camera(each: Float[Tensor, "m d h w"], top: float) -> Image:

@@ -3,13 +3,15 @@
 import io
 import math
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image as Pillow
 from rich.console import Console
 from torch import nn
 
 from mvrecon.engine.evaluation import evaluate, mean_and_spread
-from mvrecon.engine.export import save_case
+from mvrecon.engine.export import save_case, save_png
 from mvrecon.engine.report import table
 from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import UNITS
@@ -99,3 +101,10 @@ def test_a_saved_case_keeps_axes_and_affine(tmp_path):
     assert image.shape == (8, 7, 6) and image.get_fdata()[3, 4, 5] == 2
     world = image.affine @ [3, 4, 5, 1]
     assert world[:3] == pytest.approx(grid.to_world(torch.tensor([3.0, 4.0, 5.0])).tolist())
+
+
+def test_a_saved_image_comes_back_and_leaves_nothing_behind(tmp_path):
+    image = np.random.default_rng(0).integers(0, 255, (7, 9, 3), np.uint8)
+    save_png(tmp_path / "review" / "a.png", image)
+    assert (np.asarray(Pillow.open(tmp_path / "review" / "a.png")) == image).all()
+    assert [p.name for p in (tmp_path / "review").iterdir()] == ["a.png"]

@@ -48,7 +48,10 @@ def test_both_back_ends_agree(name, kind, rig, method, dtype):
 def test_pose_gradients_agree(kind, method):
     """At a size that differences could not afford, also through the adjoint."""
     name, rig = next((name, rig) for name, each, rig in RIGS if each == kind)
-    x, y = torch.rand(1, 2, *GRID.shape, dtype=torch.float64), torch.rand(1, 2, len(rig), *rig.shape, dtype=torch.float64)
+    x, y = (
+        torch.rand(1, 2, *GRID.shape, dtype=torch.float64),
+        torch.rand(1, 2, len(rig), *rig.shape, dtype=torch.float64),
+    )
     changes = []
     for backend in BACKENDS:
         vectors = [getattr(rig, each).clone().requires_grad_() for each in ("source", "origin", "u", "v")]

@@ -5,13 +5,13 @@ from mvrecon.scenes.analytic import generator
 from mvrecon.scenes.ellipsoids import RandomEllipsoids
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(60))
 def test_values_stay_in_range_and_the_body_holds_all(seed, grid):
     scene = RandomEllipsoids(count=(12, 12), value=3.0)
     (solids,) = scene.phantom(generator(seed, 0), grid).parts
     phantom = scene.phantom(generator(seed, 0), grid)
     rng = torch.Generator().manual_seed(seed)
-    xyz = (torch.rand(60_000, 3, generator=rng, dtype=torch.float64) - 0.5) * 100
+    xyz = (torch.rand(20_000, 3, generator=rng, dtype=torch.float64) - 0.5) * 100
     values = phantom.values(xyz)
     assert values.min() >= -1e-12 and values.max() <= 3 + 1e-12
     body, xyz = phantom.support().values(xyz) > 0, (xyz - solids.centres[0]) @ solids.rotations[0]

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from PIL import Image as Pillow
 
 from mvrecon.viz import montage
 from mvrecon.viz.montage import CAPTION, GAP, LABEL
@@ -75,10 +74,3 @@ def test_a_gallery_has_rows_of_four_in_order():
     assert image.shape == (2 * (64 + LABEL) + GAP, 4 * 64 + 3 * GAP, 3)
     middle = image[LABEL + 32 :: 64 + LABEL + GAP, 32 :: 64 + GAP, 0]
     assert middle.tolist() == [[42, 85, 128, 170], [212, 255, 0, 0]]
-
-
-def test_a_saved_image_comes_back_and_leaves_nothing_behind(tmp_path):
-    image = np.random.default_rng(0).integers(0, 255, (7, 9, 3), np.uint8)
-    montage.save_png(tmp_path / "review" / "a.png", image)
-    assert (np.asarray(Pillow.open(tmp_path / "review" / "a.png")) == image).all()
-    assert [p.name for p in (tmp_path / "review").iterdir()] == ["a.png"]
