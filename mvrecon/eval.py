@@ -43,7 +43,8 @@ def merged(run: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     data = {**run["data"], **(given["data"] or {})}
     data["sizes"] = {**run["data"]["sizes"], **(data["sizes"] or {})}
     scene = given["test_scene"] or run["test_scene"]
-    return {**run, "test_scene": scene, "data": data, "compare": {**run["compare"], **given["compare"]}}
+    compare = {**run["compare"], **given["compare"]}
+    return {**run, "name": f"{run['name']} ({given['name']})", "test_scene": scene, "data": data, "compare": compare}
 
 
 def task(config: DictConfig) -> float:

@@ -64,10 +64,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         sample: Sample = self.scene.sample(self.indices[item], self.seed, self.grid, self.cameras)
         made = {key: getattr(sample, key) for key in TENSORS}
         for key in ("views", "volume"):
-            if not made[key].isfinite().all():
-                raise ValueError(
-                    f"{sample.name}: expected finite {key}, got {int((~made[key].isfinite()).sum())} others"
-                )
+            if bad := int((~made[key].isfinite()).sum()):
+                raise ValueError(f"{sample.name}: expected finite {key}, got {bad} values that are not")
         return {**made, "name": sample.name}
 
 

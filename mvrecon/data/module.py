@@ -1,5 +1,6 @@
 """Training, validation and test scenes of a run."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -149,6 +150,8 @@ class SceneData(L.LightningDataModule):
         """Go on from a checkpoint with the cases that the broken epoch has not seen."""
         if self._order is not None and state_dict:
             self._order.resume(**state_dict)
+            # Lightning looks for this at the loader and does not find it there.
+            warnings.filterwarnings("ignore", ".*ended before the epoch ended and your dataloader is not resumable")
 
 
 def same_cases(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:

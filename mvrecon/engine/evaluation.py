@@ -59,12 +59,13 @@ def evaluate(
 
 
 def mean_and_spread(values: list[float]) -> dict[str, Any]:
-    """Mean, sample standard deviation, and the values; nan (a scene without an object) counts in neither."""
+    """Mean, sample standard deviation (nan where there is none), and the values.
+
+    A nan among them, from a scene without an object, counts in neither.
+    """
     known = [value for value in values if not math.isnan(value)]
-    if not known:
-        return {"mean": math.nan, "std": math.nan, "values": values}
-    mean = sum(known) / len(known)
-    spread = statistics.stdev(known) if len(known) > 1 and math.isfinite(mean) else 0.0
+    mean = sum(known) / len(known) if known else math.nan
+    spread = statistics.stdev(known) if len(known) > 1 and math.isfinite(mean) else math.nan
     return {"mean": mean, "std": spread, "values": values}
 
 

@@ -48,7 +48,7 @@ def build_module(settings: Settings, model: Settings, data_range: float) -> Reco
 
 def trainable(module: L.LightningModule) -> bool:
     """Whether there is anything to learn."""
-    return any(p.requires_grad for p in module.parameters())
+    return any(p.requires_grad and p.numel() for p in module.parameters())
 
 
 def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:

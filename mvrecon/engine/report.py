@@ -1,13 +1,15 @@
 """The result table on a terminal."""
 
-import sys
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
+WIDTH = 114
 COLUMNS = {
     "psnr": ("PSNR\ndB", "{:.2f}"),
     "ssim": ("SSIM\n", "{:.3f}"),
@@ -21,26 +23,29 @@ COLUMNS = {
 
 def table(found: Mapping[str, Any]) -> Table:
     """The result table for a terminal: mean over the scenes, and the standard deviation below it."""
-    title = f"{found['name']}: {len(found['scenes'])} unseen scenes, mean ± standard deviation over scenes"
-    shown = Table(title=title, title_justify="left")
-    shown.add_column("method\n")
-    shown.add_column("parameters\n", justify="right")
+    count = len(found["scenes"])
+    over = f"{count} unseen scenes, mean ± standard deviation" if count > 1 else "1 unseen scene"
+    shown = Table(title=f"{found['name']}: {over}", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    shown.add_column("method\n", no_wrap=True)
+    shown.add_column("parameters\n", justify="right", no_wrap=True)
     for heading, _ in COLUMNS.values():
         shown.add_column(heading, justify="right")
     shown.add_column("ms per\nvolume", justify="right")
     shown.add_column("training\ns", justify="right")
     for label, row in found["methods"].items():
-        cells = [
-            f"{form.format(row[name]['mean'])}\n± {form.format(row[name]['std'])}"
-            for name, (_, form) in COLUMNS.items()
-        ]
+        cells = [_cell(row[name], form) for name, (_, form) in COLUMNS.items()]
         seconds = f"{row['train_seconds']:.0f}" if row["train_steps"] else "-"
         shown.add_row(label, f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds)
     return shown
 
 
 def show(found: Mapping[str, Any], folder: Path) -> None:
-    """Print the table, at least 120 columns wide where no terminal says otherwise."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
+    console = Console(width=max(Console().width, WIDTH))
     console.print(table(found))
     console.print(f"Kept in {folder}", soft_wrap=True)
+
+
+def _cell(figure: Mapping[str, Any], form: str) -> str:
+    mean, spread = figure["mean"], figure["std"]
+    return form.format(mean) if math.isnan(spread) else f"{form.format(mean)}\n± {form.format(spread)}"

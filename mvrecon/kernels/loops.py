@@ -1,29 +1,51 @@
 """The compiled loops over rays: project, back-project, and how the projections change with the geometry.
 
-Compiled at the first call for a type of number and kept on disk. numba's disk cache sees edits of this file only:
-change it with `rays.py`, `joseph.py` or `siddon.py`, or clear the cache.
+Compiled at the first call for a type of number, and kept on disk.
 """
 
 from collections import namedtuple
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numba import njit
 
 from mvrecon.kernels import joseph, siddon
-from mvrecon.kernels.rays import FASTMATH, JOSEPH, at, main_axis, trace, within
+from mvrecon.kernels.rays import FASTMATH, JOSEPH, at, main_axis, scalar, trace, within
 
-compiled = njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
+
+def digest(folder: Path) -> str:
+    """What the Python files of a folder hold, in short."""
+    return sha256(b"".join(file.read_bytes() for file in sorted(folder.glob("*.py")))).hexdigest()
+
+
+SOURCES = digest(Path(__file__).parent)
+
+
+def compiled(loop: Callable[..., Any]) -> Any:
+    """The loop in machine code; threads may run it side by side."""
+    options: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "error_model": "numpy"}
+    try:
+        dispatcher: Any = njit(cache=True, **options)(loop)
+    except RuntimeError:  # numba finds no folder to write to
+        return njit(**options)(loop)
+    # numba's own stamp sees edits of this file only, not of the functions that the loops call
+    dispatcher._cache._cache_file._source_stamp = SOURCES
+    return dispatcher
+
 
 #: lines [m 4 3 3], window (w0, w1), sizes (x, y, z), flat strides (x, y, z) of the padded volume, detector, method.
 Rig = namedtuple("Rig", ["lines", "window", "sizes", "strides", "detector", "method"])
 
 
-@compiled
+@scalar
 def _steps(rig, axis):
     return rig.strides[(axis + 1) % 3], rig.strides[(axis + 2) % 3]
 
 
-@compiled
+@scalar
 def _buffers(rig, flat):
     slabs = max(rig.sizes)
     return np.empty((3, slabs), rig.strides.dtype), np.empty((3, slabs), flat.dtype)
@@ -80,7 +102,7 @@ def backproject_slabs(flat, rig, views, axis, low, high):
                     siddon.spread(flat[n], _steps(rig, axis), count, index, part, length * views[n, m, v, u])
 
 
-@compiled
+@scalar
 def _pull_back(line, ray, p, window, value, slopes, change):
     """Add to a row's `change` [4 3 3] the derivative of value * (one ray's integral) by the maps in `line`."""
     total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end = slopes

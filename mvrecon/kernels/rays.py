@@ -14,7 +14,7 @@ from mvrecon.kernels.lines import TIE
 
 JOSEPH, SIDDON = 0, 1
 #: What may be reordered: sums and products, but NaN and infinity keep their meaning.
-FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
+FASTMATH = {"reassoc", "contract", "nsz"}
 
 scalar = njit(fastmath=FASTMATH, error_model="numpy")
 
@@ -60,12 +60,13 @@ def trace(line, axis, u, v, window, sizes, method):
         method: JOSEPH or SIDDON.
     """
     b, c = (axis + 1) % 3, (axis + 2) % 3
-    per = 1.0 / at(line, 0, axis, u, v)
-    slope_b, slope_c = at(line, 0, b, u, v) * per, at(line, 0, c, u, v) * per
-    value_b, value_c = -at(line, 1, c, u, v) * per, at(line, 1, b, u, v) * per
+    D = at(line, 0, axis, u, v)
+    slope_b, slope_c = at(line, 0, b, u, v) / D, at(line, 0, c, u, v) / D
+    # divided, not multiplied by 1 / D: a ray on a face must stay on it to the last bit
+    value_b, value_c = -at(line, 1, c, u, v) / D, at(line, 1, b, u, v) / D
     world = at(line, 3, 0, u, v) ** 2 + at(line, 3, 1, u, v) ** 2 + at(line, 3, 2, u, v) ** 2
-    one = at(line, 2, axis, u, v) + window[0] / per
-    two = at(line, 2, axis, u, v) + window[1] / per
+    one = at(line, 2, axis, u, v) + window[0] * D
+    two = at(line, 2, axis, u, v) + window[1] * D
     half = sizes[axis] / 2.0
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
     # hat functions reach one voxel from the outermost centres, cells half a voxel
@@ -78,7 +79,7 @@ def trace(line, axis, u, v, window, sizes, method):
         first = max(0, int(ceil(lower + centre - margin)))
         last = min(sizes[axis], int(floor(upper + centre + margin)) + 1)
     b0, c0 = value_b + (sizes[b] - 1) / 2.0 + 1, value_c + (sizes[c] - 1) / 2.0 + 1
-    return Ray(axis, b0, slope_b, c0, slope_c, sqrt(world) * abs(per), begin, end, first, last, centre)
+    return Ray(axis, b0, slope_b, c0, slope_c, sqrt(world) / abs(D), begin, end, first, last, centre)
 
 
 @scalar

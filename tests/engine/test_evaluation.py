@@ -12,7 +12,7 @@ from torch import nn
 
 from mvrecon.engine.evaluation import evaluate, mean_and_spread
 from mvrecon.engine.export import save_case, save_png
-from mvrecon.engine.report import table
+from mvrecon.engine.report import WIDTH, table
 from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import UNITS
 from mvrecon.models.output import Reconstruction
@@ -72,7 +72,7 @@ def test_each_scene_is_shown_with_all_reconstructions():
 
 def test_mean_and_spread():
     assert mean_and_spread([1.0, 2.0, 3.0]) == {"mean": 2.0, "std": 1.0, "values": [1.0, 2.0, 3.0]}
-    assert mean_and_spread([5.0])["std"] == 0
+    assert math.isnan(mean_and_spread([5.0])["std"])
     assert mean_and_spread([1.0, math.nan, 3.0])["mean"] == 2
     assert mean_and_spread([math.inf, 3.0])["mean"] == math.inf
     assert math.isnan(mean_and_spread([math.nan])["mean"])
@@ -81,12 +81,19 @@ def test_mean_and_spread():
 def test_the_table_tells_every_method_and_both_moments():
     row = {name: {"mean": 0.5, "std": 0.125, "values": [0.5]} for name in UNITS}
     row |= {"parameters": 12345, "ms_per_volume": 1.25, "train_seconds": 61.0, "train_steps": 7}
-    sharp = {**row, "psnr": {"mean": math.inf, "std": 0.0, "values": []}, "train_steps": 0}
+    sharp = {**row, "psnr": {"mean": math.inf, "std": math.nan, "values": []}, "train_steps": 0}
+    found = {"name": "trial", "scenes": ["a", "b"], "methods": {"cross_view": row, "sirt": sharp}}
+    text = shown(found)
+    for piece in ("trial: 2 unseen scenes", "cross_view", "sirt", "12,345", "0.500", "± 0.125", "± 0.12", "inf", "61"):
+        assert piece in text, piece
+    assert "nan" not in text and "…" not in text
+    assert "1 unseen scene\n" in shown({**found, "scenes": ["a"]}).replace(" \n", "\n").replace("  ", "")
+
+
+def shown(found):
     text = io.StringIO()
-    found = {"name": "trial", "scenes": ["a"], "methods": {"cross_view": row, "sirt": sharp}}
-    Console(file=text, width=120).print(table(found))
-    for piece in ("trial", "cross_view", "sirt", "12,345", "0.500", "± 0.125", "± 0.12", "inf", "61", "…"):
-        assert (piece in text.getvalue()) == (piece != "…"), piece
+    Console(file=text, width=WIDTH).print(table(found))
+    return text.getvalue()
 
 
 def test_a_saved_case_keeps_axes_and_affine(tmp_path):

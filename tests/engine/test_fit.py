@@ -118,7 +118,8 @@ def test_averaged_weights_are_what_a_checkpoint_holds(run, settings, data, tmp_p
 
 
 def test_methods_without_weights_are_not_trained(settings, data, tmp_path):
-    fit.fit("sirt", settings, data, tmp_path)
+    for method in ("sirt", "backprojection"):
+        fit.fit(method, {**settings, "compare": {method: {"name": method}}}, data, tmp_path)
     assert not list(tmp_path.iterdir())
 
 

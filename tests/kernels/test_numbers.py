@@ -1,6 +1,7 @@
 """Digits, threads, and what torch thinks of the operators."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -87,3 +88,13 @@ def test_only_what_is_asked_for_is_differentiated(monkeypatch):
     x = torch.rand(1, 1, *GRID.shape, requires_grad=True)
     A.T(A(x)).sum().backward()
     assert x.grad is not None
+
+
+def test_the_disk_cache_knows_every_source_file():
+    """An edit of the ray arithmetic must not leave old machine code in use; numba alone looks at the loops' file."""
+    from mvrecon.kernels import loops
+
+    for loop in (loops.project_rows, loops.backproject_slabs, loops.vary_rows):
+        assert loop._cache._cache_file._source_stamp == loops.SOURCES
+    folder = Path(loops.__file__).parent
+    assert loops.digest(folder) == loops.SOURCES != loops.digest(folder.parent)

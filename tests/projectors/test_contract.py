@@ -37,7 +37,8 @@ def test_both_back_ends_agree(name, kind, rig, method, dtype):
     oracle, compiled = (PROJECTORS.build(name, grid=GRID, cameras=rig, method=method, backend=b) for b in BACKENDS)
     x = torch.rand(2, 2, *GRID.shape, dtype=dtype)
     y = oracle(x)
-    tolerance = 1e-13 if dtype == torch.float64 else 1e-6
+    # in float32 a crossing under a small slope is known to fewer digits than the slope
+    tolerance = 1e-13 if dtype == torch.float64 else 5e-6
     assert y.abs().max() > 1
     assert (compiled(x) - y).norm() < tolerance * y.norm()
     assert (compiled.T(y) - oracle.T(y)).norm() < tolerance * oracle.T(y).norm()

@@ -1,0 +1,128 @@
+"""Samples: pure in their index, in every process; orders: pure in (seed, epoch)."""
+
+import os
+import pickle
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from mvrecon.data.dataset import EpochOrder, SceneDataset
+from mvrecon.parts import CAMERAS, SCENES
+from mvrecon.scenes.sample import Sample
+from tests.data.conftest import RIG
+
+
+class Counting:
+    """A scene that tells how often it was asked."""
+
+    data_range, unit, length = 1.0, "1", None
+
+    def __init__(self, bad=None):
+        self.calls, self.bad = 0, bad
+
+    def sample(self, index, seed, grid, cameras):
+        self.calls += 1
+        views = torch.full((1, 3, 10, 12), float(index))
+        volume = torch.full((1, *grid.shape), float("nan") if index == self.bad else float(seed))
+        return Sample(views, volume, volume > 0, f"{seed}-{index}")
+
+
+@pytest.fixture
+def cameras():
+    return CAMERAS.from_config(RIG)
+
+
+def same(a, b):
+    return a["name"] == b["name"] and all(torch.equal(a[key], b[key]) for key in ("views", "volume", "inside"))
+
+
+def test_every_case_is_made_once(grid, cameras):
+    scene = Counting()
+    data = SceneDataset(scene, grid, cameras, [4, 2, 9], seed=3)
+    items = [data[k] for k in (2, 0, 1, 2)]
+    assert scene.calls == 3 and len(data) == 3
+    assert [i["name"] for i in items] == ["3-9", "3-4", "3-2", "3-9"]
+    assert items[0]["views"].unique().tolist() == [9.0]
+    uncached = SceneDataset(Counting(), grid, cameras, [4, 2, 9], seed=3, cache=False)
+    assert all(same(uncached[k], data[k]) for k in range(3)) and uncached.scene.calls == 3
+    with pytest.raises(IndexError, match="3 cases has no item 3"):
+        data[3]
+
+
+@pytest.mark.parametrize("cache", [True, False])
+def test_a_dataset_survives_the_journey_to_a_worker(volume_file, grid, cameras, cache):
+    scene = SCENES.build("hdf5", path=str(volume_file))
+    data = SceneDataset(scene, grid, cameras, range(3), 0, cache)
+    here = [data[k] for k in range(3)]
+    again = pickle.loads(pickle.dumps(data))
+    assert all(same(a, again[k]) for k, a in enumerate(here))
+
+
+WORKERS = """
+import sys, torch
+from torch.utils.data import DataLoader
+from mvrecon.data.dataset import SceneDataset
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, SCENES
+if __name__ == "__main__":
+    start, cache = sys.argv[1], sys.argv[2] == "cache"
+    cameras = CAMERAS.build("circular", views=2, sid=300.0, sdd=450.0, detector={"pixels": [6, 6], "pixel_mm": 9.0})
+    scene = SCENES.build("hdf5", path=sys.argv[3])
+    data = SceneDataset(scene, Grid.centred((6, 6, 6), 8.0), cameras, range(4), 1, cache)
+    here = list(DataLoader(data, 2))
+    there = list(DataLoader(data, 2, num_workers=1, multiprocessing_context=start))
+    for a, b in zip(here, there, strict=True):
+        assert a["name"] == b["name"] and all(torch.equal(a[k], b[k]) for k in ("views", "volume", "inside"))
+"""
+
+
+@pytest.mark.parametrize(("start", "cache"), [("spawn", "no"), ("fork", "cache")])
+def test_workers_load_what_the_main_process_loads(volume_file, tmp_path, root, start, cache):
+    script = tmp_path / "workers.py"
+    script.write_text(WORKERS)
+    environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, script, start, cache, volume_file]
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_values_that_are_not_finite_are_refused(grid, cameras):
+    with pytest.raises(ValueError, match="0-5: expected finite volume, got 512 values that are not"):
+        SceneDataset(Counting(bad=5), grid, cameras, [5], 0).prepare()
+
+
+def test_batches_have_the_promised_shapes(grid, cameras):
+    (batch,) = DataLoader(SceneDataset(Counting(), grid, cameras, range(2), 0), batch_size=2)
+    assert batch["views"].shape == (2, 1, 3, 10, 12) and batch["volume"].shape == (2, 1, 8, 8, 8)
+    assert batch["inside"].dtype == torch.bool and batch["name"] == ["0-0", "0-1"]
+
+
+def order(seed, epoch, count=50):
+    sampler = EpochOrder(count, seed)
+    sampler.set_epoch(epoch)
+    return list(sampler)
+
+
+def test_an_order_depends_on_seed_and_epoch_alone():
+    torch.manual_seed(7)
+    first = order(3, 2)
+    torch.manual_seed(8)
+    sampler = EpochOrder(50, 3)
+    for epoch in (0, 5, 2):
+        sampler.set_epoch(epoch)
+        last = list(sampler)
+    assert last == first == list(sampler)
+    assert sorted(first) == list(range(50))
+    assert len({tuple(order(seed, epoch)) for seed in range(3) for epoch in range(3)}) == 9
+
+
+def test_a_resumed_epoch_leaves_out_what_was_seen_and_the_next_is_whole():
+    sampler = EpochOrder(50, 3)
+    sampler.resume(epoch=1, seen=20)
+    sampler.set_epoch(1)
+    assert list(sampler) == order(3, 1)[20:]
+    sampler.set_epoch(2)
+    assert list(sampler) == order(3, 2)

@@ -1,0 +1,160 @@
+"""Volume files: round trip, written whole or not at all, and what is refused."""
+
+import multiprocessing
+import pickle
+
+import h5py
+import numpy as np
+import pytest
+
+from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes, written_whole
+from tests.data.conftest import SPACING, head, stored
+
+
+def test_what_is_written_is_read(tmp_path):
+    path = tmp_path / "deep" / "a.h5"
+    labels = np.arange(20 * 30 * 30, dtype=np.uint8).reshape(20, 30, 30)
+    volumes = [Stored(f"pt_ä{k}", head((k, 0, 0)), (3.0, 2.0, 1.0 + k), labels) for k in range(3)]
+    assert write_volumes(path, iter(volumes), orientation="LPI", source="a test") == 3
+    file = VolumeFile(path)
+    assert len(file) == 3 and file.orientation == "LPI"
+    for k in (2, 0, 1):
+        found = file.read(k)
+        assert found.name == f"pt_ä{k}" and found.spacing == (3.0, 2.0, 1.0 + k)
+        assert found.ct.dtype == np.int16 and np.array_equal(found.ct, volumes[k].ct)
+    with h5py.File(path) as raw:
+        assert raw.attrs["axes"] == "z, y, x" and raw.attrs["units"] == "HU" and raw.attrs["source"] == "a test"
+        assert np.array_equal(raw["label"][1], labels)
+
+
+def test_a_crash_leaves_the_old_file_and_nothing_else(volume_file):
+    before = volume_file.read_bytes()
+
+    def breaking():
+        yield stored(1)[0]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_volumes(volume_file, breaking())
+    assert volume_file.read_bytes() == before
+    assert [p.name for p in volume_file.parent.iterdir()] == [volume_file.name]
+
+
+def test_the_new_file_takes_the_place_of_the_old_at_the_end_only(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with written_whole(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "old" and part.parent == path.parent
+    assert path.read_text() == "new" and not part.exists()
+
+
+def test_volumes_that_do_not_fit_together_are_refused(tmp_path):
+    label = np.zeros((20, 30, 30), np.uint8)
+    for second in (Stored("b", head(shape=(20, 30, 31)), SPACING), Stored("b", head(), SPACING, label)):
+        with pytest.raises(ValueError, match="volume 'b' has .* expected .* as the first"):
+            write_volumes(tmp_path / "a.h5", [*stored(1), second])
+    with pytest.raises(ValueError, match="at least one volume"):
+        write_volumes(tmp_path / "a.h5", [])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no\.h5: no such file; expected an mvrecon volume file: HDF5 with"):
+        len(VolumeFile(tmp_path / "no.h5"))
+
+
+def test_a_truncated_file_is_an_error(volume_file):
+    whole = volume_file.read_bytes()
+    volume_file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"heads\.h5: cannot be opened .*cut short\? Expected"):
+        len(VolumeFile(volume_file))
+
+
+def test_damaged_bytes_are_an_error(volume_file):
+    with h5py.File(volume_file) as file:
+        chunk = file["ct"].id.get_chunk_info(3)
+    with volume_file.open("r+b") as raw:
+        raw.seek(chunk.byte_offset)
+        raw.write(b"\xff" * chunk.size)
+    file = VolumeFile(volume_file)
+    assert file.read(2).name == "pt_2"
+    with pytest.raises(ValueError, match="volume 3 cannot be read .*damaged"):
+        file.read(3)
+
+
+def rewritten(path, change):
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return path
+
+
+def replace(name, **made):
+    def change(file):
+        del file[name]
+        file.create_dataset(name, **made)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f.pop("ct"), r"no dataset 'ct', only \['id', 'spacing'\]"),
+        (replace("ct", data=np.zeros((7, 4, 4))), r"'ct': \(7, 4, 4\).*ct \[n d h w\]"),
+        (replace("ct", shape=(7, 4, 4, 4), dtype="c8"), "ct complex64.*expected numbers"),
+        (replace("spacing", data=np.ones((6, 3))), r"'spacing': \(6, 3\)"),
+        (
+            replace("spacing", data=np.diag([1.0, 1, 1, 0, 0, 0, 0])[:, :3]),
+            r"volume 0 has the spacing \[1.0, 0.0, 0.0\]",
+        ),
+        (replace("spacing", data=np.full((7, 3), np.nan)), "expected positive mm"),
+        (lambda f: f.attrs.update(axes="x, y, z"), "'axes': 'x, y, z'.*expected"),
+        (lambda f: f.attrs.pop("units"), "'units': None"),
+    ],
+)
+def test_a_file_of_another_layout_says_what_is_wrong(volume_file, change, message):
+    with pytest.raises(ValueError, match=message):
+        len(VolumeFile(rewritten(volume_file, change)))
+
+
+def test_a_file_that_is_not_hdf5_is_refused(tmp_path):
+    path = tmp_path / "a.h5"
+    path.write_text("hello")
+    with pytest.raises(ValueError, match=r"a\.h5: not an HDF5 file; expected"):
+        VolumeFile(path).read(0)
+
+
+def linked(kind):
+    def change(file):
+        shape = file["ct"].shape
+        del file["ct"]
+        if kind == "virtual":
+            layout = h5py.VirtualLayout(shape, "i2")
+            layout[:] = h5py.VirtualSource("other.h5", "ct", shape=shape)
+            file.create_virtual_dataset("ct", layout)
+        elif kind == "raw":
+            file.create_dataset("ct", shape, "i2", external=[("other.raw", 0, h5py.h5f.UNLIMITED)])
+        else:
+            file["ct"] = h5py.ExternalLink("other.h5", "ct") if kind == "external" else h5py.SoftLink("/spacing")
+
+    return change
+
+
+@pytest.mark.parametrize("kind", ["external", "soft", "virtual", "raw"])
+def test_a_file_cannot_lead_to_other_files(volume_file, kind):
+    write_volumes(volume_file.with_name("other.h5"), stored(7))
+    with pytest.raises(ValueError, match="'ct' is a link, a group or stored elsewhere"):
+        VolumeFile(rewritten(volume_file, linked(kind))).read(0)
+
+
+def first_voxels(file):
+    return [int(file.read(k).ct.astype(int).sum()) for k in range(len(file))]
+
+
+def test_an_open_file_goes_to_other_processes(volume_file):
+    file = VolumeFile(volume_file)
+    here = first_voxels(file)
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        assert pool.map(first_voxels, [file, file]) == [here, here]
+    assert pickle.loads(pickle.dumps(file))._open is None

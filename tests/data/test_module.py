@@ -1,0 +1,169 @@
+"""The data of a run: no case in two sets, and a resumed training sees what it missed."""
+
+import lightning.pytorch as L
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from mvrecon.data.module import SceneData
+from tests.data.conftest import RIG
+
+GRID = {"shape": [6, 6, 6], "spacing": 8.0}
+RANDOM = {"name": "ellipsoids"}
+
+
+def build(scene=RANDOM, test_scene=None, seed=0, **sizes):
+    scenes = {"train": scene, "test": test_scene or scene}
+    return SceneData(scenes, GRID, RIG, {"train": 5, "val": 2, "test": 3, **sizes}, batch_size=2, seed=seed)
+
+
+def names(loader):
+    return [name for batch in loader for name in batch["name"]]
+
+
+def parts(data):
+    data.setup()
+    return {
+        "train": names(data.train_dataloader()),
+        "val": names(data.val_dataloader()),
+        "test": names(data.test_dataloader()),
+    }
+
+
+def disjoint(sets):
+    return len({name for part in sets.values() for name in part}) == sum(map(len, sets.values()))
+
+
+def test_random_scenes_come_from_series_of_their_own():
+    first, second = parts(build(seed=0)), parts(build(seed=1))
+    assert [len(first[key]) for key in ("train", "val", "test")] == [5, 2, 3]
+    assert disjoint(first) and disjoint(second)
+    assert first["test"] == second["test"] and first["val"] == second["val"], "all runs are judged on the same cases"
+    assert not set(first["train"]) & {name for part in second.values() for name in part}
+
+
+def test_a_file_is_split_without_overlap(volume_file):
+    heads = {"name": "hdf5", "path": str(volume_file)}
+    sets = parts(build(heads, train=99))
+    assert disjoint(sets)
+    assert sets["val"] == ["pt_5", "pt_6"] and sets["test"] == ["pt_0"]
+    assert sorted(sets["train"]) == ["pt_1", "pt_2", "pt_3", "pt_4"]
+
+
+def test_asking_for_more_test_cases_never_takes_training_cases(volume_file):
+    heads = {"name": "hdf5", "path": str(volume_file)}
+    trained = set(build(heads, test=0).indices("train"))
+    assert not trained & set(build(heads, test=99).indices("test"))
+    same_file = {"name": "hdf5", "path": f"{volume_file.parent}/../{volume_file.parent.name}/heads.h5", "rays": 1}
+    assert not trained & set(build(heads, same_file, test=99).indices("test"))
+
+
+def test_a_test_file_of_its_own_leaves_all_others_to_training(volume_file, tmp_path):
+    other = tmp_path / "other.h5"
+    other.write_bytes(volume_file.read_bytes())
+    data = build({"name": "hdf5", "path": str(volume_file)}, {"name": "hdf5", "path": str(other)}, train=99, test=4)
+    assert data.indices("train") == [0, 1, 2, 3, 4] and data.indices("val") == [5, 6]
+    assert data.indices("test") == [0, 1, 2, 3]
+    data.setup("test")
+    assert set(data.sets) == {"test"}
+
+
+def test_the_test_stage_does_not_need_the_training_file(volume_file):
+    data = build({"name": "hdf5", "path": "gone.h5"}, {"name": "hdf5", "path": str(volume_file)})
+    data.setup("test")
+    assert names(data.test_dataloader()) == ["pt_0", "pt_1", "pt_2"]
+    with pytest.raises(FileNotFoundError, match=r"gone\.h5"):
+        data.setup("fit")
+
+
+def test_varied_copies_are_of_training_cases_alone(volume_file):
+    data = build({"name": "hdf5", "path": str(volume_file), "vary": True}, train=23)
+    train = data.indices("train")
+    assert len(set(train)) == 23 and {i % 7 for i in train} == {1, 2, 3, 4} and train[:4] == [1, 2, 3, 4]
+
+
+def test_a_file_that_is_too_small_is_refused(volume_file):
+    heads = {"name": "hdf5", "path": str(volume_file)}
+    with pytest.raises(ValueError, match=r"7 case\(s\) cannot be split into the sizes .*'val': 7"):
+        build(heads, val=7).indices("train")
+    phantom = {"name": "shepp_logan"}
+    with pytest.raises(ValueError, match=r"1 case\(s\) cannot be split"):
+        build(phantom, val=0).indices("test")
+    assert build(phantom, train=0, val=0).indices("test") == [0]
+
+
+def test_wrong_settings_are_refused():
+    with pytest.raises(ValueError, match="sizes must give train, val and test; missing or unknown: tset"):
+        build(tset=3)
+    with pytest.raises(ValueError, match="at least 0 .* got sizes .*'val': -1"):
+        build(val=-1)
+    with pytest.raises(ValueError, match="share their data_range"):
+        build(RANDOM, {"name": "ellipsoids", "value": 0.5})
+    with pytest.raises(ValueError, match="spacing must be positive"):
+        SceneData(
+            {"train": RANDOM, "test": RANDOM},
+            {"shape": [4, 4, 4], "spacing": -1.0},
+            RIG,
+            dict.fromkeys(("train", "val", "test"), 1),
+        )
+
+
+def test_loading_does_not_touch_the_global_random_numbers():
+    data = build()
+    data.setup()
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    names(data.train_dataloader()), names(data.val_dataloader())
+    assert torch.equal(torch.rand(3), expected)
+
+
+class Watching(L.LightningModule):
+    """Writes down the cases that it is trained on; may break off."""
+
+    def __init__(self, stop=None):
+        super().__init__()
+        self.weight, self.seen, self.stop = torch.nn.Parameter(torch.zeros(1)), [], stop
+
+    def training_step(self, batch, batch_idx):
+        if self.global_step == self.stop:
+            raise RuntimeError("power cut")
+        self.seen.append(batch["name"])
+        return self.weight.sum()
+
+    def validation_step(self, batch, batch_idx):
+        return None
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+def run(folder, module, ckpt_path=None, every=2):
+    keep = ModelCheckpoint(folder, "last", save_top_k=1, enable_version_counter=False)
+    trainer = L.Trainer(
+        max_steps=11,
+        max_epochs=-1,
+        val_check_interval=every,
+        check_val_every_n_epoch=None,
+        num_sanity_val_steps=0,
+        callbacks=[keep],
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        accelerator="cpu",
+        default_root_dir=folder,
+    )
+    trainer.fit(module, datamodule=build(train=10), ckpt_path=ckpt_path)
+    return module.seen
+
+
+@pytest.mark.parametrize(("stop", "every"), [(3, 2), (6, 5), (8, 2), (9, 3)])
+def test_a_resumed_training_sees_the_cases_that_the_broken_one_missed(tmp_path, stop, every):
+    whole = run(tmp_path / "whole", Watching(), every=every)
+    assert len(whole) == 11 and whole[:5] != whole[5:10]
+    assert sorted(sum(whole[:5], [])) == sorted(sum(whole[5:10], []))
+    with pytest.raises(RuntimeError, match="power cut"):
+        run(tmp_path, Watching(stop), every=every)
+    saved = stop - stop % every
+    rest = run(tmp_path, Watching(), str(tmp_path / "last.ckpt"), every)
+    assert rest == whole[saved:]

@@ -1,0 +1,119 @@
+"""NIfTI: the same object lies at the same place, however its voxels are stored."""
+
+import builtins
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.data.nifti import read_nifti
+from mvrecon.data.resample import resample
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.rigid import euler_rotation
+
+SIZE = 40
+
+
+def blobs(xyz):
+    """An asymmetric smooth object: four Gaussian balls, none the mirror image of another."""
+    places = torch.tensor([[0, 0, 0], [12, 0, 0], [0, 9, 0], [3, 0, -8]], dtype=torch.float64)
+    return (
+        torch.tensor([1.0, 0.8, 0.6, 0.4]) * torch.exp(-((xyz[..., None, :] - places) ** 2).sum(-1) / (2 * 4.0**2))
+    ).sum(-1)
+
+
+def save(path, affine, scale=1.0, units="mm"):
+    """Store the object sampled at the voxels of an affine (index i, j, k to world mm)."""
+    i, j, k = np.meshgrid(*[np.arange(SIZE)] * 3, indexing="ij")
+    xyz = np.stack([i, j, k, np.ones_like(i)], axis=-1) @ affine.T
+    values = blobs(torch.from_numpy(xyz[..., :3])).numpy()
+    stored = affine.copy()
+    stored[:3] /= {"mm": 1, "meter": 1000}[units]
+    image = nibabel.Nifti1Image(np.rint((values - 0.25) / scale).astype(np.int16) if scale != 1 else values, stored)
+    image.header.set_xyzt_units(units)
+    if scale != 1:
+        image.header.set_slope_inter(scale, 0.25)
+    nibabel.save(image, path)
+
+
+def centred(linear, target=(1.0, 2.0, -3.0)):
+    affine = np.eye(4)
+    affine[:3, :3] = linear
+    affine[:3, 3] = np.array(target) - affine[:3, :3] @ np.full(3, (SIZE - 1) / 2)
+    return affine
+
+
+AFFINES = {
+    "ras": np.diag([1.5, 1.5, 1.5]),
+    "las": np.diag([-1.5, 1.5, 1.5]),
+    "lps": np.diag([-1.5, -1.5, 1.5]),
+    "permuted": np.array([[0, 0, 1.5], [-1.5, 0, 0], [0, 1.5, 0]]),
+    "anisotropic": np.diag([1.2, -1.6, 1.4]),
+    "oblique": euler_rotation([20.0, -15.0, 10.0], "xyz").numpy() * 1.5,
+    "oblique and mirrored": euler_rotation([10.0, 25.0, -30.0], "xyz").numpy() @ np.diag([-1.5, 1.5, 1.5]),
+}
+
+
+@pytest.mark.parametrize("name", AFFINES)
+def test_an_object_lands_at_its_world_place(tmp_path, name):
+    path = tmp_path / "a.nii.gz"
+    save(path, centred(AFFINES[name]))
+    values, grid = read_nifti(path)
+    assert torch.allclose(values.double(), blobs(voxel_centres(grid)), atol=1e-6)
+    target = Grid.centred((12, 16, 18), 2.0, centre=(2.0, 1.0, -1.0))
+    expected = blobs(voxel_centres(target.refined(4))).reshape(12, 4, 16, 4, 18, 4).mean(dim=(1, 3, 5))
+    assert torch.allclose(resample(values, grid, target).double(), expected, atol=0.03)
+
+
+@pytest.mark.parametrize(("scale", "units"), [(1e-4, "mm"), (1.0, "meter")])
+def test_slope_intercept_and_units_are_respected(tmp_path, scale, units):
+    path = tmp_path / "a.nii"
+    save(path, centred(AFFINES["las"]), scale, units)
+    values, grid = read_nifti(path)
+    assert grid.spacing == pytest.approx((1.5, 1.5, 1.5), rel=1e-5)
+    assert torch.allclose(values.double(), blobs(voxel_centres(grid)), atol=1e-3)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no\.nii: no such file; expected a NIfTI volume"):
+        read_nifti(tmp_path / "no.nii")
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_a_truncated_file_is_an_error(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    save(path, centred(AFFINES["ras"]))
+    path.write_bytes(path.read_bytes()[:20_000])
+    with pytest.raises(ValueError, match=r"(?s)a\.nii.*cannot be read .*cut short\? Expected a NIfTI"):
+        read_nifti(path)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    text = tmp_path / "a.nii"
+    text.write_text("hello")
+    with pytest.raises(ValueError, match=r"a\.nii: cannot be read"):
+        read_nifti(text)
+    four = tmp_path / "four.nii"
+    nibabel.save(nibabel.Nifti1Image(np.zeros((3, 3, 3, 2)), np.eye(4)), four)
+    with pytest.raises(ValueError, match=r"shape \(3, 3, 3, 2\); expected .* three axes"):
+        read_nifti(four)
+    flat = tmp_path / "flat.nii"
+    image = nibabel.Nifti1Image(np.zeros((3, 3, 3)), np.eye(4))
+    image.header.set_sform(np.diag([1.0, 1, 0, 1]), code=1)
+    nibabel.save(nibabel.Nifti1Image(image.dataobj, None, image.header), flat)
+    with pytest.raises(ValueError, match="expected a finite one that can be inverted"):
+        read_nifti(flat)
+
+
+def test_without_nibabel_the_extra_is_named(tmp_path, monkeypatch):
+    true_import = builtins.__import__
+
+    def without(name, *rest, **options):
+        if name.startswith("nibabel"):
+            raise ImportError("No module named 'nibabel'")
+        return true_import(name, *rest, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"pip install 'mvrecon\[io\]'"):
+        read_nifti(tmp_path / "a.nii")

