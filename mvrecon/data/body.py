@@ -21,15 +21,15 @@ def body(mu: Float[Tensor, "d h w"], threshold: float) -> Bool[Tensor, "d h w"]:
     mask = mu > threshold
     size = math.ceil(max(mask.shape) / BLOCKS)
     blocks = F.avg_pool3d(mask[None, None].float(), size, ceil_mode=True)[0, 0] >= 0.5
-    near = _spread(largest_part(blocks if blocks.any() else blocks | True).double(), 3) > 0
+    near = _spread(largest_part(blocks if blocks.any() else blocks | True).float(), 3) > 0
     for axis, n in enumerate(mask.shape):
         near = near.repeat_interleave(size, dim=axis).narrow(axis, 0, n)
     return mask & near
 
 
 def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
-    """The part with the most voxels among those that touch by faces; of equal ones, the last."""
-    labels = torch.arange(1, mask.numel() + 1, dtype=torch.float64).reshape(mask.shape) * mask
+    """The part with the most voxels among those that touch by faces; of equal ones, the last. Up to 2^24 voxels."""
+    labels = torch.arange(1, mask.numel() + 1, dtype=torch.float32).reshape(mask.shape) * mask
     while True:
         spread = labels
         for axis in range(3):

@@ -18,12 +18,11 @@ def resample(volume: Float[Tensor, "d h w"], source: Grid, target: Grid) -> Floa
     """Mean of a volume over each voxel of another grid; zero outside of the volume.
 
     Where the target is coarser, voxels of the source are first averaged in whole blocks of at most the target's size,
-    then the target's voxels over points no more than about one such block apart; between centres the volume is
+    then the target's voxels over points at most one and a half such blocks apart; between centres the volume is
     trilinear. Order of accuracy: second in the voxel size.
     """
-    step = min(target.spacing)
-    volume, source = pooled(volume, source, [max(1, int(step / s + 1e-6)) for s in source.spacing])
-    split = max(1, round(max(target.spacing) / min(source.spacing)))
+    volume, source = pooled(volume, source, [max(1, int(step + 1e-6)) for step in _steps(source, target)])
+    split = max(1, round(max(_steps(source, target))))
     fine = target.refined(split)
     between = torch.linalg.inv(source.affine) @ fine.affine  # voxel indices of the target to those of the source
     slab = max(1, POINTS // (fine.shape[1] * fine.shape[2] * split)) * split
@@ -32,10 +31,16 @@ def resample(volume: Float[Tensor, "d h w"], source: Grid, target: Grid) -> Floa
         index = between.clone()
         index[:3, 3] += first * index[:3, 2]
         shape = (min(slab, fine.shape[0] - first), *fine.shape[1:])
-        points = normalised(voxel_centres(Grid(shape, index)), source.shape).to(volume.dtype)
+        points = normalised(voxel_centres(Grid(shape, index), volume.dtype), source.shape)
         values = sample(volume[None, None], points[None])
         parts.append(F.avg_pool3d(values, split)[0, 0])
     return torch.cat(parts)
+
+
+def _steps(source: Grid, target: Grid) -> list[float]:
+    """The greatest step along each axis (x, y, z) of the source, in its voxels, from one target voxel to the next."""
+    between = torch.linalg.inv(source.affine) @ target.affine
+    return between[:3, :3].abs().amax(dim=1).tolist()
 
 
 def pooled(volume: Float[Tensor, "d h w"], grid: Grid, factors: Sequence[int]) -> tuple[Float[Tensor, "e i j"], Grid]:

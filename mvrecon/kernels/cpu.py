@@ -5,6 +5,7 @@ each voxel of the adjoint (a thread owns a range of slabs, one main axis at a ti
 Threads run loops that hold no lock of the interpreter; numba's own `parallel=True` aborts under concurrent calls.
 """
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +22,9 @@ from mvrecon.kernels.rays import JOSEPH, SIDDON
 METHODS = {"joseph": JOSEPH, "siddon": SIDDON}
 #: Voxels of nothing before and behind the volume along every axis.
 PAD = (1, 2)
+INNER = (slice(None), *[slice(PAD[0], -PAD[1])] * 3)
+#: Steps along rays that are worth a thread of their own.
+LEAST = 2**18
 
 
 @cache
@@ -28,19 +32,26 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix=f"mvrecon-{process}")
 
 
-def _share(work: Callable[[int, int], None], count: int, per_thread: int = 1) -> None:
-    """Do work(first, last) for ranges that cover `count` items, on as many threads as torch has."""
+def _share(work: Callable[[int, int], None], count: int, samples: int, per_thread: int = 1) -> None:
+    """Do work(first, last) for ranges that cover `count` items, on the threads that torch has and `samples` deserve."""
     threads = torch.get_num_threads()
-    parts = min(count, threads * per_thread) if threads > 1 else 1
-    ranges = [(count * i // parts, count * (i + 1) // parts) for i in range(parts)]
+    parts = min(count, threads * per_thread, 1 + samples // LEAST) if threads > 1 else 1
     if parts <= 1:
         return work(0, count)
+    ranges = [(count * i // parts, count * (i + 1) // parts) for i in range(parts)]
     for done in [_pool(threads, os.getpid()).submit(work, *each) for each in ranges]:
         done.result()
 
 
-def _padded(volume: Float[Tensor, "n d h w"]) -> Float[Tensor, "n p"]:
-    return torch.nn.functional.pad(volume, PAD * 3).flatten(1)
+def _empty(count: int, shape: Sequence[int], like: Tensor) -> np.ndarray:
+    # by numpy here and below: torch would wake its threads for the smallest volume
+    return np.zeros([count, *(size + sum(PAD) for size in shape)], dtype=like.numpy().dtype)
+
+
+def _padded(volume: Float[Tensor, "n d h w"]) -> np.ndarray:
+    padded = _empty(len(volume), volume.shape[1:], volume)
+    padded[INNER] = volume.numpy()
+    return padded.reshape(len(padded), math.prod(padded.shape[1:]))
 
 
 def _rig(lines: Tensor, window: Sequence[float], shape: Sequence[int], detector: Sequence[int], method: str) -> Rig:
@@ -63,8 +74,8 @@ def project(
     """Line integrals of volumes, in mm times their unit; see `reference.project`."""
     rig = _rig(lines, window, volume.shape[1:], detector, method)
     views = volume.new_empty(len(volume), len(lines), *detector)
-    flat = _padded(volume).numpy()
-    _share(lambda first, last: project_rows(flat, rig, views.numpy(), first, last), len(lines) * detector[0], 4)
+    flat, rows, samples = _padded(volume), len(lines) * detector[0], views.numel() * max(rig.sizes)
+    _share(lambda first, last: project_rows(flat, rig, views.numpy(), first, last), rows, samples, 4)
     return views
 
 
@@ -77,12 +88,12 @@ def backproject(
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project`, the same to the last bit for any number of threads."""
     rig = _rig(lines, window, shape, views.shape[2:], method)
-    padded = views.new_zeros(len(views), *[size + sum(PAD) for size in shape])
-    flat, values = padded.flatten(1).numpy(), views.contiguous().numpy()
+    padded, values = _empty(len(views), shape, views), np.ascontiguousarray(views.numpy())
+    flat = padded.reshape(len(padded), math.prod(padded.shape[1:]))
+    samples = views.numel() * max(rig.sizes)
     for axis, size in enumerate(rig.sizes):
-        _share(lambda low, high, axis=axis: backproject_slabs(flat, rig, values, axis, low, high), size)
-    d, h, w = shape
-    return padded[:, 1 : d + 1, 1 : h + 1, 1 : w + 1].contiguous()
+        _share(lambda low, high, axis=axis: backproject_slabs(flat, rig, values, axis, low, high), size, samples)
+    return torch.from_numpy(np.ascontiguousarray(padded[INNER]))
 
 
 def lines_vjp(
@@ -96,6 +107,6 @@ def lines_vjp(
     rig = _rig(lines, window, volume.shape[1:], views.shape[2:], method)
     rows = views.shape[2]
     change = torch.zeros(len(lines), rows, 4, 3, 3, dtype=torch.float64)
-    flat, values = _padded(volume).numpy(), views.contiguous().numpy()
-    _share(lambda first, last: vary_rows(flat, rig, values, change.numpy(), first, last), len(lines) * rows, 4)
+    flat, values, samples = _padded(volume), np.ascontiguousarray(views.numpy()), views.numel() * max(rig.sizes)
+    _share(lambda first, last: vary_rows(flat, rig, values, change.numpy(), first, last), len(lines) * rows, samples, 4)
     return change.sum(dim=1)

@@ -1,5 +1,7 @@
 """The contract of a projector."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -64,7 +66,7 @@ def _check_gradients(name: str, grid: Grid, cameras: Cameras, **options) -> None
     vectors = [getattr(cameras, vector).clone().requires_grad_() for vector in VECTORS]
 
     def project(x: Tensor, *vectors: Tensor) -> Tensor:
-        rig = Cameras(*vectors, cameras.shape, cameras.parallel, cameras.extent)
+        rig = replace(cameras, **dict(zip(VECTORS, vectors, strict=True)))
         return PROJECTORS.build(name, grid=grid, cameras=rig, **options)(x)
 
     torch.autograd.gradcheck(project, (x, *vectors), eps=1e-6, atol=1e-5)

@@ -50,7 +50,8 @@ def restore_threads():
 
 
 @pytest.mark.parametrize("method", ["joseph", "siddon"])
-def test_threads_change_no_bit(method, restore_threads):
+def test_threads_change_no_bit(method, restore_threads, monkeypatch):
+    monkeypatch.setattr("mvrecon.kernels.cpu.LEAST", 1)
     rig = dome(5, 60.0, 20.0, 120.0, {"pixels": [14, 15], "pixel_mm": 0.8})
     A = PROJECTORS.build("drr", grid=GRID, cameras=rig, method=method, backend="cpu")
     x, y = torch.randn(2, 1, *GRID.shape), torch.randn(2, 1, 5, 14, 15)
