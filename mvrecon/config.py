@@ -26,15 +26,29 @@ VERSION_BASE = "1.3"
 
 
 @dataclass
-class Settings:
-    """Every top-level key, so that a mistyped one is an error instead of a silent extra."""
+class Measurement:
+    """The top-level keys that all apps share: what is measured, and by which rig."""
 
     name: str = MISSING
     seed: int = 0
     grid: Any = None
     scene: Any = None
-    test_scene: Any = None
     camera: Any = None
+    plugins: Any = field(default_factory=list)
+
+
+@dataclass
+class Simulation(Measurement):
+    """Every top-level key of `mvrecon-simulate`."""
+
+    cases: list[int] = MISSING
+
+
+@dataclass
+class Settings(Measurement):
+    """Every top-level key of a run, so that a mistyped one is an error instead of a silent extra."""
+
+    test_scene: Any = None
     projector: Any = None
     model: Any = None
     compare: Any = field(default_factory=dict)
@@ -44,7 +58,6 @@ class Settings:
     trainer: Any = None
     callbacks: Any = None
     logger: Any = None
-    plugins: Any = field(default_factory=list)
     resume: str | None = None
     checkpoint: str | None = MISSING
     device: str = "auto"
@@ -72,8 +85,9 @@ def plugin_conf_dirs() -> list[Path]:
 
 
 def prepare_hydra() -> None:
-    """Make the schema and the plugins' config groups known to Hydra, in this process only."""
+    """Make the schemas and the plugins' config groups known to Hydra, in this process only."""
     ConfigStore.instance().store(name="schema", node=Settings)
+    ConfigStore.instance().store(name="simulation_schema", node=Simulation)
     Plugins.instance().register(PluginConf)
 
 

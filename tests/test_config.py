@@ -116,7 +116,7 @@ def test_a_plugin_brings_its_own_choices_even_if_its_code_is_broken(tmp_path: Pa
 
 
 def test_the_help_shows_every_choice_and_setting():
-    for app in ("train", "eval"):
+    for app in ("train", "eval", "simulate"):
         text = help_text(app)
         assert f"mvrecon-{app} [group=choice ...]" in text
         assert all(file.stem in text for file in conf_dir().glob("*/*.yaml"))

@@ -7,6 +7,7 @@ REPORT = f"import atexit, sys; atexit.register(lambda: print('HEAVY', sorted({HE
 COMMANDS = {
     "train --help": "train",
     "eval --help": "eval",
+    "simulate --help": "simulate",
     "list": "listing",
     "list --help": "listing",
     "train --cfg job": "train",
@@ -26,7 +27,8 @@ def test_a_quick_answer_imports_nothing_heavy(run_python, command: str):
 
 
 def test_importing_says_nothing_and_imports_nothing_heavy(run_python):
-    modules = "mvrecon, mvrecon.registry, mvrecon.parts, mvrecon.config, mvrecon.train, mvrecon.eval, mvrecon.listing"
+    names = ("registry", "parts", "config", "train", "eval", "simulate", "listing")
+    modules = ", ".join(["mvrecon", *(f"mvrecon.{name}" for name in names)])
     done = run_python("-W", "error", "-c", f"{REPORT} import {modules}")
     assert done.returncode == 0, done.stderr
     assert done.stdout == "HEAVY []\n"

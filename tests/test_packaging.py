@@ -52,6 +52,7 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
     assert dict(scripts["console_scripts"]) == {
         "mvrecon-train": "mvrecon.train:main",
         "mvrecon-eval": "mvrecon.eval:main",
+        "mvrecon-simulate": "mvrecon.simulate:main",
         "mvrecon-list": "mvrecon.listing:main",
     }
 

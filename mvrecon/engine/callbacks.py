@@ -129,19 +129,19 @@ class BoardReview(L.Callback):
                 logger.log_hyperparams(dict(pl_module.hparams), figures)
 
     def _pictures(self, module: Any, batch: Any, out: Reconstruction, case: int) -> dict[str, Image]:
-        truth, top = batch["volume"][case, 0], module.hparams["data_range"]
+        truth, top, spacing = batch["volume"][case, 0], module.hparams["data_range"], module.projector.grid.spacing
         volumes = {module.hparams["model"]["name"]: out.volume[case, 0]}
         volumes |= {name: v[case, 0] for name, v in self._baselines(module, batch["views"]).items()}
         predicted = module.projector(out.volume[case][None])[0, 0]
         shown = {
-            "planes": montage.planes(truth, volumes, top),
-            "mip": montage.projections(truth, volumes, top),
+            "planes": montage.planes(truth, volumes, top, spacing),
+            "mip": montage.projections(truth, volumes, top, spacing),
             "views": montage.views(batch["views"][case, 0], predicted),
         }
         if out.opinions is not None:
-            shown["opinions"] = montage.opinions(out.opinions[case, :, 0], top)
+            shown["opinions"] = montage.opinions(out.opinions[case, :, 0], top, spacing)
         if out.weights is not None:
-            shown["weights"] = montage.weights(out.weights[case, :, 0])
+            shown["weights"] = montage.weights(out.weights[case, :, 0], spacing)
         return shown
 
     def _baselines(self, module: Any, views: Tensor) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""A reconstructed case as files: volumes as NIfTI, views and planes as images."""
+"""A case as files: volumes as NIfTI, views and planes as images, measured views as HDF5."""
 
 import re
 from collections.abc import Mapping
@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import h5py
 from jaxtyping import Float
 from torch import Tensor
 
@@ -22,14 +23,36 @@ def save_case(
 
     Returns the scene's own folder in `folder`.
     """
-    case = folder / re.sub(r"[^\w.-]+", "_", scene["name"][0])
+    case = folder / _file_name(scene["name"][0])
     truth = scene["volume"][0, 0]
     shown = {label: volume[0, 0] for label, volume in volumes.items()}
     save_png(case / "views.png", montage.gallery(scene["views"][0, 0]))
-    save_png(case / "planes.png", montage.planes(truth, shown, data_range))
+    save_png(case / "planes.png", montage.planes(truth, shown, data_range, grid.spacing))
     if find_spec("nibabel"):
         for label, volume in {"truth": truth, **shown}.items():
             save_nifti(case / f"{label}.nii.gz", volume, grid)
+    return case
+
+
+def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str) -> Path:
+    """Write the views of one case: `view_<camera>.png` as radiographs, black at 0, and the numbers as `views.h5`.
+
+    `views.h5` holds `views` [m v u], float32, with the attributes `axes` and `unit`, and the case's `name`.
+
+    Args:
+        folder: of all cases.
+        name: of the case, and of its own folder in `folder`, which is returned.
+        views: line integrals.
+        unit: of the line integrals.
+    """
+    case = folder / _file_name(name)
+    for m, image in enumerate(montage.radiographs(views)):
+        save_png(case / f"view_{m:03d}.png", image)
+    with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
+        file.attrs["name"] = name
+        values = views.detach().cpu().float().numpy()
+        dataset = file.create_dataset("views", data=values, compression="gzip", shuffle=True)
+        dataset.attrs.update(axes="camera, v, u", unit=unit)
     return case
 
 
@@ -47,3 +70,7 @@ def save_nifti(path: Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
 
     values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
     nibabel.save(nibabel.Nifti1Image(values, grid.affine.numpy()), path)
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", name)

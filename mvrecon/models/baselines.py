@@ -27,7 +27,7 @@ class MeanFusion(CrossView):
         projector: Projector,
         head: Mapping[str, Any],
         opinion: Mapping[str, Any] | None = None,
-        start: int = 10,
+        start: int = 12,
         consistency: int = 3,
     ):
         super().__init__(projector, head, opinion, fusion="mean", refine=0, start=start, consistency=consistency)
@@ -43,7 +43,7 @@ class BackprojectionUNet(nn.Module):
         consistency: learned gradient steps towards the data at the end.
     """
 
-    def __init__(self, projector: Projector, width: int = 18, start: int = 10, consistency: int = 3):
+    def __init__(self, projector: Projector, width: int = 18, start: int = 12, consistency: int = 3):
         super().__init__()
         self.projector = projector
         self.iterations = start

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.projectors.base import Projector
-from mvrecon.reconstruct.iterative import sirt, sirt_weights
+from mvrecon.reconstruct.iterative import correction, sirt, sirt_weights
 
 
 class Consistency(nn.Module):
@@ -31,9 +31,9 @@ class Consistency(nn.Module):
         self.lengths = nn.Parameter(torch.ones(steps))
 
     def start(self, views: Float[Tensor, "b 1 m v u"], iterations: int) -> Float[Tensor, "b 1 d h w"]:
-        """The classical start: SIRT from zero, non-negative, not differentiated."""
+        """The classical start: SIRT with momentum from zero, non-negative, not differentiated."""
         with torch.no_grad():
-            return sirt(self.projector, views, iterations, weights=(self.row, self.column))
+            return sirt(self.projector, views, iterations, weights=(self.row, self.column), momentum=True)
 
     def residual(
         self, volume: Float[Tensor, "b c d h w"], views: Float[Tensor, "b c m v u"]
@@ -43,7 +43,7 @@ class Consistency(nn.Module):
 
     def back(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """Residual views as a correction of the volume, C A^T R r."""
-        return self.column * self.projector.T(self.row * residual)
+        return correction(self.projector, residual, (self.row, self.column))
 
     def forward(
         self, volume: Float[Tensor, "b 1 d h w"], views: Float[Tensor, "b 1 m v u"]

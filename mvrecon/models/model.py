@@ -44,7 +44,7 @@ class CrossView(nn.Module):
         opinion: Mapping[str, Any] | None = None,
         fusion: Literal["weighted", "mean"] = "weighted",
         refine: int = 16,
-        start: int = 10,
+        start: int = 12,
         consistency: int = 3,
     ):
         super().__init__()
@@ -87,7 +87,8 @@ class CrossView(nn.Module):
     def _compare(self, opinions: Tensor, x0: Tensor, y: Tensor, cross_views: Tensor) -> Float[Tensor, "b m 5 d h w"]:
         """What the weighting sees: own opinion, pooled mean and spread, own disagreement with the views, the start."""
         mean, variance = pooled(opinions, self.opinions.fine.visible)
-        wrong = self.consistency.back((y - cross_views).flatten(0, 1)[:, None]).reshape(opinions.shape)
+        with torch.no_grad():  # a hint for the weights; its gradient costs more than it teaches
+            wrong = self.consistency.back((y - cross_views).flatten(0, 1)[:, None]).reshape(opinions.shape)
         shared = torch.cat([mean, _root(variance), x0[:, None]], dim=2).expand(-1, opinions.shape[1], -1, -1, -1, -1)
         return torch.cat([opinions, wrong, shared], dim=2)
 

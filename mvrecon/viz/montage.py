@@ -7,19 +7,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.viz.planes import Image, brightest, grey, middle_planes, signed
+from mvrecon.viz.planes import CUBES, Image, Spacing, brightest, grey, middle_planes, signed
 
 GAP = 2
 LABEL = 14
 CAPTION = 60
-EDGE = 96
+EDGE = 128
 PLANES = ("across z", "across y", "across x")
 
 
-def enlarged(image: Image, edge: int = EDGE) -> Image:
-    """The image with each pixel repeated so often that its longer edge just stays within `edge` (at least once)."""
-    factor = max(1, edge // max(image.shape[:2]))
-    return image.repeat(factor, axis=0).repeat(factor, axis=1)
+def enlarged(images: Sequence[Image], edge: int = EDGE) -> list[Image]:
+    """Images at one scale, each pixel repeated so often that their longest edge stays within `edge` (at least once)."""
+    factor = max(1, edge // max(max(image.shape[:2]) for image in images))
+    return [image.repeat(factor, axis=0).repeat(factor, axis=1) for image in images]
 
 
 def labelled(image: Image, text: str) -> Image:
@@ -53,24 +53,33 @@ def tiled(rows: Sequence[Sequence[Image]]) -> Image:
     return canvas
 
 
-def planes(truth: Float[Tensor, "d h w"], volumes: Mapping[str, Float[Tensor, "d h w"]], data_range: float) -> Image:
+def planes(
+    truth: Float[Tensor, "d h w"],
+    volumes: Mapping[str, Float[Tensor, "d h w"]],
+    data_range: float,
+    spacing: Spacing = CUBES,
+) -> Image:
     """Three middle planes (rows) of the truth, of every volume, and of the first volume's error (columns).
 
-    Values from 0 to data_range; the error from -data_range / 2 (blue) to data_range / 2 (red).
+    Values from 0 to data_range; the error from -data_range / 2 (blue) to data_range / 2 (red). To scale: `spacing` is
+    the voxel size along (x, y, z), mm.
     """
     error = next(iter(volumes.values())) - truth
     shown = {"truth": truth, **volumes}
-    columns = {name: [grey(p, (0, data_range)) for p in middle_planes(v)] for name, v in shown.items()}
-    columns["error"] = [signed(p, data_range / 2) for p in middle_planes(error)]
+    columns = {name: [grey(p, (0, data_range)) for p in middle_planes(v, spacing)] for name, v in shown.items()}
+    columns["error"] = [signed(p, data_range / 2) for p in middle_planes(error, spacing)]
     return _captioned(columns, PLANES)
 
 
 def projections(
-    truth: Float[Tensor, "d h w"], volumes: Mapping[str, Float[Tensor, "d h w"]], data_range: float
+    truth: Float[Tensor, "d h w"],
+    volumes: Mapping[str, Float[Tensor, "d h w"]],
+    data_range: float,
+    spacing: Spacing = CUBES,
 ) -> Image:
-    """Maximum-intensity projections along three axes (rows) of the truth and of every volume (columns)."""
+    """Maximum-intensity projections along three axes (rows) of the truth and of every volume (columns), to scale."""
     shown = {"truth": truth, **volumes}
-    columns = {name: [grey(p, (0, data_range)) for p in brightest(v)] for name, v in shown.items()}
+    columns = {name: [grey(p, (0, data_range)) for p in brightest(v, spacing)] for name, v in shown.items()}
     return _captioned(columns, ("along z", "along y", "along x"))
 
 
@@ -87,35 +96,41 @@ def views(measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"]) -
     return _captioned(columns, ("measured", "predicted", "difference"))
 
 
+def radiographs(each: Float[Tensor, "m v u"]) -> list[Image]:
+    """The views of all cameras as they are, bright where a ray met much; values from 0 to the greatest of all."""
+    top = max(each.amax().item(), torch.finfo(torch.float32).tiny)
+    return [grey(view, (0, top)) for view in each]
+
+
 def gallery(each: Float[Tensor, "m v u"], edge: int = 256) -> Image:
     """The views of all cameras in rows of at most four; values from 0 to the greatest."""
-    top = max(each.amax().item(), torch.finfo(torch.float32).tiny)
-    images = [labelled(enlarged(grey(view, (0, top)), edge), f"camera {m}") for m, view in enumerate(each)]
+    images = [labelled(image, f"camera {m}") for m, image in enumerate(enlarged(radiographs(each), edge))]
     images += [np.zeros_like(images[0])] * (-len(images) % min(4, len(images)))
     return tiled([images[i : i + 4] for i in range(0, len(images), 4)])
 
 
-def opinions(each: Float[Tensor, "m d h w"], data_range: float) -> Image:
-    """Three middle planes (rows) of every camera's own volume (columns); values from 0 to data_range."""
-    return _per_camera(each, data_range)
+def opinions(each: Float[Tensor, "m d h w"], data_range: float, spacing: Spacing = CUBES) -> Image:
+    """Three middle planes (rows) of every camera's own volume (columns), to scale; values from 0 to data_range."""
+    return _per_camera(each, data_range, spacing)
 
 
-def weights(each: Float[Tensor, "m d h w"]) -> Image:
-    """Three middle planes (rows) of every camera's weight (columns).
+def weights(each: Float[Tensor, "m d h w"], spacing: Spacing = CUBES) -> Image:
+    """Three middle planes (rows) of every camera's weight (columns), to scale.
 
     Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
     """
-    return _per_camera(each, 3 / len(each))
+    return _per_camera(each, 3 / len(each), spacing)
 
 
-def _per_camera(each: Float[Tensor, "m d h w"], top: float) -> Image:
-    columns = {f"camera {m}": [grey(p, (0, top)) for p in middle_planes(v)] for m, v in enumerate(each)}
+def _per_camera(each: Float[Tensor, "m d h w"], top: float, spacing: Spacing) -> Image:
+    columns = {f"camera {m}": [grey(p, (0, top)) for p in middle_planes(v, spacing)] for m, v in enumerate(each)}
     return _captioned(columns, PLANES)
 
 
 def _captioned(columns: Mapping[str, Sequence[Image]], rows: Sequence[str]) -> Image:
-    """Columns of images with their names above and the rows' names on the left."""
-    large = {name: [enlarged(image) for image in images] for name, images in columns.items()}
+    """Columns of images with their names above and the rows' names on the left, all at one scale."""
+    each = iter(enlarged([image for images in columns.values() for image in images]))
+    large = {name: [next(each) for _ in images] for name, images in columns.items()}
     names = [np.zeros((next(iter(large.values()))[r].shape[0] - LABEL, CAPTION, 3), np.uint8) for r in range(len(rows))]
     left = [labelled(blank, row) for blank, row in zip(names, rows, strict=True)]
     left[0] = labelled(left[0], "")

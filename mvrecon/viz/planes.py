@@ -3,25 +3,48 @@
 Convention: an image's rows run downwards; planes that hold the z axis are shown with +z up.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 Image = UInt8[np.ndarray, "h w 3"]
 Window = tuple[float, float]
+Spacing = tuple[float, float, float]
+CUBES: Spacing = (1.0, 1.0, 1.0)
 
 
-def middle_planes(volume: Float[Tensor, "d h w"]) -> list[Float[Tensor, "r c"]]:
-    """The three planes through the volume's centre: across z, across y, across x."""
+def middle_planes(volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES) -> list[Float[Tensor, "r c"]]:
+    """The three planes through the volume's centre, to scale: across z, across y, across x.
+
+    Args:
+        volume: the values.
+        spacing: voxel size along (x, y, z), mm; the pixels are squares of the smallest.
+    """
     d, h, w = (n // 2 for n in volume.shape)
-    return [volume[d], volume[:, h].flip(0), volume[:, :, w].flip(0)]
+    return _to_scale([volume[d], volume[:, h], volume[:, :, w]], spacing)
 
 
-def brightest(volume: Float[Tensor, "d h w"]) -> list[Float[Tensor, "r c"]]:
-    """Maximum-intensity projections along z, y and x."""
-    along_z, along_y, along_x = (volume.amax(dim=axis) for axis in range(3))
-    return [along_z, along_y.flip(0), along_x.flip(0)]
+def brightest(volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES) -> list[Float[Tensor, "r c"]]:
+    """Maximum-intensity projections along z, y and x, to scale; arguments as for `middle_planes`."""
+    return _to_scale([volume.amax(dim=axis) for axis in range(3)], spacing)
+
+
+def _to_scale(planes: Sequence[Float[Tensor, "r c"]], spacing: Spacing) -> list[Float[Tensor, "r c"]]:
+    """Images of planes across z, y and x: square pixels, interpolated where voxels are longer, and +z up."""
+    x, y, z = (step / min(spacing) for step in spacing)
+    across_z, across_y, across_x = map(_stretched, planes, ((y, x), (z, x), (z, y)))
+    return [across_z, across_y.flip(0), across_x.flip(0)]
+
+
+def _stretched(plane: Float[Tensor, "h w"], factors: tuple[float, float]) -> Float[Tensor, "r c"]:
+    shape = [round(n * factor) for n, factor in zip(plane.shape, factors, strict=True)]
+    if shape == list(plane.shape):
+        return plane  # as it is: interpolation would spread values that are not finite
+    return F.interpolate(plane[None, None], shape, mode="bilinear", align_corners=False)[0, 0]
 
 
 def grey(image: Float[Tensor, "h w"], window: Window) -> Image:

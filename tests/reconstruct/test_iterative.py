@@ -30,6 +30,14 @@ def test_every_iteration_lowers_the_weighted_residual(A):
         assert (later < earlier).all()
 
 
+def test_momentum_does_the_work_of_many_more_iterations(A):
+    torch.manual_seed(0)
+    y = A(torch.rand(1, 1, *GRID.shape))
+    R, _ = sirt_weights(A)
+    fast, slow = sirt(A, y, 12, momentum=True), sirt(A, y, 24)
+    assert weighted(A, fast, y, R) < weighted(A, slow, y, R)
+
+
 def test_it_recovers_a_volume_that_the_views_determine(A):
     torch.manual_seed(1)
     truth = torch.rand(1, 1, *GRID.shape)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mvrecon.viz import montage
-from mvrecon.viz.montage import CAPTION, GAP, LABEL
+from mvrecon.viz.montage import CAPTION, EDGE, GAP, LABEL
 
 LEFT = CAPTION + GAP
 
@@ -26,11 +26,12 @@ def test_ragged_rows_are_refused():
         montage.tiled([[flat(1), flat(2)], [flat(3)]])
 
 
-def test_enlarging_repeats_pixels_and_never_shrinks():
+def test_enlarging_repeats_pixels_equally_in_all_images_and_never_shrinks():
     image = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
-    assert montage.enlarged(image, 7).shape == (6, 6, 3)
-    assert (montage.enlarged(image, 7)[::3, ::3] == image).all()
-    assert montage.enlarged(image, 1).shape == image.shape
+    large, other = montage.enlarged([image, image[:, :1]], 7)
+    assert large.shape == (6, 6, 3) and other.shape == (6, 3, 3)
+    assert (large[::3, ::3] == image).all()
+    assert montage.enlarged([image], 1)[0].shape == image.shape
 
 
 def test_a_label_writes_above_the_image_only():
@@ -65,8 +66,16 @@ def test_equal_weights_are_one_third_grey_for_any_number_of_cameras():
 
 def test_opinions_and_projections_have_a_column_each():
     volumes = torch.rand(5, 8, 8, 8)
-    assert montage.opinions(volumes, 1.0).shape[1] == LEFT + 5 * 96 + 4 * GAP
-    assert montage.projections(volumes[0], {"ours": volumes[1]}, 1.0).shape[1] == LEFT + 2 * 96 + GAP
+    assert montage.opinions(volumes, 1.0).shape[1] == LEFT + 5 * EDGE + 4 * GAP
+    assert montage.projections(volumes[0], {"ours": volumes[1]}, 1.0).shape[1] == LEFT + 2 * EDGE + GAP
+
+
+def test_all_planes_have_one_scale():
+    volume, spacing = torch.rand(16, 24, 32), (2.0, 1.0, 4.0)  # a box of 64 x 24 x 64 mm
+    heights, width = (48, 128, 128), 128
+    expected = (LABEL + sum(heights) + 2 * GAP, LEFT + 2 * width + GAP, 3)
+    assert montage.projections(volume, {"ours": volume}, 1.0, spacing).shape == expected
+    assert montage.weights(volume[None].repeat(2, 1, 1, 1), spacing).shape == expected
 
 
 def test_a_gallery_has_rows_of_four_in_order():

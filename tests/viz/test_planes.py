@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.viz.planes import brightest, grey, middle_planes, signed
 
 
@@ -27,6 +28,25 @@ def test_projections_see_points_off_the_middle():
     assert along_z.nonzero().tolist() == [[1, 2]]
     assert along_y.nonzero().tolist() == [[5, 2]]
     assert along_x.nonzero().tolist() == [[5, 1]]
+
+
+@pytest.mark.parametrize("draw", [middle_planes, brightest])
+def test_a_sphere_is_round_on_any_grid(draw):
+    grid = Grid.centred((32, 33, 20), (16.0, 10.0, 12.0))
+    distance = voxel_centres(grid, torch.float32).norm(dim=-1)
+    images = draw((120 - distance) / 120, grid.spacing)  # positive within 120 mm
+    assert [list(image.shape) for image in images] == [[33, 32], [38, 32], [38, 33]]
+    for image in images:
+        inside = image > 0.25  # within 90 mm: 18 pixels of 10 mm
+        rows, columns = inside.any(dim=1).sum().item(), inside.any(dim=0).sum().item()
+        assert rows == pytest.approx(18, abs=1) and abs(rows - columns) <= 1
+
+
+def test_equal_spacing_shows_voxels_as_they_are():
+    volume = torch.rand(6, 8, 10)
+    volume[3, 4, 5] = torch.nan
+    for plain, scaled in zip(middle_planes(volume), middle_planes(volume, (4.0, 4.0, 4.0)), strict=True):
+        assert plain.isnan().sum() == 1 and torch.equal(plain.nan_to_num(), scaled.nan_to_num())
 
 
 def test_grey_maps_the_window_to_black_and_white():

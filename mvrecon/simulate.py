@@ -1,0 +1,57 @@
+"""`mvrecon-simulate`: the views of a scene's cases as a rig measures them, as images and as numbers."""
+
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from mvrecon.config import import_plugins, launch, to_plain
+
+
+def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
+    """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
+
+    The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`, for `camera=from_file`.
+    A view is a line integral: its unit is the scene's times mm.
+    """
+    import_plugins(settings["plugins"])
+    from rich.console import Console
+    from rich.progress import track
+
+    from mvrecon.cameras import files
+    from mvrecon.data.dataset import SceneDataset
+    from mvrecon.engine import export, record
+    from mvrecon.geometry.grid import Grid
+    from mvrecon.parts import CAMERAS, SCENES
+
+    grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
+    scene = SCENES.from_config(settings["scene"])
+    cases = SceneDataset(scene, grid, cameras, settings["cases"], settings["seed"], cache=False)
+    record.start(folder, settings)
+    files.save(cameras, folder / "cameras.json")
+    saved = []
+    for item in track(range(len(cases)), "Simulating", transient=True, console=Console(stderr=True)):
+        case = cases[item]
+        saved.append(export.save_views(folder / "cases", case["name"], case["views"][0], f"{scene.unit} * mm"))
+    return saved
+
+
+def task(config: DictConfig) -> None:
+    """One run of the app."""
+    from rich.console import Console
+
+    from mvrecon.engine.record import anchored
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    saved = simulate(anchored(to_plain(config)), folder)
+    Console(markup=False, highlight=False).print(f"{len(saved)} case(s) kept in {folder}", soft_wrap=True)
+
+
+def main() -> None:
+    """Entry point of `mvrecon-simulate`."""
+    launch(task, "simulate")
+
+
+if __name__ == "__main__":
+    main()

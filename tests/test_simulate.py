@@ -1,0 +1,107 @@
+"""`mvrecon-simulate` as a user calls it: what it writes is what the scene measures."""
+
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image as Pillow
+
+import mvrecon.simulate
+from mvrecon.cameras.camera import VECTORS
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, SCENES
+
+GRID = ("grid.shape=[16,16,16]", "grid.spacing=8")
+PARALLEL = ("camera=parallel", "camera.views=3", "camera.detector.pixels=[40,44]", "camera.detector.pixel_mm=3.2")
+
+
+def call(folder, *options):
+    """Run the app with a command line; the settings that it wrote down."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(sys, "argv", ["mvrecon-simulate", *options, f"hydra.run.dir={folder}", "hydra/job_logging=none"])
+    try:
+        mvrecon.simulate.main()
+    finally:
+        patch.undo()
+    return yaml.safe_load((folder / "config.yaml").read_text())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "simulate"
+    return folder, call(folder, *GRID, *PARALLEL, "seed=7", "cases=[4,1]")
+
+
+def views(folder):
+    """By case: the views, their attributes, and their images."""
+    found = {}
+    for case in sorted((folder / "cases").iterdir()):
+        with h5py.File(case / "views.h5") as file:
+            numbers, attributes, name = file["views"][:], dict(file["views"].attrs), file.attrs["name"]
+        found[name] = numbers, attributes, [np.asarray(Pillow.open(p)) for p in sorted(case.glob("*.png"))]
+    return found
+
+
+def test_the_folder_holds_cases_rig_settings_and_versions(run):
+    folder, settings = run
+    assert {"cases", "cameras.json", "config.yaml", "versions.txt"} <= {p.name for p in folder.iterdir()}
+    assert set(settings) == {"name", "seed", "grid", "scene", "camera", "cases", "plugins"}
+    for case in (folder / "cases").iterdir():
+        assert sorted(p.name for p in case.iterdir()) == [*(f"view_00{m}.png" for m in range(3)), "views.h5"]
+
+
+def test_the_numbers_are_the_scene_s_own_with_their_unit(run):
+    folder, settings = run
+    grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
+    scene = SCENES.from_config(settings["scene"])
+    found = views(folder)
+    for index in (4, 1):
+        sample = scene.sample(index, 7, grid, cameras)
+        numbers, attributes, _ = found.pop(sample.name)
+        assert numbers.dtype == np.float32 and np.array_equal(numbers, sample.views[0].numpy())
+        assert attributes == {"axes": "camera, v, u", "unit": "1/mm * mm"}
+    assert not found
+
+
+def test_every_parallel_view_holds_the_whole_mass(run):
+    for numbers, _, _ in views(run[0]).values():
+        mass = numbers.sum(axis=(1, 2)) * 3.2**2
+        assert mass == pytest.approx(np.full(3, mass.mean()), rel=0.02) and mass.mean() > 1e3
+
+
+def test_images_are_bright_where_much_was_met(run):
+    for numbers, _, images in views(run[0]).values():
+        assert all(image.dtype == np.uint8 and image.shape == (40, 44, 3) for image in images)
+        levels = np.stack(images)[..., 0]
+        assert np.abs(levels - 255 * numbers / numbers.max()).max() <= 0.5 + 1e-3
+        assert levels.max() == 255 and (levels[numbers == 0] == 0).all() and (numbers == 0).any()
+
+
+def test_the_rig_comes_back_and_measures_the_same(run, tmp_path):
+    folder, settings = run
+    rig, again = folder / "cameras.json", tmp_path / "again"
+    cameras, read = CAMERAS.from_config(settings["camera"]), CAMERAS.build("from_file", path=str(rig))
+    assert all(torch.equal(getattr(cameras, name), getattr(read, name)) for name in VECTORS)
+    call(again, *GRID, "camera=from_file", f"camera.path={rig}", "seed=7", "cases=[1]")
+    (name,) = views(again)
+    assert np.array_equal(views(again)[name][0], views(folder)[name][0])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["scene=nifti", "scene.path=nowhere.nii"], "nowhere.nii: no such file"),
+        (["cases=[-1]"], "at least 0, got seed 0, index -1"),
+        (["cases=3"], "cases"),
+        (["model=sirt"], "model"),
+        (["scene.unti=1"], "unti"),
+    ],
+)
+def test_what_goes_wrong_is_said_and_the_exit_is_not_zero(options, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        call(tmp_path, *GRID, *PARALLEL, *options)
+    assert stopped.value.code != 0
+    assert message in capsys.readouterr().err
