@@ -51,10 +51,7 @@ class BackprojectionUNet(nn.Module):
         self.consistency = Consistency(projector, consistency)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        check_views(views, self.projector.cameras)
-        start = self.consistency.start(views, self.iterations)
-        scale = content_scale(start)
-        y, x0 = views / scale, start / scale
+        y, x0, scale = self.consistency.normalised(views, self.iterations)
         seen = torch.cat([x0, self.consistency.back(y), self.consistency.residual(x0, y)], dim=1)
         return Reconstruction(volume=self.consistency(x0 + self.net(seen), y) * scale)
 

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.base import Projector, check_views
 from mvrecon.reconstruct.iterative import correction, sirt, sirt_weights
 
 
@@ -34,6 +34,19 @@ class Consistency(nn.Module):
         """The classical start: SIRT with momentum from zero, non-negative, not differentiated."""
         with torch.no_grad():
             return sirt(self.projector, views, iterations, weights=(self.row, self.column), momentum=True)
+
+    def normalised(
+        self, views: Float[Tensor, "b 1 m v u"], iterations: int
+    ) -> tuple[Float[Tensor, "b 1 m v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
+        """Checked views and their classical start, both divided by the content's scale, and that scale.
+
+        Raises:
+            ValueError: views whose shape, device or values do not fit.
+        """
+        check_views(views, self.projector.cameras)
+        start = self.start(views, iterations)
+        scale = content_scale(start)
+        return views / scale, start / scale, scale
 
     def residual(
         self, volume: Float[Tensor, "b c d h w"], views: Float[Tensor, "b c m v u"]

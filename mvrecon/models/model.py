@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, content_scale
+from mvrecon.models.consistency import Consistency
 from mvrecon.models.cross_view import pooled
 from mvrecon.models.opinion import Opinions
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.unet3d import UNet3d
 from mvrecon.models.weighting import Weighting, fuse
-from mvrecon.projectors.base import Projector, check_views
+from mvrecon.projectors.base import Projector
 
 
 class CrossView(nn.Module):
@@ -58,10 +58,7 @@ class CrossView(nn.Module):
         self.consistency = Consistency(projector, consistency)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        check_views(views, self.projector.cameras)
-        start = self.consistency.start(views, self.iterations)
-        scale = content_scale(start)
-        y, x0 = views / scale, start / scale
+        y, x0, scale = self.consistency.normalised(views, self.iterations)
         opinions, features = self.opinions(y, x0, y - self.projector(x0))
         visible = self.opinions.fine.visible
         cross_views = self.cross(opinions)
