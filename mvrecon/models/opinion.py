@@ -77,7 +77,9 @@ class Opinions(nn.Module):
         answer = self._listen(views, start, residual)  # [b m 1+f D v u], coarse
         logits = nn.functional.interpolate(answer[:, :, :1].flatten(0, 1), size=self.fine.shape, mode="trilinear")
         density = self.head(logits.unflatten(0, answer.shape[:2]), prior, views, self.fine)
-        return self.fine.to_world(density), self.coarse.to_world(answer[:, :, 1:])
+        # The change is carried to the world, not the density: what the start holds already is not blurred by two warps.
+        change = self.fine.to_world(density - prior * self.fine.occupied)
+        return start[:, None] + change, self.coarse.to_world(answer[:, :, 1:])
 
     def _listen(self, views: Tensor, start: Tensor, residual: Tensor) -> Float[Tensor, "b m f D v u"]:
         b, _, m = views.shape[:3]

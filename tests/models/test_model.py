@@ -84,6 +84,22 @@ def test_opinions_reproduce_their_own_views():
     assert _close(opinions.fine.integrate(seen[0]), views * sees, 1e-5)
 
 
+class _Unmoved(torch.nn.Module):
+    """A head that has nothing to add to the prior."""
+
+    def forward(self, logits, prior, views, frusta):
+        return prior * frusta.occupied
+
+
+def test_what_the_cameras_do_not_change_is_not_blurred_by_their_warps():
+    projector = small_projector()
+    opinions = _build("cross_view", projector).opinions
+    opinions.head = _Unmoved()
+    volume, views = _blob_views(projector)
+    said, _ = opinions(views, volume, torch.zeros_like(views))
+    assert torch.equal(said, volume[:, None].expand_as(said))
+
+
 def test_permuting_the_cameras_changes_nothing():
     grid, cameras = small_rig()
     order = [2, 0, 3, 1]
