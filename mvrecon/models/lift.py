@@ -5,7 +5,7 @@ divides by the step conserves every ray's integral exactly. A warp is one trilin
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
@@ -81,8 +81,3 @@ def _warp(volumes: Float[Tensor, "b m c *s"], points: Float[Tensor, "m d h w 3"]
     b, m = volumes.shape[:2]
     warped = sample(volumes.flatten(0, 1), points.expand(b, *points.shape).flatten(0, 1))
     return warped.unflatten(0, (b, m))
-
-
-def coarse_visible(visible: Bool[Tensor, "m 1 d h w"], shape: tuple[int, int, int]) -> Bool[Tensor, "m 1 d h w"]:
-    """Visibility on a coarser grid: a coarse voxel counts as seen when any of its voxels is."""
-    return nn.functional.adaptive_max_pool3d(visible.float(), shape) > 0
