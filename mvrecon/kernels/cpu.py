@@ -6,10 +6,7 @@ Threads run loops that hold no lock of the interpreter; numba's own `parallel=Tr
 """
 
 import math
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -18,29 +15,12 @@ from torch import Tensor
 
 from mvrecon.kernels.loops import Rig, backproject_slabs, project_rows, vary_rows
 from mvrecon.kernels.rays import JOSEPH, SIDDON
+from mvrecon.kernels.threads import share
 
 METHODS = {"joseph": JOSEPH, "siddon": SIDDON}
 #: Voxels of nothing before and behind the volume along every axis.
 PAD = (1, 2)
 INNER = (slice(None), *[slice(PAD[0], -PAD[1])] * 3)
-#: Steps along rays that are worth a thread of their own.
-LEAST = 2**18
-
-
-@cache
-def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix=f"mvrecon-{process}")
-
-
-def _share(work: Callable[[int, int], None], count: int, samples: int, per_thread: int = 1) -> None:
-    """Do work(first, last) for ranges that cover `count` items, on the threads that torch has and `samples` deserve."""
-    threads = torch.get_num_threads()
-    parts = min(count, threads * per_thread, 1 + samples // LEAST) if threads > 1 else 1
-    if parts <= 1:
-        return work(0, count)
-    ranges = [(count * i // parts, count * (i + 1) // parts) for i in range(parts)]
-    for done in [_pool(threads, os.getpid()).submit(work, *each) for each in ranges]:
-        done.result()
 
 
 def _empty(count: int, shape: Sequence[int], like: Tensor) -> np.ndarray:
@@ -75,7 +55,7 @@ def project(
     rig = _rig(lines, window, volume.shape[1:], detector, method)
     views = volume.new_empty(len(volume), len(lines), *detector)
     flat, rows, samples = _padded(volume), len(lines) * detector[0], views.numel() * max(rig.sizes)
-    _share(lambda first, last: project_rows(flat, rig, views.numpy(), first, last), rows, samples, 4)
+    share(lambda first, last: project_rows(flat, rig, views.numpy(), first, last), rows, samples, 4)
     return views
 
 
@@ -92,7 +72,7 @@ def backproject(
     flat = padded.reshape(len(padded), math.prod(padded.shape[1:]))
     samples = views.numel() * max(rig.sizes)
     for axis, size in enumerate(rig.sizes):
-        _share(lambda low, high, axis=axis: backproject_slabs(flat, rig, values, axis, low, high), size, samples)
+        share(lambda low, high, axis=axis: backproject_slabs(flat, rig, values, axis, low, high), size, samples)
     return torch.from_numpy(np.ascontiguousarray(padded[INNER]))
 
 
@@ -108,5 +88,5 @@ def lines_vjp(
     rows = views.shape[2]
     change = torch.zeros(len(lines), rows, 4, 3, 3, dtype=torch.float64)
     flat, values, samples = _padded(volume), np.ascontiguousarray(views.numpy()), views.numel() * max(rig.sizes)
-    _share(lambda first, last: vary_rows(flat, rig, values, change.numpy(), first, last), len(lines) * rows, samples, 4)
+    share(lambda first, last: vary_rows(flat, rig, values, change.numpy(), first, last), len(lines) * rows, samples, 4)
     return change.sum(dim=1)

@@ -8,7 +8,7 @@ read it. The volume is padded and flat; `steps` are the flat steps towards b and
 
 import numpy as np
 
-from mvrecon.kernels.rays import scalar
+from mvrecon.kernels.compiling import scalar
 
 
 @scalar

@@ -4,37 +4,12 @@ Compiled at the first call for a type of number, and kept on disk.
 """
 
 from collections import namedtuple
-from collections.abc import Callable
-from hashlib import sha256
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numba import njit
 
 from mvrecon.kernels import joseph, siddon
-from mvrecon.kernels.rays import FASTMATH, JOSEPH, at, main_axis, scalar, trace, within
-
-
-def digest(folder: Path) -> str:
-    """What the Python files of a folder hold, in short."""
-    return sha256(b"".join(file.read_bytes() for file in sorted(folder.glob("*.py")))).hexdigest()
-
-
-SOURCES = digest(Path(__file__).parent)
-
-
-def compiled(loop: Callable[..., Any]) -> Any:
-    """The loop in machine code; threads may run it side by side."""
-    options: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "error_model": "numpy"}
-    try:
-        dispatcher: Any = njit(cache=True, **options)(loop)
-    except RuntimeError:  # numba finds no folder to write to
-        return njit(**options)(loop)
-    # numba's own stamp sees edits of this file only, not of the functions that the loops call
-    dispatcher._cache._cache_file._source_stamp = SOURCES
-    return dispatcher
-
+from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon.kernels.rays import JOSEPH, at, main_axis, trace, within
 
 #: lines [m 4 3 3], window (w0, w1), sizes (x, y, z), flat strides (x, y, z) of the padded volume, detector, method.
 Rig = namedtuple("Rig", ["lines", "window", "sizes", "strides", "detector", "method"])

@@ -8,16 +8,10 @@ Everything is scalar and knows no CPU, so that a GPU back end can compile the sa
 from collections import namedtuple
 from math import ceil, floor, sqrt
 
-from numba import njit
-
+from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.lines import TIE
 
 JOSEPH, SIDDON = 0, 1
-#: What may be reordered: sums and products, but NaN and infinity keep their meaning.
-FASTMATH = {"reassoc", "contract", "nsz"}
-
-scalar = njit(fastmath=FASTMATH, error_model="numpy")
-
 #: One ray: main axis; transverse padded coordinates at the centre slab and their slopes; mm per slab; where it begins
 #: and ends (slab coordinate about the centre); first slab and the one behind the last; the centre's slab coordinate.
 Ray = namedtuple("Ray", ["axis", "b", "slope_b", "c", "slope_c", "length", "begin", "end", "first", "last", "centre"])

@@ -9,7 +9,7 @@ The volume is padded and flat; `steps` are the flat steps towards b and c.
 
 import numpy as np
 
-from mvrecon.kernels.rays import scalar
+from mvrecon.kernels.compiling import scalar
 
 
 @scalar

@@ -1,0 +1,34 @@
+"""How functions become machine code: at the first call for a type of number, and kept on disk for the next process."""
+
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from numba import njit
+
+#: What may be reordered: sums and products, but NaN and infinity keep their meaning.
+FASTMATH = {"reassoc", "contract", "nsz"}
+
+#: A function of scalars, compiled into whatever calls it.
+scalar = njit(fastmath=FASTMATH, error_model="numpy")
+
+
+def digest(folder: Path) -> str:
+    """What the Python files of a folder hold, in short."""
+    return sha256(b"".join(file.read_bytes() for file in sorted(folder.glob("*.py")))).hexdigest()
+
+
+SOURCES = digest(Path(__file__).parent)
+
+
+def compiled(loop: Callable[..., Any]) -> Any:
+    """The loop in machine code; threads may run it side by side."""
+    options: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "error_model": "numpy"}
+    try:
+        dispatcher: Any = njit(cache=True, **options)(loop)
+    except RuntimeError:  # numba finds no folder to write to
+        return njit(**options)(loop)
+    # numba's own stamp sees edits of this file only, not of the functions that the loops call
+    dispatcher._cache._cache_file._source_stamp = SOURCES
+    return dispatcher
