@@ -53,6 +53,7 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
         "mvrecon-train": "mvrecon.train:main",
         "mvrecon-eval": "mvrecon.eval:main",
         "mvrecon-simulate": "mvrecon.simulate:main",
+        "mvrecon-bench": "mvrecon.bench:main",
         "mvrecon-list": "mvrecon.listing:main",
     }
 

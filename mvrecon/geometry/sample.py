@@ -28,5 +28,5 @@ def sample(volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"
 
 
 def inside(points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-    """Which normalised points lie in the box of the volume."""
-    return (points.abs() <= 1).all(dim=-1)
+    """Which normalised points lie in the box of the volume; its faces count, whatever their rounding."""
+    return (points.abs() <= 1 + 1e-9).all(dim=-1)

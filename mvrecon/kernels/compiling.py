@@ -10,8 +10,11 @@ from numba import njit
 #: What may be reordered: sums and products, but NaN and infinity keep their meaning.
 FASTMATH = {"reassoc", "contract", "nsz"}
 
+#: The loops make no arrays, so they need not count who holds one: counting costs as much as a ray.
+OPTIONS: dict[str, Any] = {"fastmath": FASTMATH, "error_model": "numpy", "_nrt": False}
+
 #: A function of scalars, compiled into whatever calls it.
-scalar = njit(fastmath=FASTMATH, error_model="numpy")
+scalar = njit(forceinline=True, **OPTIONS)
 
 
 def digest(folder: Path) -> str:
@@ -24,7 +27,7 @@ SOURCES = digest(Path(__file__).parent)
 
 def compiled(loop: Callable[..., Any]) -> Any:
     """The loop in machine code; threads may run it side by side."""
-    options: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "error_model": "numpy"}
+    options = {"nogil": True, **OPTIONS}
     try:
         dispatcher: Any = njit(cache=True, **options)(loop)
     except RuntimeError:  # numba finds no folder to write to

@@ -2,91 +2,120 @@
 
 Every result is the same to the last bit for any number of threads: each ray's sum belongs to one thread, and so does
 each voxel of the adjoint (a thread owns a range of slabs, one main axis at a time, and meets the rays in one order).
-Threads run loops that hold no lock of the interpreter; numba's own `parallel=True` aborts under concurrent calls.
+
+Rays read copies of the volume, see `stores.py`, made piece by piece so that little is added to the caller's memory.
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.loops import Rig, backproject_slabs, project_rows, vary_rows
-from mvrecon.kernels.rays import JOSEPH, SIDDON
+from mvrecon.kernels.columns import ROWS, backproject_columns, column_of, project_columns
+from mvrecon.kernels.lines import unshifted
+from mvrecon.kernels.loops import Rig, backproject_slabs, project_rows, room_of, vary_rows
+from mvrecon.kernels.plan import Plan, pieces, plan_of, rig_of
+from mvrecon.kernels.stores import Store, add, empty, fill, inner, store
 from mvrecon.kernels.threads import share
 
-METHODS = {"joseph": JOSEPH, "siddon": SIDDON}
-#: Voxels of nothing before and behind the volume along every axis.
-PAD = (1, 2)
-INNER = (slice(None), *[slice(PAD[0], -PAD[1])] * 3)
 
-
-def _empty(count: int, shape: Sequence[int], like: Tensor) -> np.ndarray:
-    # by numpy here and below: torch would wake its threads for the smallest volume
-    return np.zeros([count, *(size + sum(PAD) for size in shape)], dtype=like.numpy().dtype)
-
-
-def _padded(volume: Float[Tensor, "n d h w"]) -> np.ndarray:
-    padded = _empty(len(volume), volume.shape[1:], volume)
-    padded[INNER] = volume.numpy()
-    return padded.reshape(len(padded), math.prod(padded.shape[1:]))
-
-
-def _rig(lines: Tensor, window: Sequence[float], shape: Sequence[int], detector: Sequence[int], method: str) -> Rig:
-    padded = [size + sum(PAD) for size in shape]
-    wide = padded[0] * padded[1] * padded[2] >= 2**31
-    strides = np.array([1, padded[2], padded[1] * padded[2]], dtype=np.int64 if wide else np.int32)
-    sizes = (int(shape[2]), int(shape[1]), int(shape[0]))
-    maps = np.ascontiguousarray(lines.detach().numpy(), dtype=np.float64)
-    ends = (float(window[0]), float(window[1]))
-    return Rig(maps, ends, sizes, strides, (int(detector[0]), int(detector[1])), METHODS[method])
+def _copies(volume: np.ndarray, rig: Rig, plan: Plan) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
+    """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that read them, rows."""
+    for near, axes in plan.layouts:
+        for rows, piece in pieces(rig, len(volume), volume.itemsize):
+            part, into = volume[:, :, rows], empty(len(volume), piece.sizes, near, volume.dtype)
+            share(
+                lambda a, b, part=part, to=into, near=near: fill(part, near, inner(to), a, b), part.shape[2], part.size
+            )
+            yield store(into, near), piece, axes, rows
 
 
 def project(
     volume: Float[Tensor, "n d h w"],
-    lines: Float[Tensor, "m 4 3 3"],
+    lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
 ) -> Float[Tensor, "n m v u"]:
     """Line integrals of volumes, in mm times their unit; see `reference.project`."""
-    rig = _rig(lines, window, volume.shape[1:], detector, method)
-    views = volume.new_empty(len(volume), len(lines), *detector)
-    flat, rows, samples = _padded(volume), len(lines) * detector[0], views.numel() * max(rig.sizes)
-    share(lambda first, last: project_rows(flat, rig, views.numpy(), first, last), rows, samples, 4)
-    return views
+    rig = rig_of(lines, window, volume.shape[1:], detector, method)
+    plan, values = plan_of(rig), volume.numpy()
+    views = np.zeros((len(values), len(lines), *rig.detector), values.dtype)
+    oblique, upright = len(plan.oblique) * max(rig.detector), len(plan.upright) * rig.detector[1]
+    for held, piece, axes, _ in _copies(values, rig, plan):
+
+        def add_rows(first: int, last: int, held=held, piece=piece, axes=axes) -> None:
+            project_rows(held, piece, room_of(piece, held), (*plan.reads(piece, held.near), axes), views, first, last)
+
+        def add_columns(first: int, last: int, held=held, piece=piece) -> None:
+            room = column_of(piece, held, len(views), len(views))
+            project_columns(held, piece, room, plan.upright, views, first, last)
+
+        share(add_rows, oblique, views.size * max(rig.sizes), 4)
+        share(add_columns, upright if held.near == 2 else 0, views.size * max(rig.sizes), 4)
+    return torch.from_numpy(views)
 
 
 def backproject(
     views: Float[Tensor, "n m v u"],
-    lines: Float[Tensor, "m 4 3 3"],
+    lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
     shape: Sequence[int],
     method: str,
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project`, the same to the last bit for any number of threads."""
-    rig = _rig(lines, window, shape, views.shape[2:], method)
-    padded, values = _empty(len(views), shape, views), np.ascontiguousarray(views.numpy())
-    flat = padded.reshape(len(padded), math.prod(padded.shape[1:]))
-    samples = views.numel() * max(rig.sizes)
-    for axis, size in enumerate(rig.sizes):
-        share(lambda low, high, axis=axis: backproject_slabs(flat, rig, values, axis, low, high), size, samples)
-    return torch.from_numpy(np.ascontiguousarray(padded[INNER]))
+    rig = rig_of(lines, window, shape, views.shape[2:], method)
+    plan, given = plan_of(rig), np.ascontiguousarray(views.numpy())
+    volume = np.zeros((len(views), *shape), given.dtype)
+    for near, axes in plan.layouts:
+        for rows, piece in pieces(rig, len(views), given.itemsize):
+            into, part = empty(len(views), piece.sizes, near, given.dtype), volume[:, :, rows]
+            for axis in range(3):
+                _spread(store(into, near), piece, plan, (axis, axes[axis]), given)
+            share(
+                lambda a, b, held=into, to=part, near=near: add(inner(held), near, to, a, b), part.shape[2], part.size
+            )
+    return torch.from_numpy(volume)
+
+
+def _spread(held: Store, piece: Rig, plan: Plan, axis: tuple[int, bool], views: np.ndarray) -> None:
+    """Spread views along the rays of one main axis, slab by slab, where it has oblique or upright ones."""
+    along, oblique = axis
+
+    def add_slabs(low: int, high: int) -> None:
+        backproject_slabs(held, piece, room_of(piece, held), (*plan.reads(piece, held.near), along), views, low, high)
+
+    def add_columns(low: int, high: int) -> None:
+        room = column_of(piece, held, len(views), ROWS)
+        backproject_columns(held, piece, room, (plan.upright, along), views, low, high)
+
+    steps = views.size * max(piece.sizes)
+    share(add_slabs, piece.sizes[along] if oblique else 0, steps)
+    share(add_columns, piece.sizes[along] if held.near == 2 and along < 2 and len(plan.upright) else 0, steps)
 
 
 def lines_vjp(
     volume: Float[Tensor, "n d h w"],
     views: Float[Tensor, "n m v u"],
-    lines: Float[Tensor, "m 4 3 3"],
+    lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
     method: str,
-) -> Float[Tensor, "m 4 3 3"]:
-    """The derivative of <views, project(volume, lines)> by the lines, both methods by hand; float64."""
-    rig = _rig(lines, window, volume.shape[1:], views.shape[2:], method)
-    rows = views.shape[2]
-    change = torch.zeros(len(lines), rows, 4, 3, 3, dtype=torch.float64)
-    flat, values, samples = _padded(volume), np.ascontiguousarray(views.numpy()), views.numel() * max(rig.sizes)
-    share(lambda first, last: vary_rows(flat, rig, values, change.numpy(), first, last), len(lines) * rows, samples, 4)
-    return change.sum(dim=1)
+) -> Float[Tensor, "m 4 3 k"]:
+    """The derivative of <views, project(volume, lines)> by the lines, all methods by hand; float64."""
+    rig = rig_of(lines, window, volume.shape[1:], views.shape[2:], method)
+    plan, given = plan_of(rig, columns=False), np.ascontiguousarray(views.numpy())
+    total = torch.zeros(lines.shape, dtype=torch.float64)
+    for held, piece, axes, rows in _copies(volume.numpy(), rig, plan):
+        # a row or column of pixels has its own sum, so that threads change no bit
+        change = np.zeros((len(lines), max(rig.detector), *lines.shape[1:]))
+
+        def vary(first: int, last: int, held=held, piece=piece, axes=axes, change=change) -> None:
+            vary_rows(
+                held, piece, room_of(piece, held), (*plan.reads(piece, held.near), axes), (given, change), first, last
+            )
+
+        share(vary, len(lines) * max(rig.detector), given.size * max(rig.sizes), 4)
+        total += unshifted(torch.from_numpy(change).sum(dim=1), (rows.start + rows.stop - rig.sizes[1]) / 2)
+    return total

@@ -2,8 +2,9 @@
 
 P. M. Joseph, An improved algorithm for reprojecting rays through pixel images, IEEE Trans. Med. Imaging 1, 1982.
 
-`cells` writes where the ray goes (a loop without gathers, that every CPU vectorises); `sum`, `spread` and `slopes`
-read it. The volume is padded and flat; `steps` are the flat steps towards b and c.
+`cells` writes where the ray goes; `sum`, `spread` and `slopes` read it. The two corners of a cell that lie beside each
+other in memory are fetched as one complex number, and all arithmetic is left to loops without gathers, which every CPU
+vectorises.
 """
 
 import numpy as np
@@ -12,82 +13,91 @@ from mvrecon.kernels.compiling import scalar
 
 
 @scalar
-def cells(ray, strides, at, part):
-    """Per slab of a ray: flat index of its bilinear cell, weights towards b and c, part of the slab that counts."""
-    index, y, z, share = at[0], part[0], part[1], part[2]
-    real, whole = part.dtype.type, at.dtype.type
+def cells(ray, span, steps, room):
+    """Per slab in span = (first, last): flat index of a bilinear cell, place in it towards b and c, length, slab.
+
+    Returns:
+        the number of slabs.
+    """
+    index, y, z, share, slab = room.index, room.one, room.two, room.three, room.four
+    real, whole = y.dtype.type, index.dtype.type
     b, slope_b, c, slope_c = real(ray.b), real(ray.slope_b), real(ray.c), real(ray.slope_c)
     begin, end, half = real(ray.begin), real(ray.end), real(0.5)
-    start, first = real(ray.first - ray.centre), whole(ray.first + 1)
-    along, across, up = strides[ray.axis], strides[(ray.axis + 1) % 3], strides[(ray.axis + 2) % 3]
-    for i in range(np.uint32(max(0, ray.last - ray.first))):
+    start, first, count = real(span[0] - ray.centre), whole(span[0] + 1), np.uint32(max(0, span[1] - span[0]))
+    along, far = whole(steps.along), whole(steps.far)
+    for i in range(count):
         s = real(whole(i)) + start
-        share[i] = min(end, s + half) - max(begin, s - half)
         py, pz = b + s * slope_b, c + s * slope_c
         iy, iz = np.int32(py), np.int32(pz)
-        y[i], z[i] = py - real(iy), pz - real(iz)
-        base = whole(whole(first + whole(i)) * along)
-        index[i] = whole(base + whole(whole(whole(iy) * across) + whole(whole(iz) * up)))
+        y[i], z[i], slab[i] = py - real(iy), pz - real(iz), s
+        share[i] = min(end, s + half) - max(begin, s - half)
+        index[i] = whole(whole(whole(first + whole(i)) * along) + whole(whole(whole(iy) * far) + whole(iz)))
+    return count
 
 
 @scalar
-def corners(flat, steps):
-    """The volume as seen from the four corners of a bilinear cell, so that one index serves all."""
-    return flat, flat[steps[0] :], flat[steps[1] :], flat[steps[0] + steps[1] :]
-
-
-@scalar
-def sum(flat, steps, count, at, part):
-    """The sum of the volume along a ray, in voxels of the main axis."""
-    index, y, z, share = at[0], part[0], part[1], part[2]
-    f00, f10, f01, f11 = corners(flat, steps)
-    total = flat.dtype.type(0)
+def fetch(pairs, offset, far, count, room):
+    """The two pairs of corners of every cell, as complex numbers."""
+    index, low, high = room.index, room.low, room.high
+    above = np.uint64(offset) + np.uint64(far)
     for i in range(np.uint32(count)):
         k = np.uint64(index[i])
-        low, high = f00[k] + y[i] * (f10[k] - f00[k]), f01[k] + y[i] * (f11[k] - f01[k])
-        total += share[i] * (low + z[i] * (high - low))
+        low[i], high[i] = pairs[k + np.uint64(offset)], pairs[k + above]
+
+
+@scalar
+def sum(store, n, steps, count, room):
+    """The sum of volume n along a ray, in voxels of the main axis."""
+    fetch(store.pairs, n * store.size, steps.far, count, room)
+    y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
+    total = y.dtype.type(0)
+    for i in range(np.uint32(count)):
+        lower = low[2 * i] + z[i] * (low[2 * i + 1] - low[2 * i])
+        upper = high[2 * i] + z[i] * (high[2 * i + 1] - high[2 * i])
+        total += share[i] * (lower + y[i] * (upper - lower))
     return total
 
 
 @scalar
-def spread(flat, steps, count, at, part, value):
-    """Add a value along a ray with the weights of `sum`: its transpose."""
-    index, y, z, share = at[0], part[0], part[1], part[2]
-    f00, f10, f01, f11 = corners(flat, steps)
+def spread(store, n, steps, count, room, value):
+    """Add a value to volume n along a ray with the weights of `sum`: its transpose."""
+    y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
+    for i in range(np.uint32(count)):
+        both = value * share[i]
+        upper = both * y[i]
+        lower = both - upper
+        low_z, high_z = lower * z[i], upper * z[i]
+        low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1] = lower - low_z, low_z, upper - high_z, high_z
+    pairs, index, lowers, uppers = store.pairs, room.index, room.low, room.high
+    offset, above = np.uint64(n * store.size), np.uint64(n * store.size) + np.uint64(steps.far)
     for i in range(np.uint32(count)):
         k = np.uint64(index[i])
-        both = share[i] * value
-        high = both * z[i]
-        low = both - high
-        high_b, low_b = high * y[i], low * y[i]
-        f00[k] += low - low_b
-        f10[k] += low_b
-        f01[k] += high - high_b
-        f11[k] += high_b
+        pairs[k + offset] += lowers[i]
+        pairs[k + above] += uppers[i]
 
 
 @scalar
-def slopes(flat, steps, count, at, part, ray):
+def slopes(store, n, steps, count, room, ray):
     """How a ray's `sum` changes with its place.
 
     Returns:
         the sum; its derivatives by b, slope_b, c, slope_c; the volume where the ray begins and ends inside the box.
     """
-    across, up = steps
-    total = by_b = by_slope_b = by_c = by_slope_c = at_begin = at_end = 0.0
-    for i in range(count):
-        k, y, z, share = at[0, i], part[0, i], part[1, i], part[2, i]
-        s = i + ray.first - ray.centre
-        f00, f10, f01, f11 = flat[k], flat[k + across], flat[k + up], flat[k + across + up]
-        low, high = f00 + y * (f10 - f00), f01 + y * (f11 - f01)
-        value = low + z * (high - low)
-        along_b = share * ((1 - z) * (f10 - f00) + z * (f11 - f01))
-        along_c = share * (high - low)
-        total += share * value
+    fetch(store.pairs, n * store.size, steps.far, count, room)
+    y, z, share, slab, low, high = room.one, room.two, room.three, room.four, room.low_parts, room.high_parts
+    real = y.dtype.type
+    half, none, begin, end = real(0.5), real(0), real(ray.begin), real(ray.end)
+    total = by_b = by_slope_b = by_c = by_slope_c = at_begin = at_end = none
+    for i in range(np.uint32(count)):
+        low_z, high_z = low[2 * i + 1] - low[2 * i], high[2 * i + 1] - high[2 * i]
+        lower, upper = low[2 * i] + z[i] * low_z, high[2 * i] + z[i] * high_z
+        value = lower + y[i] * (upper - lower)
+        along_b, along_c = share[i] * (upper - lower), share[i] * (low_z + y[i] * (high_z - low_z))
+        total += share[i] * value
         by_b += along_b
-        by_slope_b += s * along_b
+        by_slope_b += slab[i] * along_b
         by_c += along_c
-        by_slope_c += s * along_c
-        at_begin += value if s - 0.5 < ray.begin else 0.0
-        at_end += value if s + 0.5 > ray.end else 0.0
+        by_slope_c += slab[i] * along_c
+        at_begin += value if slab[i] - half < begin else none
+        at_end += value if slab[i] + half > end else none
     return total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end

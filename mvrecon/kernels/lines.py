@@ -10,6 +10,7 @@ in each other axis b. h_b is a component of the moment up to sign, formed in flo
 numbers, so a far source and a far world origin lose no digits (Pluecker coordinates: Hartley & Zisserman, ch. 3.2).
 """
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -45,3 +46,21 @@ def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
         moment = tuple(torch.linalg.cross(source, each) for each in (U, V, detector))
     maps = [torch.stack(columns, dim=-1) for columns in (direction, moment, start, world)]
     return torch.stack(maps, dim=1)
+
+
+def shifted(lines: Float[np.ndarray, "m 4 3 k"], y: float) -> Float[np.ndarray, "m 4 3 k"]:
+    """The same rays about a point that lies y voxels beyond the centre along the y axis."""
+    moved = lines.copy()
+    # (start - o) x direction, the start being a number and not linear in the pixel in its last column alone
+    moved[:, START, 1, -1] -= y
+    moved[:, MOMENT, 0] -= y * lines[:, DIRECTION, 2]
+    moved[:, MOMENT, 2] += y * lines[:, DIRECTION, 0]
+    return moved
+
+
+def unshifted(change: Float[Tensor, "m 4 3 k"], y: float) -> Float[Tensor, "m 4 3 k"]:
+    """The derivative by the rays of `lines_of` from that by `shifted` ones: the transpose of its linear part."""
+    moved = change.clone()
+    moved[:, DIRECTION, 2] -= y * change[:, MOMENT, 0]
+    moved[:, DIRECTION, 0] += y * change[:, MOMENT, 2]
+    return moved

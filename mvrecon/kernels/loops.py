@@ -1,89 +1,137 @@
-"""The compiled loops over rays: project, back-project, and how the projections change with the geometry.
-
-Compiled at the first call for a type of number, and kept on disk.
-"""
+"""The compiled loops over rays: project, back-project, and how the projections change with the geometry."""
 
 from collections import namedtuple
 
 import numpy as np
 
-from mvrecon.kernels import joseph, siddon
+from mvrecon.kernels import joseph, march, siddon
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rays import JOSEPH, at, main_axis, trace, within
+from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR, at, crossing, main_axis, trace, within
+from mvrecon.kernels.stores import Store
 
-#: lines [m 4 3 3], window (w0, w1), sizes (x, y, z), flat strides (x, y, z) of the padded volume, detector, method.
-Rig = namedtuple("Rig", ["lines", "window", "sizes", "strides", "detector", "method"])
-
-
-@scalar
-def _steps(rig, axis):
-    return rig.strides[(axis + 1) % 3], rig.strides[(axis + 2) % 3]
+#: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a ray (trilinear).
+Rig = namedtuple("Rig", ["lines", "window", "sizes", "detector", "method", "samples"])
+#: Flat strides along the ray's main and far axis; samples a ray.
+Steps = namedtuple("Steps", ["along", "far", "samples"])
 
 
 @scalar
-def _buffers(rig, flat):
-    slabs = max(rig.sizes)
-    return np.empty((3, slabs), rig.strides.dtype), np.empty((3, slabs), flat.dtype)
+def steps_of(rig, store, axis):
+    """How the loops step through a store along rays of one main axis."""
+    return Steps(store.strides[axis], store.strides[3 - axis - store.near], rig.samples)
+
+
+#: What is known of the cells of one ray: flat indices, four numbers each, pairs of corners whole and in their parts.
+Room = namedtuple(
+    "Room",
+    ["index", "index_b", "index_c", "one", "two", "three", "four", "low", "high", "low_parts", "high_parts"],
+)
+
+
+def room_of(rig: Rig, store: Store) -> Room:
+    """Room for the cells of one ray of a thread; the loops themselves make no arrays."""
+    length = max(2 * rig.samples, max(rig.sizes))
+    index, index_b, index_c = np.empty((3, length), store.strides.dtype)
+    low, high = np.empty((2, length), store.pairs.dtype)
+    real = store.values.dtype
+    return Room(index, index_b, index_c, *np.empty((4, length), real), low, high, low.view(real), high.view(real))
+
+
+@scalar
+def pixel(rig, u, v):
+    """A pixel counted from the detector's centre."""
+    rows, columns = rig.detector
+    return u - (columns - 1) / 2, v - (rows - 1) / 2
+
+
+@scalar
+def walk(rig, tall, unit):
+    """The part of the detector to go through as one unit: its view and place, and how many rays it has.
+
+    It is a row, or a column where a step from row to row goes along the near axis: rays in turn then meet again the
+    voxels that the cache still holds.
+    """
+    rows, columns = rig.detector
+    units = max(rows, columns)
+    view, place = unit // units, unit % units
+    if tall[view]:
+        return view, place, rows if place < columns else 0
+    return view, place, columns if place < rows else 0
+
+
+@scalar
+def _cells(rig, ray, span, steps, room):
+    if rig.method == JOSEPH:
+        return joseph.cells(ray, span, steps, room)
+    if rig.method == SIDDON:
+        return siddon.cells(ray, span, steps, room)
+    return march.cells(ray, span, steps, room)
 
 
 @compiled
-def project_rows(flat, rig, views, first, last):
-    """Sum the volumes [n p] along the rays of the detector rows first to last of all views [n m v u]."""
-    index, part = _buffers(rig, flat)
-    rows, columns = rig.detector
-    for row in range(first, last):
-        m, v = row // rows, row % rows
+def project_rows(store, rig, room, reads, views, first, last):
+    """Add to views [n m v u] the sums of the volumes along the rays of reads = (chosen views, tall ones, main axes).
+
+    Of all units of those views, see `walk`, these are the first to last.
+    """
+    chosen, tall, axes = reads
+    volumes = len(views)
+    for unit in range(first, last):
+        view, place, rays = walk(rig, tall, unit)
+        m = chosen[view]
         line = rig.lines[m]
-        for u in range(columns):
-            pu, pv = u - (columns - 1) / 2, v - (rows - 1) / 2
-            axis = main_axis(line, pu, pv)
-            ray = trace(line, axis, pu, pv, rig.window, rig.sizes, rig.method)
-            count = max(0, ray.last - ray.first)
-            length = flat.dtype.type(ray.length)
-            if rig.method == JOSEPH:
-                joseph.cells(ray, rig.strides, index, part)
-                for n in range(len(flat)):
-                    views[n, m, v, u] = length * joseph.sum(flat[n], _steps(rig, axis), count, index, part)
-            else:
-                siddon.cells(ray, rig.strides, index, part)
-                for n in range(len(flat)):
-                    views[n, m, v, u] = length * siddon.sum(flat[n], _steps(rig, axis), count, index, part)
+        for other in range(rays):
+            u, v = (place, other) if tall[view] else (other, place)
+            here = pixel(rig, u, v)
+            axis = main_axis(line, here[0], here[1])
+            if not axes[axis]:
+                continue
+            ray = trace(line, axis, store.near, here, rig.window, rig.sizes, rig.method)
+            steps = steps_of(rig, store, axis)
+            count = _cells(rig, ray, (ray.first, ray.last), steps, room)
+            length = store.values.dtype.type(ray.length)
+            for n in range(volumes):
+                if rig.method == SIDDON:
+                    views[n, m, v, u] += length * siddon.sum(store, n, count, room)
+                else:
+                    views[n, m, v, u] += length * joseph.sum(store, n, steps, count, room)
 
 
 @compiled
-def backproject_slabs(flat, rig, views, axis, low, high):
-    """Spread views [n m v u] into the slabs [low, high) of the volumes [n p], for the rays with one main axis."""
-    index, part = _buffers(rig, flat)
-    rows, columns = rig.detector
-    for row in range(len(rig.lines) * rows):
-        m, v = row // rows, row % rows
+def backproject_slabs(store, rig, room, reads, views, low, high):
+    """Spread views [n m v u] into the slabs [low, high), along the rays of reads = (chosen views, tall ones, axis)."""
+    chosen, tall, axis = reads
+    volumes, steps = len(views), steps_of(rig, store, axis)
+    for unit in range(len(chosen) * max(rig.detector)):
+        view, place, rays = walk(rig, tall, unit)
+        m = chosen[view]
         line = rig.lines[m]
-        for u in range(columns):
-            pu, pv = u - (columns - 1) / 2, v - (rows - 1) / 2
-            if main_axis(line, pu, pv) != axis:
+        for other in range(rays):
+            u, v = (place, other) if tall[view] else (other, place)
+            here = pixel(rig, u, v)
+            if main_axis(line, here[0], here[1]) != axis:
                 continue
-            ray = within(trace(line, axis, pu, pv, rig.window, rig.sizes, rig.method), low, high)
-            count = ray.last - ray.first
-            if count <= 0:
+            ray = trace(line, axis, store.near, here, rig.window, rig.sizes, rig.method)
+            span = within(ray, low, high)
+            if span[0] >= span[1]:
                 continue
-            length = flat.dtype.type(ray.length)
-            if rig.method == JOSEPH:
-                joseph.cells(ray, rig.strides, index, part)
-                for n in range(len(flat)):
-                    joseph.spread(flat[n], _steps(rig, axis), count, index, part, length * views[n, m, v, u])
-            else:
-                siddon.cells(ray, rig.strides, index, part)
-                for n in range(len(flat)):
-                    siddon.spread(flat[n], _steps(rig, axis), count, index, part, length * views[n, m, v, u])
+            count = _cells(rig, ray, span, steps, room)
+            length = store.values.dtype.type(ray.length)
+            for n in range(volumes):
+                value = length * views[n, m, v, u]
+                if rig.method == SIDDON:
+                    siddon.spread(store, n, count, room, value)
+                else:
+                    joseph.spread(store, n, steps, count, room, value)
 
 
 @scalar
 def _pull_back(line, ray, p, window, value, slopes, change):
-    """Add to a row's `change` [4 3 3] the derivative of value * (one ray's integral) by the maps in `line`."""
+    """Add to a row's `change` [4 3 k] the derivative of value * (one ray's integral) by the maps in `line`."""
     total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end = slopes
-    axis, b, c = ray.axis, (ray.axis + 1) % 3, (ray.axis + 2) % 3
+    axis, b, c = ray.axis, ray.far, ray.near
     D = at(line, 0, axis, p[0], p[1])
-    value_b, value_c = -at(line, 1, c, p[0], p[1]) / D, at(line, 1, b, p[0], p[1]) / D
+    value_b, value_c = crossing(line, axis, b, p[0], p[1]), crossing(line, axis, c, p[0], p[1])
     across = by_b * value_b + by_slope_b * ray.slope_b + by_c * value_c + by_slope_c * ray.slope_c
     scale = ray.length * value
     by_D = -(across + total) / D
@@ -92,35 +140,44 @@ def _pull_back(line, ray, p, window, value, slopes, change):
     by_D -= at_begin * near if at_begin != 0 else 0.0
     by_D += at_end * far if at_end != 0 else 0.0
     world = (ray.length * D) ** 2
-    for k in range(3):
-        change[0, axis, k] += scale * by_D * p[k]
-        change[0, b, k] += scale * by_slope_b / D * p[k]
-        change[0, c, k] += scale * by_slope_c / D * p[k]
-        change[1, c, k] -= scale * by_b / D * p[k]
-        change[1, b, k] += scale * by_c / D * p[k]
-        change[2, axis, k] += scale * (at_end - at_begin) * p[k]
+    turn_b = 1.0 if (b + 1) % 3 == axis else -1.0
+    first = 3 - line.shape[2]
+    for k in range(first, 3):
+        change[0, axis, k - first] += scale * by_D * p[k]
+        change[0, b, k - first] += scale * by_slope_b / D * p[k]
+        change[0, c, k - first] += scale * by_slope_c / D * p[k]
+        change[1, c, k - first] += turn_b * scale * by_b / D * p[k]
+        change[1, b, k - first] -= turn_b * scale * by_c / D * p[k]
+        change[2, axis, k - first] += scale * (at_end - at_begin) * p[k]
         for x in range(3):
-            change[3, x, k] += scale * total * at(line, 3, x, p[0], p[1]) / world * p[k]
+            change[3, x, k - first] += scale * total * at(line, 3, x, p[0], p[1]) / world * p[k]
 
 
 @compiled
-def vary_rows(flat, rig, views, change, first, last):
-    """Into `change` [m v 4 3 3]: per detector row, the derivative of sum(views * projections) by the maps."""
-    index, part = _buffers(rig, flat)
-    rows, columns = rig.detector
-    for row in range(first, last):
-        m, v = row // rows, row % rows
+def vary_rows(store, rig, room, reads, given, first, last):
+    """For given = (views, change): into `change` [m unit 4 3 k], the derivative of sum(views * projections) by maps."""
+    chosen, tall, axes = reads
+    views, change = given
+    volumes = len(views)
+    for unit in range(first, last):
+        view, place, rays = walk(rig, tall, unit)
+        m = chosen[view]
         line = rig.lines[m]
-        for u in range(columns):
-            p = (u - (columns - 1) / 2, v - (rows - 1) / 2, 1.0)
-            axis = main_axis(line, p[0], p[1])
-            ray = trace(line, axis, p[0], p[1], rig.window, rig.sizes, rig.method)
-            count = max(0, ray.last - ray.first)
-            for n in range(len(flat)):
+        for other in range(rays):
+            u, v = (place, other) if tall[view] else (other, place)
+            here = pixel(rig, u, v)
+            axis = main_axis(line, here[0], here[1])
+            if not axes[axis]:
+                continue
+            ray = trace(line, axis, store.near, here, rig.window, rig.sizes, rig.method)
+            steps, span = steps_of(rig, store, axis), (ray.first, ray.last)
+            count = joseph.cells(ray, span, steps, room) if rig.method == JOSEPH else 0
+            for n in range(volumes):
                 if rig.method == JOSEPH:
-                    joseph.cells(ray, rig.strides, index, part)
-                    slopes = joseph.slopes(flat[n], _steps(rig, axis), count, index, part, ray)
+                    slopes = joseph.slopes(store, n, steps, count, room, ray)
+                elif rig.method == TRILINEAR:
+                    slopes = march.slopes(store, n, steps, ray)
                 else:
-                    siddon.cells(ray, rig.strides, index, part)
-                    slopes = siddon.slopes(flat[n], _steps(rig, axis), count, index, part, ray)
-                _pull_back(line, ray, p, rig.window, views[n, m, v, u], slopes, change[m, v])
+                    slopes = siddon.slopes(store, n, steps, span, ray)
+                value = views[n, m, v, u]
+                _pull_back(line, ray, (here[0], here[1], 1.0), rig.window, value, slopes, change[m, place])

@@ -1,7 +1,7 @@
 """Where one ray runs through the volume, for every compiled kernel.
 
 A ray is first clipped to the slabs in which it can touch the volume, so that no later loop tests a bound. Slabs are
-counted along its main axis; the other two axes b, c follow cyclically. `joseph.py` and `siddon.py` go on from here.
+counted along its main axis; of the two other axes the `near` one is contiguous in memory, the `far` one is not.
 Everything is scalar and knows no CPU, so that a GPU back end can compile the same source.
 """
 
@@ -11,15 +11,25 @@ from math import ceil, floor, sqrt
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.lines import TIE
 
-JOSEPH, SIDDON = 0, 1
-#: One ray: main axis; transverse padded coordinates at the centre slab and their slopes; mm per slab; where it begins
-#: and ends (slab coordinate about the centre); first slab and the one behind the last; the centre's slab coordinate.
-Ray = namedtuple("Ray", ["axis", "b", "slope_b", "c", "slope_c", "length", "begin", "end", "first", "last", "centre"])
+JOSEPH, SIDDON, TRILINEAR = 0, 1, 2
+
+#: One ray: main, far and near axis; padded coordinates along far (b) and near (c) at the centre slab, and their slopes;
+#: mm per slab; where it begins and ends (slab coordinate about the centre); what bounds the beginning and the end, see
+#: below; first slab and the one behind the last; the centre's slab coordinate.
+Ray = namedtuple(
+    "Ray",
+    ["axis", "far", "near", "b", "slope_b", "c", "slope_c", "length"]
+    + ["begin", "end", "from_", "to", "first", "last", "centre"],
+)
+#: What bounds a ray: a face across its main axis, its own end, or a face across its far or near axis.
+FACE, OWN, FAR, NEAR = 0, 1, 2, 3
 
 
 @scalar
 def at(line, kind, axis, u, v):
     """Component `axis` of one of a view's four linear maps, at the pixel (u, v) counted from the detector's centre."""
+    if line.shape[2] == 1:  # an explicit ray is the same for every pixel
+        return line[kind, axis, 0]
     return line[kind, axis, 0] * u + line[kind, axis, 1] * v + line[kind, axis, 2]
 
 
@@ -33,6 +43,14 @@ def main_axis(line, u, v):
 
 
 @scalar
+def crossing(line, axis, other, u, v):
+    """Where the ray crosses the centre slab: its coordinate along the other axis, in voxels from the centre."""
+    moment = at(line, 1, 3 - axis - other, u, v)
+    # divided, not multiplied by 1 / D: a ray on a face must stay on it to the last bit
+    return (moment if (other + 1) % 3 == axis else -moment) / at(line, 0, axis, u, v)
+
+
+@scalar
 def transverse(value, slope, half, lower, upper):
     """The part of (lower, upper) in which -half <= value + s slope < half."""
     if slope == 0:
@@ -42,44 +60,51 @@ def transverse(value, slope, half, lower, upper):
 
 
 @scalar
-def trace(line, axis, u, v, window, sizes, method):
+def trace(line, axis, near, pixel, window, sizes, method):
     """Where the ray of a pixel runs; `first >= last` says that it misses. All in float64.
 
     Args:
         line: the view's maps [4 3 3], see `lines.py`.
         axis: the ray's main axis.
-        u, v: the pixel, counted from the detector's centre.
+        near: the other axis that is contiguous in memory.
+        pixel: the pixel (u, v), counted from the detector's centre.
         window: the part of the ray that counts, as fractions of its direction.
         sizes: voxels along (x, y, z).
-        method: JOSEPH or SIDDON.
+        method: JOSEPH, SIDDON or TRILINEAR.
     """
-    b, c = (axis + 1) % 3, (axis + 2) % 3
+    u, v = pixel
+    far = 3 - axis - near
     D = at(line, 0, axis, u, v)
-    slope_b, slope_c = at(line, 0, b, u, v) / D, at(line, 0, c, u, v) / D
-    # divided, not multiplied by 1 / D: a ray on a face must stay on it to the last bit
-    value_b, value_c = -at(line, 1, c, u, v) / D, at(line, 1, b, u, v) / D
+    slope_b, slope_c = at(line, 0, far, u, v) / D, at(line, 0, near, u, v) / D
+    value_b, value_c = crossing(line, axis, far, u, v), crossing(line, axis, near, u, v)
     world = at(line, 3, 0, u, v) ** 2 + at(line, 3, 1, u, v) ** 2 + at(line, 3, 2, u, v) ** 2
     one = at(line, 2, axis, u, v) + window[0] * D
     two = at(line, 2, axis, u, v) + window[1] * D
-    half = sizes[axis] / 2.0
-    begin, end = max(-half, min(one, two)), min(half, max(one, two))
     # hat functions reach one voxel from the outermost centres, cells half a voxel
-    reach, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5)
-    lower, upper = transverse(value_b, slope_b, sizes[b] / 2.0 + reach, begin - 0.5 + margin, end + 0.5 - margin)
-    lower, upper = transverse(value_c, slope_c, sizes[c] / 2.0 + reach, lower, upper)
+    reach = 0.0 if method == SIDDON else 0.5
+    half = sizes[axis] / 2.0 + (0.5 if method == TRILINEAR else 0.0)
+    begin, end = max(-half, min(one, two)), min(half, max(one, two))
+    from_, to = OWN if begin > -half else FACE, OWN if end < half else FACE
+    # a slab counts where it overlaps the ray: centres within half a voxel (joseph: of the hats) of its ends
+    slack, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5 if method == SIDDON else 1.0)
+    lower, upper = transverse(value_b, slope_b, sizes[far] / 2.0 + reach, begin - slack, end + slack)
+    far_lower, far_upper = lower, upper
+    lower, upper = transverse(value_c, slope_c, sizes[near] / 2.0 + reach, lower, upper)
     centre = (sizes[axis] - 1) / 2.0
     first, last = 0, 0
     if begin < end and lower <= upper:
         first = max(0, int(ceil(lower + centre - margin)))
         last = min(sizes[axis], int(floor(upper + centre + margin)) + 1)
-    b0, c0 = value_b + (sizes[b] - 1) / 2.0 + 1, value_c + (sizes[c] - 1) / 2.0 + 1
-    return Ray(axis, b0, slope_b, c0, slope_c, sqrt(world) / abs(D), begin, end, first, last, centre)
+    if method == TRILINEAR:
+        from_ = NEAR if lower > far_lower else FAR if far_lower > begin else from_
+        to = NEAR if upper < far_upper else FAR if far_upper < end else to
+        begin, end = lower, upper
+    b0, c0 = value_b + (sizes[far] - 1) / 2.0 + 1, value_c + (sizes[near] - 1) / 2.0 + 1
+    length = sqrt(world) / abs(D)
+    return Ray(axis, far, near, b0, slope_b, c0, slope_c, length, begin, end, from_, to, first, last, centre)
 
 
 @scalar
 def within(ray, low, high):
-    """The slabs of a ray that lie in [low, high)."""
-    first, last = max(ray.first, low), min(ray.last, high)
-    return Ray(
-        ray.axis, ray.b, ray.slope_b, ray.c, ray.slope_c, ray.length, ray.begin, ray.end, first, last, ray.centre
-    )
+    """The first slab of a ray that lies in [low, high), and the one behind the last."""
+    return max(ray.first, low), min(ray.last, high)

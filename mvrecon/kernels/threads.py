@@ -21,10 +21,13 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
 
 def share(work: Callable[[int, int], None], count: int, samples: int, per_thread: int = 1) -> None:
     """Do work(first, last) for ranges that cover `count` items, on the threads that torch has and `samples` deserve."""
+    if not count:
+        return
     threads = torch.get_num_threads()
     parts = min(count, threads * per_thread, 1 + samples // LEAST) if threads > 1 else 1
     if parts <= 1:
-        return work(0, count)
+        work(0, count)
+        return
     ranges = [(count * i // parts, count * (i + 1) // parts) for i in range(parts)]
     for done in [_pool(threads, os.getpid()).submit(work, *each) for each in ranges]:
         done.result()

@@ -9,9 +9,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.geometry.frustum import Spacing, depth_centres, depth_edges, depth_index
-from mvrecon.geometry.grid import Grid, pixel_centres, voxel_centres
-from mvrecon.geometry.sample import inside, normalised, sample
+from mvrecon.cameras.frusta import frusta_lattice
+from mvrecon.geometry.frustum import Spacing, depth_edges
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.lattice import grid_lattice, lattice_maps
+from mvrecon.geometry.sample import inside
+from mvrecon.kernels.warp import warp
+from mvrecon.kernels.warp_reference import normalised_places
 
 
 class Frusta(nn.Module):
@@ -24,28 +28,34 @@ class Frusta(nn.Module):
         spacing: bins equally spaced in depth "z", or in the homogeneous factor "k" = f/z.
     """
 
-    points_in_frusta: Tensor  # [m d h w 3] where each voxel lies in each frustum
-    points_in_world: Tensor  # [m D v u 3] where each bin lies in the world grid
+    frusta_from_world: Tensor  # [m 1 5 2 3] where each voxel lies in each frustum
+    world_from_frusta: Tensor  # [1 m 5 2 3] where each bin lies in the world grid
     visible: Tensor  # [m 1 d h w] voxels that a frustum holds
-    occupied: Tensor  # [m 1 D v u] bins inside the grid's box
+    occupied: Tensor  # [m 1 D v u] bins inside the grid's box, ahead of the source
     step: Tensor  # [m 1 D v u] mm of ray in a bin
 
     def __init__(self, grid: Grid, cameras: Cameras, depth: int, spacing: Spacing = "z"):
         super().__init__()
-        self.shape = (depth, *cameras.shape)
+        self.grid_shape, self.shape = grid.shape, (depth, *cameras.shape)
         edges = depth_edges(cameras.depth_range(grid), depth, spacing)
-        uvz = cameras.project(voxel_centres(grid).to(cameras.source))
-        index = torch.cat([uvz[..., :2], depth_index(uvz[..., 2], edges, spacing)[..., None]], dim=-1)
-        in_frusta = normalised(index, self.shape)
-        in_world = normalised(grid.to_index(_bin_centres(cameras, edges, spacing)), grid.shape)
+        world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges, spacing)
+        of_voxels, of_bins = lattice_maps(frusta, world), lattice_maps(world, frusta)
         start, end = cameras.rays()
         per_mm = (end - start).norm(dim=-1) / cameras.distance[:, None, None]  # mm of ray per mm of depth
         step = (edges[:, 1:] - edges[:, :-1]).abs()[:, :, None, None] * per_mm[:, None]
-        self.register_buffer("points_in_frusta", in_frusta.float(), persistent=False)
-        self.register_buffer("points_in_world", in_world.float(), persistent=False)
-        self.register_buffer("visible", inside(in_frusta)[:, None], persistent=False)
-        self.register_buffer("occupied", inside(in_world)[:, None], persistent=False)
+        self.register_buffer("frusta_from_world", of_voxels, persistent=False)
+        self.register_buffer("world_from_frusta", of_bins, persistent=False)
+        self.register_buffer("visible", inside(normalised_places(of_voxels, self.shape, grid.shape)), persistent=False)
+        held = inside(normalised_places(of_bins, grid.shape, self.shape)).transpose(0, 1)
+        ahead = frusta.ahead[:, None, :, None, None]
+        self.register_buffer("occupied", held & ahead, persistent=False)
         self.register_buffer("step", step[:, None].float(), persistent=False)
+
+    def _apply(self, fn, recurse: bool = True):
+        exact = self.frusta_from_world, self.world_from_frusta
+        super()._apply(fn, recurse)  # moves the maps; their digits stay
+        self.frusta_from_world, self.world_from_frusta = (maps.to(self.step.device) for maps in exact)
+        return self
 
     def spread(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b m c D v u"]:
         """Uniform lift: each pixel's integral spread evenly along its ray's chord of the grid's box."""
@@ -63,21 +73,10 @@ class Frusta(nn.Module):
 
     def to_world(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
         """Each frustum's density at the voxels of the grid; zero where the camera does not see."""
-        return _warp(frusta, self.points_in_frusta)
+        return warp(frusta, self.frusta_from_world, self.grid_shape)[:, :, 0]
 
     def to_frusta(self, volumes: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m c D v u"]:
         """World volumes at the bins of the frusta, one volume for each camera (or one for all, m = 1)."""
-        return _warp(volumes.expand(-1, len(self.step), -1, -1, -1, -1), self.points_in_world)
-
-
-def _bin_centres(cameras: Cameras, edges: Tensor, spacing: Spacing) -> Float[Tensor, "m D v u 3"]:
-    z = depth_centres(edges, spacing)
-    pixels = pixel_centres(cameras.shape).to(z)
-    uv = pixels[None, None].expand(len(cameras), z.shape[1], -1, -1, -1)
-    return cameras.unproject(torch.cat([uv, z[:, :, None, None, None].expand(*uv.shape[:-1], 1)], dim=-1))
-
-
-def _warp(volumes: Float[Tensor, "b m c *s"], points: Float[Tensor, "m d h w 3"]) -> Float[Tensor, "b m c d h w"]:
-    b, m = volumes.shape[:2]
-    warped = sample(volumes.flatten(0, 1), points.expand(b, *points.shape).flatten(0, 1))
-    return warped.unflatten(0, (b, m))
+        if volumes.shape[1] == 1:
+            return warp(volumes, self.world_from_frusta, self.shape)[:, 0]
+        return warp(volumes, self.world_from_frusta.transpose(0, 1), self.shape)[:, :, 0]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -75,3 +77,36 @@ def test_pinholes_behind_their_detectors_lift_like_any_other():
     views = torch.rand(1, 1, 3, 9, 9) * (frusta.chord.reshape(1, 1, 3, 9, 9) > 0)
     assert (frusta.step > 0).all() and views.any()
     assert torch.allclose(frusta.integrate(frusta.spread(views)), views, rtol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_casting_the_module_costs_its_geometry_no_digit(dtype):
+    grid, cameras = small_rig()
+    frusta = torch.rand(1, len(cameras), 1, 12, *cameras.shape)
+    expected = Frusta(grid, cameras, 12).to_world(frusta)
+    assert torch.equal(Frusta(grid, cameras, 12).to(dtype).to_world(frusta), expected)
+
+
+def test_warps_compile_into_one_graph():
+    grid, cameras = small_rig()
+    frusta = Frusta(grid, cameras, 12)
+    volumes = torch.rand(1, 1, 2, *grid.shape)
+    compiled = torch.compile(lambda x: frusta.to_world(frusta.to_frusta(x)), fullgraph=True, backend="aot_eager")
+    assert torch.equal(compiled(volumes), frusta.to_world(frusta.to_frusta(volumes)))
+
+
+def test_one_volume_for_all_cameras_is_one_for_each():
+    grid, cameras = small_rig()
+    frusta, volume = Frusta(grid, cameras, 12), torch.rand(2, 1, 3, *grid.shape)
+    each = frusta.to_frusta(volume.expand(-1, len(cameras), -1, -1, -1, -1))
+    assert torch.equal(frusta.to_frusta(volume), each) and each.any()
+
+
+def test_nothing_behind_a_source_inside_the_grid_is_occupied_or_visible():
+    grid, cameras = small_rig(views=1)
+    inner = replace(cameras, source=0.05 * cameras.source)
+    frusta = Frusta(grid, inner, 12)
+    z = depth_centres(depth_edges(inner.depth_range(grid), 12))[0]
+    assert (z < 0).any() and frusta.occupied[0, 0, z > 0].any() and not frusta.occupied[0, 0, z < 0].any()
+    behind = inner.project(voxel_centres(grid))[0, ..., 2] < 0
+    assert behind.any() and frusta.visible.any() and not frusta.visible[0, 0][behind].any()

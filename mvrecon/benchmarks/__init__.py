@@ -1,0 +1,1 @@
+"""Measurements of what the parts cost and how wrong they are: run time against error."""

@@ -1,0 +1,160 @@
+"""What is projected, and by which rig: scenes, cameras and sizes of one benchmark."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from mvrecon.cameras import rigs
+from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.cameras.dcspect80 import DETECTOR_MM, dcspect80, modules
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import SCENES
+from mvrecon.scenes.analytic import generator
+from mvrecon.scenes.solids import Phantom, Solids
+
+#: Edge of the volume in mm; the pinholes of DC-SPECT stand closer.
+FIELD, NEAR_FIELD = 256.0, 160.0
+DTYPES = {name: getattr(torch, name) for name in ("float32", "float64", "float16", "bfloat16")}
+#: Rigs that come with their number of views.
+FIXED_VIEWS = {"dcspect80": 80, "axis_aligned": 4, "axis_parallel": 3}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One volume under one rig, in one precision.
+
+    Args:
+        scene: "box", or a scene of closed-form phantoms in the registry of scenes.
+        camera: a name in `RIGS`.
+        n: voxels along each edge.
+        ratio: pixel / voxel, both at the isocentre.
+        views: of the rigs that do not come with their own number.
+        device: "cpu", "cuda", or "auto": a GPU where there is one.
+        dtype: in which volume and views are kept.
+        threads: 0: as many as torch has.
+
+    Raises:
+        ValueError: an unknown camera or dtype, or sizes that are not positive.
+    """
+
+    scene: str = "ellipsoids"
+    camera: str = "circular"
+    n: int = 128
+    ratio: float = 1.0
+    views: int = 32
+    device: str = "cpu"
+    dtype: str = "float32"
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        for what, name, known in (("camera", self.camera, RIGS), ("dtype", self.dtype, DTYPES)):
+            if name not in known:
+                raise ValueError(f"Unknown {what} {name!r} of a benchmark. Known: {', '.join(known)}")
+        if self.n < 1 or not self.ratio > 0 or self.views < 1 or self.threads < 0:
+            raise ValueError(f"A benchmark's n, ratio and views must be positive, got {self}")
+        found = "cuda" if torch.cuda.is_available() else "cpu"
+        settled = {
+            "views": FIXED_VIEWS.get(self.camera, self.views),
+            "device": found if self.device == "auto" else self.device,
+            "threads": self.threads or torch.get_num_threads(),
+        }
+        for name, value in settled.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def geometry(self) -> "Case":
+        """The case that has the same truth, whatever computes it."""
+        return replace(self, device="cpu", dtype="float32", threads=1)
+
+    @property
+    def field(self) -> float:
+        """Edge of the volume in mm."""
+        return NEAR_FIELD if self.camera == "dcspect80" else FIELD
+
+    @property
+    def pixel(self) -> float:
+        """Pixel size at the isocentre in mm."""
+        return self.ratio * self.field / self.n
+
+    def grid(self) -> Grid:
+        """The volume's voxels, about the origin."""
+        return Grid.centred((self.n,) * 3, self.field / self.n)
+
+    def cameras(self) -> Cameras:
+        """The rig."""
+        return RIGS[self.camera](self)
+
+    def phantom(self) -> Phantom:
+        """The object, the same in mm for every n."""
+        if self.scene == "box":
+            return boxes(self.field)
+        return SCENES.build(self.scene).phantom(generator(0, 0), self.grid())
+
+
+def boxes(field: float) -> Phantom:
+    """Three boxes whose faces lie on those of the voxels wherever 32 divides n, so that the voxels err nowhere."""
+    centres = torch.tensor([[1, -1, 0], [-3, 2, 4], [5, -4, -2]])
+    halves = torch.tensor([[12, 10, 11], [3, 4, 2], [2, 3, 5]])
+    values = torch.tensor([0.4, 0.5, -0.3])
+    step = field / 32
+    return Phantom((Solids("box", centres * step, torch.eye(3).expand(3, 3, 3), halves * step, values),))
+
+
+def expand(base: Mapping[str, Any], plan: Mapping[str, Mapping[str, Any]]) -> list[tuple[Case, dict[str, Any]]]:
+    """The cases of a plan, each once, with the settings and the name of its block, small volumes first.
+
+    A block `{about: {...}, vary: {axis: [values]}, **settings}` is the base with the changes of `about`, and from there
+    every axis varied on its own.
+    """
+    found: dict[Case, dict[str, Any]] = {}
+    for name, block in plan.items():
+        about = Case(**{**base, **block.get("about", {})})
+        axes: Mapping[str, Sequence[Any]] = block.get("vary", {})
+        points = [about, *(replace(about, **{axis: value}) for axis, values in axes.items() for value in values)]
+        settings = {key: value for key, value in block.items() if key not in ("about", "vary")} | {"block": name}
+        for case in sorted(points, key=lambda case: case.n):
+            found.setdefault(case, settings)
+    return list(found.items())
+
+
+def _cone(case: Case, sid: float, sdd: float, odd: int = 0, **angles: Any) -> Cameras:
+    count = max(1, round(case.n / case.ratio)) | odd
+    detector = {"pixels": [count, count], "pixel_mm": case.pixel * sdd / sid}
+    return rigs.circular(case.views, sid, sdd, detector, **angles)
+
+
+def _parallel(case: Case, views: int) -> Cameras:
+    count = max(1, round(case.n / case.ratio))
+    start = 0.0 if views == 1 else 3.0
+    return rigs.parallel(views, {"pixels": [count, count], "pixel_mm": case.pixel}, start_degrees=start)
+
+
+def _dcspect80(case: Case) -> Cameras:
+    table = torch.tensor(modules(), dtype=torch.float64)
+    zoom = (table[:, :3].norm(dim=1) / table[:, 3]).mean().item()
+    return dcspect80(max(1, round(DETECTOR_MM * zoom / case.pixel)))
+
+
+def _axis_aligned(case: Case) -> Cameras:
+    rig = _cone(case, 1000.0, 1536.0, odd=1)
+    return replace(rig, **{name: getattr(rig, name).round(decimals=9) for name in VECTORS})
+
+
+def _axis_parallel(case: Case) -> Cameras:
+    one = _parallel(case, 1)
+    turn, still = torch.eye(3, dtype=torch.float64).roll(1, 0), torch.zeros(3, dtype=torch.float64)
+    turned = (one, one.moved(turn, still), one.moved(turn @ turn, still))
+    return replace(one, **{name: torch.cat([getattr(rig, name) for rig in turned]) for name in VECTORS})
+
+
+RIGS: dict[str, Callable[[Case], Cameras]] = {
+    "circular": lambda case: _cone(case, 1000.0, 1536.0, start_degrees=3.0),
+    "dcspect80": _dcspect80,
+    "parallel": lambda case: _parallel(case, case.views),
+    "axis_aligned": _axis_aligned,
+    "axis_parallel": _axis_parallel,
+    "inside": lambda case: _cone(case, 100.0, 300.0, start_degrees=3.0),
+    "far": lambda case: _cone(case, 1e6, 1e6 + 536.0, start_degrees=3.0),
+}

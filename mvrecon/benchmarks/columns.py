@@ -1,0 +1,64 @@
+"""What each column of `results.csv` means, with its unit."""
+
+KEYS = ("part", "options", "device", "dtype", "threads", "scene", "camera", "n", "ratio", "views")
+
+#: `bench=operators`.
+OPERATORS = {
+    "part": "projector, by its name in the registry",
+    "method": "its option of that name, where it has one",
+    "options": "all its options, as JSON",
+    "backend": "what computed, as far as the part tells: cpu, cuda, reference, or own of another library",
+    "device": "where volume and views are",
+    "dtype": "in which volume and views are kept; float16 and bfloat16 are storage, the arithmetic is the part's",
+    "threads": "threads of torch",
+    "scene": "the object, whose integrals are known in closed form",
+    "camera": "the rig",
+    "n": "voxels along each edge of the volume",
+    "ratio": "pixel / voxel, both at the isocentre",
+    "views": "number of cameras",
+    "pixels": "rows x columns of each detector",
+    "rays": "views x pixels",
+    "status": "ok, or skipped: and the reason",
+    "note": "calls that gave no figure, or that were too slow to repeat",
+    "error_thin": "|A x - t| / |t| over all pixels, t the exact integrals along the pixels' central rays",
+    "error_pixel": "the same, t the mean of exact integrals along rays x rays lines to a pixel",
+    "floor_thin": "error_thin of the exact integrals of the same voxels (Siddon in float64)",
+    "floor_pixel": "error_pixel of the same integrals; an interpolating method may err less",
+    "forward_ms": "y = A x, in ms: median of at least `repeats` calls, launch included, the first call not",
+    "adjoint_ms": "A^T y, in ms, likewise",
+    "volume_grad_ms": "forward and backward to the volume, in ms, likewise",
+    "pose_grad_ms": "forward and backward to the cameras, in ms, likewise",
+    "first_ms": "the first forward call in ms: compiling, where this process had not done it before, and loading",
+    "calls": "the least number of calls of which one of the four times is the median",
+    "forward_ratio": "forward_ms / that of the first part of the list, timed in turns with it",
+    "adjoint_ratio": "adjoint_ms / that of the first part, likewise",
+    "volume_grad_ratio": "volume_grad_ms / that of the first part, likewise",
+    "pose_grad_ratio": "pose_grad_ms / that of the first part, likewise",
+    "peak_mb": "most memory in 2^20 bytes of a forward call beyond what was in use before it, its output included",
+    "adjoint_peak_mb": "the same of an adjoint call",
+    "ray_slabs_per_s": "rays x n / forward time: nominal, whatever is skipped",
+    "adjointness": "|<A x, y> - <x, A^T y>| / (|A x| |y|) for random x and y",
+    "repeatable": "whether forward and adjoint give the same bits twice",
+    "nans": "values that are NaN or infinite in views, adjoint and both gradients",
+    "pose_cosine": "cosine between the derivatives of sum(w y) by rigid motions of up to four cameras and those of the "
+    "closed form, averaged over 2 x 2 rays to a pixel; w is white noise",
+    "load": "the machine's load average over the minute before",
+}
+
+SCALING_KEYS = (
+    "part", "options", "device", "dtype", "axis", "n", "pixels", "views", "batch", "channels", "threads",
+)  # fmt: skip
+
+#: `bench=scaling`.
+SCALING = {
+    **{name: OPERATORS[name] for name in ("part", "method", "options", "backend", "device", "dtype")},
+    "axis": "what is varied: voxels, rays (of each view), views, batch, channels or threads",
+    "size": "how much of it: n^3, pixels^2, or the count",
+    "n": OPERATORS["n"],
+    "pixels": "rows, and columns, of each detector",
+    "views": OPERATORS["views"],
+    "batch": "volumes, each with channels of its own, on the same rays",
+    "channels": "of each volume",
+    "threads": OPERATORS["threads"],
+    **{name: OPERATORS[name] for name in ("status", "note", "forward_ms", "adjoint_ms", "calls", "load")},
+}

@@ -1,0 +1,118 @@
+"""How long a call takes and how much memory it needs, launch and waiting for the device included."""
+
+import ctypes
+import os
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+Call = Callable[[], Any]
+#: A fast call is repeated until it took so many seconds, or MORE times as often as asked.
+WORTH_S, MORE = 0.2, 4
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Median time of a call in ms, and of how many calls."""
+
+    ms: float
+    calls: int
+
+
+def once(call: Call, device: str) -> tuple[Any, float]:
+    """What a call returns, and the seconds it took."""
+    wait(device)
+    start = time.perf_counter()
+    found = call()
+    wait(device)
+    return found, time.perf_counter() - start
+
+
+def wait(device: str) -> None:
+    """Until a GPU has done all it was given."""
+    if device.startswith("cuda"):
+        torch.cuda.synchronize(device)
+
+
+def interleaved(
+    calls: Mapping[int, Call], first_s: Mapping[int, float], repeats: int, device: str
+) -> dict[int, Timing]:
+    """Median time of each call, taken in turns so that a noisy machine is unfair to none.
+
+    Args:
+        calls: each has been made before, so that nothing is compiled any more.
+        first_s: seconds that each took then; a fast one is repeated more often than `repeats`.
+        repeats: least number of calls.
+        device: on which they work.
+    """
+    rounds = {key: max(repeats, min(MORE * repeats, round(WORTH_S / max(first_s[key], 1e-9)))) for key in calls}
+    times: dict[int, list[float]] = {key: [] for key in calls}
+    for turn in range(max(rounds.values(), default=0)):
+        for key, call in calls.items():
+            if turn < rounds[key]:
+                times[key].append(once(call, device)[1])
+    return {key: Timing(1e3 * statistics.median(taken), len(taken)) for key, taken in times.items()}
+
+
+def with_memory(call: Call, device: str) -> tuple[Any, float]:
+    """What a call returns, and the most MB (2^20 bytes) that it needed beyond what was in use before it, its result
+    included.
+
+    On a GPU what torch's allocator gave out; on Linux the high-water mark of resident memory, reset before the call;
+    elsewhere the growth of the process's lifetime maximum, which misses what an earlier call has used already.
+    """
+    if device.startswith("cuda"):
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        found = once(call, device)[0]
+        return found, (torch.cuda.max_memory_allocated(device) - before) / 2**20
+    before = _fresh_mark()
+    found = call()
+    return found, max(0.0, _high_mark() - before)
+
+
+def _fresh_mark() -> float:
+    """MB in use, from where the high-water mark counts anew."""
+    if hasattr(trim := ctypes.CDLL(None) if sys.platform == "linux" else None, "malloc_trim"):
+        trim.malloc_trim(0)  # type: ignore[union-attr]  # what the allocator keeps would hide what a call takes
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return _high_mark()
+    return _status("VmRSS")
+
+
+def _high_mark() -> float:
+    if sys.platform == "linux":
+        return _status("VmHWM")
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+def _status(name: str) -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith(f"{name}:")) / 1024
+
+
+def load_average() -> float:
+    """Processes that wanted to run, mean over the last minute: how quiet the machine is."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """So many threads of torch, and of what sizes itself by torch, inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

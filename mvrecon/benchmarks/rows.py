@@ -1,0 +1,95 @@
+"""A table that grows by a row at a time and outlives a crash: what is in it need not be measured again."""
+
+import csv
+import io
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mvrecon.engine.record import write
+
+Row = dict[str, Any]
+
+
+class Rows:
+    """A CSV file with a fixed header.
+
+    Args:
+        path: of the file; made where it is not there.
+        columns: the header.
+        keys: the columns that tell one row from all others.
+
+    Raises:
+        ValueError: the file has another header.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], keys: Sequence[str]):
+        self.path, self.columns, self.keys = path, list(columns), list(keys)
+        if not path.exists():
+            write(path, _line(self.columns))
+        text = path.read_text(encoding="utf-8")
+        if not text.endswith("\n"):  # a crash cut the last row
+            text = text[: text.rfind("\n") + 1]
+            write(path, text)
+        header, *lines = list(csv.reader(io.StringIO(text))) or [[]]
+        if header != self.columns:
+            raise ValueError(f"{path} has the columns {header}, expected {self.columns}; give another folder")
+        self._done = {self._key(dict(zip(header, line, strict=True))) for line in lines}
+        self.rows: list[Row] = [
+            {name: value(text) for name, text in zip(header, line, strict=True) if text} for line in lines
+        ]
+
+    def _key(self, row: Mapping[str, Any]) -> tuple[str, ...]:
+        return tuple(cell(row.get(name)) for name in self.keys)
+
+    def __contains__(self, row: Mapping[str, Any]) -> bool:
+        """Whether a row with these keys is there."""
+        return self._key(row) in self._done
+
+    def append(self, row: Mapping[str, Any]) -> Row:
+        """Add a row, on the disk before this returns; the row as it can be read back.
+
+        Raises:
+            KeyError: a figure that the table has no column for.
+        """
+        if unknown := set(row) - set(self.columns):
+            raise KeyError(f"{self.path.name} has no column {', '.join(sorted(unknown))}")
+        cells = [cell(row.get(name)) for name in self.columns]
+        with open(self.path, "a", encoding="utf-8", newline="") as file:
+            file.write(_line(cells))
+            file.flush()
+            os.fsync(file.fileno())
+        self._done.add(self._key(row))
+        self.rows.append({name: value(text) for name, text in zip(self.columns, cells, strict=True) if text})
+        return self.rows[-1]
+
+
+def cell(figure: Any) -> str:
+    """A figure as text: six digits, yes or no, nothing for None."""
+    if figure is None:
+        return ""
+    if isinstance(figure, bool):
+        return "yes" if figure else "no"
+    return f"{figure:.6g}" if isinstance(figure, float) else " ".join(str(figure).split())
+
+
+def value(text: str) -> Any:
+    """The number that a text is, or the text."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def number(row: Mapping[str, Any], name: str) -> float:
+    """A figure of a row; NaN where there is none."""
+    found = row.get(name)
+    return found if isinstance(found, float) else math.nan
+
+
+def _line(cells: Sequence[str]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerow(cells)
+    return out.getvalue()

@@ -1,0 +1,99 @@
+"""Where the samples of volumes lie, a world grid's and frusta's alike, and the maps from one lattice into another.
+
+An index (i, j, k), counted from the volume's centre, is lifted to (i s, j s, k, 1) with s = a + b k. For each lattice
+one choice of (a, b) makes space and lifted index a homography of each other: s = 1 for a world grid, for parallel beams
+with depths equally spaced in z, and for a central frustum with depths equally spaced in f/z; s in proportion to z for a
+central frustum with depths equally spaced in z, and to 1/z for parallel beams with depths equally spaced in f/z. So is
+every map between two lattices (projective coordinates: Hartley & Zisserman, Multiple View Geometry, ch. 2 and 3).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+
+#: What turns an index into a place in another lattice: numerators of the three axes, denominator of the first two,
+#: denominator of the third; each a bilinear function (c_i i + c_j j + c) + k (c_ik i + c_jk j + c_k) of the index.
+NUMERATORS, ACROSS, DEPTH = slice(0, 3), 3, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """The samples of M volumes of one shape.
+
+    Args:
+        shape: samples along the tensor's axes (k, j, i).
+        matrix: from space, in voxels of one grid about its centre, to lifted indices; denominators are positive on the
+            side of the source that counts.
+        lift: (a, b) of s = a + b k.
+    """
+
+    shape: tuple[int, int, int]
+    matrix: Float[Tensor, "m 4 4"]
+    lift: Float[Tensor, "m 2"]
+
+    @property
+    def ahead(self) -> Bool[Tensor, "m k"]:
+        """Which planes k lie on the side of the source that counts."""
+        k = torch.arange(self.shape[0]).to(self.lift) - (self.shape[0] - 1) / 2
+        return self.lift[:, :1] + self.lift[:, 1:] * k > 0
+
+
+def centred_affine(grid: Grid) -> Float[Tensor, "4 4"]:
+    """From voxel indices about the grid's centre to world mm."""
+    affine = grid.affine.clone()
+    affine[:3, 3] = grid.centre
+    return affine
+
+
+def grid_lattice(grid: Grid) -> Lattice:
+    """The voxels of the grid by which space is measured."""
+    return Lattice(grid.shape, torch.eye(4).to(grid.affine)[None], grid.affine.new_tensor([[1.0, 0.0]]))
+
+
+def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:
+    """Where each sample of every lattice of `to` lies in every lattice of `of`; rows NUMERATORS, ACROSS and DEPTH.
+
+    A volume on `of` warped by them is the same field on `to`. All pairs: frusta to one grid [m 1 ..], one grid to
+    frusta [1 m ..], frusta to frusta [m m ..].
+    """
+    H = of.matrix[:, None] @ torch.linalg.inv(to.matrix)[None]
+    return lifted_maps(H, of.lift[:, None], to.lift[None])
+
+
+def lifted_maps(
+    H: Float[Tensor, "*n 4 4"], of: Float[Tensor, "*n 2"] | None = None, to: Float[Tensor, "*n 2"] | None = None
+) -> Float[Tensor, "*n 5 2 3"]:
+    """The maps of a homography between lifted indices; without lifts H relates the centred indices themselves."""
+    plain = H.new_tensor([1.0, 0.0])
+    of, to = plain if of is None else of, plain if to is None else to
+    across = of[..., :1] * H[..., 3, :] + of[..., 1:] * H[..., 2, :]
+    rows = torch.cat([H[..., :3, :], across[..., None, :], H[..., 3:, :]], dim=-2)
+    a, b = to[..., None, :1], to[..., None, 1:]
+    fixed = torch.cat([a * rows[..., :2], rows[..., 3:]], dim=-1)
+    growing = torch.cat([b * rows[..., :2], rows[..., 2:3]], dim=-1)
+    return torch.stack([fixed, growing], dim=-2)
+
+
+def spread_map(maps: Float[Tensor, "*n r 2 3"], shape: tuple[int, int, int]) -> Float[Tensor, "*n d h w r"]:
+    """The values of bilinear maps at the centred indices of all samples of a volume of `shape`."""
+    k, j, i = (torch.arange(n, dtype=maps.dtype, device=maps.device) - (n - 1) / 2 for n in shape)
+    planes = maps[..., 0, None, :] + k[:, None] * maps[..., 1, None, :]  # [*n r d 3]
+    x, y, one = planes[..., None, None, :].unbind(dim=-1)
+    return (x * i + y * j[:, None] + one).movedim(-4, -1)
+
+
+def places(
+    maps: Float[Tensor, "*n 5 2 3"], shape: tuple[int, int, int]
+) -> tuple[Float[Tensor, "*n d h w 3"], Bool[Tensor, "*n d h w"]]:
+    """Centred indices in the source lattice of all samples of an output of `shape`, and which of them count.
+
+    Samples behind the plane of a source do not count; their place means nothing.
+    """
+    rows = spread_map(maps, shape)
+    under = rows[..., [ACROSS, ACROSS, DEPTH]]
+    counts = (under > 0).all(dim=-1)
+    return rows[..., NUMERATORS] / torch.where(counts[..., None], under, 1.0), counts

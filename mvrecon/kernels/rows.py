@@ -1,0 +1,57 @@
+"""One row of an output lattice in a source lattice: where it enters and leaves it, for every kernel driven by voxels.
+
+Numerators and denominators of a row's places are affine in the position i along it, so that the part of the row inside
+the source's box is an interval, cut out by linear inequalities, and no later loop tests a bound. Scalar, without a
+CPU's own, so that a GPU back end can compile the same source.
+"""
+
+from math import ceil, floor
+
+from mvrecon.kernels.compiling import scalar
+
+#: Below this a denominator is a rounding error: a sample in the plane of the source.
+LEAST = 1e-200
+
+
+@scalar
+def affine(line, j, k):
+    """Value and slope along i of a bilinear map [2 3] on the row (j, k), all counted from the lattice's centre."""
+    slope = line[0, 0] + k * line[1, 0]
+    return (line[0, 1] + k * line[1, 1]) * j + (line[0, 2] + k * line[1, 2]), slope
+
+
+@scalar
+def positive(value, slope, lower, upper):
+    """The part of (lower, upper) in which value + i slope > 0."""
+    if slope > 0:
+        return max(lower, -value / slope), upper
+    if slope < 0:
+        return lower, min(upper, -value / slope)
+    return (lower, upper) if value > 0 else (0.0, -1.0)
+
+
+@scalar
+def between(top, under, low, high, part):
+    """The part of an interval in which low < top / under < high, where under > 0."""
+    lower, upper = positive(top[0] - low * under[0], top[1] - low * under[1], part[0], part[1])
+    return positive(high * under[0] - top[0], high * under[1] - top[1], lower, upper)
+
+
+@scalar
+def whole(part, half, count):
+    """The first position of a row of `count`, whose centre is at `half`, inside an interval, and the one behind."""
+    if part[0] > part[1]:
+        return 0, 0
+    return max(0, int(ceil(part[0] + half))), min(count, int(floor(part[1] + half)) + 1)
+
+
+@scalar
+def over(under, i):
+    """One over a denominator at position i."""
+    return 1.0 / max(under[0] + i * under[1], LEAST)
+
+
+@scalar
+def cell(top, inverse, i, border, size):
+    """The padded coordinate of a sample along one axis; held in the border should rounding carry it out."""
+    return min(max((top[0] + i * top[1]) * inverse + border, 0.0), size + 1.0)

@@ -1,0 +1,75 @@
+"""Copies of volumes as the loops over rays want them: one axis contiguous, neighbours along it readable as a pair.
+
+Around each volume lies nothing, one voxel in front and two behind, so that no loop tests a bound: a ray is clipped to
+where its cell touches the volume, and the rounding of single precision may carry it half a cell further.
+"""
+
+from collections import namedtuple
+
+import numpy as np
+
+from mvrecon.kernels.compiling import compiled
+from mvrecon.kernels.padding import PAD, padded_shape
+
+#: values [n p] in one row; pairs, each value and the next as one complex number on the same memory; p, the size of a
+#: volume; flat strides of the axes (x, y, z); the contiguous axis.
+Store = namedtuple("Store", ["values", "pairs", "size", "strides", "near"])
+COMPLEX = {np.dtype(np.float32): np.complex64, np.dtype(np.float64): np.complex128}
+#: Edge in voxels of the tiles in which a volume is turned.
+TILE = 16
+
+
+def empty(count: int, sizes: tuple[int, int, int], near: int, dtype: np.dtype) -> np.ndarray:
+    """Nothing for volumes of `sizes` (x, y, z), padded: [n z y x] when x is the near axis, [n y x z] when it is z."""
+    x, y, z = padded_shape(sizes)
+    return np.zeros((count, *((z, y, x) if near == 0 else (y, x, z))), dtype)
+
+
+def inner(padded: np.ndarray) -> np.ndarray:
+    """The volumes without their padding."""
+    return padded[(slice(None), *[slice(PAD[0], -PAD[1])] * 3)]
+
+
+def store(volumes: np.ndarray, near: int) -> Store:
+    """Padded volumes as a store."""
+    values, size = volumes.reshape(-1), volumes[:1].size
+    pairs = np.ndarray((max(0, values.size - 1),), COMPLEX[values.dtype], values, strides=values.strides)
+    beside, across = volumes.shape[3], volumes.shape[3] * volumes.shape[2]
+    steps = (1, beside, across) if near == 0 else (beside, across, 1)
+    return Store(values, pairs, size, np.array(steps, np.int64 if size >= 2**31 else np.int32), near)
+
+
+@compiled
+def fill(volumes, near, into, first, last):
+    """Write rows (along y) first to last of volumes [n d h w] into volumes as a store has them."""
+    count, depth, _, width = volumes.shape
+    for n in range(count):
+        for y in range(first, last):
+            if near == 0:
+                for z in range(depth):
+                    for x in range(width):
+                        into[n, z, y, x] = volumes[n, z, y, x]
+                continue
+            for x0 in range(0, width, TILE):
+                for z0 in range(0, depth, TILE):
+                    for x in range(x0, min(x0 + TILE, width)):
+                        for z in range(z0, min(z0 + TILE, depth)):
+                            into[n, y, x, z] = volumes[n, z, y, x]
+
+
+@compiled
+def add(held, near, volumes, first, last):
+    """Add rows (along y) first to last of volumes as a store has them to volumes [n d h w]."""
+    count, depth, _, width = volumes.shape
+    for n in range(count):
+        for y in range(first, last):
+            if near == 0:
+                for z in range(depth):
+                    for x in range(width):
+                        volumes[n, z, y, x] += held[n, z, y, x]
+                continue
+            for x0 in range(0, width, TILE):
+                for z0 in range(0, depth, TILE):
+                    for z in range(z0, min(z0 + TILE, depth)):
+                        for x in range(x0, min(x0 + TILE, width)):
+                            volumes[n, z, y, x] += held[n, y, x, z]

@@ -1,0 +1,62 @@
+"""Voxel-driven back-projection on the CPU, and its transpose: the same to the last bit for any number of threads.
+
+A thread owns slabs of the volume, in the transpose rows of views, and meets what adds to them in one order.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.kernels.padding import padded, room, steps
+from mvrecon.kernels.threads import share
+from mvrecon.kernels.voxel_loops import Sight, look_up, show_rows
+
+
+def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weighted: bool) -> Sight:
+    numbers = np.ascontiguousarray(maps.numpy(), dtype=np.float64)
+    ends = (float(window[0]), float(window[1]))
+    return Sight(numbers, (int(detector[1]), int(detector[0])), steps(detector), ends, bool(weighted))
+
+
+def look(
+    views: Float[Tensor, "n m v u"],
+    maps: Float[Tensor, "m 4 2 3"],
+    window: Sequence[float],
+    weighted: bool,
+    shape: Sequence[int],
+) -> Float[Tensor, "n d h w"]:
+    """What every voxel sees in all views; see `voxel_reference.look`."""
+    sight = _sight(maps, views.shape[2:], window, weighted)
+    volumes = np.zeros([len(views), *shape], dtype=views.numpy().dtype)
+    flat, samples = padded(views.numpy(), 2), volumes.size * len(maps)
+
+    def work(first: int, last: int) -> None:
+        look_up(flat, sight, room(int(shape[2]), sight.steps, flat.dtype), volumes, first, last)
+
+    share(work, int(shape[0]), samples, 4)
+    return torch.from_numpy(volumes)
+
+
+def show(
+    volumes: Float[Tensor, "n d h w"],
+    maps: Float[Tensor, "m 4 2 3"],
+    window: Sequence[float],
+    weighted: bool,
+    detector: Sequence[int],
+) -> Float[Tensor, "n m v u"]:
+    """The exact transpose of `look`."""
+    sight = _sight(maps, detector, window, weighted)
+    given, rows = np.ascontiguousarray(volumes.numpy()), int(detector[0])
+    views = volumes.new_empty(len(volumes), len(maps), *detector)
+
+    def work(first: int, last: int) -> None:
+        for m in range(first // rows, (last - 1) // rows + 1):
+            low, high = max(0, first - m * rows), min(rows, last - m * rows)
+            own = (len(given), (high - low + 2) * int(sight.steps[1]))
+            show_rows(given, sight, room(given.shape[3], sight.steps, given.dtype, own), views.numpy(), m, low, high)
+
+    share(work, len(maps) * rows, given.size * len(maps))
+    return views

@@ -1,0 +1,76 @@
+"""Plots of benchmarks; the one file that knows matplotlib, of the optional extra `bench`."""
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+Points = Sequence[tuple[float, float]]
+MARKERS = "osD^v<>PX*hd8p"
+
+
+def pareto(panels: Mapping[str, tuple[Mapping[str, Points], Mapping[int, float]]], path: Path) -> None:
+    """Error against forward time, one marker for each part, large for its largest volume; both axes logarithmic.
+
+    Args:
+        panels: title -> (part -> (ms, error) at growing volumes, voxels along an edge -> floor of the error).
+        path: of the PNG.
+    """
+    figure, axes = _figure(len(panels), "forward time, ms")
+    for ax, (title, (curves, floors)) in zip(axes, panels.items(), strict=True):
+        for marker, (label, points) in zip(cycle(MARKERS), sorted(curves.items()), strict=False):
+            (line,) = ax.plot(*zip(*points, strict=True), marker=marker, markersize=4, linewidth=0.6, alpha=0.7)
+            ax.plot(*points[-1], marker=marker, markersize=9, linestyle="", color=line.get_color(), label=label)
+        for n, floor in floors.items():
+            ax.axhline(floor, color="0.6", linewidth=0.8, linestyle="--")
+            ax.annotate(
+                f"floor, {n}³", (0.995, floor), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7
+            )
+        ax.set_ylabel(title)
+    _save(figure, axes, path)
+
+
+def scaling(panels: Mapping[str, Mapping[str, Points]], path: Path) -> None:
+    """Time against the amount of work, a panel for each kind of work; both axes logarithmic.
+
+    Args:
+        panels: what is varied -> label -> (amount, ms).
+        path: of the PNG.
+    """
+    figure, axes = _figure(len(panels), None)
+    for ax, (axis, curves) in zip(axes, panels.items(), strict=True):
+        for marker, (label, points) in zip(cycle(MARKERS), sorted(curves.items()), strict=False):
+            ax.plot(*zip(*points, strict=True), marker=marker, markersize=4, linewidth=0.8, label=label)
+        ax.set_xlabel(axis)
+        ax.set_ylabel("time, ms")
+    _save(figure, axes, path)
+
+
+def _figure(count: int, xlabel: str | None) -> tuple[Figure, list[Any]]:
+    columns = min(3, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(5.2 * columns, 4.4 * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for spare in axes[count:]:
+        spare.remove()
+    for ax in axes[:count]:
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.grid(True, which="both", linewidth=0.3)
+        for axis in (ax.xaxis, ax.yaxis):  # a decade or less needs figures between the powers of ten
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter(FormatStrFormatter("%g"))
+            axis.set_minor_formatter(NullFormatter())
+        if xlabel:
+            ax.set_xlabel(xlabel)
+    return figure, axes[:count]
+
+
+def _save(figure: Figure, axes: Sequence[Any], path: Path) -> None:
+    handles, labels = axes[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+    figure.savefig(path, dpi=130, format="png")

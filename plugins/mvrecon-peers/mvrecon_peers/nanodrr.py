@@ -1,0 +1,47 @@
+"""nanodrr: a trilinear ray marcher in torch, with a Triton kernel on CUDA (https://github.com/eigenvivek/nanodrr)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon_peers.base import Traced, load
+
+
+class Nanodrr(Traced):
+    """nanodrr's trilinear renderer: equally many samples on every ray's part in the box grown by the kernel.
+
+    Matched adjoint and gradients, in the pose too, by autograd. Takes every rig of mvrecon, parallel ones included.
+
+    Args:
+        grid: where the voxels lie.
+        cameras: the rig.
+        samples: on a ray; as many as the grid has voxels along its longest axis by default.
+        backend: nanodrr's own: "auto", "torch", "triton".
+
+    Raises:
+        ValueError: a geometry that `framed` does not take, or fewer than 2 samples.
+        ImportError: nanodrr is not installed.
+    """
+
+    def __init__(self, grid: Grid, cameras: Cameras, samples: int | None = None, backend: str = "auto"):
+        super().__init__(grid, cameras)
+        self.samples, self.backend = samples or max(2, *grid.shape), backend
+        if self.samples < 2:
+            raise ValueError(f"nanodrr takes at least 2 samples on a ray, got {samples}")
+        self.subject = load("nanodrr.data", "nanodrr", "Subject")
+        self.march = load("nanodrr.drr.renderer", "nanodrr", "render")
+
+    def render(
+        self, volume: Float[Tensor, "d h w"], first: Float[Tensor, "k r 3"], last: Float[Tensor, "k r 3"]
+    ) -> Float[Tensor, "k r"]:
+        """nanodrr's views; its detector is one row of all rays, since only their ends matter."""
+        x, size = volume[None, None], first.shape[1]
+        affine, scale = self.box.affine.to(volume), self.subject._make_voxel_to_grid((1, 1, *volume.shape)).to(volume)
+        subject = self.subject(x, torch.zeros_like(x), affine, affine.inverse(), scale, affine[:3, 3], 0)
+        subject.convert_to_mu = False
+        still = torch.eye(4).to(volume).expand(len(first), 4, 4)
+        frame = still[:, :3, :3], still, volume.new_ones(len(first))
+        ends = {"src": first, "tgt": last}
+        return self.march(subject, *frame, 1, size, self.samples, backend=self.backend, **ends)[:, 0, 0]

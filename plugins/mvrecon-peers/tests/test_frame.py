@@ -1,0 +1,196 @@
+"""Rigs in the volume's frame, and what libraries cannot take: pure geometry, no library needed."""
+
+import sys
+import tomllib
+from dataclasses import replace
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import random_rotation
+from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon_peers.astra import Astra
+from mvrecon_peers.diffdrr import Diffdrr
+from mvrecon_peers.frame import framed, plane_of_rows
+from mvrecon_peers.mbirtorch import Mbirtorch, rig_of, scan_of
+from mvrecon_peers.nanodrr import Nanodrr
+from mvrecon_peers.rtk import Rtk, view_arguments
+from mvrecon_peers.skimage import Skimage, turns
+
+GRID = Grid.centred((10, 12, 14), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+DETECTOR = {"pixels": [5, 7], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
+CONE = circular(4, 40.0, 70.0, DETECTOR, start_degrees=13.0).moved(torch.eye(3), GRID.centre)
+BEAM = parallel(4, DETECTOR, 60.0, start_degrees=11.0).moved(torch.eye(3), GRID.centre)
+PINHOLES = dome(4, 30.0, 20.0, 120.0, DETECTOR, target=GRID.centre.tolist())
+RIGS = {
+    "cone": CONE,
+    "ahead": replace(CONE, extent="ahead"),
+    "pinholes": PINHOLES,
+    "dcspect80": dcspect80(48).moved(torch.eye(3), GRID.centre),
+    "beam": BEAM,
+    "line": replace(BEAM, extent="line"),
+    "half lines": replace(BEAM, extent="ahead"),
+}
+PLUGIN = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+PARTS = {k.partition(".")[2]: v for k, v in PLUGIN["entry-points"]["mvrecon.plugins"].items() if k[:9] == "projector"}
+
+
+@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.parametrize("tilt", [False, True])
+def test_the_rays_of_a_framed_rig_measure_the_same(kind: str, tilt: bool):
+    grid, rig = GRID, RIGS[kind]
+    R = random_rotation(torch.Generator().manual_seed(0)) if tilt else torch.eye(3, dtype=torch.float64)
+    affine = grid.affine.clone()
+    affine[:3] = R @ affine[:3]
+    box, inner = framed(Grid(grid.shape, affine), rig.moved(R, torch.zeros(3)))
+    assert inner.extent == "segment"
+    centres = torch.tensor([[1.0, 2.0, -1.0], [-2.0, 0.5, 2.0]], dtype=torch.float64)
+    turn = random_rotation(torch.Generator().manual_seed(1), 2)
+    inside = Phantom((Solids("ellipsoid", centres, turn, torch.tensor([[2.0, 3, 1], [1, 2, 2]]), torch.ones(2)),))
+    there = inside.integrals(*inner.rays(), extent=inner.limits)
+    world = inside.moved(torch.eye(3), GRID.centre).integrals(*rig.rays(), extent=rig.limits)
+    assert there.any()
+    assert torch.allclose(there, world, atol=1e-9)
+    assert torch.allclose(box.centre, torch.zeros(3, dtype=torch.float64), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["ahead", "pinholes", "dcspect80"])
+def test_detectors_moved_beyond_the_box_keep_one_pixel_size_and_clear_the_kernel(kind: str):
+    box, rig = framed(GRID, RIGS[kind])
+    pitch = rig.u.norm(dim=-1)
+    assert torch.allclose(pitch, pitch[0])
+    assert (rig.depth_range(box)[:, 1] + min(box.spacing) < rig.distance).all()
+
+
+def test_framing_keeps_the_graph_of_the_cameras():
+    source = PINHOLES.source.clone().requires_grad_()
+    _, rig = framed(GRID, replace(PINHOLES, source=source))
+    assert torch.autograd.grad(torch.stack(rig.rays()).square().sum(), source)[0].any()
+
+
+def test_rtk_gets_unit_vectors_and_angles_that_make_the_detector():
+    box, rig = framed(GRID, CONE)
+    source, centre, u, v = view_arguments(box, rig)[2]
+    across = rig.unproject(torch.tensor([3.0, 2.0, 70.0], dtype=torch.float64).expand(4, 3))[2]
+    given = torch.tensor([centre, u, v, source], dtype=torch.float64)
+    assert torch.allclose(given[0], across)
+    assert torch.allclose(given[1:], torch.stack([rig.u[2] / 2.3, rig.v[2] / 2.1, rig.source[2]]))
+    for start in (0.0, 25.0, 90.0):
+        box, rig = framed(GRID, parallel(4, DETECTOR, 60.0, start_degrees=start, arc_degrees=360.0))
+        for m, (_, none, gantry, _, _, out, inner) in enumerate(view_arguments(box, rig)):
+            axes = turned(-inner, 2) @ turned(-out, 0) @ turned(-gantry, 1)
+            assert none == 0
+            assert torch.allclose(axes[0] * 2.3, rig.u[m], atol=1e-9)
+            assert torch.allclose(axes[1] * 2.1, rig.v[m], atol=1e-9)
+
+
+def turned(degrees: float, axis: int) -> torch.Tensor:
+    """The rotation about an axis, counter-clockwise."""
+    angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    generator = torch.zeros(3, 3, dtype=torch.float64)
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    generator[b, a], generator[a, b] = angle, -angle
+    return torch.linalg.matrix_exp(generator)
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_mbirtorch_gets_a_scan_that_makes_the_rig(upright: bool):
+    flip = replace(CONE, origin=CONE.origin + 4 * CONE.v + 6 * CONE.u, u=-CONE.u, v=-CONE.v) if upright else CONE
+    heights = torch.linspace(0, 3, 4, dtype=torch.float64)[:, None] * torch.tensor([0, 0, 1.0])
+    helix = replace(flip, source=flip.source + heights, origin=flip.origin + heights)
+    _, rig = framed(GRID, helix)
+    scan = scan_of(rig)
+    assert scan.turned is not upright
+    assert (round(scan.sid, 9), round(scan.sdd, 9)) == (40.0, 70.0)
+    again = rig_of(scan, rig)
+    for one, other in zip(rig.rays(), again.rays(), strict=True):
+        assert torch.allclose(one, other, atol=1e-9)
+
+
+def test_rows_know_their_slices_and_the_axis_its_column():
+    detector = {"pixels": [6, 9], "pixel_mm": [1.0, 1.5], "offset_mm": [0.0, 3.0]}
+    box, rig = framed(Grid.centred((4, 7, 7), (1.5, 1.5, 1.0)), parallel(3, detector, 60.0, start_degrees=20.0))
+    assert plane_of_rows(box, rig, "it") == [(1, 3), (2, 2), (3, 1), (4, 0)]
+    angles, columns = turns(box, rig)
+    assert columns == [2, 2, 2]
+    assert angles[1] - angles[0] == pytest.approx(-60.0)
+
+
+TILTED = CONE.moved(random_rotation(torch.Generator().manual_seed(0)), torch.zeros(3))
+FLAT = Grid.centred((5, 7, 7), 2.0)
+STACK = parallel(3, {"pixels": [5, 7], "pixel_mm": 2.0}, 60.0)
+SHEARED = Grid(GRID.shape, GRID.affine + torch.tensor([[0.0, 0.3, 0.0, 0.0]] + [[0.0] * 4] * 3))
+REFUSED = {
+    "sheared grid": (Nanodrr, SHEARED, CONE, {}, "right angles"),
+    "central line": (Nanodrr, GRID, replace(CONE, extent="line"), {}, "got central cameras of extent 'line'"),
+    "one sample": (Nanodrr, GRID, CONE, {"samples": 1}, "at least 2 samples on a ray, got 1"),
+    "unknown method": (Diffdrr, GRID, CONE, {"method": "joseph"}, "Known: siddon, trilinear"),
+    "source inside": (Diffdrr, GRID, replace(CONE, source=GRID.centre + CONE.source * 0), {}, "between sources"),
+    "skew pixels": (Rtk, GRID, replace(CONE, v=CONE.v + 0.1 * CONE.u), {}, "right angles"),
+    "two pixel sizes": (Rtk, GRID, replace(CONE, u=CONE.u * torch.arange(1, 5)[:, None]), {}, "one pixel size"),
+    "slanted beam": (Rtk, GRID, replace(BEAM, origin=BEAM.origin + 9 * BEAM.u), {}, "square to their detector"),
+    "pose gradient": (Rtk, GRID, replace(CONE, u=CONE.u.clone().requires_grad_()), {}, "no gradient in the cameras"),
+    "cone in 2-D": (Astra, GRID, CONE, {}, "stay in the middle of a slice"),
+    "oblong voxels": (Astra, Grid.centred((5, 7, 7), (2.0, 1.5, 2.0)), STACK, {}, "square voxels, got 2 by 1.5 mm"),
+    "linear fan": (Astra, FLAT, circular(3, 40, 70, {"pixels": [1, 9], "pixel_mm": 2.0}), {"method": "linear"}, "fan"),
+    "rows between": (Astra, FLAT, STACK.moved(torch.eye(3), torch.tensor([0, 0, 1.0])), {}, "got rays 0.5 slices off"),
+    "pinholes": (Mbirtorch, GRID, PINHOLES, {}, "a circle or a helix about the z axis"),
+    "tilted circle": (Mbirtorch, GRID, TILTED, {}, "a circle or a helix about the z axis"),
+    "axis elsewhere": (Mbirtorch, GRID, CONE.moved(torch.eye(3), torch.tensor([1.0, 0, 0])), {}, "volume's centre"),
+    "cone to radon": (Skimage, FLAT, CONE, {}, "takes parallel beams, got central"),
+    "wide columns": (Skimage, Grid.centred((5, 7, 7), 1.9), STACK, {}, "as wide as the detector's columns"),
+    "even size": (Skimage, Grid.centred((5, 8, 8), 2.0), STACK, {}, "take odd sizes"),
+}
+
+
+@pytest.mark.parametrize("why", REFUSED)
+def test_what_a_library_cannot_take_is_refused_with_the_reason(why: str):
+    part, grid, rig, options, message = REFUSED[why]
+    with pytest.raises(ValueError, match=message):
+        part(grid, rig, **options)
+
+
+LIBRARIES: dict[str, tuple[str, str, Grid, Cameras]] = {
+    "rtk": ("itk", "itk-rtk", GRID, CONE),
+    "nanodrr": ("nanodrr.data", "nanodrr", GRID, CONE),
+    "diffdrr": ("diffdrr.renderers", "diffdrr", GRID, CONE),
+    "astra": ("astra", "astra-toolbox", FLAT, STACK),
+    "mbirtorch": ("mbirtorch", "mbirtorch", GRID, CONE),
+    "skimage": ("skimage.transform", "scikit-image", FLAT, STACK),
+}
+
+
+@pytest.mark.parametrize("name", LIBRARIES)
+def test_a_library_that_is_absent_is_named_with_what_installs_it(name: str, monkeypatch: pytest.MonkeyPatch):
+    module, package, grid, rig = LIBRARIES[name]
+    monkeypatch.setitem(sys.modules, module, None)
+    where, _, attribute = PARTS[name].partition(":")
+    with pytest.raises(ImportError, match=f"pip install {package}"):
+        getattr(import_module(where), attribute)(grid, rig)
+
+
+def test_every_part_is_configured_by_its_own_defaults():
+    folder = Path(__file__).parents[1] / "mvrecon_peers" / "conf" / "projector"
+    assert {file.stem for file in folder.glob("*.yaml")} == set(PARTS) == set(LIBRARIES)
+    for name, where in PARTS.items():
+        module, _, attribute = where.partition(":")
+        parameters = signature(getattr(import_module(module), attribute)).parameters
+        options = {key: p.default for key, p in parameters.items() if key not in ("grid", "cameras")}
+        assert yaml.safe_load((folder / f"{name}.yaml").read_text()) == {"name": name} | options
+
+
+def test_importing_the_parts_imports_no_library():
+    import subprocess
+
+    code = f"import sys\nfor m in {[w.partition(':')[0] for w in PARTS.values()]}: __import__(m)\n"
+    code += "print({'itk', 'nanodrr', 'diffdrr', 'astra', 'mbirtorch', 'skimage'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "set()\n"

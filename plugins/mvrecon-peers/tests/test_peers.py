@@ -1,0 +1,189 @@
+"""Each library, where it is installed, sees what mvrecon sees: same rays, same voxels, same units, and its adjoint."""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from torch import Tensor
+
+from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import random_rotation
+from mvrecon.parts import PROJECTORS
+from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon.scenes.voxelise import voxelise
+
+CENTRE = torch.tensor([7.0, -5.0, 9.0], dtype=torch.float64)
+DETECTOR = {"pixels": [34, 38], "pixel_mm": [1.7, 1.5], "offset_mm": [0.8, -0.6]}
+GRID = Grid.centred((26, 27, 29), (1.1, 0.9, 1.2), CENTRE.tolist())
+SQUARE = Grid.centred((21, 27, 29), (1.1, 1.1, 1.3), CENTRE.tolist())
+
+
+def tilted(grid: Grid) -> Grid:
+    """The same voxels about the same centre, in no direction of the world."""
+    R, affine = random_rotation(torch.Generator().manual_seed(3)), grid.affine.clone()
+    affine[:3, :3] = R @ affine[:3, :3]
+    affine[:3, 3] = grid.centre - affine[:3, :3] @ grid.centre_index
+    return Grid(grid.shape, affine)
+
+
+def about(rig: Cameras, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Cameras:
+    """The rig about a point beside the grid's centre."""
+    return rig.moved(torch.eye(3), CENTRE + torch.tensor([x, y, z]))
+
+
+CASES: dict[str, tuple[Grid, Cameras]] = {
+    "cone": (GRID, about(circular(4, 70.0, 110.0, DETECTOR, start_degrees=13.0), 1.0, -2.0, 3.0)),
+    "dome": (tilted(GRID), dome(4, 70.0, 110.0, 150.0, DETECTOR, target=CENTRE.tolist(), extent="segment")),
+    "pinholes": (GRID, dome(4, 70.0, 40.0, 150.0, DETECTOR, target=CENTRE.tolist())),
+    "beam": (tilted(GRID), about(parallel(4, DETECTOR, 90.0, start_degrees=11.0), 1.0, -2.0, 3.0)),
+    "scan": (GRID, about(circular(5, 70.0, 110.0, DETECTOR, start_degrees=13.0), z=2.0)),
+    "stack": (SQUARE, about(parallel(5, {"pixels": [23, 35], "pixel_mm": [1.3, 1.1], "offset_mm": [0, 2.2]}, 90.0))),
+    "fan": (SQUARE, about(circular(5, 70.0, 110.0, DETECTOR | {"pixels": [1, 38], "offset_mm": [0, 0.7]}), z=2.6)),
+}
+ANY = ("cone", "dome", "pinholes", "beam", "scan", "stack")
+#: Peer: what it imports, its options, the cases that it takes, our method, and how far from it the peer may be.
+PEERS = {
+    "rtk": ("itk.RTK", {}, ANY, "joseph", 1e-4),
+    "nanodrr": ("nanodrr", {}, ANY, "joseph", 0.012),
+    "diffdrr": ("diffdrr", {}, ANY, "siddon", 1e-5),
+    "diffdrr trilinear": ("diffdrr", {"method": "trilinear", "samples": 200}, ANY, "joseph", 0.012),
+    "astra": ("astra", {}, ("stack", "fan"), "siddon", 1e-5),
+    "astra linear": ("astra", {"method": "linear"}, ("stack",), "joseph", 1e-5),
+    "astra strip": ("astra", {"method": "strip"}, ("stack",), "joseph", 0.012),
+    "mbirtorch": ("mbirtorch", {"compile_mode": "off"}, ("scan", "stack", "fan"), "joseph", 0.012),
+    "skimage": ("skimage", {}, ("stack",), "joseph", 0.012),
+}
+PAIRS = [(peer, case) for peer, (_, _, cases, _, _) in PEERS.items() for case in cases]
+#: Of the exact integrals; the voxels' own error.
+TOLERANCE = 0.085
+
+
+def phantom() -> Phantom:
+    """Three ellipsoids without any symmetry, off the grid's centre."""
+    centres = torch.tensor([[-3.0, 3.0, -3.0], [4.0, -3.0, 3.0], [1.0, 5.0, 6.0]], dtype=torch.float64) + CENTRE
+    semi_axes = torch.tensor([[8.0, 5.0, 6.0], [6.0, 8.0, 5.0], [6.0, 4.0, 5.0]], dtype=torch.float64)
+    return Phantom(
+        (Solids("ellipsoid", centres, random_rotation(torch.Generator().manual_seed(1), 3), semi_axes, torch.ones(3)),)
+    )
+
+
+@cache
+def seen(case: str) -> tuple[Tensor, Tensor]:
+    """The phantom's voxels and its exact views."""
+    grid, rig = CASES[case]
+    return voxelise(phantom(), grid)[None, None], phantom().integrals(*rig.rays(), extent=rig.limits)[None, None]
+
+
+def build(peer: str, case: str, **change):
+    """A peer on a case, or a skip where its library is absent."""
+    library, options, *_ = PEERS[peer]
+    if library == "itk.RTK":
+        pytest.importorskip("itk", exc_type=ImportError)
+    pytest.importorskip(library.partition(".")[0], exc_type=ImportError)
+    grid, rig = CASES[case]
+    return PROJECTORS.build(peer.split()[0], **({"grid": grid, "cameras": rig} | options | change))
+
+
+def ours(case: str, method: str):
+    grid, rig = CASES[case]
+    return PROJECTORS.build("radon" if rig.parallel else "drr", grid=grid, cameras=rig, method=method)
+
+
+def error(views: Tensor, truth: Tensor) -> float:
+    return ((views - truth).norm() / truth.norm()).item()
+
+
+@pytest.mark.parametrize(("peer", "case"), PAIRS)
+def test_a_peer_gives_the_exact_integrals_and_our_own(peer: str, case: str):
+    A, (x, exact) = build(peer, case), seen(case)
+    views = A(x)
+    assert views.shape == exact.shape
+    assert error(views, exact) < TOLERANCE
+    _, _, _, method, far = PEERS[peer]
+    assert error(views, ours(case, method)(x)) < far
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_half_a_voxel_or_pixel_a_flip_or_a_turn_would_exceed_the_tolerance(case: str):
+    """What our own operator, put wrong in any such way, sees of the phantom."""
+    A, (x, exact) = ours(case, "joseph"), seen(case)
+    right = A(x)
+    grid, rig = CASES[case]
+    wrong = {f"flipped {axis}": A(x.flip(axis)) for axis in (2, 3, 4)}
+    wrong |= {f"views flipped {axis}": right.flip(axis) for axis in (2, 3, 4) if right.shape[axis] > 1}
+    for axis in range(3):
+        affine = grid.affine.clone()
+        affine[:3, 3] += grid.affine[:3, axis] / 2
+        if case != "fan" or axis < 2:  # a fan sees one slice
+            name = "radon" if rig.parallel else "drr"
+            wrong[f"half a voxel {axis}"] = PROJECTORS.build(name, grid=Grid(grid.shape, affine), cameras=rig)(x)
+    for axis, steps in ((-1, (0.5, 0)), (-2, (0, 0.5))):
+        if right.shape[axis] > 1:
+            shift = rig.u * steps[0] + rig.v * steps[1]
+            moved = replace(rig, origin=rig.origin + shift, source=rig.source + (shift if rig.parallel else 0))
+            wrong[f"half a pixel {axis}"] = phantom().integrals(*moved.rays(), extent=rig.limits)[None, None]
+    for name, views in wrong.items():
+        assert error(views, exact) > TOLERANCE, name
+    assert error(right, exact) < TOLERANCE
+
+
+@pytest.mark.parametrize(("peer", "case"), [pair for pair in PAIRS if pair[0] != "skimage"])
+def test_the_adjoint_matches(peer: str, case: str):
+    A = build(peer, case)
+    torch.manual_seed(0)
+    x, y = torch.rand(1, 1, *A.grid.shape), torch.rand(1, 1, len(A.cameras), *A.cameras.shape)
+    left, right = (A(x).double() * y).sum(), (A.T(y).double() * x).sum()
+    assert left.item() == pytest.approx(right.item(), rel=1e-5)
+
+
+def test_skimage_has_a_back_projection_near_the_adjoint():
+    A, (_, exact) = build("skimage", "stack"), seen("stack")
+    assert error(A.T(exact), ours("stack", "joseph").T(exact)) < 0.05
+
+
+@pytest.mark.parametrize("peer", PEERS)
+def test_gradients_are_the_adjoint_and_batch_channels_and_types_go_through(peer: str):
+    case = PEERS[peer][2][-1]
+    A, torch_seed = build(peer, case), torch.Generator().manual_seed(0)
+    x = torch.rand(2, 2, *A.grid.shape, generator=torch_seed, requires_grad=True)
+    views = A(x)
+    assert torch.equal(views[1:, 1:], A(x[1:, 1:]))
+    y = torch.rand(views.shape, generator=torch_seed)
+    (gradient,) = torch.autograd.grad(views, x, y)
+    assert error(gradient, A.T(y)) < 1e-6
+    y.requires_grad_()
+    (second,) = torch.autograd.grad(A.T(y).square().sum(), y)
+    assert error(second, 2 * A(A.T(y.detach()))) < 1e-5
+    for dtype, wide in ((torch.float64, torch.float64), (torch.float16, torch.float32)):
+        other = A(x.detach().to(dtype))
+        assert other.dtype == wide
+        assert error(other.float(), views.detach()) < 1e-3
+
+
+@pytest.mark.parametrize("peer", ["nanodrr", "diffdrr trilinear"])
+def test_gradients_in_the_pose_are_those_of_differences(peer: str):
+    grid, rig = CASES["dome"]
+    x = seen("dome")[0].double()
+    rig, (way,) = rig[:2], torch.randn(1, 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weight = torch.linspace(0, 1, rig.shape[1], dtype=torch.float64)
+
+    def value(step: Tensor) -> Tensor:
+        moved = replace(rig, source=rig.source + step * way)
+        return (build(peer, "dome", cameras=moved)(x) * weight).sum()
+
+    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(value(step), step)
+    with torch.no_grad():
+        difference = (value(step + 1e-4) - value(step - 1e-4)) / 2e-4
+    assert gradient.item() == pytest.approx(difference.item(), rel=0.02)
+
+
+def test_siddon_of_diffdrr_has_finite_gradients_in_every_vector_of_the_cameras():
+    _, rig = CASES["cone"]
+    vectors = {name: getattr(rig, name).clone().requires_grad_() for name in VECTORS}
+    views = build("diffdrr", "cone", cameras=replace(rig, **vectors))(seen("cone")[0])
+    for gradient in torch.autograd.grad(views.sum(), list(vectors.values())):
+        assert gradient.isfinite().all() and gradient.any()
