@@ -183,6 +183,16 @@ class Cameras:
         u, v = self.u * factor, self.v * factor
         return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
 
+    def refined(self, factor: int) -> "Cameras":
+        """The same detectors with every pixel cut into `factor` x `factor`; undone by `binned`."""
+        if factor < 1:
+            raise ValueError(f"A pixel is cut into a positive number of rays each way, got {factor}")
+        u, v = self.u / factor, self.v / factor
+        shift = (u + v) * (1 - factor) / 2
+        shape = (self.shape[0] * factor, self.shape[1] * factor)
+        source = self.source + shift if self.parallel else self.source
+        return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
+
     def moved(self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> "Cameras":
         """The rig after the rigid motion X -> R X + t of the world."""
         R, t = rotation.to(self.source), translation.to(self.source)

@@ -13,8 +13,13 @@ FASTMATH = {"reassoc", "contract", "nsz"}
 #: The loops make no arrays, so they need not count who holds one: counting costs as much as a ray.
 OPTIONS: dict[str, Any] = {"fastmath": FASTMATH, "error_model": "numpy", "_nrt": False}
 
-#: A function of scalars, compiled into whatever calls it.
-scalar = njit(forceinline=True, **OPTIONS)
+
+def scalar(function: Callable[..., Any]) -> Any:
+    """A function of scalars, compiled into whatever calls it, on the CPU and on CUDA devices."""
+    dispatcher: Any = njit(forceinline=True, **OPTIONS)(function)
+    # read by numba-cuda alone: it would take some flags of fast mathematics for all, reciprocals for divisions too
+    dispatcher.targetoptions = {"forceinline": True}
+    return dispatcher
 
 
 def digest(folder: Path) -> str:
@@ -32,6 +37,7 @@ def compiled(loop: Callable[..., Any]) -> Any:
         dispatcher: Any = njit(cache=True, **options)(loop)
     except RuntimeError:  # numba finds no folder to write to
         return njit(**options)(loop)
-    # numba's own stamp sees edits of this file only, not of the functions that the loops call
-    dispatcher._cache._cache_file._source_stamp = SOURCES
+    if dispatcher is not loop:  # numba may be told to compile nothing, as under its simulator of CUDA
+        # numba's own stamp sees edits of this file only, not of the functions that the loops call
+        dispatcher._cache._cache_file._source_stamp = SOURCES
     return dispatcher

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.kernels.backends import wide
 from mvrecon.kernels.columns import ROWS, backproject_columns, column_of, project_columns
 from mvrecon.kernels.lines import unshifted
 from mvrecon.kernels.loops import Rig, backproject_slabs, project_rows, room_of, vary_rows
@@ -21,11 +22,13 @@ from mvrecon.kernels.stores import Store, add, empty, fill, inner, store
 from mvrecon.kernels.threads import share
 
 
-def _copies(volume: np.ndarray, rig: Rig, plan: Plan) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
+def _copies(volume: Tensor, rig: Rig, plan: Plan) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
     """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that read them, rows."""
     for near, axes in plan.layouts:
-        for rows, piece in pieces(rig, len(volume), volume.itemsize):
-            part, into = volume[:, :, rows], empty(len(volume), piece.sizes, near, volume.dtype)
+        # a volume of half precision is widened piece by piece, and takes twice the room
+        for rows, piece in pieces(rig, len(volume), max(volume.itemsize, 16 // volume.itemsize)):
+            part = wide(volume[:, :, rows]).numpy()
+            into = empty(len(volume), piece.sizes, near, part.dtype)
             share(
                 lambda a, b, part=part, to=into, near=near: fill(part, near, inner(to), a, b), part.shape[2], part.size
             )
@@ -41,10 +44,10 @@ def project(
 ) -> Float[Tensor, "n m v u"]:
     """Line integrals of volumes, in mm times their unit; see `reference.project`."""
     rig = rig_of(lines, window, volume.shape[1:], detector, method)
-    plan, values = plan_of(rig), volume.numpy()
-    views = np.zeros((len(values), len(lines), *rig.detector), values.dtype)
+    plan = plan_of(rig)
+    views = np.zeros((len(volume), len(lines), *rig.detector), wide(volume[:0]).numpy().dtype)
     oblique, upright = len(plan.oblique) * max(rig.detector), len(plan.upright) * rig.detector[1]
-    for held, piece, axes, _ in _copies(values, rig, plan):
+    for held, piece, axes, _ in _copies(volume, rig, plan):
 
         def add_rows(first: int, last: int, held=held, piece=piece, axes=axes) -> None:
             project_rows(held, piece, room_of(piece, held), (*plan.reads(piece, held.near), axes), views, first, last)
@@ -107,7 +110,7 @@ def lines_vjp(
     rig = rig_of(lines, window, volume.shape[1:], views.shape[2:], method)
     plan, given = plan_of(rig, columns=False), np.ascontiguousarray(views.numpy())
     total = torch.zeros(lines.shape, dtype=torch.float64)
-    for held, piece, axes, rows in _copies(volume.numpy(), rig, plan):
+    for held, piece, axes, rows in _copies(volume, rig, plan):
         # a row or column of pixels has its own sum, so that threads change no bit
         change = np.zeros((len(lines), max(rig.detector), *lines.shape[1:]))
 

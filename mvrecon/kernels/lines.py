@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 
 #: The four linear maps of a view in `lines_of`.
@@ -46,6 +47,15 @@ def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
         moment = tuple(torch.linalg.cross(source, each) for each in (U, V, detector))
     maps = [torch.stack(columns, dim=-1) for columns in (direction, moment, start, world)]
     return torch.stack(maps, dim=1)
+
+
+def lines_of_rays(rays: ExplicitRays, grid: Grid) -> Float[Tensor, "r 4 3 1"]:
+    """Rays given one by one, each as a view of one pixel: maps of the constant alone, as in `lines_of`."""
+    voxel = torch.linalg.inv(grid.affine[:3, :3])
+    source, target = rays.source.flatten(0, 2), rays.target.flatten(0, 2)
+    start, end = ((points - grid.centre) @ voxel.T for points in (source, target))
+    maps = (end - start, torch.linalg.cross(start, end), start, target - source)
+    return torch.stack(maps, dim=1)[..., None]
 
 
 def shifted(lines: Float[np.ndarray, "m 4 3 k"], y: float) -> Float[np.ndarray, "m 4 3 k"]:

@@ -11,14 +11,14 @@ from mvrecon.kernels.stores import Store
 
 #: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a ray (trilinear).
 Rig = namedtuple("Rig", ["lines", "window", "sizes", "detector", "method", "samples"])
-#: Flat strides along the ray's main and far axis; samples a ray.
-Steps = namedtuple("Steps", ["along", "far", "samples"])
+#: Flat strides along the ray's main, far and near axis; samples a ray.
+Steps = namedtuple("Steps", ["along", "far", "near", "samples"])
 
 
 @scalar
 def steps_of(rig, store, axis):
     """How the loops step through a store along rays of one main axis."""
-    return Steps(store.strides[axis], store.strides[3 - axis - store.near], rig.samples)
+    return Steps(store.strides[axis], store.strides[3 - axis - store.near], 1, rig.samples)
 
 
 #: What is known of the cells of one ray: flat indices, four numbers each, pairs of corners whole and in their parts.
@@ -126,7 +126,7 @@ def backproject_slabs(store, rig, room, reads, views, low, high):
 
 
 @scalar
-def _pull_back(line, ray, p, window, value, slopes, change):
+def pull_back(line, ray, p, window, value, slopes, change):
     """Add to a row's `change` [4 3 k] the derivative of value * (one ray's integral) by the maps in `line`."""
     total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end = slopes
     axis, b, c = ray.axis, ray.far, ray.near
@@ -180,4 +180,4 @@ def vary_rows(store, rig, room, reads, given, first, last):
                 else:
                     slopes = siddon.slopes(store, n, steps, span, ray)
                 value = views[n, m, v, u]
-                _pull_back(line, ray, (here[0], here[1], 1.0), rig.window, value, slopes, change[m, place])
+                pull_back(line, ray, (here[0], here[1], 1.0), rig.window, value, slopes, change[m, place])

@@ -32,10 +32,11 @@ def cells(ray, span, steps, room):
 
 
 @scalar
-def _face(flat, k, far, y, z):
+def _face(flat, k, steps, y, z):
     """The interpolated volume in one slab, and its slopes along the far and the near axis."""
-    low_z, high_z = flat[k + 1] - flat[k], flat[k + far + 1] - flat[k + far]
-    lower, upper = flat[k] + z * low_z, flat[k + far] + z * high_z
+    above = k + steps.far
+    low_z, high_z = flat[k + steps.near] - flat[k], flat[above + steps.near] - flat[above]
+    lower, upper = flat[k] + z * low_z, flat[above] + z * high_z
     return lower + y * (upper - lower), upper - lower, low_z + y * (high_z - low_z)
 
 
@@ -43,9 +44,9 @@ def _face(flat, k, far, y, z):
 def _local(flat, steps, px, py, pz):
     """The interpolated volume at a place, and its slopes along the main, the far and the near axis."""
     below, iy, iz = int(floor(px)), int(py), int(pz)
-    k, x = (below + 1) * steps.along + iy * steps.far + iz, px - below
-    low, low_b, low_c = _face(flat, k, steps.far, py - iy, pz - iz)
-    high, high_b, high_c = _face(flat, k + steps.along, steps.far, py - iy, pz - iz)
+    k, x = (below + 1) * steps.along + iy * steps.far + iz * steps.near, px - below
+    low, low_b, low_c = _face(flat, k, steps, py - iy, pz - iz)
+    high, high_b, high_c = _face(flat, k + steps.along, steps, py - iy, pz - iz)
     return low + x * (high - low), high - low, low_b + x * (high_b - low_b), low_c + x * (high_c - low_c)
 
 

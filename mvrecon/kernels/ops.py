@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from mvrecon.kernels import cpu
+from mvrecon.kernels.mapping import batched, looped
 
 
 @torch.library.custom_op("mvrecon::project", mutates_args=(), device_types="cpu")
 def project(volume: Tensor, lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str) -> Tensor:
-    """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`."""
+    """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`. Half volumes give float32."""
     return cpu.project(volume, lines, window, detector, method)
 
 
@@ -31,7 +32,8 @@ def lines_vjp(volume: Tensor, views: Tensor, lines: Tensor, window: Sequence[flo
 
 @project.register_fake
 def _(volume, lines, window, detector, method):
-    return volume.new_empty(volume.shape[0], lines.shape[0], *detector)
+    wide = torch.float64 if volume.dtype == torch.float64 else torch.float32
+    return volume.new_empty(volume.shape[0], lines.shape[0], *detector, dtype=wide)
 
 
 @backproject.register_fake
@@ -47,13 +49,15 @@ def _(volume, views, lines, window, method):
 def _keep(ctx, inputs, output):
     first, lines, ctx.window, ctx.size, ctx.method = inputs
     ctx.save_for_backward(first if ctx.needs_input_grad[1] else None, lines)
-    ctx.shape = first.shape
+    ctx.shape, ctx.dtype = first.shape, first.dtype
 
 
 def _project_back(ctx, views):
     volume, lines = ctx.saved_tensors
     needs_volume, needs_lines = ctx.needs_input_grad[:2]
-    by_volume = backproject(views, lines, ctx.window, list(ctx.shape[1:]), ctx.method) if needs_volume else None
+    by_volume = None
+    if needs_volume:
+        by_volume = backproject(views, lines, ctx.window, list(ctx.shape[1:]), ctx.method).to(ctx.dtype)
     by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method) if needs_lines else None
     return by_volume, by_lines, None, None, None
 
@@ -73,3 +77,6 @@ def _no_second_order(ctx, grad):
 project.register_autograd(_project_back, setup_context=_keep)
 backproject.register_autograd(_backproject_back, setup_context=_keep)
 lines_vjp.register_autograd(_no_second_order)
+project.register_vmap(batched(project))
+backproject.register_vmap(batched(backproject))
+lines_vjp.register_vmap(looped(lines_vjp, 3))

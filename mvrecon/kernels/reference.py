@@ -3,6 +3,8 @@
 It shares no arithmetic with the compiled kernels. All rays advance together, slab by slab of their own main axis.
 """
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -29,12 +31,17 @@ class Rays:
 
 
 def rays_of(
-    lines: Tensor, window: Sequence[float], detector: Sequence[int], shape: Sequence[int], like: Tensor
+    lines: Tensor,
+    window: Sequence[float],
+    detector: Sequence[int],
+    shape: Sequence[int],
+    like: Tensor,
+    reach: float = 0.0,
 ) -> Rays:
-    """Where every ray runs; formed in float64, then cast to the volume's type."""
+    """Where every ray runs, to `reach` voxels beyond the box; formed in float64, then cast to the volume's type."""
     centre = lines.new_tensor([(detector[1] - 1) / 2, (detector[0] - 1) / 2])
     uv = pixel_centres(detector).to(lines) - centre
-    p = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1).reshape(-1, 3)
+    p = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1).reshape(-1, 3)[:, -lines.shape[-1] :]
     maps = torch.einsum("mkxc,rc->kxmr", lines, p).flatten(2)
     direction, moment = maps[DIRECTION], maps[MOMENT]
     preference = 1 + TIE * torch.arange(2, -1, -1, device=lines.device, dtype=lines.dtype)
@@ -44,7 +51,7 @@ def rays_of(
     M = moment.gather(0, order)
     start = maps[START].gather(0, order[:1])[0]
     sizes = torch.tensor(shape[::-1], device=lines.device)
-    half = sizes[main] / 2
+    half = sizes[main] / 2 + reach
     ends = [_end(start, D[0], w) for w in window]
     steps = torch.tensor([1, shape[2] + 2, (shape[2] + 2) * (shape[1] + 2)], device=lines.device)
     value = torch.stack([-M[2], M[1]]) / D[0]
@@ -98,12 +105,45 @@ def _siddon(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]
         yield (k + 1) * rays.strides[0] + ((inside + 1) * rays.strides[1:]).sum(dim=0), weight
 
 
+def _grown(rays: Rays) -> tuple[Tensor, Tensor]:
+    """Where each ray enters and leaves the box grown by half a voxel, the reach of the trilinear kernel."""
+    half = rays.sizes / 2 + 0.5
+    # a ray on its way to a face that it cannot reach is let through by the box or misses it
+    slope = torch.where(
+        rays.slope == 0, torch.full_like(rays.slope, 1e-300 if rays.slope.dtype == torch.float64 else 1e-30), rays.slope
+    )
+    one, two = (-half[1:] - rays.value) / slope, (half[1:] - rays.value) / slope
+    enter = torch.maximum(rays.begin, torch.minimum(one, two).amax(dim=0))
+    return enter, torch.maximum(enter, torch.minimum(rays.end, torch.maximum(one, two).amin(dim=0)))
+
+
+def _trilinear(rays: Rays, samples: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Flat indices and weights of a fixed number of samples a ray, each in the middle of its share."""
+    begin, end = _grown(rays)
+    axes = rays.sizes
+    for j in range(samples):
+        s = begin + (end - begin) * ((j + 0.5) / samples)
+        place = torch.cat([s[None], rays.value + s * rays.slope]) + (axes - 1) / 2
+        place = torch.minimum(place.clamp_min(-1), axes.to(s.dtype))
+        cell = torch.minimum(place.detach().floor().long(), axes - 1)
+        part = place - cell
+        for corner in itertools.product((0, 1), repeat=3):
+            index = ((cell + 1 + cell.new_tensor(corner)[:, None]) * rays.strides).sum(dim=0)
+            weight = math.prod(part[a] if corner[a] else 1 - part[a] for a in range(3))
+            yield index, (end - begin) / samples * weight
+
+
 def _weights(
     lines: Tensor, window: Sequence[float], detector: Sequence[int], shape: Sequence[int], like: Tensor, method: str
 ):
     """Every flat index and weight, in mm, of all rays: the rows of the system matrix, slab by slab."""
-    rays = rays_of(lines, window, detector, shape, like)
-    cells = {"joseph": _joseph, "siddon": _siddon}[method]
+    name, _, samples = method.partition(":")
+    rays = rays_of(lines, window, detector, shape, like, 0.5 if name == "trilinear" else 0.0)
+    if name == "trilinear":
+        for index, weight in _trilinear(rays, int(samples)):
+            yield index, weight * rays.length
+        return
+    cells = {"joseph": _joseph, "siddon": _siddon}[name]
     for slab in range(max(shape)):
         k = torch.minimum(torch.tensor(slab, device=lines.device), rays.sizes[0] - 1)
         s = k.to(like.dtype) - (rays.sizes[0] - 1) / 2
@@ -126,7 +166,8 @@ def project(
         lines: the views' rays, from `lines_of`.
         window: the part of each ray that counts, as fractions of the way from source to pixel.
         detector: pixels (rows, columns).
-        method: "joseph" (second order in the voxel size for smooth volumes) or "siddon" (exact for constant voxels).
+        method: "joseph" (second order in the voxel size for smooth volumes), "siddon" (exact for constant voxels), or
+            "trilinear:n" with n samples a ray (second order in both the voxel size and the distance of samples).
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
     total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1])

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mvrecon.kernels.warp_ops import batched
+from mvrecon.kernels.mapping import batched
 
 # numba is heavy, so the kernels are imported at their first call
 

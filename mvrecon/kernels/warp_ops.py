@@ -3,10 +3,12 @@
 Second derivatives in the values are exact. A second derivative in the maps raises: the reference has it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+
+from mvrecon.kernels.mapping import batched, looped
 
 # numba is heavy, so the kernels are imported at their first call
 
@@ -77,28 +79,6 @@ warp_back.register_autograd(_warp_back_back, setup_context=_keep)
 warp_vjp.register_autograd(_no_second_order)
 
 
-def batched(operator: Callable[..., Tensor]) -> Callable[..., tuple[Tensor, int]]:
-    """How `torch.func.vmap` maps operator(values, geometry, ..): values join its batch, geometries are looped over."""
-
-    def mapped(info, in_dims, values, geometry, *rest):
-        where, of_geometry = in_dims[:2]
-        if of_geometry is None:
-            moved = values.movedim(where, 0)
-            return operator(moved.flatten(0, 1), geometry, *rest).unflatten(0, moved.shape[:2]), 0
-        each = values.unbind(where) if where is not None else [values] * info.batch_size
-        pairs = zip(each, geometry.unbind(of_geometry), strict=True)
-        return torch.stack([operator(*pair, *rest) for pair in pairs]), 0
-
-    return mapped
-
-
 warp.register_vmap(batched(warp))
 warp_back.register_vmap(batched(warp_back))
-
-
-@warp_vjp.register_vmap
-def _(info, in_dims, *tensors):
-    each = [
-        t.unbind(dim) if dim is not None else [t] * info.batch_size for t, dim in zip(tensors, in_dims, strict=True)
-    ]
-    return torch.stack([warp_vjp(*three) for three in zip(*each, strict=True)]), 0
+warp_vjp.register_vmap(looped(warp_vjp, 3))

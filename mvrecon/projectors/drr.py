@@ -1,6 +1,7 @@
-"""Central projection: X-ray cone beams and pinholes alike."""
+"""Central projection: X-ray cone beams, pinholes, and rays given one by one."""
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.base import Projector
 
@@ -8,19 +9,29 @@ from mvrecon.projectors.base import Projector
 class Drr(Projector):
     """Digitally reconstructed radiographs: integrals along the rays through each camera's point; see `Projector`.
 
-    Order of accuracy in the voxel size: "joseph" two for smooth volumes, "siddon" one.
+    Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth volumes, "siddon" one.
 
     Args:
         grid: where the voxels lie.
-        cameras: a rig of central cameras.
-        method: "joseph" or "siddon".
-        backend: "auto", "cpu" or "reference".
+        cameras: a rig of central cameras, or explicit rays.
+        method: "joseph", "siddon" or "trilinear".
+        backend: "auto", "cpu", "cuda" or "reference".
+        samples: of "trilinear", on each ray.
+        rays_per_pixel: rays each way over which a pixel is the mean.
 
     Raises:
         ValueError: a parallel rig, or as `Projector`.
     """
 
-    def __init__(self, grid: Grid, cameras: Cameras, method: str = "joseph", backend: str = "auto"):
+    def __init__(
+        self,
+        grid: Grid,
+        cameras: Cameras | ExplicitRays,
+        method: str = "joseph",
+        backend: str = "auto",
+        samples: int | None = None,
+        rays_per_pixel: int = 1,
+    ):
         if cameras.parallel:
             raise ValueError("The projector 'drr' needs central cameras, got a parallel rig; use 'radon'")
-        super().__init__(grid, cameras, method, backend)
+        super().__init__(grid, cameras, method, backend, samples, rays_per_pixel)

@@ -8,20 +8,31 @@ from mvrecon.projectors.base import Projector
 class Radon(Projector):
     """Integrals along parallel rays; see `Projector`.
 
-    A grid of one slice under detectors of one row is the 2-D Radon transform; detector rows along z see one slice each.
-    Order of accuracy in the voxel size: "joseph" two for smooth volumes, "siddon" one.
+    A grid of one slice under detectors of one row is the 2-D Radon transform. Detector rows along z see a stack of
+    slices: the volume is then read as whole rows along z, several times faster than by rays that are tilted.
+    Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth volumes, "siddon" one.
 
     Args:
         grid: where the voxels lie.
         cameras: a rig of parallel beams.
-        method: "joseph" or "siddon".
-        backend: "auto", "cpu" or "reference".
+        method: "joseph", "siddon" or "trilinear".
+        backend: "auto", "cpu", "cuda" or "reference".
+        samples: of "trilinear", on each ray.
+        rays_per_pixel: rays each way over which a pixel is the mean.
 
     Raises:
         ValueError: a rig of central cameras, or as `Projector`.
     """
 
-    def __init__(self, grid: Grid, cameras: Cameras, method: str = "joseph", backend: str = "auto"):
+    def __init__(
+        self,
+        grid: Grid,
+        cameras: Cameras,
+        method: str = "joseph",
+        backend: str = "auto",
+        samples: int | None = None,
+        rays_per_pixel: int = 1,
+    ):
         if not cameras.parallel:
             raise ValueError("The projector 'radon' needs a parallel rig, got central cameras; use 'drr'")
-        super().__init__(grid, cameras, method, backend)
+        super().__init__(grid, cameras, method, backend, samples, rays_per_pixel)

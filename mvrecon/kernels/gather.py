@@ -1,0 +1,139 @@
+"""The adjoint of Joseph's method, voxel by voxel: no two threads write the same number, so none waits for another.
+
+A voxel X gets something from a ray of main axis a where the ray passes its slab less than a voxel from X along both
+other axes. In a view these rays hit the picture of a square of two voxels about X, which stays convex as long as it
+lies on one side of the source. Every pixel of the picture's box is asked for the weight that `joseph.py` gives it, so
+the result is the exact transpose also where a view mixes main axes. Box and weights need nothing but scalars.
+"""
+
+from math import ceil, floor
+
+import numpy as np
+
+from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays import JOSEPH, main_axis, trace
+
+#: What is kept of each ray, the last its main axis, or -1 when it misses the volume.
+B, SLOPE_B, C, SLOPE_C, BEGIN, END, LENGTH, AXIS = range(8)
+
+
+@scalar
+def near_of(axis):
+    """The axis nearest in memory, in a volume [d h w], of the two across a main axis."""
+    return 0 if axis != 0 else 1
+
+
+@scalar
+def cross(matrix, one, two, axis):
+    """A component of the cross product of two columns (kind, column) of a view's maps."""
+    p, q = (axis + 1) % 3, (axis + 2) % 3
+    return matrix[one[0], p, one[1]] * matrix[two[0], q, two[1]] - matrix[one[0], q, one[1]] * matrix[two[0], p, two[1]]
+
+
+@scalar
+def camera(line, into):
+    """Write the matrix [3 4] that takes points (x, y, z, 1) of a view to pixels (u, v, 1) up to a factor.
+
+    It solves source + w (U u + V v + A) = X, for parallel beams O + U u + V v + w A = X (Cramer's rule). For explicit
+    rays, and where U, V and A lie in one plane, it takes everything to (0, 0, 0).
+    """
+    into[:] = 0
+    if line.shape[2] == 1:
+        return
+    parallel = True
+    for axis in range(3):
+        parallel = parallel and line[0, axis, 0] == 0 and line[0, axis, 1] == 0
+    kind = 2 if parallel else 0
+    U, V, A = (kind, 0), (kind, 1), (0, 2)
+    scale = 0.0
+    for axis in range(3):
+        into[0, axis], into[1, axis] = cross(line, V, A, axis), cross(line, A, U, axis)
+        if parallel:
+            into[2, 3] += cross(line, V, A, axis) * line[kind, axis, 0]
+        else:
+            into[2, axis] = cross(line, U, V, axis)
+        start = line[2, axis, 2]
+        into[0, 3] -= into[0, axis] * start
+        into[1, 3] -= into[1, axis] * start
+        into[2, 3] -= into[2, axis] * start
+        scale += abs(into[2, axis])
+    scale += abs(into[2, 3])
+    for row in range(3):
+        for column in range(4):
+            into[row, column] = into[row, column] / scale if scale > 0 else 0.0
+
+
+@scalar
+def record(line, here, window, sizes, into, k):
+    """Write into column k what `weight` needs of the ray of a pixel, and tell its main axis."""
+    axis = main_axis(line, here[0], here[1])
+    ray = trace(line, axis, near_of(axis), here, window, sizes, JOSEPH)
+    into[B, k], into[SLOPE_B, k] = ray.b - 1, ray.slope_b  # voxels here are counted without their padding
+    into[C, k], into[SLOPE_C, k] = ray.c - 1, ray.slope_c
+    into[BEGIN, k], into[END, k], into[LENGTH, k] = ray.begin, ray.end, ray.length
+    into[AXIS, k] = axis if ray.first < ray.last else -1
+    return axis
+
+
+@scalar
+def limits(low, high, size):
+    """The whole numbers from low to high that are pixels of `size` ones, first and last."""
+    return np.int32(ceil(max(low, low * 0))), np.int32(floor(min(max(high, low * 0 - 1), low * 0 + (size - 1))))
+
+
+@scalar
+def box(frame, point, axis, detector, real):
+    """The pixels (first and last column, first and last row) whose rays can pass a voxel less than a voxel away.
+
+    Args:
+        frame: the view's matrix from `camera`, in the type `real`.
+        point: the voxel (x, y, z), from the volume's centre.
+        axis: the rays' main axis.
+        detector: pixels (rows, columns).
+        real: the type to compute in.
+    """
+    rows, columns = detector
+    x, y, z = real(point[0]), real(point[1]), real(point[2])
+    u = frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3]
+    v = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z + frame[1, 3]
+    w = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3]
+    near = near_of(axis)
+    far = 3 - axis - near
+    # on both sides of the source the picture is no longer convex: ask every pixel
+    if abs(w) * real(0.999) <= abs(frame[2, far]) + abs(frame[2, near]):
+        return np.int32(0), np.int32(columns - 1), np.int32(0), np.int32(rows - 1)
+    one = real(1)
+    low_u = low_v = real(1e30)
+    high_u = high_v = real(-1e30)
+    for i in (-one, one):
+        for j in (-one, one):
+            per = one / (w + i * frame[2, far] + j * frame[2, near])
+            pu = (u + i * frame[0, far] + j * frame[0, near]) * per
+            pv = (v + i * frame[1, far] + j * frame[1, near]) * per
+            low_u, high_u, low_v, high_v = min(low_u, pu), max(high_u, pu), min(low_v, pv), max(high_v, pv)
+    # what rounding may move a corner by, in single precision
+    slack_u, slack_v = real(0.02) + real(1e-5) * real(columns), real(0.02) + real(1e-5) * real(rows)
+    centre_u, centre_v = real(columns - 1) / real(2), real(rows - 1) / real(2)
+    u0, u1 = limits(low_u - slack_u + centre_u, high_u + slack_u + centre_u, columns)
+    v0, v1 = limits(low_v - slack_v + centre_v, high_v + slack_v + centre_v, rows)
+    return u0, u1, v0, v1
+
+
+@scalar
+def hat(t, one):
+    """A triangle of unit height and reach."""
+    return max(one - one, one - abs(t))
+
+
+@scalar
+def weight(rays, k, s, b, c, real):
+    """What the ray in column k gives to the voxel (b, c) of the slab at s; lengths in mm."""
+    half, one = real(0.5), real(1)
+    share = min(rays[END, k], s + half) - max(rays[BEGIN, k], s - half)
+    across = hat(rays[B, k] + s * rays[SLOPE_B, k] - b, one) * hat(rays[C, k] + s * rays[SLOPE_C, k] - c, one)
+    return max(real(0), share) * rays[LENGTH, k] * across
+
+
+@scalar
+def collect(frame, rays, views, voxel, sizes, start, detector, axis, first, totals, real):
+    """Add to totals what the rays of one view and one main axis give to a voxel, for views first, first + 1, .."""

@@ -1,0 +1,36 @@
+"""How `torch.func.vmap` maps the compiled operators."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Mapped = Callable[..., tuple[Tensor, int]]
+
+
+def batched(operator: Callable[..., Tensor]) -> Mapped:
+    """How `torch.func.vmap` maps operator(values, geometry, ..): values join its batch, geometries are looped over."""
+
+    def mapped(info, in_dims, values, geometry, *rest):
+        where, of_geometry = in_dims[:2]
+        if of_geometry is None:
+            moved = values.movedim(where, 0)
+            return operator(moved.flatten(0, 1), geometry, *rest).unflatten(0, moved.shape[:2]), 0
+        each = values.unbind(where) if where is not None else [values] * info.batch_size
+        pairs = zip(each, geometry.unbind(of_geometry), strict=True)
+        return torch.stack([operator(*pair, *rest) for pair in pairs]), 0
+
+    return mapped
+
+
+def looped(operator: Callable[..., Tensor], tensors: int) -> Mapped:
+    """How `torch.func.vmap` maps an operator whose result sums over the batch: one call each."""
+
+    def mapped(info, in_dims, *inputs):
+        each = [
+            given.unbind(dim) if dim is not None else [given] * info.batch_size
+            for given, dim in zip(inputs[:tensors], in_dims, strict=False)
+        ]
+        return torch.stack([operator(*one, *inputs[tensors:]) for one in zip(*each, strict=True)]), 0
+
+    return mapped
