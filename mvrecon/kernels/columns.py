@@ -12,6 +12,7 @@ from collections import namedtuple
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon.kernels.lanes import LANES, mix, more, put, take
 from mvrecon.kernels.lines import DIRECTION, MOMENT, START
 from mvrecon.kernels.loops import Rig, pixel, steps_of
 from mvrecon.kernels.rays import JOSEPH, at, crossing, main_axis, trace, within
@@ -20,6 +21,8 @@ from mvrecon.kernels.stores import store as store_of
 
 #: Rays in turn add to rows of their own, so that no addition waits for the one before.
 ROWS = 4
+#: Pieces whose rows are fetched one after the other, so that the processor waits for many at once.
+BATCH = 8
 #: Larger than any volume: a column is not clipped along z.
 ENDLESS = 1 << 40
 
@@ -100,49 +103,58 @@ def _extent(height, s, rows, size):
 
 
 @scalar
-def _blend(room, first, flat, k, weights, span, add):
-    """Row n of the room = low * (voxels along z at k) + high * (those of the next row), added where `add`."""
-    row, low, high, far = room.row, weights[0], weights[1], weights[2]
-    for z in range(np.uint32(span[0]), np.uint32(span[1])):
-        blend = low * flat[np.uint64(k) + z] + high * flat[np.uint64(k + far) + z]
-        row[np.uint64(first) + z] = blend + row[np.uint64(first) + z] if add else blend
+def _blend(room, store, slot, k, weights, span, add):
+    """A row of the room = low * (voxels along z at k) + high * (those of the next row), added where `add`."""
+    row, flat, low, high = room.row, store.values, weights[0], weights[1]
+    first, lanes = np.uint64((slot * room.width + 1) * store.lanes), store.lanes
+    below = np.uint64(k * lanes)
+    above = below + np.uint64(weights[2] * lanes)
+    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+        blend = low * flat[below + z] + high * flat[above + z]
+        row[first + z] = blend + row[first + z] if add else blend
 
 
 @scalar
 def _read(room, first, n):
     """Add to the values each ray's share of its two neighbours in a row."""
-    places, pairs, row, parts, shares, sums = (
-        room.places,
-        room.pairs,
-        room.row_pairs,
-        room.parts,
-        room.shares,
-        room.values[n],
-    )
-    for v in range(np.uint32(len(sums))):
+    places, pairs, row, parts = room.places, room.pairs, room.row_pairs, room.parts
+    shares, sums = room.shares, room.values[n]
+    for v in range(np.uint32(len(shares))):
         pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
-    for v in range(np.uint32(len(sums))):
+    for v in range(np.uint32(len(shares))):
         sums[v] += parts[2 * v] + shares[v] * (parts[2 * v + 1] - parts[2 * v])
 
 
+@scalar
+def _read_lanes(room, first, group):
+    """Add to a group's values each ray's share of its two neighbours in a row: `_read` of side by side volumes."""
+    places, row, shares, sums = room.places, room.row, room.shares, room.values[group]
+    four, start, one = np.uint64(LANES), np.uint64(first * LANES), room.shares.dtype.type(1)
+    for v in range(np.uint32(len(shares))):
+        below, here = np.uint64(places[v]) * four + start, np.uint64(v) * four
+        value = mix(take(row, below), take(row, below + four), shares[v])
+        put(sums, here, more(take(sums, here), one, value))
+
+
 #: Room for one column: flat indices of its pieces, four numbers each; per ray its place in a row of voxels, its share
-#: of the upper neighbour, its two neighbours whole and in their parts; values [n v]; blended rows [n z]; padded rows.
+#: of the upper neighbour, its two neighbours whole and in their parts; values [g v l]; blended rows [z l]; rows.
 Column = namedtuple(
     "Column",
     ["index", "pieces", "places", "shares", "pairs", "parts", "values", "blended", "row", "row_pairs", "width"],
 )
 
 
-def column_of(rig: Rig, store: Store, volumes: int, rows: int) -> Column:
-    """Room for one column of a thread, with `rows` padded rows of nothing."""
-    real, paired = store.values.dtype, store.pairs.dtype
-    height, length, width = rig.detector[0], 2 * max(rig.sizes[:2]), rig.sizes[2] + 3
-    pairs = np.empty(height, paired)
-    padded = store_of(np.zeros((1, 1, 1, rows * width), real), 0)
+def column_of(rig: Rig, store: Store, volumes: int) -> Column:
+    """Room for one column of a thread, its padded rows empty."""
+    real, lanes, height = store.values.dtype, store.lanes, rig.detector[0]
+    length, width = 2 * max(rig.sizes[:2]), rig.sizes[2] + 3
+    pairs = np.empty(height, store.pairs.dtype)
+    groups = -(-volumes // lanes)
+    row, row_pairs, *_ = store_of(np.zeros((1, 1, 1, max(ROWS, BATCH * groups) * width, lanes), real), 0)
     index, pieces = np.empty(length, store.strides.dtype), np.empty((4, length))
-    places, shares, values = np.empty(height, np.uint32), np.empty(height, real), np.empty((volumes, height), real)
-    blended = np.empty((volumes, rig.sizes[2]), real)
-    return Column(index, pieces, places, shares, pairs, pairs.view(real), values, blended, *padded[:2], width)
+    places, shares = np.empty(height, np.uint32), np.empty(height, real)
+    values, blended = np.empty((groups, height * lanes), real), np.empty((BATCH, rig.sizes[2] * lanes), real)
+    return Column(index, pieces, places, shares, pairs, pairs.view(real), values, blended, row, row_pairs, width)
 
 
 @scalar
@@ -157,7 +169,7 @@ def _length(rig, line, axis, u, v):
 def project_columns(store, rig, room, chosen, views, first, last):
     """Add to views [n m v u] the sums of the volumes along the chosen views' columns first to last, counted in one."""
     rows, columns = rig.detector
-    volumes, real = len(views), store.values.dtype.type
+    volumes, groups, lanes, real = len(views), len(room.values), store.lanes, store.values.dtype.type
     for column in range(first, last):
         m, u = chosen[column // columns], column % columns
         line, here = rig.lines[m], pixel(rig, u, 0)
@@ -167,59 +179,74 @@ def project_columns(store, rig, room, chosen, views, first, last):
         count = _pieces(rig, ray, (ray.first, ray.last), steps, room)
         level = height[2] == 0 and height[3] == 0
         room.values[:] = 0
-        for i in range(count):
-            span = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
-            weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
-            if not level or i == 0:
+        for start in range(0, count, BATCH):
+            stop = min(start + BATCH, count)
+            for i in range(start, stop):
+                span = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
+                weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
+                for group in range(groups):
+                    slot = group if level else (i - start) * groups + group
+                    k = group * store.size + np.int64(room.index[i])
+                    _blend(room, store, slot, k, weights, span, level and i > 0)
+            for i in range(count - 1 if level else start, stop):
                 _places(rig, height, room.pieces[2, i], room.pieces[3, i], room)
-            for n in range(volumes):
-                k = np.int64(room.index[i]) + n * store.size
-                _blend(room, n * room.width + 1, store.values, k, weights, span, level and i > 0)
-                if not level or i == count - 1:
-                    _read(room, n * room.width, n)
+                for group in range(groups):
+                    slot = group if level else (i - start) * groups + group
+                    if lanes > 1:
+                        _read_lanes(room, slot * room.width, group)
+                    else:
+                        _read(room, slot * room.width, group)
         for v in range(rows):
             length = real(_length(rig, line, axis, u, v))
             for n in range(volumes):
-                views[n, m, v, u] += length * room.values[n, v]
+                views[n, m, v, u] += length * room.values[n // lanes, v * lanes + n % lanes]
 
 
 @scalar
 def _write(room, n):
     """Spread the rays' values over `ROWS` rows of neighbours in turn: the transpose of `_read`."""
-    places, pairs, row, parts, shares, values = (
-        room.places,
-        room.pairs,
-        room.row_pairs,
-        room.parts,
-        room.shares,
-        room.values[n],
-    )
-    one, width = shares.dtype.type(1), np.uint32(room.width)
-    for v in range(np.uint32(len(values))):
+    places, pairs, row, parts = room.places, room.pairs, room.row_pairs, room.parts
+    shares, values, one, width = room.shares, room.values[n], room.shares.dtype.type(1), np.uint32(room.width)
+    for v in range(np.uint32(len(shares))):
         parts[2 * v], parts[2 * v + 1] = values[v] * (one - shares[v]), values[v] * shares[v]
-    for v in range(np.uint32(len(values))):
+    for v in range(np.uint32(len(shares))):
         row[np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width)] += pairs[v]
 
 
 @scalar
-def _gather(room, span, n):
-    """The sum of the `ROWS` rows, without their padding; they are empty then."""
-    flat, blended, width = room.row, room.blended[n], room.width
-    one, two, three, four = flat[1:], flat[width + 1 :], flat[2 * width + 1 :], flat[3 * width + 1 :]
-    for z in range(np.uint32(span[0]), np.uint32(span[1])):
-        blended[z] = (one[z] + two[z]) + (three[z] + four[z])
-    flat[:] = 0
+def _write_lanes(room, group):
+    """Spread a group's values over `ROWS` rows of neighbours in turn: the transpose of `_read_lanes`."""
+    places, row, shares, values = room.places, room.row, room.shares, room.values[group]
+    four, width, one = np.uint64(LANES), np.uint32(room.width), room.shares.dtype.type(1)
+    for v in range(np.uint32(len(shares))):
+        below = np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width) * four
+        given = take(values, np.uint64(v) * four)
+        put(row, below, more(take(row, below), one - shares[v], given))
+        put(row, below + four, more(take(row, below + four), shares[v], given))
 
 
 @scalar
-def _unblend(room, n, flat, k, weights, span):
+def _gather(room, slot, lanes, span):
+    """The sum of the `ROWS` rows, without their padding; they are empty then."""
+    flat, blended, width = room.row[lanes:], room.blended[slot], room.width * lanes
+    one, two, three, four = flat, flat[width:], flat[2 * width :], flat[3 * width :]
+    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+        blended[z] = (one[z] + two[z]) + (three[z] + four[z])
+    for z in range(np.uint32(ROWS * width)):
+        room.row[z] = 0
+
+
+@scalar
+def _unblend(room, store, slot, k, weights, span):
     """Add to two rows of voxels their shares of a row: the transpose of `_blend`."""
-    given, low, high, far = room.blended[n], weights[0], weights[1], weights[2]
-    for z in range(np.uint32(span[0]), np.uint32(span[1])):
-        flat[np.uint64(k) + z] += low * given[z]
+    given, flat, low, high, lanes = room.blended[slot], store.values, weights[0], weights[1], store.lanes
+    below = np.uint64(k * lanes)
+    above = below + np.uint64(weights[2] * lanes)
+    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+        flat[below + z] += low * given[z]
     if high != 0:
-        for z in range(np.uint32(span[0]), np.uint32(span[1])):
-            flat[np.uint64(k + far) + z] += high * given[z]
+        for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+            flat[above + z] += high * given[z]
 
 
 @compiled
@@ -227,7 +254,7 @@ def backproject_columns(store, rig, room, reads, views, low, high):
     """Spread views [n m v u] into the slabs [low, high) of the store, for some upright views and one main axis."""
     chosen, axis = reads
     rows, columns = rig.detector
-    volumes, real, steps = len(views), store.values.dtype.type, steps_of(rig, store, axis)
+    volumes, lanes, real, steps = len(views), store.lanes, store.values.dtype.type, steps_of(rig, store, axis)
     for column in range(len(chosen) * columns):
         m, u = chosen[column // columns], column % columns
         line, here = rig.lines[m], pixel(rig, u, 0)
@@ -239,20 +266,27 @@ def backproject_columns(store, rig, room, reads, views, low, high):
             continue
         count = _pieces(rig, ray, span, steps, room)
         level = height[2] == 0 and height[3] == 0
+        room.values[:] = 0
         for v in range(rows):
             length = real(_length(rig, line, axis, u, v))
             for n in range(volumes):
-                room.values[n, v] = length * views[n, m, v, u]
-        for i in range(count):
-            extent = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
-            weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
-            if not level or i == 0:
-                _places(rig, height, room.pieces[2, i], room.pieces[3, i], room)
-            for n in range(volumes):
-                if not level or i == 0:
-                    _write(room, n)
-                    _gather(room, extent, n)
-                _unblend(room, n, store.values, np.int64(room.index[i]) + n * store.size, weights, extent)
+                room.values[n // lanes, v * lanes + n % lanes] = length * views[n, m, v, u]
+        for group in range(len(room.values)):
+            for start in range(0, count, BATCH):
+                stop = min(start + BATCH, count)
+                for i in range(start, min(stop, 1) if level else stop):
+                    extent = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
+                    _places(rig, height, room.pieces[2, i], room.pieces[3, i], room)
+                    if lanes > 1:
+                        _write_lanes(room, group)
+                    else:
+                        _write(room, group)
+                    _gather(room, i - start, lanes, extent)
+                for i in range(start, stop):
+                    extent = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
+                    weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
+                    k = group * store.size + np.int64(room.index[i])
+                    _unblend(room, store, 0 if level else i - start, k, weights, extent)
 
 
 def columnar(rig) -> np.ndarray:

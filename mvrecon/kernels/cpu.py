@@ -14,10 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.backends import wide
-from mvrecon.kernels.columns import ROWS, backproject_columns, column_of, project_columns
+from mvrecon.kernels.columns import backproject_columns, column_of, project_columns
 from mvrecon.kernels.lines import unshifted
 from mvrecon.kernels.loops import Rig, backproject_slabs, project_rows, room_of, vary_rows
-from mvrecon.kernels.plan import Plan, pieces, plan_of, rig_of
+from mvrecon.kernels.plan import Plan, pieces, plan_of, ray_plan_of, rig_of
 from mvrecon.kernels.stores import Store, add, empty, fill, inner, store
 from mvrecon.kernels.threads import share
 
@@ -28,7 +28,7 @@ def _copies(volume: Tensor, rig: Rig, plan: Plan) -> Iterator[tuple[Store, Rig, 
         # a volume of half precision is widened piece by piece, and takes twice the room
         for rows, piece in pieces(rig, len(volume), max(volume.itemsize, 16 // volume.itemsize)):
             part = wide(volume[:, :, rows]).numpy()
-            into = empty(len(volume), piece.sizes, near, part.dtype)
+            into = empty(len(volume), piece.sizes, near, plan.lanes, part.dtype)
             share(
                 lambda a, b, part=part, to=into, near=near: fill(part, near, inner(to), a, b), part.shape[2], part.size
             )
@@ -44,7 +44,7 @@ def project(
 ) -> Float[Tensor, "n m v u"]:
     """Line integrals of volumes, in mm times their unit; see `reference.project`."""
     rig = rig_of(lines, window, volume.shape[1:], detector, method)
-    plan = plan_of(rig)
+    plan = plan_of(rig, len(volume))
     views = np.zeros((len(volume), len(lines), *rig.detector), wide(volume[:0]).numpy().dtype)
     oblique, upright = len(plan.oblique) * max(rig.detector), len(plan.upright) * rig.detector[1]
     for held, piece, axes, _ in _copies(volume, rig, plan):
@@ -53,7 +53,7 @@ def project(
             project_rows(held, piece, room_of(piece, held), (*plan.reads(piece, held.near), axes), views, first, last)
 
         def add_columns(first: int, last: int, held=held, piece=piece) -> None:
-            room = column_of(piece, held, len(views), len(views))
+            room = column_of(piece, held, len(views))
             project_columns(held, piece, room, plan.upright, views, first, last)
 
         share(add_rows, oblique, views.size * max(rig.sizes), 4)
@@ -70,11 +70,11 @@ def backproject(
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project`, the same to the last bit for any number of threads."""
     rig = rig_of(lines, window, shape, views.shape[2:], method)
-    plan, given = plan_of(rig), np.ascontiguousarray(views.numpy())
+    plan, given = plan_of(rig, len(views)), np.ascontiguousarray(views.numpy())
     volume = np.zeros((len(views), *shape), given.dtype)
     for near, axes in plan.layouts:
         for rows, piece in pieces(rig, len(views), given.itemsize):
-            into, part = empty(len(views), piece.sizes, near, given.dtype), volume[:, :, rows]
+            into, part = empty(len(views), piece.sizes, near, plan.lanes, given.dtype), volume[:, :, rows]
             for axis in range(3):
                 _spread(store(into, near), piece, plan, (axis, axes[axis]), given)
             share(
@@ -91,7 +91,7 @@ def _spread(held: Store, piece: Rig, plan: Plan, axis: tuple[int, bool], views: 
         backproject_slabs(held, piece, room_of(piece, held), (*plan.reads(piece, held.near), along), views, low, high)
 
     def add_columns(low: int, high: int) -> None:
-        room = column_of(piece, held, len(views), ROWS)
+        room = column_of(piece, held, len(views))
         backproject_columns(held, piece, room, (plan.upright, along), views, low, high)
 
     steps = views.size * max(piece.sizes)
@@ -108,7 +108,7 @@ def lines_vjp(
 ) -> Float[Tensor, "m 4 3 k"]:
     """The derivative of <views, project(volume, lines)> by the lines, all methods by hand; float64."""
     rig = rig_of(lines, window, volume.shape[1:], views.shape[2:], method)
-    plan, given = plan_of(rig, columns=False), np.ascontiguousarray(views.numpy())
+    plan, given = ray_plan_of(rig), np.ascontiguousarray(views.numpy())
     total = torch.zeros(lines.shape, dtype=torch.float64)
     for held, piece, axes, rows in _copies(volume, rig, plan):
         # a row or column of pixels has its own sum, so that threads change no bit

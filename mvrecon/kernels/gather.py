@@ -76,9 +76,13 @@ def record(line, here, window, sizes, into, k):
 
 
 @scalar
-def limits(low, high, size):
-    """The whole numbers from low to high that are pixels of `size` ones, first and last."""
-    return np.int32(ceil(max(low, low * 0))), np.int32(floor(min(max(high, low * 0 - 1), low * 0 + (size - 1))))
+def limits(low, high, size, real):
+    """The first and the last pixel from low to high, counted from the detector's centre, of `size` pixels."""
+    # what rounding may move a corner by, in single precision
+    slack, centre = real(0.02) + real(1e-5) * real(size), real(size - 1) / real(2)
+    one = min(max(low - slack + centre, real(0)), real(size))
+    two = min(max(high + slack + centre, real(-1)), real(size - 1))
+    return np.int32(ceil(one)), np.int32(floor(two))
 
 
 @scalar
@@ -111,11 +115,8 @@ def box(frame, point, axis, detector, real):
             pu = (u + i * frame[0, far] + j * frame[0, near]) * per
             pv = (v + i * frame[1, far] + j * frame[1, near]) * per
             low_u, high_u, low_v, high_v = min(low_u, pu), max(high_u, pu), min(low_v, pv), max(high_v, pv)
-    # what rounding may move a corner by, in single precision
-    slack_u, slack_v = real(0.02) + real(1e-5) * real(columns), real(0.02) + real(1e-5) * real(rows)
-    centre_u, centre_v = real(columns - 1) / real(2), real(rows - 1) / real(2)
-    u0, u1 = limits(low_u - slack_u + centre_u, high_u + slack_u + centre_u, columns)
-    v0, v1 = limits(low_v - slack_v + centre_v, high_v + slack_v + centre_v, rows)
+    u0, u1 = limits(low_u, high_u, columns, real)
+    v0, v1 = limits(low_v, high_v, rows, real)
     return u0, u1, v0, v1
 
 
@@ -135,5 +136,34 @@ def weight(rays, k, s, b, c, real):
 
 
 @scalar
-def collect(frame, rays, views, voxel, sizes, start, detector, axis, first, totals, real):
-    """Add to totals what the rays of one view and one main axis give to a voxel, for views first, first + 1, .."""
+def collect(view, voxel, axis, first, totals, real):
+    """Add to totals what the rays of one view and one main axis give to a voxel (x, y, z).
+
+    Args:
+        view: matrix [3 4] from `camera`; rays [8 p] of `record`; values [n p'] of all pixels; where the view begins in
+            the rays, and where in the values; sizes (x, y, z); detector (rows, columns).
+        voxel: its indices.
+        axis: the rays' main axis.
+        first: the first of the volumes, of which `totals` has a few.
+        totals: a number per volume.
+        real: the type to compute in.
+    """
+    frame, rays, values, start, begin, sizes, detector = view
+    point = (
+        voxel[0] - (sizes[0] - 1) / 2,
+        voxel[1] - (sizes[1] - 1) / 2,
+        voxel[2] - (sizes[2] - 1) / 2,
+    )
+    near = near_of(axis)
+    s, b, c = real(point[axis]), real(voxel[3 - axis - near]), real(voxel[near])
+    u0, u1, v0, v1 = box(frame, point, axis, detector, real)
+    for v in range(v0, v1 + 1):
+        for u in range(u0, u1 + 1):
+            place = v * detector[1] + u
+            k, value = np.uint64(start + place), np.uint64(begin + place)
+            if rays[AXIS, k] != axis:
+                continue
+            share = weight(rays, k, s, b, c, real)
+            for n in range(len(totals)):
+                if first + n < len(values):
+                    totals[n] += share * values[np.uint64(first + n), value]

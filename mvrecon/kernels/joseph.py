@@ -10,6 +10,7 @@ vectorises.
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.lanes import LANES, mix, more, put, take
 
 
 @scalar
@@ -74,6 +75,38 @@ def spread(store, n, steps, count, room, value):
         k = np.uint64(index[i])
         pairs[k + offset] += lowers[i]
         pairs[k + above] += uppers[i]
+
+
+@scalar
+def sum_lanes(store, group, steps, count, room):
+    """The sums of four volumes along a ray, in voxels of the main axis, into room.totals."""
+    index, y, z, share, values = room.index, room.one, room.two, room.three, store.values
+    first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
+    far, none = np.uint64(steps.far) * four, y.dtype.type(0)
+    totals = (none, none, none, none)
+    for i in range(np.uint32(count)):
+        k = np.uint64(index[i]) * four + first
+        lower = mix(take(values, k), take(values, k + four), z[i])
+        upper = mix(take(values, k + far), take(values, k + far + four), z[i])
+        totals = more(totals, share[i], mix(lower, upper, y[i]))
+    put(room.totals, np.uint64(0), totals)
+
+
+@scalar
+def spread_lanes(store, group, steps, count, room):
+    """Add room.totals to four volumes along a ray: the transpose of `sum_lanes`."""
+    index, y, z, share, values = room.index, room.one, room.two, room.three, store.values
+    first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
+    far, given = np.uint64(steps.far) * four, take(room.totals, np.uint64(0))
+    for i in range(np.uint32(count)):
+        k = np.uint64(index[i]) * four + first
+        high = share[i] * y[i]
+        low = share[i] - high
+        low_z, high_z = low * z[i], high * z[i]
+        put(values, k, more(take(values, k), low - low_z, given))
+        put(values, k + four, more(take(values, k + four), low_z, given))
+        put(values, k + far, more(take(values, k + far), high - high_z, given))
+        put(values, k + far + four, more(take(values, k + far + four), high_z, given))
 
 
 @scalar

@@ -6,6 +6,7 @@ import numpy as np
 
 from mvrecon.kernels import joseph, march, siddon
 from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon.kernels.lanes import LANES
 from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR, at, crossing, main_axis, trace, within
 from mvrecon.kernels.stores import Store
 
@@ -21,20 +22,20 @@ def steps_of(rig, store, axis):
     return Steps(store.strides[axis], store.strides[3 - axis - store.near], 1, rig.samples)
 
 
-#: What is known of the cells of one ray: flat indices, four numbers each, pairs of corners whole and in their parts.
+#: What is known of the cells of one ray: flat indices, four numbers each, pairs of corners whole and in their parts;
+#: one number for each of a group of volumes.
 Room = namedtuple(
     "Room",
-    ["index", "index_b", "index_c", "one", "two", "three", "four", "low", "high", "low_parts", "high_parts"],
+    ["index", "index_b", "index_c", "one", "two", "three", "four", "low", "high", "low_parts", "high_parts", "totals"],
 )
 
 
 def room_of(rig: Rig, store: Store) -> Room:
     """Room for the cells of one ray of a thread; the loops themselves make no arrays."""
     length = max(2 * rig.samples, max(rig.sizes))
-    index, index_b, index_c = np.empty((3, length), store.strides.dtype)
-    low, high = np.empty((2, length), store.pairs.dtype)
-    real = store.values.dtype
-    return Room(index, index_b, index_c, *np.empty((4, length), real), low, high, low.view(real), high.view(real))
+    index, corners = np.empty((3, length), store.strides.dtype), np.empty((2, length), store.pairs.dtype)
+    numbers = np.empty((4, length), store.values.dtype)
+    return Room(*index, *numbers, *corners, *corners.view(numbers.dtype), np.empty(LANES, numbers.dtype))
 
 
 @scalar
@@ -90,6 +91,12 @@ def project_rows(store, rig, room, reads, views, first, last):
             steps = steps_of(rig, store, axis)
             count = _cells(rig, ray, (ray.first, ray.last), steps, room)
             length = store.values.dtype.type(ray.length)
+            if store.lanes > 1:
+                for n in range(0, volumes, store.lanes):
+                    joseph.sum_lanes(store, n // store.lanes, steps, count, room)
+                    for lane in range(min(store.lanes, volumes - n)):
+                        views[n + lane, m, v, u] += length * room.totals[lane]
+                continue
             for n in range(volumes):
                 if rig.method == SIDDON:
                     views[n, m, v, u] += length * siddon.sum(store, n, count, room)
@@ -117,6 +124,12 @@ def backproject_slabs(store, rig, room, reads, views, low, high):
                 continue
             count = _cells(rig, ray, span, steps, room)
             length = store.values.dtype.type(ray.length)
+            if store.lanes > 1:
+                for n in range(0, volumes, store.lanes):
+                    for lane in range(store.lanes):
+                        room.totals[lane] = length * views[n + lane, m, v, u] if n + lane < volumes else 0
+                    joseph.spread_lanes(store, n // store.lanes, steps, count, room)
+                continue
             for n in range(volumes):
                 value = length * views[n, m, v, u]
                 if rig.method == SIDDON:

@@ -32,7 +32,7 @@ def cells(ray, span, steps, room):
 
 
 @scalar
-def _face(flat, k, steps, y, z):
+def face(flat, k, steps, y, z):
     """The interpolated volume in one slab, and its slopes along the far and the near axis."""
     above = k + steps.far
     low_z, high_z = flat[k + steps.near] - flat[k], flat[above + steps.near] - flat[above]
@@ -45,8 +45,8 @@ def _local(flat, steps, px, py, pz):
     """The interpolated volume at a place, and its slopes along the main, the far and the near axis."""
     below, iy, iz = int(floor(px)), int(py), int(pz)
     k, x = (below + 1) * steps.along + iy * steps.far + iz * steps.near, px - below
-    low, low_b, low_c = _face(flat, k, steps, py - iy, pz - iz)
-    high, high_b, high_c = _face(flat, k + steps.along, steps, py - iy, pz - iz)
+    low, low_b, low_c = face(flat, k, steps, py - iy, pz - iz)
+    high, high_b, high_c = face(flat, k + steps.along, steps, py - iy, pz - iz)
     return low + x * (high - low), high - low, low_b + x * (high_b - low_b), low_c + x * (high_c - low_c)
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.columns import columnar
+from mvrecon.kernels.lanes import LANES
 from mvrecon.kernels.lines import DIRECTION, START, shifted
 from mvrecon.kernels.loops import Rig
 from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR
@@ -25,11 +26,13 @@ class Plan:
         upright: indices of the views whose columns are read as rows of voxels.
         oblique: indices of the others.
         axes: whether a ray of an oblique view can have each main axis.
+        lanes: volumes that lie side by side.
     """
 
     upright: np.ndarray
     oblique: np.ndarray
     axes: tuple[bool, bool, bool]
+    lanes: int
 
     @property
     def layouts(self) -> list[tuple[int, tuple[bool, bool, bool]]]:
@@ -54,11 +57,18 @@ def rig_of(lines: Tensor, window: Sequence[float], shape: Sequence[int], detecto
     return Rig(maps, ends, sizes, (int(detector[0]), int(detector[1])), METHODS[name], int(samples or 0))
 
 
-def plan_of(rig: Rig, columns: bool = True) -> Plan:
-    """The plan of a rig, with or without the special case of upright columns."""
-    upright = columnar(rig) if columns and rig.method != TRILINEAR else np.zeros(len(rig.lines), bool)
+def plan_of(rig: Rig, volumes: int) -> Plan:
+    """The plan for projecting volumes, or for back-projecting into them."""
+    upright = columnar(rig) if rig.method != TRILINEAR else np.zeros(len(rig.lines), bool)
     oblique = np.flatnonzero(~upright)
-    return Plan(np.flatnonzero(upright), oblique, _main_axes(rig, rig.lines[oblique, 0]))
+    lanes = LANES if rig.method == JOSEPH and volumes > 2 else 1
+    return Plan(np.flatnonzero(upright), oblique, _main_axes(rig, rig.lines[oblique, 0]), lanes)
+
+
+def ray_plan_of(rig: Rig) -> Plan:
+    """The plan that goes ray by ray, volume by volume, for derivatives in the geometry."""
+    every = np.arange(len(rig.lines))
+    return Plan(every[:0], every, _main_axes(rig, rig.lines[:, 0]), 1)
 
 
 def _main_axes(rig: Rig, direction: Float[np.ndarray, "m 3 k"]) -> tuple[bool, bool, bool]:

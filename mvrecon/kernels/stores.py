@@ -11,18 +11,18 @@ import numpy as np
 from mvrecon.kernels.compiling import compiled
 from mvrecon.kernels.padding import PAD, padded_shape
 
-#: values [n p] in one row; pairs, each value and the next as one complex number on the same memory; p, the size of a
-#: volume; flat strides of the axes (x, y, z); the contiguous axis.
-Store = namedtuple("Store", ["values", "pairs", "size", "strides", "near"])
+#: values [g p l] in one row, of g groups of l volumes; pairs, each value and the next as one complex number on the same
+#: memory; p, the voxels of a volume; strides in voxels of the axes (x, y, z); the contiguous axis; l.
+Store = namedtuple("Store", ["values", "pairs", "size", "strides", "near", "lanes"])
 COMPLEX = {np.dtype(np.float32): np.complex64, np.dtype(np.float64): np.complex128}
 #: Edge in voxels of the tiles in which a volume is turned.
 TILE = 16
 
 
-def empty(count: int, sizes: tuple[int, int, int], near: int, dtype: np.dtype) -> np.ndarray:
-    """Nothing for volumes of `sizes` (x, y, z), padded: [n z y x] when x is the near axis, [n y x z] when it is z."""
+def empty(count: int, sizes: tuple[int, int, int], near: int, lanes: int, dtype: np.dtype) -> np.ndarray:
+    """Nothing, padded, for volumes of `sizes` (x, y, z): [g z y x l] with x as near axis, [g y x z l] with z."""
     x, y, z = padded_shape(sizes)
-    return np.zeros((count, *((z, y, x) if near == 0 else (y, x, z))), dtype)
+    return np.zeros((-(-count // lanes), *((z, y, x) if near == 0 else (y, x, z)), lanes), dtype)
 
 
 def inner(padded: np.ndarray) -> np.ndarray:
@@ -32,44 +32,48 @@ def inner(padded: np.ndarray) -> np.ndarray:
 
 def store(volumes: np.ndarray, near: int) -> Store:
     """Padded volumes as a store."""
-    values, size = volumes.reshape(-1), volumes[:1].size
+    values, size, lanes = volumes.reshape(-1), volumes[:1, ..., 0].size, volumes.shape[4]
     pairs = np.ndarray((max(0, values.size - 1),), COMPLEX[values.dtype], values, strides=values.strides)
     beside, across = volumes.shape[3], volumes.shape[3] * volumes.shape[2]
     steps = (1, beside, across) if near == 0 else (beside, across, 1)
-    return Store(values, pairs, size, np.array(steps, np.int64 if size >= 2**31 else np.int32), near)
+    return Store(values, pairs, size, np.array(steps, np.int64 if size >= 2**31 else np.int32), near, lanes)
 
 
 @compiled
 def fill(volumes, near, into, first, last):
     """Write rows (along y) first to last of volumes [n d h w] into volumes as a store has them."""
     count, depth, _, width = volumes.shape
+    lanes = into.shape[4]
     for n in range(count):
+        g, lane = n // lanes, n % lanes
         for y in range(first, last):
             if near == 0:
                 for z in range(depth):
                     for x in range(width):
-                        into[n, z, y, x] = volumes[n, z, y, x]
+                        into[g, z, y, x, lane] = volumes[n, z, y, x]
                 continue
             for x0 in range(0, width, TILE):
                 for z0 in range(0, depth, TILE):
                     for x in range(x0, min(x0 + TILE, width)):
                         for z in range(z0, min(z0 + TILE, depth)):
-                            into[n, y, x, z] = volumes[n, z, y, x]
+                            into[g, y, x, z, lane] = volumes[n, z, y, x]
 
 
 @compiled
 def add(held, near, volumes, first, last):
     """Add rows (along y) first to last of volumes as a store has them to volumes [n d h w]."""
     count, depth, _, width = volumes.shape
+    lanes = held.shape[4]
     for n in range(count):
+        g, lane = n // lanes, n % lanes
         for y in range(first, last):
             if near == 0:
                 for z in range(depth):
                     for x in range(width):
-                        volumes[n, z, y, x] += held[n, z, y, x]
+                        volumes[n, z, y, x] += held[g, z, y, x, lane]
                 continue
             for x0 in range(0, width, TILE):
                 for z0 in range(0, depth, TILE):
                     for z in range(z0, min(z0 + TILE, depth)):
                         for x in range(x0, min(x0 + TILE, width)):
-                            volumes[n, z, y, x] += held[n, y, x, z]
+                            volumes[n, z, y, x] += held[g, y, x, z, lane]

@@ -60,7 +60,7 @@ class Projector(nn.Module):
             raise ValueError(
                 f"Grid and cameras must be on one device, got {grid.affine.device} and {cameras.source.device}"
             )
-        self.grid, self.cameras, self.method, self.backend = grid, cameras, method, backend
+        self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
         self.samples, self.rays_per_pixel = _samples(samples, method, grid), rays_per_pixel
         self.last_backend: str | None = None
         self.window = list(cameras.limits)
@@ -68,12 +68,23 @@ class Projector(nn.Module):
         self.poses = lines.requires_grad
         self.register_buffer("fixed_lines", lines.detach(), persistent=False)
 
+    @property
+    def cameras(self) -> Cameras:
+        """The rig.
+
+        Raises:
+            ValueError: the rays were given one by one, and have no cameras with frusta.
+        """
+        if isinstance(self.rays, ExplicitRays):
+            raise ValueError("This needs cameras, which the projector has not: it was given explicit rays")
+        return self.rays
+
     def _lines(self) -> Float[Tensor, "m 4 3 k"]:
-        if isinstance(self.cameras, ExplicitRays):
+        if isinstance(self.rays, ExplicitRays):
             if self.rays_per_pixel != 1:
                 raise ValueError(f"Explicit rays are one a pixel, got rays_per_pixel={self.rays_per_pixel}")
-            return lines_of_rays(self.cameras, self.grid)
-        return lines_of(self.cameras.refined(self.rays_per_pixel), self.grid)
+            return lines_of_rays(self.rays, self.grid)
+        return lines_of(self.rays.refined(self.rays_per_pixel), self.grid)
 
     def _apply(self, fn, recurse: bool = True):
         exact = self.fixed_lines
@@ -89,8 +100,8 @@ class Projector(nn.Module):
     @property
     def _detector(self) -> list[int]:
         """Rays (rows, columns) of one of the views that `lines` describes."""
-        explicit = isinstance(self.cameras, ExplicitRays)
-        return [1, 1] if explicit else [n * self.rays_per_pixel for n in self.cameras.shape]
+        explicit = isinstance(self.rays, ExplicitRays)
+        return [1, 1] if explicit else [n * self.rays_per_pixel for n in self.rays.shape]
 
     @property
     def _kernel(self) -> str:
@@ -108,7 +119,7 @@ class Projector(nn.Module):
         views = kernels.project(x, self.lines, self.window, self._detector, self._kernel)
         if self.rays_per_pixel > 1:
             views = avg_pool2d(views, self.rays_per_pixel)
-        return views.reshape(*volume.shape[:2], len(self.cameras), *self.cameras.shape)
+        return views.reshape(*volume.shape[:2], len(self.rays), *self.rays.shape)
 
     @property
     def T(self) -> Callable[[Float[Tensor, "b c m v u"]], Float[Tensor, "b c d h w"]]:
@@ -121,7 +132,7 @@ class Projector(nn.Module):
         Raises:
             ValueError: a wrong rank, size or device.
         """
-        check(views, "views [b c m v u]", (len(self.cameras), *self.cameras.shape), self.fixed_lines.device)
+        check(views, "views [b c m v u]", (len(self.rays), *self.rays.shape), self.fixed_lines.device)
         y, r = wide(views).flatten(0, 1), self.rays_per_pixel
         if r > 1:
             y = (y / r**2).repeat_interleave(r, dim=2).repeat_interleave(r, dim=3)
@@ -136,7 +147,7 @@ class Projector(nn.Module):
 
     def extra_repr(self) -> str:
         return (
-            f"{len(self.cameras)} views of {self.cameras.shape}, grid {self.grid.shape}, {self.method}, {self.backend}"
+            f"{len(self.rays)} views of {self.rays.shape}, grid {self.grid.shape}, {self.method}, {self.backend}"
         )
 
 

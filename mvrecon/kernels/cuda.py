@@ -1,0 +1,183 @@
+"""The compiled operators of CUDA devices: the same three as `cpu.py`, on torch's current stream.
+
+Forward and derivative by the geometry are the same to the last bit in every run. So is the adjoint where it gathers,
+voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of its additions, and so the last digits, vary.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from numba import cuda
+from torch import Tensor
+
+from mvrecon.kernels import cuda_loops
+from mvrecon.kernels.cpu import wide
+from mvrecon.kernels.cuda_loops import BLOCK, GROUP, TILE, Scene
+from mvrecon.kernels.padding import PAD
+from mvrecon.kernels.plan import METHODS
+
+#: Pixels per voxel, by area, up to which a voxel asks all pixels of its picture.
+GATHER = 4.0
+#: Pixels whose rays are kept at a time for the gather, and threads of a derivative: 32 and 36 MB in single precision.
+RAYS, THREADS = 2**20, 2**17
+#: Voxels from which on a volume needs indices of 64 bits.
+WIDE = 2**32
+#: Stands for infinity: the compiler may take it that there is none.
+FAR = 1e200
+
+
+def project(
+    volume: Float[Tensor, "n d h w"],
+    lines: Float[Tensor, "m 4 3 k"],
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+) -> Float[Tensor, "n m v u"]:
+    """Line integrals of volumes, in mm times their unit; see `reference.project`."""
+    x = wide(volume)
+    scene = scene_of(window, volume.shape[1:], detector, method)
+    views = x.new_empty(len(x), len(lines), *detector)
+    kernel = cuda_loops.project_kernel(_number(method), *_shares(len(x), scene))
+    launch(kernel, (_blocks(scene, len(lines)), _groups(len(x))), padded(x), maps(lines), scene, views)
+    return views
+
+
+def backproject(
+    views: Float[Tensor, "n m v u"],
+    lines: Float[Tensor, "m 4 3 k"],
+    window: Sequence[float],
+    shape: Sequence[int],
+    method: str,
+) -> Float[Tensor, "n d h w"]:
+    """The exact transpose of `project`."""
+    if gathers(shape, views.shape[2:], lines.shape[3], method):
+        return gather(views, lines, window, shape, method)
+    return scatter(views, lines, window, shape, method)
+
+
+def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method: str) -> bool:
+    """Whether the adjoint goes by voxels: for Joseph's method, where few pixels lie on the picture of a voxel.
+
+    The detector is taken to show the whole volume: to know better would mean to wait for the device.
+    """
+    return method == "joseph" and columns == 3 and math.prod(detector) <= GATHER * math.prod(shape) ** (2 / 3)
+
+
+def gather(
+    views: Tensor, lines: Tensor, window: Sequence[float], shape: Sequence[int], method: str
+) -> Float[Tensor, "n d h w"]:
+    """`backproject` of Joseph's method by voxels, the same to the last bit in every run."""
+    y, given = wide(views).contiguous(), maps(lines)
+    scene = scene_of(window, shape, views.shape[2:], method)
+    volume = y.new_zeros(len(y), *shape)
+    pixels, blocks = math.prod(scene.detector), (-(-math.prod(shape) // BLOCK), _groups(len(y)))
+    record, collect = cuda_loops.record_kernel(), cuda_loops.gather_kernel(_group(len(y)))
+    some = max(1, RAYS // pixels)
+    for first in range(0, len(lines), some):
+        count = min(some, len(lines) - first)
+        rays, frames = y.new_empty(8, count * pixels), y.new_empty(count, 3, 4)
+        axes = torch.zeros(count, 3, dtype=torch.int32, device=y.device)
+        launch(record, (-(-count * pixels // BLOCK),), given, scene, first, rays, frames, axes)
+        launch(collect, blocks, y.flatten(1), rays, frames, axes, scene, first, volume)
+    return volume
+
+
+def scatter(
+    views: Tensor, lines: Tensor, window: Sequence[float], shape: Sequence[int], method: str
+) -> Float[Tensor, "n d h w"]:
+    """`backproject` of any method by rays, with atomic additions."""
+    y = wide(views).contiguous()
+    scene = scene_of(window, shape, views.shape[2:], method)
+    sizes = [size + sum(PAD) for size in shape]
+    flat = y.new_zeros(len(y) * scene.size)
+    kernel = cuda_loops.scatter_kernel(_number(method), *_shares(len(y), scene))
+    launch(kernel, (_blocks(scene, len(lines)), _groups(len(y))), y, maps(lines), scene, flat)
+    inner = tuple(slice(PAD[0], -PAD[1]) for _ in shape)
+    return flat.view(len(y), *sizes)[(slice(None), *inner)].contiguous()
+
+
+def lines_vjp(
+    volume: Float[Tensor, "n d h w"],
+    views: Float[Tensor, "n m v u"],
+    lines: Float[Tensor, "m 4 3 k"],
+    window: Sequence[float],
+    method: str,
+) -> Float[Tensor, "m 4 3 k"]:
+    """The derivative of <views, project(volume, lines)> by the lines; float64."""
+    x, y = wide(volume), wide(views).contiguous()
+    scene = scene_of(window, volume.shape[1:], views.shape[2:], method)
+    threads = min(math.prod(scene.detector), max(1, THREADS // len(lines)))
+    change = lines.new_zeros(4, 3, lines.shape[3], len(lines), threads, dtype=torch.float64)
+    kernel = cuda_loops.vary_kernel(_number(method))
+    launch(kernel, (-(-len(lines) * threads // BLOCK),), padded(x), y, maps(lines), scene, change)
+    return change.sum(dim=4).permute(3, 0, 1, 2).contiguous()
+
+
+def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
+    """Start a kernel on torch's current stream; under numba's simulator, run it on tensors in main memory."""
+    if 0 in blocks:
+        return
+    device = next(each.device for each in arguments if isinstance(each, Tensor))
+    if device.type == "cpu":
+        given = [each.numpy() if isinstance(each, Tensor) else each for each in arguments]
+        kernel[blocks, BLOCK](*given)
+        return
+    index = torch.cuda.current_device() if device.index is None else device.index
+    with torch.cuda.device(index), cuda.gpus[index]:
+        stream = cuda.external_stream(torch.cuda.current_stream(index).cuda_stream)
+        given = [cuda.as_cuda_array(each, sync=False) if isinstance(each, Tensor) else each for each in arguments]
+        kernel[blocks, BLOCK, stream](*given)
+
+
+def scene_of(window: Sequence[float], shape: Sequence[int], detector: Sequence[int], method: str) -> Scene:
+    """The numbers of a scene. A method is its name, with ":samples" a ray behind it for "trilinear"."""
+    depth, height, width = (int(size) + sum(PAD) for size in shape)
+    rows, columns = (int(size) for size in detector)
+    low, high = (min(max(float(end), -FAR), FAR) for end in window)
+    return Scene(
+        sizes=(int(shape[2]), int(shape[1]), int(shape[0])),
+        strides=(1, width, width * height),
+        size=width * height * depth,
+        detector=(rows, columns),
+        tile=TILE if columns >= TILE[0] and rows >= TILE[1] else (1, 1),
+        window=(low, high),
+        samples=int(method.partition(":")[2] or 0),
+    )
+
+
+def padded(volume: Float[Tensor, "n d h w"]) -> Float[Tensor, " p"]:
+    """Volumes with their border of nothing, in one row."""
+    return F.pad(volume, PAD * 3).flatten()
+
+
+def maps(lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "m 4 3 k"]:
+    """The rays' maps as the kernels read them."""
+    return lines.detach().double().contiguous()
+
+
+def _number(method: str) -> int:
+    return METHODS[method.partition(":")[0]]
+
+
+def _group(volumes: int) -> int:
+    return 1 if volumes == 1 else GROUP
+
+
+def _groups(volumes: int) -> int:
+    return -(-volumes // _group(volumes))
+
+
+def _shares(volumes: int, scene: Scene) -> tuple[int, type]:
+    """How many volumes share a thread, and the type of flat indices in one of them."""
+    return _group(volumes), np.uint64 if scene.size >= WIDE else np.uint32
+
+
+def _blocks(scene: Scene, views: int) -> int:
+    rows, columns = scene.detector
+    wide, high = scene.tile
+    return -(-views * (-(-columns // wide)) * (-(-rows // high)) * wide * high // BLOCK)

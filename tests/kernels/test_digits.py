@@ -1,0 +1,104 @@
+"""Digits: far sources, far worlds, tiny and huge voxels, single precision, and halves in storage."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.grid import Grid
+from tests.projectors.cases import CASES, METHODS, OPTIONS, Case, gap, noise
+
+SHAPE, SPACING = (18, 20, 22), (1.0, 1.1, 0.9)
+DETECTOR = {"pixels": [14, 15], "pixel_mm": 2.1}
+TURNED = torch.tensor([[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]], dtype=torch.float64)
+RIGS = {
+    "circular": circular(4, 60.0, 90.0, DETECTOR, start_degrees=7.0),
+    "far": circular(4, 1e6, 1e6 + 30, DETECTOR, start_degrees=7.0),
+    "dome": dome(4, 60.0, 30.0, 150.0, DETECTOR),
+    "far dome": dome(4, 1e6, 1e6 + 30, 150.0, DETECTOR, extent="ahead"),
+    "parallel": parallel(4, DETECTOR, 2e6, start_degrees=7.0),
+    "tilted": parallel(4, DETECTOR, 90.0, start_degrees=7.0).moved(TURNED, torch.zeros(3)),
+}
+
+
+def elsewhere(rig, offset: float, voxel: float) -> Case:
+    """The same picture in other units and at another place."""
+    shift = torch.full((3,), offset, dtype=torch.float64)
+    scaled = replace(rig, **{name: voxel * getattr(rig, name) for name in ("source", "origin", "u", "v")})
+    grid = Grid.centred(SHAPE, [voxel * mm for mm in SPACING], shift.tolist())
+    return Case(grid, scaled.moved(torch.eye(3), shift))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("offset", "voxel"), [(0.0, 1.0), (1e5, 1.0), (0.0, 1e-6), (0.0, 1e6)])
+@pytest.mark.parametrize("kind", RIGS)
+def test_neither_place_nor_scale_costs_digits(kind, offset, voxel, method):
+    case = elsewhere(RIGS[kind], offset, voxel)
+    x, y = (each.abs() for each in noise(case))
+    oracle, A = (case.build(method=method, backend=backend) for backend in ("reference", "cpu"))
+    views, volume = oracle(x), oracle.T(y)
+    assert (views > 5 * voxel).any() and views.isfinite().all()
+    # a face that a ray runs along, or a crossing under a small slope, is not the same to the last bit
+    exact, single = (1e-9, 5e-6) if method == "siddon" else (1e-11, 2e-6)
+    assert gap(A(x), views) < exact and gap(A.T(y), volume) < exact
+    assert gap(A(x.float()), views) < 2e-6 and gap(A.T(y.float()), volume) < single
+    near = elsewhere(RIGS[kind], 0.0, 1.0).build(method=method, backend="reference")
+    assert gap(views / voxel, near(x)) < 1e-7
+
+
+def brute_force(x: np.ndarray, grid: Grid, start: np.ndarray, end: np.ndarray) -> float:
+    """The sum along one ray: every crossing with every plane, sorted; each piece in the voxel of its middle."""
+    inverse = np.linalg.inv(grid.affine.numpy())
+    a, b = (inverse[:3, :3] @ point + inverse[:3, 3] for point in (start, end))
+    step, sizes = b - a, np.array(grid.shape[::-1])
+    w = np.concatenate([(np.arange(n + 1) - 0.5 - p) / d for n, p, d in zip(sizes, a, step, strict=True) if d])
+    w = np.sort(np.concatenate([np.clip(w, 0, 1), [0, 1]]))
+    voxel = np.rint(a + ((w[1:] + w[:-1]) / 2)[:, None] * step).astype(int)
+    inside = ((voxel >= 0) & (voxel < sizes)).all(axis=1)
+    i, j, k = voxel[inside].T
+    return float((np.diff(w)[inside] * x[k, j, i]).sum() * np.linalg.norm(end - start))
+
+
+@pytest.mark.parametrize("kind", ["circular", "far", "dome", "parallel", "tilted", "explicit"])
+def test_siddon_equals_brute_force(kind):
+    case = CASES[kind] if kind in CASES else elsewhere(RIGS[kind], 0.0, 1.0)
+    start, end = (points.flatten(0, 2).numpy() for points in case.rays.rays())
+    if kind == "dome":
+        # pinholes: from the detector through the hole and far beyond the object
+        start, end = start, start + 10 * (start - end)
+    x = noise(case)[0][:1].abs()
+    sums = [brute_force(x[0, 0].numpy(), case.grid, a, b) for a, b in zip(start, end, strict=True)]
+    expected = torch.tensor(sums, dtype=torch.float64)
+    A = case.build(method="siddon")
+    assert gap(A(x).flatten(), expected) < 1e-9 and gap(A(x.float()).flatten(), expected) < 1e-6
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("kind", ["cone", "stack", "dome", "explicit"])
+def test_halves_are_stored_and_summed_in_float32(kind, option, dtype, monkeypatch):
+    case = CASES[kind]
+    A = case.build(**OPTIONS[option])
+    x = noise(case, dtype, channels=2)[0].requires_grad_()
+    single = x.detach().float().requires_grad_()
+    views, expected = A(x), A(single)
+    assert views.dtype == torch.float32 and torch.equal(views, expected)
+    one, two = (torch.autograd.grad(y.square().sum(), v)[0] for y, v in ((views, x), (expected, single)))
+    assert one.dtype == dtype and torch.equal(one, two.to(dtype))
+    back = A.T(views.detach().to(dtype))
+    assert back.dtype == torch.float32 and torch.equal(back, A.T(views.detach().to(dtype).float()))
+    monkeypatch.setattr("mvrecon.kernels.plan.BUDGET", 1)
+    assert gap(A(x), expected) < (1e-5 if option == "siddon" else 1e-6)
+
+
+def test_detectors_much_taller_than_the_volume_lose_no_digits():
+    """Its first rows lie many volumes away from the rays that count."""
+    n = 32
+    rig = circular(3, 100.0, 160.0, {"pixels": [16 * n, 6], "pixel_mm": 1.6}, start_degrees=3.0)
+    case = Case(Grid.centred((n, n, n), 1.0), rig)
+    x, y = (each.abs() for each in noise(case))
+    for method in ("joseph", "siddon"):
+        A = case.build(method=method)
+        assert gap(A(x.float()), A(x)) < 2e-6 and gap(A.T(y.float()), A.T(y)) < 5e-6
