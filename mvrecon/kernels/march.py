@@ -73,6 +73,8 @@ def slopes(store, n, steps, ray):
         by_slope_c += step * s * along_c
         by_begin += step * (1 - way) * along - value / count
         by_end += step * way * along + value / count
+    if ray.first >= ray.last:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for face, place, change in ((ray.from_, ray.begin, by_begin), (ray.to, ray.end, by_end)):
         # an end on a face b + s slope = constant moves with b and the slope
         if face == FAR:
