@@ -1,15 +1,15 @@
 """Which back end serves a tensor."""
 
-from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
 
 import torch
 from torch import Tensor
 
-from mvrecon.kernels import reference
+from mvrecon.kernels import ops, reference
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
+COMPILED = find_spec("numba") is not None
 
 
 def wide(tensor: Tensor) -> Tensor:
@@ -21,12 +21,13 @@ def kernels_for(device: torch.device, backend: str) -> tuple[str, ModuleType]:
     """The back end's name and its functions, for tensors on a device.
 
     Raises:
-        ValueError: a compiled back end for a tensor elsewhere.
+        ValueError: an unknown back end, or a compiled one for a tensor elsewhere.
     """
+    if backend not in BACKENDS:
+        raise ValueError(f"Unknown backend {backend!r}. Known: {', '.join(BACKENDS)}")
     if backend in ("cpu", "cuda") and device.type != backend:
         memory = "main memory" if backend == "cpu" else "a GPU's memory"
         raise ValueError(f"backend {backend!r} needs tensors in {memory}, got {device}; use 'auto' or 'reference'")
-    if backend == "reference" or device.type != "cpu" or find_spec("numba") is None:
+    if backend == "reference" or device.type != "cpu" or not COMPILED:
         return "reference", reference
-    # numba is heavy and only the compiled back ends need it
-    return device.type, import_module("mvrecon.kernels.ops")
+    return device.type, ops

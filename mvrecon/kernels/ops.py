@@ -8,25 +8,32 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mvrecon.kernels import cpu
 from mvrecon.kernels.mapping import batched, looped
+
+# numba is heavy, so the kernels are imported at their first call
 
 
 @torch.library.custom_op("mvrecon::project", mutates_args=(), device_types="cpu")
 def project(volume: Tensor, lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str) -> Tensor:
     """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`. Half volumes give float32."""
+    from mvrecon.kernels import cpu
+
     return cpu.project(volume, lines, window, detector, method)
 
 
 @torch.library.custom_op("mvrecon::backproject", mutates_args=(), device_types="cpu")
 def backproject(views: Tensor, lines: Tensor, window: Sequence[float], shape: Sequence[int], method: str) -> Tensor:
     """The exact transpose of `project`: views [n m v u] to volumes [n d h w]."""
+    from mvrecon.kernels import cpu
+
     return cpu.backproject(views, lines, window, shape, method)
 
 
 @torch.library.custom_op("mvrecon::lines_vjp", mutates_args=(), device_types="cpu")
 def lines_vjp(volume: Tensor, views: Tensor, lines: Tensor, window: Sequence[float], method: str) -> Tensor:
     """The derivative of <views, project(volume, lines)> by the lines [m 4 3 3]."""
+    from mvrecon.kernels import cpu
+
     return cpu.lines_vjp(volume, views, lines, window, method)
 
 

@@ -1,30 +1,13 @@
 """Volumes carried from one lattice to another: frustum to world, world to frustum, frustum to frustum."""
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels import warp_ops, warp_reference
-
-COMPILED = find_spec("numba") is not None
-BACKENDS = ("auto", "cpu", "reference")
-
-
-def compiled_for(tensor: Tensor, backend: str) -> bool:
-    """Whether the compiled kernels are meant, and can be had.
-
-    Raises:
-        ValueError: an unknown back end, or "cpu" for a tensor elsewhere.
-    """
-    if backend not in BACKENDS:
-        raise ValueError(f"Unknown backend {backend!r}. Known: {', '.join(BACKENDS)}")
-    here = tensor.device.type == "cpu"
-    if backend == "cpu" and not here:
-        raise ValueError(f"backend 'cpu' needs tensors in main memory, got {tensor.device}; use 'auto' or 'reference'")
-    return backend == "cpu" or (backend == "auto" and here and COMPILED)
+from mvrecon.kernels.backends import kernels_for
 
 
 def warp(
@@ -52,5 +35,5 @@ def warp(
         )
     if volumes.dtype not in (torch.float32, torch.float64):
         return warp(volumes.float(), maps, shape, backend).to(volumes.dtype)
-    kernels = warp_ops if compiled_for(volumes, backend) else warp_reference
+    kernels = warp_ops if kernels_for(volumes.device, backend)[0] == "cpu" else warp_reference
     return kernels.warp(volumes, maps, list(shape))

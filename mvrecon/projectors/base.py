@@ -146,9 +146,7 @@ class Projector(nn.Module):
         return kernels
 
     def extra_repr(self) -> str:
-        return (
-            f"{len(self.rays)} views of {self.rays.shape}, grid {self.grid.shape}, {self.method}, {self.backend}"
-        )
+        return f"{len(self.rays)} views of {self.rays.shape}, grid {self.grid.shape}, {self.method}, {self.backend}"
 
 
 def _samples(samples: int | None, method: str, grid: Grid) -> int | None:

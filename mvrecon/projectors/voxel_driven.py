@@ -11,7 +11,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
 from mvrecon.kernels import voxel_ops, voxel_reference
-from mvrecon.kernels.warp import compiled_for
+from mvrecon.kernels.backends import kernels_for, wide
 from mvrecon.projectors.base import check
 
 Weight = Literal["none", "distance"]
@@ -49,8 +49,8 @@ def backproject(
         raise ValueError(f"Unknown weight {weight!r}. Known: none, distance")
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     maps = image_maps(cameras, grid).to(views.device)
-    values = (views if views.dtype in (torch.float32, torch.float64) else views.float()).flatten(0, 1)
-    compiled = compiled_for(views, backend) and not (backend == "auto" and maps.requires_grad)
+    values = wide(views).flatten(0, 1)
+    compiled = kernels_for(views.device, backend)[0] == "cpu" and not (backend == "auto" and maps.requires_grad)
     kernels = voxel_ops if compiled else voxel_reference
     volumes = kernels.look(values, maps, list(cameras.limits), weight == "distance", list(grid.shape))
     return volumes.unflatten(0, views.shape[:2])
