@@ -14,8 +14,8 @@ from mvrecon.kernels.loops import Rig
 from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR
 
 METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
-#: Bytes of the copy of a piece of the volume.
-BUDGET = 48 * 2**20
+#: Bytes of the copy of a piece of the volume; the last one may still be held when the next is made.
+BUDGET = 24 * 2**20
 
 
 @dataclass(frozen=True)
