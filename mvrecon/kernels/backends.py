@@ -6,7 +6,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from mvrecon.kernels import ops, reference
+from mvrecon.kernels import ops, reference, selfcheck
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 COMPILED = find_spec("numba") is not None
@@ -17,17 +17,34 @@ def wide(tensor: Tensor) -> Tensor:
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
-def kernels_for(device: torch.device, backend: str) -> tuple[str, ModuleType]:
-    """The back end's name and its functions, for tensors on a device.
+def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tuple[str, ModuleType]:
+    """The back end's name and its functions along rays, for volumes or views [b c ..].
+
+    Args:
+        tensor: what is to be projected or back-projected.
+        backend: "auto" takes the compiled one of the tensor's device where that can be had, else the reference.
+        method: of the rays; without it, the name alone tells, and a GPU has none but the reference.
 
     Raises:
         ValueError: an unknown back end, or a compiled one for a tensor elsewhere.
+        RuntimeError: "cuda" was asked for, and its kernels cannot be used; the reason is told.
     """
     if backend not in BACKENDS:
         raise ValueError(f"Unknown backend {backend!r}. Known: {', '.join(BACKENDS)}")
-    if backend in ("cpu", "cuda") and device.type != backend:
+    here = tensor.device.type
+    if backend in ("cpu", "cuda") and here != backend:
         memory = "main memory" if backend == "cpu" else "a GPU's memory"
-        raise ValueError(f"backend {backend!r} needs tensors in {memory}, got {device}; use 'auto' or 'reference'")
-    if backend == "reference" or device.type != "cpu" or not COMPILED:
+        raise ValueError(
+            f"backend {backend!r} needs tensors in {memory}, got {tensor.device}; use 'auto' or 'reference'"
+        )
+    if backend == "reference" or not COMPILED:
         return "reference", reference
-    return device.type, ops
+    if here == "cuda":
+        volumes = tensor.shape[0] * tensor.shape[1]
+        why = (
+            selfcheck.reason(tensor.device, method, tensor.dtype, volumes) if method else "only rays have kernels there"
+        )
+        if why and backend == "cuda":
+            raise RuntimeError(f"backend 'cuda' cannot be used on {tensor.device}: {why}")
+        return ("reference", reference) if why else ("cuda", ops)
+    return ("cpu", ops) if here == "cpu" else ("reference", reference)

@@ -21,8 +21,6 @@ from mvrecon.kernels.stores import store as store_of
 
 #: Rays in turn add to rows of their own, so that no addition waits for the one before.
 ROWS = 4
-#: Pieces whose rows are fetched one after the other, so that the processor waits for many at once.
-BATCH = 8
 #: Larger than any volume: a column is not clipped along z.
 ENDLESS = 1 << 40
 
@@ -103,10 +101,10 @@ def _extent(height, s, rows, size):
 
 
 @scalar
-def _blend(room, store, slot, k, weights, span, add):
-    """A row of the room = low * (voxels along z at k) + high * (those of the next row), added where `add`."""
+def _blend(room, store, group, k, weights, span, add):
+    """A group's row of the room = low * (voxels along z at k) + high * (those of the next row), added where `add`."""
     row, flat, low, high = room.row, store.values, weights[0], weights[1]
-    first, lanes = np.uint64((slot * room.width + 1) * store.lanes), store.lanes
+    first, lanes = np.uint64((group * room.width + 1) * store.lanes), store.lanes
     below = np.uint64(k * lanes)
     above = below + np.uint64(weights[2] * lanes)
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
@@ -115,29 +113,33 @@ def _blend(room, store, slot, k, weights, span, add):
 
 
 @scalar
-def _read(room, first, n):
-    """Add to the values each ray's share of its two neighbours in a row."""
-    places, pairs, row, parts = room.places, room.pairs, room.row_pairs, room.parts
-    shares, sums = room.shares, room.values[n]
-    for v in range(np.uint32(len(shares))):
-        pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
-    for v in range(np.uint32(len(shares))):
-        sums[v] += parts[2 * v] + shares[v] * (parts[2 * v + 1] - parts[2 * v])
-
-
-@scalar
-def _read_lanes(room, first, group):
-    """Add to a group's values each ray's share of its two neighbours in a row: `_read` of side by side volumes."""
+def _read_lanes(room, group):
+    """`_read` of four volumes side by side."""
     places, row, shares, sums = room.places, room.row, room.shares, room.values[group]
-    four, start, one = np.uint64(LANES), np.uint64(first * LANES), room.shares.dtype.type(1)
+    four, start, one = np.uint64(LANES), np.uint64(group * room.width * LANES), room.shares.dtype.type(1)
     for v in range(np.uint32(len(shares))):
         below, here = np.uint64(places[v]) * four + start, np.uint64(v) * four
         value = mix(take(row, below), take(row, below + four), shares[v])
         put(sums, here, more(take(sums, here), one, value))
 
 
+@scalar
+def _read(room, lanes, group):
+    """Add to a group's values each ray's share of its two neighbours in the group's row."""
+    if lanes > 1:
+        _read_lanes(room, group)
+        return
+    first = group * room.width
+    places, pairs, row, parts = room.places, room.pairs, room.row_pairs, room.parts
+    shares, sums = room.shares, room.values[group]
+    for v in range(np.uint32(len(shares))):
+        pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
+    for v in range(np.uint32(len(shares))):
+        sums[v] += parts[2 * v] + shares[v] * (parts[2 * v + 1] - parts[2 * v])
+
+
 #: Room for one column: flat indices of its pieces, four numbers each; per ray its place in a row of voxels, its share
-#: of the upper neighbour, its two neighbours whole and in their parts; values [g v l]; blended rows [z l]; rows.
+#: of the upper neighbour, its two neighbours whole and in their parts; values [g v l]; a blended row [z l]; rows.
 Column = namedtuple(
     "Column",
     ["index", "pieces", "places", "shares", "pairs", "parts", "values", "blended", "row", "row_pairs", "width"],
@@ -150,10 +152,10 @@ def column_of(rig: Rig, store: Store, volumes: int) -> Column:
     length, width = 2 * max(rig.sizes[:2]), rig.sizes[2] + 3
     pairs = np.empty(height, store.pairs.dtype)
     groups = -(-volumes // lanes)
-    row, row_pairs, *_ = store_of(np.zeros((1, 1, 1, max(ROWS, BATCH * groups) * width, lanes), real), 0)
+    row, row_pairs, *_ = store_of(np.zeros((1, 1, 1, max(ROWS, groups) * width, lanes), real), 0)
     index, pieces = np.empty(length, store.strides.dtype), np.empty((4, length))
     places, shares = np.empty(height, np.uint32), np.empty(height, real)
-    values, blended = np.empty((groups, height * lanes), real), np.empty((BATCH, rig.sizes[2] * lanes), real)
+    values, blended = np.empty((groups, height * lanes), real), np.empty(rig.sizes[2] * lanes, real)
     return Column(index, pieces, places, shares, pairs, pairs.view(real), values, blended, row, row_pairs, width)
 
 
@@ -179,23 +181,16 @@ def project_columns(store, rig, room, chosen, views, first, last):
         count = _pieces(rig, ray, (ray.first, ray.last), steps, room)
         level = height[2] == 0 and height[3] == 0
         room.values[:] = 0
-        for start in range(0, count, BATCH):
-            stop = min(start + BATCH, count)
-            for i in range(start, stop):
-                span = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
-                weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
-                for group in range(groups):
-                    slot = group if level else (i - start) * groups + group
-                    k = group * store.size + np.int64(room.index[i])
-                    _blend(room, store, slot, k, weights, span, level and i > 0)
-            for i in range(count - 1 if level else start, stop):
+        for i in range(count):
+            span = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
+            weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
+            if not level or i == 0:
                 _places(rig, height, room.pieces[2, i], room.pieces[3, i], room)
-                for group in range(groups):
-                    slot = group if level else (i - start) * groups + group
-                    if lanes > 1:
-                        _read_lanes(room, slot * room.width, group)
-                    else:
-                        _read(room, slot * room.width, group)
+            for group in range(groups):
+                k = group * store.size + np.int64(room.index[i])
+                _blend(room, store, group, k, weights, span, level and i > 0)
+                if not level or i == count - 1:
+                    _read(room, lanes, group)
         for v in range(rows):
             length = real(_length(rig, line, axis, u, v))
             for n in range(volumes):
@@ -203,19 +198,8 @@ def project_columns(store, rig, room, chosen, views, first, last):
 
 
 @scalar
-def _write(room, n):
-    """Spread the rays' values over `ROWS` rows of neighbours in turn: the transpose of `_read`."""
-    places, pairs, row, parts = room.places, room.pairs, room.row_pairs, room.parts
-    shares, values, one, width = room.shares, room.values[n], room.shares.dtype.type(1), np.uint32(room.width)
-    for v in range(np.uint32(len(shares))):
-        parts[2 * v], parts[2 * v + 1] = values[v] * (one - shares[v]), values[v] * shares[v]
-    for v in range(np.uint32(len(shares))):
-        row[np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width)] += pairs[v]
-
-
-@scalar
 def _write_lanes(room, group):
-    """Spread a group's values over `ROWS` rows of neighbours in turn: the transpose of `_read_lanes`."""
+    """`_write` of four volumes side by side."""
     places, row, shares, values = room.places, room.row, room.shares, room.values[group]
     four, width, one = np.uint64(LANES), np.uint32(room.width), room.shares.dtype.type(1)
     for v in range(np.uint32(len(shares))):
@@ -226,9 +210,23 @@ def _write_lanes(room, group):
 
 
 @scalar
-def _gather(room, slot, lanes, span):
+def _write(room, lanes, group):
+    """Spread a group's values over `ROWS` rows of neighbours in turn: the transpose of `_read`."""
+    if lanes > 1:
+        _write_lanes(room, group)
+        return
+    places, pairs, row, parts = room.places, room.pairs, room.row_pairs, room.parts
+    shares, values, one, width = room.shares, room.values[group], room.shares.dtype.type(1), np.uint32(room.width)
+    for v in range(np.uint32(len(shares))):
+        parts[2 * v], parts[2 * v + 1] = values[v] * (one - shares[v]), values[v] * shares[v]
+    for v in range(np.uint32(len(shares))):
+        row[np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width)] += pairs[v]
+
+
+@scalar
+def _gather(room, lanes, span):
     """The sum of the `ROWS` rows, without their padding; they are empty then."""
-    flat, blended, width = room.row[lanes:], room.blended[slot], room.width * lanes
+    flat, blended, width = room.row[lanes:], room.blended, room.width * lanes
     one, two, three, four = flat, flat[width:], flat[2 * width :], flat[3 * width :]
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
         blended[z] = (one[z] + two[z]) + (three[z] + four[z])
@@ -237,9 +235,9 @@ def _gather(room, slot, lanes, span):
 
 
 @scalar
-def _unblend(room, store, slot, k, weights, span):
+def _unblend(room, store, k, weights, span):
     """Add to two rows of voxels their shares of a row: the transpose of `_blend`."""
-    given, flat, low, high, lanes = room.blended[slot], store.values, weights[0], weights[1], store.lanes
+    given, flat, low, high, lanes = room.blended, store.values, weights[0], weights[1], store.lanes
     below = np.uint64(k * lanes)
     above = below + np.uint64(weights[2] * lanes)
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
@@ -272,21 +270,14 @@ def backproject_columns(store, rig, room, reads, views, low, high):
             for n in range(volumes):
                 room.values[n // lanes, v * lanes + n % lanes] = length * views[n, m, v, u]
         for group in range(len(room.values)):
-            for start in range(0, count, BATCH):
-                stop = min(start + BATCH, count)
-                for i in range(start, min(stop, 1) if level else stop):
-                    extent = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
+            for i in range(count):
+                extent = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
+                weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
+                if not level or i == 0:
                     _places(rig, height, room.pieces[2, i], room.pieces[3, i], room)
-                    if lanes > 1:
-                        _write_lanes(room, group)
-                    else:
-                        _write(room, group)
-                    _gather(room, i - start, lanes, extent)
-                for i in range(start, stop):
-                    extent = _extent(height, room.pieces[2, i], rows, rig.sizes[2])
-                    weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
-                    k = group * store.size + np.int64(room.index[i])
-                    _unblend(room, store, 0 if level else i - start, k, weights, extent)
+                    _write(room, lanes, group)
+                    _gather(room, lanes, extent)
+                _unblend(room, store, group * store.size + np.int64(room.index[i]), weights, extent)
 
 
 def columnar(rig) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The compiled operators of CUDA devices: the same three as `cpu.py`, on torch's current stream.
 
 Forward and derivative by the geometry are the same to the last bit in every run. So is the adjoint where it gathers,
-voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of its additions, and so the last digits, vary.
+voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of additions, and so the last digits, vary.
 """
 
 import math
@@ -16,7 +16,7 @@ from numba import cuda
 from torch import Tensor
 
 from mvrecon.kernels import cuda_loops
-from mvrecon.kernels.cpu import wide
+from mvrecon.kernels.backends import wide
 from mvrecon.kernels.cuda_loops import BLOCK, GROUP, TILE, Scene
 from mvrecon.kernels.padding import PAD
 from mvrecon.kernels.plan import METHODS
@@ -111,7 +111,7 @@ def lines_vjp(
     """The derivative of <views, project(volume, lines)> by the lines; float64."""
     x, y = wide(volume), wide(views).contiguous()
     scene = scene_of(window, volume.shape[1:], views.shape[2:], method)
-    threads = min(math.prod(scene.detector), max(1, THREADS // len(lines)))
+    threads = min(math.prod(scene.detector), max(1, THREADS // max(1, len(lines))))
     change = lines.new_zeros(4, 3, lines.shape[3], len(lines), threads, dtype=torch.float64)
     kernel = cuda_loops.vary_kernel(_number(method))
     launch(kernel, (-(-len(lines) * threads // BLOCK),), padded(x), y, maps(lines), scene, change)
@@ -124,13 +124,15 @@ def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
         return
     device = next(each.device for each in arguments if isinstance(each, Tensor))
     if device.type == "cpu":
-        given = [each.numpy() if isinstance(each, Tensor) else each for each in arguments]
+        given = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
         kernel[blocks, BLOCK](*given)
         return
     index = torch.cuda.current_device() if device.index is None else device.index
     with torch.cuda.device(index), cuda.gpus[index]:
         stream = cuda.external_stream(torch.cuda.current_stream(index).cuda_stream)
-        given = [cuda.as_cuda_array(each, sync=False) if isinstance(each, Tensor) else each for each in arguments]
+        given = [
+            cuda.as_cuda_array(each.detach(), sync=False) if isinstance(each, Tensor) else each for each in arguments
+        ]
         kernel[blocks, BLOCK, stream](*given)
 
 

@@ -1,3 +1,5 @@
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false, reportOptionalSubscript=false
+# (numba.cuda declares what kernels see as stubs without types)
 """The kernels of the CUDA back end, in Python: numba compiles them for a device, its simulator runs them without one.
 
 Rays and their derivatives are computed by the very functions of the CPU (`rays.py`, `march.py`, `loops.py`), the steps
@@ -204,10 +206,7 @@ def vary_kernel(method):
         if view >= len(lines):
             return
         own, held = cuda.local.array((4, 3, 3), np.float64), slopes.Values(flat, scene.size)
-        for kind in range(4):
-            for axis in range(3):
-                for k in range(3):
-                    own[kind, axis, k] = 0
+        own[:] = 0
         for place in range(start, scene.detector[0] * scene.detector[1], threads):
             v, u = place // scene.detector[1], place % scene.detector[1]
             ray, here = ray_of(scene, lines, (view, u, v), method)

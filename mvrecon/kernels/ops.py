@@ -37,6 +37,27 @@ def lines_vjp(volume: Tensor, views: Tensor, lines: Tensor, window: Sequence[flo
     return cpu.lines_vjp(volume, views, lines, window, method)
 
 
+@project.register_kernel("cuda")
+def _(volume, lines, window, detector, method):
+    from mvrecon.kernels import cuda
+
+    return cuda.project(volume, lines, window, detector, method)
+
+
+@backproject.register_kernel("cuda")
+def _(views, lines, window, shape, method):
+    from mvrecon.kernels import cuda
+
+    return cuda.backproject(views, lines, window, shape, method)
+
+
+@lines_vjp.register_kernel("cuda")
+def _(volume, views, lines, window, method):
+    from mvrecon.kernels import cuda
+
+    return cuda.lines_vjp(volume, views, lines, window, method)
+
+
 @project.register_fake
 def _(volume, lines, window, detector, method):
     wide = torch.float64 if volume.dtype == torch.float64 else torch.float32

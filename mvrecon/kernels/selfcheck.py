@@ -16,6 +16,7 @@ logger = logging.getLogger(__name__)
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
 
 
+@torch.compiler.assume_constant_result
 def reason(
     device: torch.device | str, method: str = "joseph", dtype: torch.dtype = torch.float32, volumes: int = 1
 ) -> str | None:
@@ -53,8 +54,16 @@ def _reason(device: str, name: str, dtype: torch.dtype, several: bool) -> str | 
 
 
 def differences(device: str, method: str, dtype: torch.dtype, volumes: int) -> Iterator[tuple[str, float]]:
-    """What was tried on a tiny scene, and its greatest difference to the reference by the reference's greatest value."""
-    from mvrecon.kernels import cuda  # only here: it needs numba-cuda
+    """What was tried on a tiny scene, and its greatest difference to the reference, by the reference's greatest value.
+
+    Raises:
+        ImportError: numba is missing, or on a device numba-cuda: what numba itself brings cannot compile the kernels.
+    """
+    from numba import cuda as numba_cuda
+
+    if device != "cpu" and getattr(numba_cuda, "implementation", "") == "Built-in":
+        raise ImportError("numba-cuda is not installed, pip install mvrecon[cuda]")
+    from mvrecon.kernels import cuda
 
     lines, window, detector, shape = tiny_scene(device)
     generator = torch.Generator().manual_seed(0)

@@ -1,7 +1,7 @@
 """How the integral along one ray changes with its place, for kernels that keep nothing from step to step.
 
-Each function returns the sum in voxels of the main axis; its derivatives by b, slope_b, c, slope_c; and the volume where
-the ray begins and ends inside the box. `loops.pull_back` makes derivatives by the geometry of them.
+Each function returns the sum in voxels of the main axis; its derivatives by b, slope_b, c, slope_c; and the volume
+where the ray begins and ends inside the box. `loops.pull_back` makes derivatives by the geometry of them.
 """
 
 from collections import namedtuple

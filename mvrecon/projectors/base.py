@@ -141,7 +141,7 @@ class Projector(nn.Module):
         return volume.unflatten(0, views.shape[:2])
 
     def _kernels(self, tensor: Tensor) -> ModuleType:
-        chosen, kernels = backends.kernels_for(tensor.device, self.backend)
+        chosen, kernels = backends.kernels_for(tensor, self.backend, self._kernel)
         self.last_backend = chosen
         return kernels
 

@@ -18,7 +18,7 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
     """Raise AssertionError unless the named projector keeps its promises on this grid and rig.
 
     Views and volumes of the right shape; A.T the transpose of A in float32 and float64; linear, nothing from nothing;
-    moving the object is un-moving the cameras; gradients in volume and pose that differences confirm (on a small grid
+    volumes of a batch seen each alone, twice the same to the last bit; moving the object is un-moving the cameras; gradients in volume and pose that differences confirm (on a small grid
     and rig in a generic pose; `gradients=False` leaves them out), and second ones in volume and views.
     """
     torch.manual_seed(seed)
@@ -36,6 +36,8 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
         other = torch.randn_like(x)
         assert _close(A(2 * x - other), 2 * views - A(other), tolerance), f"not linear in {dtype}"
         assert not A(torch.zeros_like(x)).any(), "views of nothing"
+        assert torch.equal(A(x), views) and torch.equal(A.T(y), volume), "not the same twice"
+        assert _close(A(x[1:]), views[1:], tolerance), "a volume's views depend on the others of its batch"
     _check_motion(name, grid, cameras, **options)
     if gradients:
         _check_gradients(name, grid, cameras, **options)
@@ -72,5 +74,7 @@ def _check_gradients(name: str, grid: Grid, cameras: Cameras, **options) -> None
     torch.autograd.gradcheck(project, (x, *vectors), eps=1e-6, atol=1e-5)
     A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)
     y = torch.rand(1, 1, len(cameras), *cameras.shape, dtype=torch.float64, requires_grad=True)
+    (change,) = torch.autograd.grad(A(x), x, y.detach())
+    assert _close(change, A.T(y.detach()), 1e-12), "the gradient in the volume is not the adjoint"
     torch.autograd.gradcheck(A.T, (y,))
     torch.autograd.gradgradcheck(lambda x, y: (A(x) * y).sum(), (x, y))

@@ -34,6 +34,14 @@ METHODS = ("joseph", "siddon", "trilinear:8")  # of an odd number, one sample ma
 CASES = [(kind, method) for kind in RIGS for method in METHODS]
 
 
+@pytest.fixture(autouse=True)
+def few_threads(monkeypatch):
+    """A thread of the simulator is one of the interpreter, so idle ones cost as much as busy ones."""
+    if SIMULATED:
+        monkeypatch.setattr("mvrecon.kernels.cuda.BLOCK", 32)
+        monkeypatch.setattr("mvrecon.kernels.cuda_loops.BLOCK", 32)
+
+
 def scene(kind: str, dtype: torch.dtype = torch.float64, count: int = 1):
     """Lines, window, detector, and volumes and views of noise."""
     torch.manual_seed(1)
@@ -206,6 +214,19 @@ def test_a_wrong_back_end_is_found_and_said_once(monkeypatch, caplog):
 def test_without_a_device_the_reason_is_recorded():
     selfcheck._reason.cache_clear()
     assert selfcheck.reason("cuda:0")
+    selfcheck._reason.cache_clear()
+
+
+@pytest.mark.skipif(SIMULATED, reason="is about torch")
+def test_compiled_code_asks_while_it_is_traced():
+    selfcheck._reason.cache_clear()
+    missing = torch.device("cuda", 99)
+
+    @torch.compile(backend="eager", fullgraph=True)
+    def choose(x):
+        return x + 1 if selfcheck.reason(missing, "joseph", x.dtype, len(x)) else x
+
+    assert choose(torch.zeros(1)) == 1
     selfcheck._reason.cache_clear()
 
 

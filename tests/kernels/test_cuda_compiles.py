@@ -1,4 +1,4 @@
-"""Every kernel of the CUDA back end is compiled for a device, with none at hand: numba-cuda's compiler needs no driver."""
+"""Every kernel of the CUDA back end is compiled for a device with none at hand: numba-cuda needs no driver for it."""
 
 from types import SimpleNamespace
 
@@ -19,6 +19,8 @@ METHODS = (JOSEPH, SIDDON, TRILINEAR)
 
 
 def compilable() -> bool:
+    if getattr(cuda, "implementation", "") != "NVIDIA":  # numba's own CUDA target knows no min and max of two numbers
+        return False
     try:
         cuda.compile_ptx(lambda x: None, types.void(float32), cc=HOPPER, device=False)
     except Exception:  # no compiler, or the simulator

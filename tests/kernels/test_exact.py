@@ -54,12 +54,12 @@ def test_both_methods_are_exact_from_face_to_face(method, backend):
     assert (expected >= 6).all() and torch.allclose(views, expected, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("method", ["joseph", "siddon"])
+@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
 def test_rays_that_miss_give_exactly_nothing(method):
     grid = Grid.centred((6, 6, 6), 1.0)
     rig = circular(5, 50.0, 90.0, {"pixels": [20, 20], "pixel_mm": 4.0})
     views = PROJECTORS.build("drr", grid=grid, cameras=rig, method=method)(torch.rand(1, 1, 6, 6, 6))[0, 0]
-    grown = Grid.centred((8, 8, 8), 1.0) if method == "joseph" else grid
+    grown = Grid.centred((8, 8, 8), 1.0) if method != "siddon" else grid
     misses = box(grown).integrals(*rig.rays(), extent=rig.limits) == 0
     assert misses.any() and not misses.all() and not views[misses].any()
     behind = Cameras(rig.source, rig.origin, rig.u, -rig.v, rig.shape, extent="behind")
@@ -73,7 +73,7 @@ def error(method: str, values, expected: torch.Tensor, n: int, name: str, rig: C
     return ((views - expected).norm() / expected.norm()).item()
 
 
-@pytest.mark.parametrize(("method", "order"), [("joseph", 0.9), ("siddon", 0.7)])
+@pytest.mark.parametrize(("method", "order"), [("joseph", 0.9), ("siddon", 0.7), ("trilinear", 0.9)])
 def test_ellipsoids_converge_at_first_order(method, order):
     """Across a sharp edge the voxels themselves are first-order truth."""
     rig = circular(3, 100.0, 160.0, DETECTOR, start_degrees=17.0)
@@ -84,7 +84,13 @@ def test_ellipsoids_converge_at_first_order(method, order):
     assert slope > order and errors[2] < 0.03, f"errors {errors}"
 
 
-@pytest.mark.parametrize(("method", "least", "most"), [("joseph", 1.8, 2.3), ("siddon", 0.8, 1.9)])
+#: Halving the voxel divides a second-order error by more than 3.5.
+SECOND = (1.81, 2.3)
+
+
+@pytest.mark.parametrize(
+    ("method", "least", "most"), [("joseph", *SECOND), ("trilinear", *SECOND), ("siddon", 0.8, 1.9)]
+)
 @pytest.mark.parametrize("name", ["drr", "radon"])
 def test_a_smooth_blob_converges_at_the_method_order(name, method, least, most):
     cone = circular(3, 100.0, 160.0, DETECTOR, start_degrees=17.0)

@@ -6,6 +6,13 @@ import torch
 from mvrecon.kernels import ops
 from tests.projectors.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, noise
 
+
+@pytest.fixture(autouse=True)
+def fresh_graphs():
+    """Forgets the graphs of other projectors, of which torch keeps but a few."""
+    torch.compiler.reset()
+
+
 CHECKS = ("test_schema", "test_autograd_registration", "test_faketensor", "test_aot_dispatch_static")
 
 
@@ -59,7 +66,7 @@ def test_a_compiled_graph_differentiates_by_the_rays(method):
     lines.requires_grad_()
     compiled = torch.compile(step, fullgraph=True, backend="aot_eager")
     expected, found = (torch.autograd.grad(run(lines), lines)[0] for run in (step, compiled))
-    assert expected.norm() > 1 and torch.allclose(found, expected)
+    assert expected.norm() > 0.1 and torch.allclose(found, expected)
 
 
 @pytest.mark.parametrize("option", OPTIONS)

@@ -70,9 +70,10 @@ def test_single_precision_leaves_the_pose_its_digits(method):
 def calls(monkeypatch):
     """Counts what the CPU does."""
     made: list[str] = []
-    for name in ("project", "backproject", "lines_vjp"):
+    works = {name: getattr(cpu, name) for name in ("project", "backproject", "lines_vjp")}
+    for name, work in works.items():
 
-        def counted(*arguments, name=name, work=getattr(cpu, name)):
+        def counted(*arguments, name=name, work=work):
             made.append(name)
             return work(*arguments)
 
