@@ -15,7 +15,7 @@ from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.lanes import LANES, mix, more, put, take
 from mvrecon.kernels.lines import DIRECTION, MOMENT, START
 from mvrecon.kernels.loops import Rig, pixel, steps_of
-from mvrecon.kernels.rays import JOSEPH, at, crossing, main_axis, trace, within
+from mvrecon.kernels.rays import JOSEPH, at, crossing, main_axis, slab_length, trace, within
 from mvrecon.kernels.stores import Store
 from mvrecon.kernels.stores import store as store_of
 
@@ -159,14 +159,6 @@ def column_of(rig: Rig, store: Store, volumes: int) -> Column:
     return Column(index, pieces, places, shares, pairs, pairs.view(real), values, blended, row, row_pairs, width)
 
 
-@scalar
-def _length(rig, line, axis, u, v):
-    """Mm of a ray in one slab."""
-    here = pixel(rig, u, v)
-    x, y, z = at(line, 3, 0, here[0], here[1]), at(line, 3, 1, here[0], here[1]), at(line, 3, 2, here[0], here[1])
-    return np.sqrt(x * x + y * y + z * z) / abs(at(line, 0, axis, here[0], here[1]))
-
-
 @compiled
 def project_columns(store, rig, room, chosen, views, first, last):
     """Add to views [n m v u] the sums of the volumes along the chosen views' columns first to last, counted in one."""
@@ -192,7 +184,7 @@ def project_columns(store, rig, room, chosen, views, first, last):
                 if not level or i == count - 1:
                     _read(room, lanes, group)
         for v in range(rows):
-            length = real(_length(rig, line, axis, u, v))
+            length = real(slab_length(line, axis, here[0], v - (rows - 1) / 2))
             for n in range(volumes):
                 views[n, m, v, u] += length * room.values[n // lanes, v * lanes + n % lanes]
 
@@ -266,7 +258,7 @@ def backproject_columns(store, rig, room, reads, views, low, high):
         level = height[2] == 0 and height[3] == 0
         room.values[:] = 0
         for v in range(rows):
-            length = real(_length(rig, line, axis, u, v))
+            length = real(slab_length(line, axis, here[0], v - (rows - 1) / 2))
             for n in range(volumes):
                 room.values[n // lanes, v * lanes + n % lanes] = length * views[n, m, v, u]
         for group in range(len(room.values)):

@@ -24,11 +24,12 @@ from mvrecon.kernels.threads import share
 
 def _copies(volume: Tensor, rig: Rig, plan: Plan) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
     """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that read them, rows."""
+    into = None
     for near, axes in plan.layouts:
         # a volume of half precision is widened piece by piece, and takes twice the room
         for rows, piece in pieces(rig, len(volume), max(volume.itemsize, 16 // volume.itemsize)):
             part = wide(volume[:, :, rows]).numpy()
-            into = empty(len(volume), piece.sizes, near, plan.lanes, part.dtype)
+            into = empty(len(volume), piece.sizes, (near, plan.lanes), part.dtype, into)
             share(
                 lambda a, b, part=part, to=into, near=near: fill(part, near, inner(to), a, b), part.shape[2], part.size
             )
@@ -71,10 +72,11 @@ def backproject(
     """The exact transpose of `project`, the same to the last bit for any number of threads."""
     rig = rig_of(lines, window, shape, views.shape[2:], method)
     plan, given = plan_of(rig, len(views)), np.ascontiguousarray(views.numpy())
-    volume = np.zeros((len(views), *shape), given.dtype)
+    volume, into = np.zeros((len(views), *shape), given.dtype), None
     for near, axes in plan.layouts:
         for rows, piece in pieces(rig, len(views), given.itemsize):
-            into, part = empty(len(views), piece.sizes, near, plan.lanes, given.dtype), volume[:, :, rows]
+            into = empty(len(views), piece.sizes, (near, plan.lanes), given.dtype, into)
+            part = volume[:, :, rows]
             for axis in range(3):
                 _spread(store(into, near), piece, plan, (axis, axes[axis]), given)
             share(

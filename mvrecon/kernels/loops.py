@@ -35,7 +35,7 @@ def room_of(rig: Rig, store: Store) -> Room:
     length = max(2 * rig.samples, max(rig.sizes))
     index, corners = np.empty((3, length), store.strides.dtype), np.empty((2, length), store.pairs.dtype)
     numbers = np.empty((4, length), store.values.dtype)
-    return Room(*index, *numbers, *corners, *corners.view(numbers.dtype), np.empty(LANES, numbers.dtype))
+    return Room._make((*index, *numbers, *corners, *corners.view(numbers.dtype), np.empty(LANES, numbers.dtype)))
 
 
 @scalar

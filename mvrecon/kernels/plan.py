@@ -1,5 +1,6 @@
 """How the loops share out a rig: which views are read how, and the volume in which layout, piece by piece."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -11,10 +12,11 @@ from mvrecon.kernels.columns import columnar
 from mvrecon.kernels.lanes import LANES
 from mvrecon.kernels.lines import DIRECTION, START, shifted
 from mvrecon.kernels.loops import Rig
+from mvrecon.kernels.padding import padded_shape
 from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR
 
 METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
-#: Bytes of the copy of a piece of the volume; the last one may still be held when the next is made.
+#: Bytes of the copy of a piece of the volume.
 BUDGET = 24 * 2**20
 
 
@@ -89,9 +91,9 @@ def pieces(rig: Rig, volumes: int, itemsize: int) -> Iterator[tuple[slice, Rig]]
     samples of "trilinear" are spaced along the ray's way through the whole volume: it is one piece.
     """
     width, height, depth = rig.sizes
-    size = volumes * (width + 1) * (height + 1) * (depth + 1) * itemsize
+    size = volumes * math.prod(padded_shape(rig.sizes)) * itemsize
     parts = 1 if rig.method == TRILINEAR else max(1, min(height, -(-size // BUDGET)))
-    for part in range(parts):
-        low, high = height * part // parts, height * (part + 1) // parts
+    for part in range(parts):  # the first is the greatest, and its memory serves the others
+        low, high = -(-height * part // parts), -(-height * (part + 1) // parts)
         lines = shifted(rig.lines, (low + high - height) / 2)
         yield slice(low, high), rig._replace(lines=lines, sizes=(width, high - low, depth))

@@ -51,6 +51,13 @@ def crossing(line, axis, other, u, v):
 
 
 @scalar
+def slab_length(line, axis, u, v):
+    """Mm of a ray in one slab of its main axis."""
+    x, y, z = at(line, 3, 0, u, v), at(line, 3, 1, u, v), at(line, 3, 2, u, v)
+    return sqrt(x * x + y * y + z * z) / abs(at(line, 0, axis, u, v))
+
+
+@scalar
 def transverse(value, slope, half, lower, upper):
     """The part of (lower, upper) in which -half <= value + s slope < half."""
     if slope == 0:
@@ -72,12 +79,10 @@ def trace(line, axis, near, pixel, window, sizes, method):
         sizes: voxels along (x, y, z).
         method: JOSEPH, SIDDON or TRILINEAR.
     """
-    u, v = pixel
-    far = 3 - axis - near
+    (u, v), far = pixel, 3 - axis - near
     D = at(line, 0, axis, u, v)
     slope_b, slope_c = at(line, 0, far, u, v) / D, at(line, 0, near, u, v) / D
     value_b, value_c = crossing(line, axis, far, u, v), crossing(line, axis, near, u, v)
-    world = at(line, 3, 0, u, v) ** 2 + at(line, 3, 1, u, v) ** 2 + at(line, 3, 2, u, v) ** 2
     one = at(line, 2, axis, u, v) + window[0] * D
     two = at(line, 2, axis, u, v) + window[1] * D
     # hat functions reach one voxel from the outermost centres, cells half a voxel
@@ -85,13 +90,12 @@ def trace(line, axis, near, pixel, window, sizes, method):
     half = sizes[axis] / 2.0 + (0.5 if method == TRILINEAR else 0.0)
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
     from_, to = OWN if begin > -half else FACE, OWN if end < half else FACE
-    # a slab counts where it overlaps the ray: centres within half a voxel (joseph: of the hats) of its ends
+    # a slab counts where it overlaps the ray
     slack, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5 if method == SIDDON else 1.0)
     lower, upper = transverse(value_b, slope_b, sizes[far] / 2.0 + reach, begin - slack, end + slack)
     far_lower, far_upper = lower, upper
     lower, upper = transverse(value_c, slope_c, sizes[near] / 2.0 + reach, lower, upper)
-    centre = (sizes[axis] - 1) / 2.0
-    first, last = 0, 0
+    centre, first, last = (sizes[axis] - 1) / 2.0, 0, 0
     if begin < end and lower <= upper:
         first = max(0, int(ceil(lower + centre - margin)))
         last = min(sizes[axis], int(floor(upper + centre + margin)) + 1)
@@ -100,7 +104,7 @@ def trace(line, axis, near, pixel, window, sizes, method):
         to = NEAR if upper < far_upper else FAR if far_upper < end else to
         begin, end = lower, upper
     b0, c0 = value_b + (sizes[far] - 1) / 2.0 + 1, value_c + (sizes[near] - 1) / 2.0 + 1
-    length = sqrt(world) / abs(D)
+    length = slab_length(line, axis, u, v)
     return Ray(axis, far, near, b0, slope_b, c0, slope_c, length, begin, end, from_, to, first, last, centre)
 
 

@@ -4,7 +4,9 @@ Around each volume lies nothing, one voxel in front and two behind, so that no l
 where its cell touches the volume, and the rounding of single precision may carry it half a cell further.
 """
 
+import math
 from collections import namedtuple
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -19,10 +21,19 @@ COMPLEX = {np.dtype(np.float32): np.complex64, np.dtype(np.float64): np.complex1
 TILE = 16
 
 
-def empty(count: int, sizes: tuple[int, int, int], near: int, lanes: int, dtype: np.dtype) -> np.ndarray:
-    """Nothing, padded, for volumes of `sizes` (x, y, z): [g z y x l] with x as near axis, [g y x z l] with z."""
+def empty(count: int, sizes: Sequence[int], plan: tuple[int, int], dtype: np.dtype, memory=None) -> np.ndarray:
+    """Nothing, padded, for volumes of `sizes` (x, y, z); plan = (near axis, lanes).
+
+    It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of an array that has served if there is one.
+    """
+    near, lanes = plan
     x, y, z = padded_shape(sizes)
-    return np.zeros((-(-count // lanes), *((z, y, x) if near == 0 else (y, x, z)), lanes), dtype)
+    shape = (-(-count // lanes), *((z, y, x) if near == 0 else (y, x, z)), lanes)
+    if memory is None or memory.size < math.prod(shape):
+        return np.zeros(shape, dtype)
+    flat = memory.reshape(-1)[: math.prod(shape)]
+    flat[:] = 0
+    return flat.reshape(shape)
 
 
 def inner(padded: np.ndarray) -> np.ndarray:

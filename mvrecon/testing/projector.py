@@ -18,8 +18,9 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
     """Raise AssertionError unless the named projector keeps its promises on this grid and rig.
 
     Views and volumes of the right shape; A.T the transpose of A in float32 and float64; linear, nothing from nothing;
-    volumes of a batch seen each alone, twice the same to the last bit; moving the object is un-moving the cameras; gradients in volume and pose that differences confirm (on a small grid
-    and rig in a generic pose; `gradients=False` leaves them out), and second ones in volume and views.
+    volumes of a batch seen each alone, twice the same to the last bit; moving the object is un-moving the cameras;
+    gradients in volume and pose that differences confirm (on a small grid and rig in a generic pose; `gradients=False`
+    leaves them out), that in the volume being the adjoint, and second ones in volume and views.
     """
     torch.manual_seed(seed)
     A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)

@@ -79,7 +79,7 @@ def test_memory_layout_does_not_matter(A):
     y = A(x)
     assert torch.equal(A(x.to(memory_format=torch.channels_last_3d)), y)
     swapped = x.transpose(0, 1).contiguous().transpose(0, 1)
-    assert torch.equal(A(swapped), y) and torch.equal(A(x[:, 1:2]), y[:, 1:2])
+    assert torch.equal(A(swapped), y) and torch.equal(A(x[:, 1:2]), A(x[:, 1:2].contiguous()))
     spread = torch.rand(1, 1, 4, 5, 1).expand(2, 3, 4, 5, 6)
     assert torch.equal(A.T(spread), A.T(spread.contiguous()))
 

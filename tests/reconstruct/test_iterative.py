@@ -59,7 +59,8 @@ def test_nothing_is_negative_unless_allowed(A):
 def test_a_batch_is_its_cases(A):
     y = torch.rand(2, 2, 9, 9, 11)
     whole = sirt(A, y, 3)
-    assert torch.equal(whole[1:, :1], sirt(A, y[1:, :1].contiguous(), 3))
+    # several volumes travel side by side, which sums in another order: the last digits alone may differ
+    torch.testing.assert_close(whole[1:, :1], sirt(A, y[1:, :1].contiguous(), 3), rtol=1e-5, atol=1e-6)
     assert torch.equal(whole, sirt(A, y, 3, weights=sirt_weights(A)))
 
 
