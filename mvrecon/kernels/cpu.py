@@ -21,18 +21,23 @@ from mvrecon.kernels.plan import Plan, pieces, plan_of, ray_plan_of, rig_of
 from mvrecon.kernels.stores import Store, add, empty, fill, inner, store
 from mvrecon.kernels.threads import share
 
+#: Rows of a volume of half precision that are widened at a time.
+TOGETHER = 8
+
 
 def _copies(volume: Tensor, rig: Rig, plan: Plan) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
     """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that read them, rows."""
-    into = None
+    into, real = None, wide(volume[:0]).numpy().dtype
     for near, axes in plan.layouts:
-        # a volume of half precision is widened piece by piece, and takes twice the room
-        for rows, piece in pieces(rig, len(volume), max(volume.itemsize, 16 // volume.itemsize)):
-            part = wide(volume[:, :, rows]).numpy()
-            into = empty(len(volume), piece.sizes, (near, plan.lanes), part.dtype, into)
-            share(
-                lambda a, b, part=part, to=into, near=near: fill(part, near, inner(to), a, b), part.shape[2], part.size
-            )
+        for rows, piece in pieces(rig, len(volume), real.itemsize):
+            into = empty(len(volume), piece.sizes, (near, plan.lanes), real, into)
+
+            def copy(first: int, last: int, into=into, near=near, start=rows.start) -> None:
+                for row in range(first, last, TOGETHER):
+                    part = volume[:, :, start + row : start + min(row + TOGETHER, last)]
+                    fill(wide(part).numpy(), near, inner(into), row)
+
+            share(copy, rows.stop - rows.start, into.size, 4)
             yield store(into, near), piece, axes, rows
 
 

@@ -24,7 +24,7 @@ TILE = 16
 def empty(count: int, sizes: Sequence[int], plan: tuple[int, int], dtype: np.dtype, memory=None) -> np.ndarray:
     """Nothing, padded, for volumes of `sizes` (x, y, z); plan = (near axis, lanes).
 
-    It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of an array that has served if there is one.
+    It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of an array that has served, if any.
     """
     near, lanes = plan
     x, y, z = padded_shape(sizes)
@@ -51,23 +51,23 @@ def store(volumes: np.ndarray, near: int) -> Store:
 
 
 @compiled
-def fill(volumes, near, into, first, last):
-    """Write rows (along y) first to last of volumes [n d h w] into volumes as a store has them."""
-    count, depth, _, width = volumes.shape
+def fill(volumes, near, into, first):
+    """Write volumes [n d h w] into those of a store, from row (along y) `first` on."""
+    count, depth, height, width = volumes.shape
     lanes = into.shape[4]
     for n in range(count):
         g, lane = n // lanes, n % lanes
-        for y in range(first, last):
+        for y in range(height):
             if near == 0:
                 for z in range(depth):
                     for x in range(width):
-                        into[g, z, y, x, lane] = volumes[n, z, y, x]
+                        into[g, z, first + y, x, lane] = volumes[n, z, y, x]
                 continue
             for x0 in range(0, width, TILE):
                 for z0 in range(0, depth, TILE):
                     for x in range(x0, min(x0 + TILE, width)):
                         for z in range(z0, min(z0 + TILE, depth)):
-                            into[g, y, x, z, lane] = volumes[n, z, y, x]
+                            into[g, first + y, x, z, lane] = volumes[n, z, y, x]
 
 
 @compiled
