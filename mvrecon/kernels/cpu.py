@@ -27,6 +27,8 @@ TOGETHER = 8
 
 def _copies(volume: Tensor, rig: Rig, plan: Plan) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
     """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that read them, rows."""
+    # grad mode belongs to a thread: in the pool's threads it would be on
+    volume = volume.detach()
     into, real = None, wide(volume[:0]).numpy().dtype
     for near, axes in plan.layouts:
         for rows, piece in pieces(rig, len(volume), real.itemsize):

@@ -1,6 +1,7 @@
 """What the loops cost: time against the oracle's and each other's, memory, and volumes of more than 2^31 voxels."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import columns, cpu, plan, stores
 from mvrecon.kernels.loops import backproject_slabs, project_rows, room_of
+from mvrecon.parts import PROJECTORS
 from tests.projectors.cases import CASES, OPTIONS, Case, noise
 
 PIXELS = {"pixels": [48, 48], "pixel_mm": 1.5}
@@ -120,3 +122,17 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
     row[:] = 0
     backproject_slabs(volume, held, room_of(held, volume), (*reads, 0), np.full_like(views, 2), 0, 40)
     assert np.allclose(row, 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_gradients_cross_the_threads(dtype, monkeypatch):
+    """Grad mode belongs to a thread: what the pool's threads touch must not want a graph."""
+    monkeypatch.setattr("mvrecon.kernels.threads.LEAST", 1)
+    with threads(3):
+        rig = circular(3, 40.0, 70.0, {"pixels": [9, 10], "pixel_mm": 2.0}, start_degrees=13)
+        source = rig.source.clone().requires_grad_()
+        A = PROJECTORS.build("drr", grid=Grid.centred((9, 10, 11), 1.0), cameras=replace(rig, source=source))
+        x = torch.rand(1, 1, 9, 10, 11).to(dtype).requires_grad_()
+        views = A(x)
+        by_x, by_source = torch.autograd.grad(views.sum(), (x, source))
+        assert torch.equal(by_x, A.T(torch.ones_like(views)).detach().to(dtype)) and by_source.abs().max() > 0
