@@ -18,8 +18,8 @@ from torch import Tensor
 from mvrecon.kernels import cuda_loops
 from mvrecon.kernels.backends import wide
 from mvrecon.kernels.cuda_loops import BLOCK, GROUP, TILE, Scene
-from mvrecon.kernels.padding import PAD
-from mvrecon.kernels.plan import METHODS
+from mvrecon.kernels.padding import INNER, PAD, padded_shape
+from mvrecon.kernels.rays import numbered
 
 #: Pixels per voxel, by area, up to which a voxel asks all pixels of its picture.
 GATHER = 4.0
@@ -42,7 +42,7 @@ def project(
     x = wide(volume)
     scene = scene_of(window, volume.shape[1:], detector, method)
     views = x.new_empty(len(x), len(lines), *detector)
-    kernel = cuda_loops.project_kernel(_number(method), *_shares(len(x), scene))
+    kernel = cuda_loops.project_kernel(numbered(method)[0], *_shares(len(x), scene))
     launch(kernel, (_blocks(scene, len(lines)), _groups(len(x))), padded(x), maps(lines), scene, views)
     return views
 
@@ -93,12 +93,10 @@ def scatter(
     """`backproject` of any method by rays, with atomic additions."""
     y = wide(views).contiguous()
     scene = scene_of(window, shape, views.shape[2:], method)
-    sizes = [size + sum(PAD) for size in shape]
     flat = y.new_zeros(len(y) * scene.size)
-    kernel = cuda_loops.scatter_kernel(_number(method), *_shares(len(y), scene))
+    kernel = cuda_loops.scatter_kernel(numbered(method)[0], *_shares(len(y), scene))
     launch(kernel, (_blocks(scene, len(lines)), _groups(len(y))), y, maps(lines), scene, flat)
-    inner = tuple(slice(PAD[0], -PAD[1]) for _ in shape)
-    return flat.view(len(y), *sizes)[(slice(None), *inner)].contiguous()
+    return flat.view(len(y), *padded_shape(shape))[:, INNER, INNER, INNER].contiguous()
 
 
 def lines_vjp(
@@ -113,7 +111,7 @@ def lines_vjp(
     scene = scene_of(window, volume.shape[1:], views.shape[2:], method)
     threads = min(math.prod(scene.detector), max(1, THREADS // max(1, len(lines))))
     change = lines.new_zeros(4, 3, lines.shape[3], len(lines), threads, dtype=torch.float64)
-    kernel = cuda_loops.vary_kernel(_number(method))
+    kernel = cuda_loops.vary_kernel(numbered(method)[0])
     launch(kernel, (-(-len(lines) * threads // BLOCK),), padded(x), y, maps(lines), scene, change)
     return change.sum(dim=4).permute(3, 0, 1, 2).contiguous()
 
@@ -137,8 +135,8 @@ def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
 
 
 def scene_of(window: Sequence[float], shape: Sequence[int], detector: Sequence[int], method: str) -> Scene:
-    """The numbers of a scene. A method is its name, with ":samples" a ray behind it for "trilinear"."""
-    depth, height, width = (int(size) + sum(PAD) for size in shape)
+    """The numbers of a scene."""
+    depth, height, width = padded_shape(shape)
     rows, columns = (int(size) for size in detector)
     low, high = (min(max(float(end), -FAR), FAR) for end in window)
     return Scene(
@@ -148,7 +146,7 @@ def scene_of(window: Sequence[float], shape: Sequence[int], detector: Sequence[i
         detector=(rows, columns),
         tile=TILE if columns >= TILE[0] and rows >= TILE[1] else (1, 1),
         window=(low, high),
-        samples=int(method.partition(":")[2] or 0),
+        samples=numbered(method)[1],
     )
 
 
@@ -160,10 +158,6 @@ def padded(volume: Float[Tensor, "n d h w"]) -> Float[Tensor, " p"]:
 def maps(lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "m 4 3 k"]:
     """The rays' maps as the kernels read them."""
     return lines.detach().double().contiguous()
-
-
-def _number(method: str) -> int:
-    return METHODS[method.partition(":")[0]]
 
 
 def _group(volumes: int) -> int:

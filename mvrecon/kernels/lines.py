@@ -60,6 +60,8 @@ def lines_of_rays(rays: ExplicitRays, grid: Grid) -> Float[Tensor, "r 4 3 1"]:
 
 def shifted(lines: Float[np.ndarray, "m 4 3 k"], y: float) -> Float[np.ndarray, "m 4 3 k"]:
     """The same rays about a point that lies y voxels beyond the centre along the y axis."""
+    if y == 0:
+        return lines
     moved = lines.copy()
     # (start - o) x direction, the start being a number and not linear in the pixel in its last column alone
     moved[:, START, 1, -1] -= y

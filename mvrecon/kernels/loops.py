@@ -4,7 +4,7 @@ from collections import namedtuple
 
 import numpy as np
 
-from mvrecon.kernels import joseph, march, siddon
+from mvrecon.kernels import joseph, march, siddon, slopes
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.lanes import LANES
 from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR, at, crossing, main_axis, trace, within
@@ -139,9 +139,9 @@ def backproject_slabs(store, rig, room, reads, views, low, high):
 
 
 @scalar
-def pull_back(line, ray, p, window, value, slopes, change):
+def pull_back(line, ray, p, window, value, change_of, change):
     """Add to a row's `change` [4 3 k] the derivative of value * (one ray's integral) by the maps in `line`."""
-    total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end = slopes
+    total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end = change_of
     axis, b, c = ray.axis, ray.far, ray.near
     D = at(line, 0, axis, p[0], p[1])
     value_b, value_c = crossing(line, axis, b, p[0], p[1]), crossing(line, axis, c, p[0], p[1])
@@ -183,14 +183,14 @@ def vary_rows(store, rig, room, reads, given, first, last):
             if not axes[axis]:
                 continue
             ray = trace(line, axis, store.near, here, rig.window, rig.sizes, rig.method)
-            steps, span = steps_of(rig, store, axis), (ray.first, ray.last)
-            count = joseph.cells(ray, span, steps, room) if rig.method == JOSEPH else 0
+            steps = steps_of(rig, store, axis)
+            count = joseph.cells(ray, (ray.first, ray.last), steps, room) if rig.method == JOSEPH else 0
             for n in range(volumes):
                 if rig.method == JOSEPH:
-                    slopes = joseph.slopes(store, n, steps, count, room, ray)
+                    change_of = joseph.slopes(store, n, steps, count, room, ray)
                 elif rig.method == TRILINEAR:
-                    slopes = march.slopes(store, n, steps, ray)
+                    change_of = slopes.trilinear(store, n, ray, steps)
                 else:
-                    slopes = siddon.slopes(store, n, steps, span, ray)
+                    change_of = slopes.siddon(store, n, ray, steps)
                 value = views[n, m, v, u]
-                pull_back(line, ray, (here[0], here[1], 1.0), rig.window, value, slopes, change[m, place])
+                pull_back(line, ray, (here[0], here[1], 1.0), rig.window, value, change_of, change[m, place])

@@ -8,6 +8,8 @@ import numpy as np
 
 #: Samples of nothing before and behind along every axis: a cell that just misses, and one more for rounding.
 PAD = (1, 2)
+#: What lies inside the border, along one axis.
+INNER = slice(PAD[0], -PAD[1])
 #: What a thread works in, since compiled loops make no arrays: per position of a row a flat index and three weights;
 #: and what it gathers for itself.
 Room = namedtuple("Room", ["at", "weight", "own"])
@@ -29,7 +31,7 @@ def padded(values: np.ndarray, axes: int) -> np.ndarray:
     """The last axes with their border, made one."""
     lead, shape = values.shape[:-axes], padded_shape(values.shape[-axes:])
     wide = np.zeros((*lead, *shape), dtype=values.dtype)
-    wide[(..., *[slice(PAD[0], -PAD[1])] * axes)] = values
+    wide[(..., *[INNER] * axes)] = values
     return wide.reshape(*lead, math.prod(shape))
 
 

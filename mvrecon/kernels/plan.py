@@ -13,9 +13,8 @@ from mvrecon.kernels.lanes import LANES
 from mvrecon.kernels.lines import DIRECTION, START, shifted
 from mvrecon.kernels.loops import Rig
 from mvrecon.kernels.padding import padded_shape
-from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR
+from mvrecon.kernels.rays import JOSEPH, TRILINEAR, numbered
 
-METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
 #: Bytes of the copy of a piece of the volume.
 BUDGET = 24 * 2**20
 
@@ -51,12 +50,11 @@ class Plan:
 
 
 def rig_of(lines: Tensor, window: Sequence[float], shape: Sequence[int], detector: Sequence[int], method: str) -> Rig:
-    """What the loops know of the rays. A method is its name, with ":samples" a ray behind it for "trilinear"."""
-    name, _, samples = method.partition(":")
+    """What the loops know of the rays."""
     maps = np.ascontiguousarray(lines.detach().numpy(), dtype=np.float64)
     ends = (float(window[0]), float(window[1]))
     sizes = (int(shape[2]), int(shape[1]), int(shape[0]))
-    return Rig(maps, ends, sizes, (int(detector[0]), int(detector[1])), METHODS[name], int(samples or 0))
+    return Rig(maps, ends, sizes, (int(detector[0]), int(detector[1])), *numbered(method))
 
 
 def plan_of(rig: Rig, volumes: int) -> Plan:

@@ -12,6 +12,7 @@ from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.lines import TIE
 
 JOSEPH, SIDDON, TRILINEAR = 0, 1, 2
+METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
 
 #: One ray: main, far and near axis; padded coordinates along far (b) and near (c) at the centre slab, and their slopes;
 #: mm per slab; where it begins and ends (slab coordinate about the centre); what bounds the beginning and the end, see
@@ -23,6 +24,12 @@ Ray = namedtuple(
 )
 #: What bounds a ray: a face across its main axis, its own end, or a face across its far or near axis.
 FACE, OWN, FAR, NEAR = 0, 1, 2, 3
+
+
+def numbered(method: str) -> tuple[int, int]:
+    """The number of a method, and its samples a ray: "trilinear" has them behind its name, ":samples"."""
+    name, _, samples = method.partition(":")
+    return METHODS[name], int(samples or 0)
 
 
 @scalar

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled
-from mvrecon.kernels.padding import PAD, padded_shape
+from mvrecon.kernels.padding import INNER, padded_shape
 
 #: values [g p l] in one row, of g groups of l volumes; pairs, each value and the next as one complex number on the same
 #: memory; p, the voxels of a volume; strides in voxels of the axes (x, y, z); the contiguous axis; l.
@@ -38,7 +38,7 @@ def empty(count: int, sizes: Sequence[int], plan: tuple[int, int], dtype: np.dty
 
 def inner(padded: np.ndarray) -> np.ndarray:
     """The volumes without their padding."""
-    return padded[(slice(None), *[slice(PAD[0], -PAD[1])] * 3)]
+    return padded[(slice(None), *[INNER] * 3)]
 
 
 def store(volumes: np.ndarray, near: int) -> Store:
