@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.geometry.box import Box
+
 
 @dataclass(frozen=True, eq=False)
 class Grid:
@@ -97,6 +99,19 @@ class Grid:
         sizes = torch.tensor(self.shape[::-1], dtype=torch.float64)
         ends = torch.cartesian_prod(*[torch.tensor([-0.5, n - 0.5], dtype=torch.float64) for n in sizes.tolist()])
         return self.to_world(ends)
+
+    def cropped(self, box: Box) -> "Grid":
+        """The voxels in a box, where they are.
+
+        Raises:
+            ValueError: a box that is empty or not inside the grid.
+        """
+        inside = all(0 <= low < high <= n for low, high, n in zip(box.low, box.high, self.shape, strict=True))
+        if not inside:
+            raise ValueError(f"A grid of {self.shape} voxels cannot be cropped to {box.low} .. {box.high}")
+        affine = self.affine.clone()
+        affine[:3, 3] = self.to_world(torch.tensor(box.low[::-1], dtype=torch.float64))
+        return Grid(box.shape, affine)
 
     def refined(self, factor: int) -> "Grid":
         """The same box cut into `factor` times as many voxels along each axis."""

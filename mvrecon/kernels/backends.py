@@ -6,7 +6,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from mvrecon.kernels import ops, reference, selfcheck
+from mvrecon.kernels.rays import ops, reference, selfcheck
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 COMPILED = find_spec("numba") is not None

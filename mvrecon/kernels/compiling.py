@@ -23,8 +23,8 @@ def scalar(function: Callable[..., Any]) -> Any:
 
 
 def digest(folder: Path) -> str:
-    """What the Python files of a folder hold, in short."""
-    return sha256(b"".join(file.read_bytes() for file in sorted(folder.glob("*.py")))).hexdigest()
+    """What the Python files of a folder and below hold, in short."""
+    return sha256(b"".join(file.read_bytes() for file in sorted(folder.rglob("*.py")))).hexdigest()
 
 
 SOURCES = digest(Path(__file__).parent)

@@ -14,8 +14,8 @@ from mvrecon.geometry.frustum import Spacing, depth_edges
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps
 from mvrecon.geometry.sample import inside
-from mvrecon.kernels.warp import warp
-from mvrecon.kernels.warp_reference import normalised_places
+from mvrecon.kernels.warps.reference import normalised_places
+from mvrecon.kernels.warps.warp import warp
 
 
 class Frusta(nn.Module):

@@ -12,9 +12,10 @@ from torch.nn.functional import avg_pool2d
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import backends, reference
+from mvrecon.kernels import backends
 from mvrecon.kernels.backends import wide
-from mvrecon.kernels.lines import lines_of, lines_of_rays
+from mvrecon.kernels.rays import reference
+from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 
 METHODS = ("joseph", "siddon", "trilinear")
 

@@ -10,8 +10,9 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
-from mvrecon.kernels import voxel_ops, voxel_reference
 from mvrecon.kernels.backends import kernels_for, wide
+from mvrecon.kernels.voxels import ops as voxel_ops
+from mvrecon.kernels.voxels import reference as voxel_reference
 from mvrecon.projectors.base import check
 
 Weight = Literal["none", "distance"]

@@ -14,8 +14,8 @@ import torch
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import reference, selfcheck
-from mvrecon.kernels.lines import lines_of
+from mvrecon.kernels.rays import reference, selfcheck
+from mvrecon.kernels.rays.lines import lines_of
 from tests.projectors.rigs import GRID, PARALLEL, PINHOLES
 
 SIMULATED = os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
@@ -38,8 +38,8 @@ CASES = [(kind, method) for kind in RIGS for method in METHODS]
 def few_threads(monkeypatch):
     """A thread of the simulator is one of the interpreter, so idle ones cost as much as busy ones."""
     if SIMULATED:
-        monkeypatch.setattr("mvrecon.kernels.cuda.BLOCK", 32)
-        monkeypatch.setattr("mvrecon.kernels.cuda_loops.BLOCK", 32)
+        monkeypatch.setattr("mvrecon.kernels.rays.cuda.BLOCK", 32)
+        monkeypatch.setattr("mvrecon.kernels.rays.cuda_loops.BLOCK", 32)
 
 
 def scene(kind: str, dtype: torch.dtype = torch.float64, count: int = 1):
@@ -69,7 +69,7 @@ def test_in_the_simulator():
 @kernels
 @pytest.mark.parametrize(("kind", "method"), CASES)
 def test_project(kind, method):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     x, _, lines, window, detector = scene(kind)
     expected = reference.project(x, lines, window, detector, method)
@@ -79,7 +79,7 @@ def test_project(kind, method):
 @kernels
 @pytest.mark.parametrize(("kind", "method"), CASES)
 def test_backproject(kind, method):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     x, y, lines, window, _ = scene(kind)
     shape = list(x.shape[1:])
@@ -91,7 +91,7 @@ def test_backproject(kind, method):
 @kernels
 @pytest.mark.parametrize("kind", ["dome", "parallel"])
 def test_gather_in_pieces(kind, monkeypatch):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     x, y, lines, window, _ = scene(kind)
     shape = list(x.shape[1:])
@@ -102,7 +102,7 @@ def test_gather_in_pieces(kind, monkeypatch):
 @kernels
 @pytest.mark.parametrize(("kind", "method"), CASES)
 def test_lines_vjp(kind, method, monkeypatch):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     x, y, lines, window, detector = scene(kind)
     monkeypatch.setattr(cuda, "THREADS", 16)  # several pixels a thread
@@ -115,7 +115,7 @@ def test_lines_vjp(kind, method, monkeypatch):
 @pytest.mark.parametrize("method", METHODS)
 def test_several_volumes_share_their_rays(method):
     """Six volumes are a whole group and a part of one."""
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     x, y, lines, window, detector = scene("dome", count=6)
     shape = list(x.shape[1:])
@@ -133,7 +133,7 @@ def test_several_volumes_share_their_rays(method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 def test_single_precision_stays_single(dtype, method):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     x, y, lines, window, detector = scene("dome", dtype)
     shape = list(x.shape[1:])
@@ -149,7 +149,7 @@ def test_single_precision_stays_single(dtype, method):
 @pytest.mark.parametrize("method", METHODS)
 def test_tiles_cover_the_detector(method):
     """A detector larger than a tile, and no multiple of one."""
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     x, _, lines, window, _ = scene("dome")
     detector = [9, 17]
@@ -161,7 +161,7 @@ def test_tiles_cover_the_detector(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_wide_indices_change_nothing(method, monkeypatch):
     """Volumes beyond 2^32 voxels are counted in 64 bits."""
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     x, y, lines, window, detector = scene("dome")
     shape = list(x.shape[1:])
@@ -174,7 +174,7 @@ def test_wide_indices_change_nothing(method, monkeypatch):
 @kernels
 @pytest.mark.parametrize("method", METHODS)
 def test_rays_given_one_by_one(method):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     grid, cameras = RIGS["dome"]
     x, *_ = scene("dome")
@@ -199,7 +199,7 @@ def test_a_right_back_end_checks_itself_and_stays(method, dtype, volumes):
 
 @kernels
 def test_a_wrong_back_end_is_found_and_said_once(monkeypatch, caplog):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     selfcheck._reason.cache_clear()
     right = cuda.project

@@ -10,7 +10,7 @@ from numba import cuda, float32, float64, int32, int64, typeof, types  # noqa: E
 
 from mvrecon.kernels import cuda as back_end  # noqa: E402
 from mvrecon.kernels import cuda_loops  # noqa: E402
-from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR  # noqa: E402
+from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR  # noqa: E402
 
 SCENE = typeof(back_end.scene_of((0.0, 1.0), (8, 8, 8), (16, 16), "trilinear:9"))
 LINES = float64[:, :, :, ::1]

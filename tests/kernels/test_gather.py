@@ -10,9 +10,9 @@ from numba import njit
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import cpu
-from mvrecon.kernels.gather import camera, collect, record
-from mvrecon.kernels.lines import lines_of
+from mvrecon.kernels.rays import cpu
+from mvrecon.kernels.rays.gather import camera, collect, record
+from mvrecon.kernels.rays.lines import lines_of
 from tests.projectors.rigs import AXIAL, CONE, GRID, INSIDE, PARALLEL, PINHOLES
 
 BODY = Grid.centred((9, 8, 10), 22.0)

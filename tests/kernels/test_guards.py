@@ -10,8 +10,8 @@ import torch
 from mvrecon.benchmarks.measure import once, threads, with_memory
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import columns, cpu, plan, stores
-from mvrecon.kernels.loops import backproject_slabs, project_rows, room_of
+from mvrecon.kernels.rays import columns, cpu, plan, stores
+from mvrecon.kernels.rays.loops import backproject_slabs, project_rows, room_of
 from mvrecon.parts import PROJECTORS
 from tests.projectors.cases import CASES, OPTIONS, Case, noise
 

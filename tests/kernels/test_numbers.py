@@ -43,7 +43,8 @@ def test_scale_changes_nothing_but_the_unit():
 
 def test_the_disk_cache_knows_every_source_file():
     """An edit of the ray arithmetic must not leave old machine code in use; numba alone looks at the loops' file."""
-    from mvrecon.kernels import compiling, loops
+    from mvrecon.kernels import compiling
+    from mvrecon.kernels.rays import loops
 
     for loop in (loops.project_rows, loops.backproject_slabs, loops.vary_rows):
         assert loop._cache._cache_file._source_stamp == compiling.SOURCES

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.kernels import ops
+from mvrecon.kernels.rays import ops
 from tests.projectors.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, noise
 
 

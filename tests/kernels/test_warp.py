@@ -13,8 +13,8 @@ from mvrecon.geometry.frustum import Spacing, depth_centres, depth_edges, depth_
 from mvrecon.geometry.grid import Grid, pixel_centres, voxel_centres
 from mvrecon.geometry.lattice import Lattice, grid_lattice, lattice_maps, lifted_maps
 from mvrecon.geometry.sample import normalised, sample
-from mvrecon.kernels import warp_ops
-from mvrecon.kernels.warp import warp
+from mvrecon.kernels.warps import ops as warp_ops
+from mvrecon.kernels.warps.warp import warp
 from tests.projectors.rigs import CONE, GRID, PARALLEL, PINHOLES
 
 BODY = Grid.centred((9, 8, 10), 22.0)
@@ -135,7 +135,7 @@ def test_second_derivatives_in_values_are_exact_and_in_maps_refused():
 
 
 def test_only_what_is_asked_for_is_differentiated(monkeypatch):
-    from mvrecon.kernels import warp_cpu
+    from mvrecon.kernels.warps import cpu as warp_cpu
 
     monkeypatch.setattr(warp_cpu, "warp_vjp", lambda *_: pytest.fail("no gradient in the maps was asked for"))
     x = torch.randn(1, 2, 1, *SMALL, requires_grad=True)
@@ -218,7 +218,8 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(spacing, sid, offset, 
 
 
 def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
-    from mvrecon.kernels import padding, warp_cpu
+    from mvrecon.kernels import padding
+    from mvrecon.kernels.warps import cpu as warp_cpu
 
     assert padding.steps((2**10, 2**11, 2**10)).dtype == "int64" and padding.steps(SMALL).dtype == "int32"
     maps = lifted_maps(generic())

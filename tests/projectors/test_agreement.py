@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.kernels import columns, plan
+from mvrecon.kernels.rays import columns, plan
 from tests.projectors.cases import CASES, OPTIONS, UPRIGHT, Case, gap, noise
 
 #: Relative errors in float32. Siddon: where a ray passes from cell to cell under a small slope is known to few digits.

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.kernels import cpu, plan
+from mvrecon.kernels.rays import cpu, plan
 from tests.projectors.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, Case, noise
 
 

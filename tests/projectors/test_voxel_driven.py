@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.kernels import voxel_ops
+from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.projectors.voxel_driven import backproject, image_maps
 from tests.projectors.rigs import CENTRAL, CONE, GRID, PARALLEL, PINHOLES
 

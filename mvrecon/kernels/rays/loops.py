@@ -4,11 +4,11 @@ from collections import namedtuple
 
 import numpy as np
 
-from mvrecon.kernels import joseph, march, siddon, slopes
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.lanes import LANES
-from mvrecon.kernels.rays import JOSEPH, SIDDON, TRILINEAR, at, crossing, main_axis, trace, within
-from mvrecon.kernels.stores import Store
+from mvrecon.kernels.rays import joseph, march, siddon, slopes
+from mvrecon.kernels.rays.lanes import LANES
+from mvrecon.kernels.rays.stores import Store
+from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR, at, crossing, main_axis, trace, within
 
 #: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a ray (trilinear).
 Rig = namedtuple("Rig", ["lines", "window", "sizes", "detector", "method", "samples"])

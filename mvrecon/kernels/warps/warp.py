@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels import warp_ops, warp_reference
 from mvrecon.kernels.backends import kernels_for
+from mvrecon.kernels.warps import ops as warp_ops
+from mvrecon.kernels.warps import reference as warp_reference
 
 
 def warp(

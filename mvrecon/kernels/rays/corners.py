@@ -10,7 +10,7 @@ from math import floor
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays import TRILINEAR
+from mvrecon.kernels.rays.trace import TRILINEAR
 
 
 @scalar

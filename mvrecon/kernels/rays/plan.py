@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.columns import columnar
-from mvrecon.kernels.lanes import LANES
-from mvrecon.kernels.lines import DIRECTION, START, shifted
-from mvrecon.kernels.loops import Rig
 from mvrecon.kernels.padding import padded_shape
-from mvrecon.kernels.rays import JOSEPH, TRILINEAR, numbered
+from mvrecon.kernels.rays.columns import columnar
+from mvrecon.kernels.rays.lanes import LANES
+from mvrecon.kernels.rays.lines import DIRECTION, START, shifted
+from mvrecon.kernels.rays.loops import Rig
+from mvrecon.kernels.rays.trace import JOSEPH, TRILINEAR, numbered
 
 #: Bytes of the copy of a piece of the volume.
 BUDGET = 24 * 2**20

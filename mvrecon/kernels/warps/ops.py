@@ -16,25 +16,25 @@ from mvrecon.kernels.mapping import batched, looped
 @torch.library.custom_op("mvrecon::warp", mutates_args=(), device_types="cpu")
 def warp(volumes: Tensor, maps: Tensor, shape: Sequence[int]) -> Tensor:
     """Volumes [n s c d h w] through maps [s k 5 2 3] as [n s k c d h w]; see `warp_reference.warp`."""
-    from mvrecon.kernels import warp_cpu
+    from mvrecon.kernels.warps import cpu
 
-    return warp_cpu.warp(volumes, maps, shape)
+    return cpu.warp(volumes, maps, shape)
 
 
 @torch.library.custom_op("mvrecon::warp_back", mutates_args=(), device_types="cpu")
 def warp_back(values: Tensor, maps: Tensor, shape: Sequence[int]) -> Tensor:
     """The exact transpose of `warp`: values [n s k c d h w] to volumes [n s c d h w]."""
-    from mvrecon.kernels import warp_cpu
+    from mvrecon.kernels.warps import cpu
 
-    return warp_cpu.warp_back(values, maps, shape)
+    return cpu.warp_back(values, maps, shape)
 
 
 @torch.library.custom_op("mvrecon::warp_vjp", mutates_args=(), device_types="cpu")
 def warp_vjp(volumes: Tensor, values: Tensor, maps: Tensor) -> Tensor:
     """The derivative of <values, warp(volumes, maps)> by the maps [s k 5 2 3]."""
-    from mvrecon.kernels import warp_cpu
+    from mvrecon.kernels.warps import cpu
 
-    return warp_cpu.warp_vjp(volumes, values, maps)
+    return cpu.warp_vjp(volumes, values, maps)
 
 
 @warp.register_fake

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mvrecon.geometry.grid import pixel_centres
-from mvrecon.kernels.lines import DIRECTION, MOMENT, START, TIE, WORLD
+from mvrecon.kernels.rays.lines import DIRECTION, MOMENT, START, TIE, WORLD
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections import namedtuple
 from math import ceil, floor, sqrt
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.lines import TIE
+from mvrecon.kernels.rays.lines import TIE
 
 JOSEPH, SIDDON, TRILINEAR = 0, 1, 2
 METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}

@@ -13,10 +13,10 @@ from functools import cache
 import numpy as np
 from numba import cuda
 
-from mvrecon.kernels import corners, gather, slopes
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.loops import Steps, pixel, pull_back
-from mvrecon.kernels.rays import JOSEPH, SIDDON, main_axis, trace
+from mvrecon.kernels.rays import corners, gather, slopes
+from mvrecon.kernels.rays.loops import Steps, pixel, pull_back
+from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, main_axis, trace
 
 #: Threads of a block, and the tile of the detector, columns by rows, that they share.
 BLOCK, TILE = 128, (16, 8)

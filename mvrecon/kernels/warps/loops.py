@@ -1,7 +1,7 @@
 """The compiled loops over the rows of warped volumes: forward, transpose, and how the result changes with the maps."""
 
-from mvrecon.kernels import trilinear
 from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon.kernels.warps import trilinear
 
 
 @compiled

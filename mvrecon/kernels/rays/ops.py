@@ -16,7 +16,7 @@ from mvrecon.kernels.mapping import batched, looped
 @torch.library.custom_op("mvrecon::project", mutates_args=(), device_types="cpu")
 def project(volume: Tensor, lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str) -> Tensor:
     """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`. Half volumes give float32."""
-    from mvrecon.kernels import cpu
+    from mvrecon.kernels.rays import cpu
 
     return cpu.project(volume, lines, window, detector, method)
 
@@ -24,7 +24,7 @@ def project(volume: Tensor, lines: Tensor, window: Sequence[float], detector: Se
 @torch.library.custom_op("mvrecon::backproject", mutates_args=(), device_types="cpu")
 def backproject(views: Tensor, lines: Tensor, window: Sequence[float], shape: Sequence[int], method: str) -> Tensor:
     """The exact transpose of `project`: views [n m v u] to volumes [n d h w]."""
-    from mvrecon.kernels import cpu
+    from mvrecon.kernels.rays import cpu
 
     return cpu.backproject(views, lines, window, shape, method)
 
@@ -32,28 +32,28 @@ def backproject(views: Tensor, lines: Tensor, window: Sequence[float], shape: Se
 @torch.library.custom_op("mvrecon::lines_vjp", mutates_args=(), device_types="cpu")
 def lines_vjp(volume: Tensor, views: Tensor, lines: Tensor, window: Sequence[float], method: str) -> Tensor:
     """The derivative of <views, project(volume, lines)> by the lines [m 4 3 3]."""
-    from mvrecon.kernels import cpu
+    from mvrecon.kernels.rays import cpu
 
     return cpu.lines_vjp(volume, views, lines, window, method)
 
 
 @project.register_kernel("cuda")
 def _(volume, lines, window, detector, method):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     return cuda.project(volume, lines, window, detector, method)
 
 
 @backproject.register_kernel("cuda")
 def _(views, lines, window, shape, method):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     return cuda.backproject(views, lines, window, shape, method)
 
 
 @lines_vjp.register_kernel("cuda")
 def _(volume, views, lines, window, method):
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     return cuda.lines_vjp(volume, views, lines, window, method)
 

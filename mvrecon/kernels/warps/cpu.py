@@ -13,8 +13,8 @@ from torch import Tensor
 
 from mvrecon.kernels.padding import padded, room, steps
 from mvrecon.kernels.threads import share
-from mvrecon.kernels.trilinear import Warp
-from mvrecon.kernels.warp_loops import spread_slabs, vary_planes, warp_rows
+from mvrecon.kernels.warps.loops import spread_slabs, vary_planes, warp_rows
+from mvrecon.kernels.warps.trilinear import Warp
 
 
 def _warp(maps: Tensor, source: Sequence[int], shape: Sequence[int]) -> Warp:

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.backends import wide
-from mvrecon.kernels.columns import backproject_columns, column_of, project_columns
-from mvrecon.kernels.lines import unshifted
-from mvrecon.kernels.loops import Rig, backproject_slabs, project_rows, room_of, vary_rows
-from mvrecon.kernels.plan import Plan, pieces, plan_of, ray_plan_of, rig_of
-from mvrecon.kernels.stores import Store, add, empty, fill, inner, store
+from mvrecon.kernels.rays.columns import backproject_columns, column_of, project_columns
+from mvrecon.kernels.rays.lines import unshifted
+from mvrecon.kernels.rays.loops import Rig, backproject_slabs, project_rows, room_of, vary_rows
+from mvrecon.kernels.rays.plan import Plan, pieces, plan_of, ray_plan_of, rig_of
+from mvrecon.kernels.rays.stores import Store, add, empty, fill, inner, store
 from mvrecon.kernels.threads import share
 
 #: Rows of a volume of half precision that are widened at a time.

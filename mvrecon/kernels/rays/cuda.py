@@ -15,11 +15,11 @@ from jaxtyping import Float
 from numba import cuda
 from torch import Tensor
 
-from mvrecon.kernels import cuda_loops
 from mvrecon.kernels.backends import wide
-from mvrecon.kernels.cuda_loops import BLOCK, GROUP, TILE, Scene
 from mvrecon.kernels.padding import INNER, PAD, padded_shape
-from mvrecon.kernels.rays import numbered
+from mvrecon.kernels.rays import cuda_loops
+from mvrecon.kernels.rays.cuda_loops import BLOCK, GROUP, TILE, Scene
+from mvrecon.kernels.rays.trace import numbered
 
 #: Pixels per voxel, by area, up to which a voxel asks all pixels of its picture.
 GATHER = 4.0

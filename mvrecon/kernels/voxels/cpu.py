@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mvrecon.kernels.padding import padded, room, steps
 from mvrecon.kernels.threads import share
-from mvrecon.kernels.voxel_loops import Sight, look_up, show_rows
+from mvrecon.kernels.voxels.loops import Sight, look_up, show_rows
 
 
 def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weighted: bool) -> Sight:

@@ -16,17 +16,17 @@ from mvrecon.kernels.mapping import batched
 @torch.library.custom_op("mvrecon::look", mutates_args=(), device_types="cpu")
 def look(views: Tensor, maps: Tensor, window: Sequence[float], weighted: bool, shape: Sequence[int]) -> Tensor:
     """What the voxels [n d h w] see in views [n m v u]; see `voxel_reference.look`."""
-    from mvrecon.kernels import voxel_cpu
+    from mvrecon.kernels.voxels import cpu
 
-    return voxel_cpu.look(views, maps, window, weighted, shape)
+    return cpu.look(views, maps, window, weighted, shape)
 
 
 @torch.library.custom_op("mvrecon::show", mutates_args=(), device_types="cpu")
 def show(volumes: Tensor, maps: Tensor, window: Sequence[float], weighted: bool, detector: Sequence[int]) -> Tensor:
     """The exact transpose of `look`: volumes [n d h w] to views [n m v u]."""
-    from mvrecon.kernels import voxel_cpu
+    from mvrecon.kernels.voxels import cpu
 
-    return voxel_cpu.show(volumes, maps, window, weighted, detector)
+    return cpu.show(volumes, maps, window, weighted, detector)
 
 
 @look.register_fake

@@ -8,8 +8,8 @@ from collections import namedtuple
 
 import numpy as np
 
-from mvrecon.kernels import corners, march
 from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays import corners, march
 
 #: As much of `stores.Store` as is read here: padded volumes in one row, and the size of one.
 Values = namedtuple("Values", ["values", "size"])

@@ -7,7 +7,7 @@ sample lies between two slabs; in each it is one bilinear cell, so `joseph.sum` 
 from math import floor
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays import FAR, NEAR, OWN
+from mvrecon.kernels.rays.trace import FAR, NEAR, OWN
 
 
 @scalar

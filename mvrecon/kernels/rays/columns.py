@@ -12,12 +12,12 @@ from collections import namedtuple
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.lanes import LANES, mix, more, put, take
-from mvrecon.kernels.lines import DIRECTION, MOMENT, START
-from mvrecon.kernels.loops import Rig, pixel, steps_of
-from mvrecon.kernels.rays import JOSEPH, at, crossing, main_axis, slab_length, trace, within
-from mvrecon.kernels.stores import Store
-from mvrecon.kernels.stores import store as store_of
+from mvrecon.kernels.rays.lanes import LANES, mix, more, put, take
+from mvrecon.kernels.rays.lines import DIRECTION, MOMENT, START
+from mvrecon.kernels.rays.loops import Rig, pixel, steps_of
+from mvrecon.kernels.rays.stores import Store
+from mvrecon.kernels.rays.stores import store as store_of
+from mvrecon.kernels.rays.trace import JOSEPH, at, crossing, main_axis, slab_length, trace, within
 
 #: Rays in turn add to rows of their own, so that no addition waits for the one before.
 ROWS = 4

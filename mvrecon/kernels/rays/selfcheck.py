@@ -8,7 +8,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from mvrecon.kernels import reference
+from mvrecon.kernels.rays import reference
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def differences(device: str, method: str, dtype: torch.dtype, volumes: int) -> I
 
     if device != "cpu" and getattr(numba_cuda, "implementation", "") == "Built-in":
         raise ImportError("numba-cuda is not installed, pip install mvrecon[cuda]")
-    from mvrecon.kernels import cuda
+    from mvrecon.kernels.rays import cuda
 
     lines, window, detector, shape = tiny_scene(device)
     generator = torch.Generator().manual_seed(0)

@@ -11,7 +11,7 @@ from math import ceil, floor
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays import JOSEPH, main_axis, trace
+from mvrecon.kernels.rays.trace import JOSEPH, main_axis, trace
 
 #: What is kept of each ray, the last its main axis, or -1 when it misses the volume.
 B, SLOPE_B, C, SLOPE_C, BEGIN, END, LENGTH, AXIS = range(8)

@@ -10,7 +10,7 @@ vectorises.
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.lanes import LANES, mix, more, put, take
+from mvrecon.kernels.rays.lanes import LANES, mix, more, put, take
 
 
 @scalar

@@ -1,0 +1,84 @@
+"""Boxes of voxels: the part of a volume that has anything in it.
+
+Convention: bounds are in the order of the tensor's axes (z, y, x), the upper ones one behind the last voxel.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Bool
+from torch import Tensor
+
+Three = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Box:
+    """The voxels with low <= index < high along (z, y, x); empty where a bound meets the other.
+
+    Args:
+        low: first voxel along each axis.
+        high: one behind the last.
+    """
+
+    low: Three
+    high: Three
+
+    @classmethod
+    def whole(cls, shape: Sequence[int]) -> "Box":
+        """All of a volume of `shape` (z, y, x)."""
+        return cls((0, 0, 0), _three(shape))
+
+    @classmethod
+    def around(cls, mask: Bool[Tensor, "*n d h w"]) -> "Box":
+        """The least box that holds every true voxel of any of the masks; empty for none."""
+        mask = mask.flatten(0, -4).any(dim=0) if mask.ndim > 3 else mask
+        lines = mask.any(dim=2).any(dim=1), mask.any(dim=2).any(dim=0), mask.any(dim=1).any(dim=0)
+        found = [line.nonzero()[:, 0].tolist() for line in lines]
+        if not found[0]:
+            return cls((0, 0, 0), (0, 0, 0))
+        return cls(_three([places[0] for places in found]), _three([places[-1] + 1 for places in found]))
+
+    @property
+    def shape(self) -> Three:
+        """Voxels along (z, y, x)."""
+        return _three([max(0, high - low) for low, high in zip(self.low, self.high, strict=True)])
+
+    @property
+    def size(self) -> int:
+        """How many voxels it holds."""
+        d, h, w = self.shape
+        return d * h * w
+
+    @property
+    def slices(self) -> tuple[slice, slice, slice]:
+        """What cuts it out of the last three axes of a volume: `volume[..., *box.slices]`."""
+        z, y, x = (slice(low, high) for low, high in zip(self.low, self.high, strict=True))
+        return z, y, x
+
+    def grown(self, voxels: int, shape: Sequence[int]) -> "Box":
+        """With so many voxels more on every side, as far as a volume of `shape` goes; an empty box stays empty."""
+        if not self.size:
+            return self
+        low = [max(0, each - voxels) for each in self.low]
+        high = [min(int(n), each + voxels) for each, n in zip(self.high, shape, strict=True)]
+        return Box(_three(low), _three(high))
+
+    def aligned(self, multiple: int, shape: Sequence[int]) -> "Box":
+        """Grown to bounds that are multiples of a number, or the volume's own."""
+        low = [each - each % multiple for each in self.low]
+        high = [min(int(n), each + -each % multiple) for each, n in zip(self.high, shape, strict=True)]
+        return Box(_three(low), _three(high))
+
+    def joined(self, other: "Box") -> "Box":
+        """The least box that holds both."""
+        if not self.size or not other.size:
+            return self if self.size else other
+        low = [min(pair) for pair in zip(self.low, other.low, strict=True)]
+        high = [max(pair) for pair in zip(self.high, other.high, strict=True)]
+        return Box(_three(low), _three(high))
+
+
+def _three(values: Sequence[int]) -> Three:
+    d, h, w = (int(each) for each in values)
+    return d, h, w

@@ -1,0 +1,1 @@
+"""Along rays: project, back-project, and how projections change with the geometry."""

@@ -1,0 +1,1 @@
+"""Voxel by voxel: each looks up its own image in every view."""

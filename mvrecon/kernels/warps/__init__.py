@@ -1,0 +1,1 @@
+"""Volumes carried between lattices: the world's grid and the cameras' frusta."""

@@ -1,0 +1,39 @@
+"""Boxes of voxels, and the grids that they cut out."""
+
+import pytest
+import torch
+
+from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Grid, voxel_centres
+
+
+def test_a_box_holds_what_is_there_and_no_plane_more():
+    mask = torch.zeros(2, 1, 7, 8, 9, dtype=torch.bool)
+    mask[0, 0, 2, 3, 8], mask[1, 0, 4, 1, 5] = True, True
+    box = Box.around(mask)
+    assert (box.low, box.high, box.shape, box.size) == ((2, 1, 5), (5, 4, 9), (3, 3, 4), 36)
+    assert mask[..., *box.slices].sum() == mask.sum()
+
+
+def test_an_empty_mask_has_an_empty_box_that_does_not_grow():
+    box = Box.around(torch.zeros(4, 4, 4, dtype=torch.bool))
+    assert box.size == box.grown(2, (4, 4, 4)).size == box.aligned(2, (4, 4, 4)).size == 0
+    assert box.joined(Box.whole((1, 2, 3))) == Box.whole((1, 2, 3)).joined(box) == Box.whole((1, 2, 3))
+
+
+def test_growing_and_aligning_stay_inside_the_volume():
+    box = Box((0, 3, 5), (2, 4, 9))
+    assert box.grown(2, (7, 8, 9)) == Box((0, 1, 3), (4, 6, 9))
+    assert box.aligned(4, (7, 8, 9)) == Box((0, 0, 4), (4, 4, 9))
+    assert box.joined(Box((1, 1, 1), (3, 3, 3))) == Box((0, 1, 1), (3, 4, 9))
+
+
+def test_a_cropped_grid_keeps_its_voxels_where_they_are():
+    grid, box = Grid.centred((6, 7, 8), (1.0, 2.0, 3.0), (9.0, -4.0, 1.0)), Box((1, 2, 3), (4, 7, 5))
+    assert torch.equal(voxel_centres(grid.cropped(box)), voxel_centres(grid)[box.slices])
+
+
+@pytest.mark.parametrize("box", [Box((0, 0, 0), (0, 1, 1)), Box((0, 0, 0), (1, 1, 9)), Box((-1, 0, 0), (1, 1, 1))])
+def test_a_grid_is_not_cropped_to_nothing_or_beyond(box):
+    with pytest.raises(ValueError, match="cannot be cropped"):
+        Grid.centred((6, 7, 8), 1.0).cropped(box)
