@@ -24,6 +24,13 @@ def test_no_function_is_too_long(file: Path):
     assert not long
 
 
+@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
+def test_no_function_has_too_many_parameters(file: Path):
+    functions = (n for n in ast.walk(ast.parse(file.read_text())) if isinstance(n, ast.FunctionDef))
+    taken = {f.name: {a.arg for a in f.args.args + f.args.kwonlyargs} - {"self", "cls"} for f in functions}
+    assert not {name: names for name, names in taken.items() if len(names) > 7}
+
+
 @pytest.mark.parametrize("file", sorted((ROOT / "mvrecon").rglob("*.py")), ids=lambda f: str(f.relative_to(ROOT)))
 def test_the_package_does_not_print(file: Path):
     calls = (n for n in ast.walk(ast.parse(file.read_text())) if isinstance(n, ast.Call))

@@ -3,7 +3,7 @@
 Convention: bounds are in the order of the tensor's axes (z, y, x), the upper ones one behind the last voxel.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Bool
@@ -27,7 +27,7 @@ class Box:
     @classmethod
     def whole(cls, shape: Sequence[int]) -> "Box":
         """All of a volume of `shape` (z, y, x)."""
-        return cls((0, 0, 0), _three(shape))
+        return cls((0, 0, 0), three(shape))
 
     @classmethod
     def around(cls, mask: Bool[Tensor, "*n d h w"]) -> "Box":
@@ -37,12 +37,12 @@ class Box:
         found = [line.nonzero()[:, 0].tolist() for line in lines]
         if not found[0]:
             return cls((0, 0, 0), (0, 0, 0))
-        return cls(_three([places[0] for places in found]), _three([places[-1] + 1 for places in found]))
+        return cls(three([places[0] for places in found]), three([places[-1] + 1 for places in found]))
 
     @property
     def shape(self) -> Three:
         """Voxels along (z, y, x)."""
-        return _three([max(0, high - low) for low, high in zip(self.low, self.high, strict=True)])
+        return three([max(0, high - low) for low, high in zip(self.low, self.high, strict=True)])
 
     @property
     def size(self) -> int:
@@ -62,13 +62,13 @@ class Box:
             return self
         low = [max(0, each - voxels) for each in self.low]
         high = [min(int(n), each + voxels) for each, n in zip(self.high, shape, strict=True)]
-        return Box(_three(low), _three(high))
+        return Box(three(low), three(high))
 
     def aligned(self, multiple: int, shape: Sequence[int]) -> "Box":
         """Grown to bounds that are multiples of a number, or the volume's own."""
         low = [each - each % multiple for each in self.low]
         high = [min(int(n), each + -each % multiple) for each, n in zip(self.high, shape, strict=True)]
-        return Box(_three(low), _three(high))
+        return Box(three(low), three(high))
 
     def joined(self, other: "Box") -> "Box":
         """The least box that holds both."""
@@ -76,9 +76,10 @@ class Box:
             return self if self.size else other
         low = [min(pair) for pair in zip(self.low, other.low, strict=True)]
         high = [max(pair) for pair in zip(self.high, other.high, strict=True)]
-        return Box(_three(low), _three(high))
+        return Box(three(low), three(high))
 
 
-def _three(values: Sequence[int]) -> Three:
+def three(values: Iterable[int]) -> Three:
+    """Three integers (z, y, x)."""
     d, h, w = (int(each) for each in values)
     return d, h, w

@@ -22,6 +22,12 @@ def scalar(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
+def ordered(function: Callable[..., Any]) -> Any:
+    """A function of scalars whose sums and products are taken as they are written, in no other order."""
+    options: dict[str, Any] = {**OPTIONS, "fastmath": FASTMATH - {"reassoc"}}
+    return njit(forceinline=True, **options)(function)
+
+
 def digest(folder: Path) -> str:
     """What the Python files of a folder and below hold, in short."""
     return sha256(b"".join(file.read_bytes() for file in sorted(folder.rglob("*.py")))).hexdigest()

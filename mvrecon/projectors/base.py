@@ -1,21 +1,25 @@
 """What every projector is: a linear operator between the volumes of one grid and the views of one rig."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 from types import ModuleType
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
 from mvrecon.kernels.backends import wide
-from mvrecon.kernels.rays import reference
+from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
+from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.projectors.skipping import SKIPS, Skipped, check_support, placed, told, verify, within
 
 METHODS = ("joseph", "siddon", "trilinear")
 
@@ -26,23 +30,31 @@ class Projector(nn.Module):
     Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; twice in volume and views.
     Half and bfloat16 volumes are read as they are and summed in float32, which views and adjoints are given back in.
     Geometry stays in float64 whatever the module is cast to. Grid and cameras stay where they were made;
-    `.to(device)` moves the operator. `last_backend` tells which back end did the last call.
+    `.to(device)` moves the operator. `last_backend` tells which back end did the last call, `skipped` what it left out.
 
     Args:
         grid: where the voxels lie.
         cameras: the rig, or rays given one by one.
         method: "joseph", second order in the voxel size for smooth volumes, first across sharp edges, with a step where
             a ray's main axis changes; "siddon", exact for volumes of constant voxels, first order otherwise; or
-            "trilinear", second order in the distance of its samples too, and dearer than "joseph" at no gain.
+            "trilinear", second order in the distance of its samples too, and dearer than "joseph" at no gain. It has as
+            many samples on each ray as voxels fit along the grid's diagonal; "trilinear:300" has 300.
         backend: "cpu" (compiled), "cuda" (compiled), "reference" (torch, any device and order of derivative), or
             "auto": the compiled one of the tensors' device where it can be had, else reference.
-        samples: of "trilinear", on each ray; by default as many as voxels fit along the grid's diagonal.
         rays_per_pixel: a pixel is the mean over so many rays each way (1: the thin ray at its centre).
+        skip: what `forward` leaves out of a volume: "off", nothing; "box", what lies outside the box of its voxels that
+            are not zero; "brick", its empty bricks of 8 voxels a side, too; "auto", what costs least. The volume is
+            looked at in every call, and the views are the same to the last bit. "verify" also goes without skipping,
+            and raises where a bit differs. Its gradient by the volume stays dense.
+        support: the voxels that may be anything but zero, a mask [d h w]. It is part of the operator, A diag(support),
+            and of its adjoint, diag(support) A^T; what lies outside of it is neither read nor written.
 
     Raises:
-        ValueError: an unknown method or back end, counts below one, samples for another method, or grid and cameras on
-            different devices.
+        ValueError: an unknown method, back end or way to skip, counts below one, a support that does not fit, or grid
+            and cameras on different devices.
     """
+
+    support: Tensor | None
 
     def __init__(
         self,
@@ -50,24 +62,38 @@ class Projector(nn.Module):
         cameras: Cameras | ExplicitRays,
         method: str = "joseph",
         backend: str = "auto",
-        samples: int | None = None,
         rays_per_pixel: int = 1,
+        skip: str = "auto",
+        support: Bool[Tensor, "d h w"] | None = None,
     ):
         super().__init__()
-        for what, name, known in (("method", method, METHODS), ("backend", backend, backends.BACKENDS)):
-            if name not in known:
-                raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(known)}")
+        known = {"method": METHODS, "backend": backends.BACKENDS, "skip": SKIPS}
+        for what, name in (("method", method.partition(":")[0]), ("backend", backend), ("skip", skip)):
+            if name not in known[what]:
+                raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(known[what])}")
         if cameras.source.device != grid.affine.device:
             raise ValueError(
                 f"Grid and cameras must be on one device, got {grid.affine.device} and {cameras.source.device}"
             )
         self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
-        self.samples, self.rays_per_pixel = _samples(samples, method, grid), rays_per_pixel
+        self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
         self.last_backend: str | None = None
         self.window = list(cameras.limits)
         lines = self._lines()
         self.poses = lines.requires_grad
         self.register_buffer("fixed_lines", lines.detach(), persistent=False)
+        self.register_buffer("support", check_support(support, grid), persistent=False)
+        self._held = self._hold()
+        self._last: Tensor | None = None
+
+    def with_support(self, support: Bool[Tensor, "d h w"] | None) -> "Projector":
+        """The same operator with another support, or with none."""
+        other = copy(self)
+        other._buffers = dict(self._buffers)
+        moved = check_support(support, self.grid)
+        other.support = None if moved is None else moved.to(self.fixed_lines.device)
+        other._held, other._last = other._hold(), None
+        return other
 
     @property
     def cameras(self) -> Cameras:
@@ -79,6 +105,11 @@ class Projector(nn.Module):
         if isinstance(self.rays, ExplicitRays):
             raise ValueError("This needs cameras, which the projector has not: it was given explicit rays")
         return self.rays
+
+    @property
+    def skipped(self) -> Skipped:
+        """What the last call left out, and why."""
+        return told(self._last, self.skip, self.grid.shape)
 
     def _lines(self) -> Float[Tensor, "m 4 3 k"]:
         if isinstance(self.rays, ExplicitRays):
@@ -99,25 +130,19 @@ class Projector(nn.Module):
         return self._lines().to(self.fixed_lines.device) if self.poses else self.fixed_lines
 
     @property
-    def _detector(self) -> list[int]:
+    def detector(self) -> list[int]:
         """Rays (rows, columns) of one of the views that `lines` describes."""
         explicit = isinstance(self.rays, ExplicitRays)
         return [1, 1] if explicit else [n * self.rays_per_pixel for n in self.rays.shape]
-
-    @property
-    def _kernel(self) -> str:
-        return self.method if self.samples is None else f"{self.method}:{self.samples}"
 
     def forward(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Views of volumes.
 
         Raises:
             ValueError: a wrong rank, size or device.
+            RuntimeError: skip is "verify", and a view is not the same without skipping.
         """
-        check(volume, "a volume [b c d h w]", self.grid.shape, self.fixed_lines.device)
-        x, kernels = volume.flatten(0, 1), self._kernels(volume)
-        x = wide(x) if kernels is reference else x
-        views = kernels.project(x, self.lines, self.window, self._detector, self._kernel)
+        views = self.project_along(volume, self.lines, self.detector)
         if self.rays_per_pixel > 1:
             views = avg_pool2d(views, self.rays_per_pixel)
         return views.reshape(*volume.shape[:2], len(self.rays), *self.rays.shape)
@@ -128,7 +153,7 @@ class Projector(nn.Module):
         return self.adjoint
 
     def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
-        """Volumes from views: every value spread along its ray with the weights of `forward`.
+        """Volumes from views: every value spread along its ray with the weights of `forward`; zeros cost nothing.
 
         Raises:
             ValueError: a wrong rank, size or device.
@@ -137,12 +162,56 @@ class Projector(nn.Module):
         y, r = wide(views).flatten(0, 1), self.rays_per_pixel
         if r > 1:
             y = (y / r**2).repeat_interleave(r, dim=2).repeat_interleave(r, dim=3)
-        y = y.reshape(len(y), len(self.fixed_lines), *self._detector)
-        volume = self._kernels(y).backproject(y, self.lines, self.window, list(self.grid.shape), self._kernel)
-        return volume.unflatten(0, views.shape[:2])
+        y = y.reshape(len(y), len(self.fixed_lines), *self.detector)
+        return self.backproject_along(y, self.lines).unflatten(0, views.shape[:2])
+
+    def project_along(
+        self, volume: Float[Tensor, "b c d h w"], lines: Float[Tensor, "r 4 3 k"], detector: Sequence[int]
+    ) -> Float[Tensor, "n r v u"]:
+        """Integrals along rays in voxel space, see `kernels/rays/lines.py`; a detector has so many (rows, columns)."""
+        check(volume, "a volume [b c d h w]", self.grid.shape, self.fixed_lines.device)
+        x, kernels = volume.flatten(0, 1), self._kernels(volume)
+        rays = lines, self.window, list(detector), self.kernel
+        if kernels is reference:
+            self._last = None
+            return kernels.project(wide(x if self.support is None else within(x, self.support)), *rays)
+        if self.support is not None:
+            self._last, box = self._held
+            part = within(x[:, *box.slices], self.support[box.slices])
+            return kernels.project(part, *rays, self._last)
+        if self.skip == "off":
+            self._last = None
+            return kernels.project(x, *rays)
+        self._last = kernels.occupied(x.detach(), lines.detach(), *rays[1:], self.skip.replace("verify", "auto"))
+        views = kernels.project(x, *rays, None, self._last)
+        if self.skip == "verify":
+            verify(views, kernels.project(x, *rays), self.skipped)
+        return views
+
+    def backproject_along(
+        self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]
+    ) -> Float[Tensor, "n d h w"]:
+        """The transpose of `project_along`; views in the precision of arithmetic."""
+        kernels, shape = self._kernels(views[:, None]), list(self.grid.shape)
+        if self.support is None:
+            return kernels.backproject(views, lines, self.window, shape, self.kernel)
+        if kernels is reference:
+            return within(kernels.backproject(views, lines, self.window, shape, self.kernel), self.support)
+        self._last, box = self._held
+        part = kernels.backproject(views, lines, self.window, list(box.shape), self.kernel, self._last)
+        return placed(within(part, self.support[box.slices]), box, self.grid.shape)
+
+    def _hold(self) -> tuple[Tensor, Box]:
+        """Where the support is, in code, and its box: found once."""
+        held = Occupancy.whole(self.grid.shape)
+        if self.support is not None and self.skip != "off" and backends.COMPILED:
+            mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
+            how = self.skip.replace("verify", "auto")
+            held = Occupancy.decoded(ops.occupied(mask, rays, self.window, self.detector, self.kernel, how))
+        return held.encoded(), held.box
 
     def _kernels(self, tensor: Tensor) -> ModuleType:
-        chosen, kernels = backends.kernels_for(tensor, self.backend, self._kernel)
+        chosen, kernels = backends.kernels_for(tensor, self.backend, self.kernel)
         self.last_backend = chosen
         return kernels
 
@@ -150,16 +219,17 @@ class Projector(nn.Module):
         return f"{len(self.rays)} views of {self.rays.shape}, grid {self.grid.shape}, {self.method}, {self.backend}"
 
 
-def _samples(samples: int | None, method: str, grid: Grid) -> int | None:
-    if method != "trilinear":
-        if samples is not None:
-            raise ValueError(f"samples={samples} goes with method 'trilinear', got {method!r}")
-        return None
-    if samples is None:
-        return math.ceil(math.hypot(*grid.shape))
-    if samples < 1:
-        raise ValueError(f"A ray needs a positive number of samples, got {samples}")
-    return samples
+def _kernel(method: str, grid: Grid) -> str:
+    name, colon, samples = method.partition(":")
+    if name != "trilinear":
+        if colon:
+            raise ValueError(f"Samples go with method 'trilinear', got {method!r}")
+        return name
+    if not colon:
+        return f"{name}:{math.ceil(math.hypot(*grid.shape))}"
+    if not samples.isdecimal() or int(samples) < 1:
+        raise ValueError(f"A ray needs a positive number of samples, as in 'trilinear:300', got {method!r}")
+    return method
 
 
 def check(tensor: Tensor, what: str, sizes: tuple[int, ...], device: torch.device) -> None:

@@ -1,5 +1,8 @@
 """Central projection: X-ray cone beams, pinholes, and rays given one by one."""
 
+from jaxtyping import Bool
+from torch import Tensor
+
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
@@ -14,10 +17,11 @@ class Drr(Projector):
     Args:
         grid: where the voxels lie.
         cameras: a rig of central cameras, or explicit rays.
-        method: "joseph", "siddon" or "trilinear".
+        method: "joseph", "siddon", "trilinear" or "trilinear:<samples>".
         backend: "auto", "cpu", "cuda" or "reference".
-        samples: of "trilinear", on each ray.
         rays_per_pixel: rays each way over which a pixel is the mean.
+        skip: what is left out of a volume, "auto", "off", "box", "brick" or "verify".
+        support: the voxels that may be anything but zero.
 
     Raises:
         ValueError: a parallel rig, or as `Projector`.
@@ -29,9 +33,10 @@ class Drr(Projector):
         cameras: Cameras | ExplicitRays,
         method: str = "joseph",
         backend: str = "auto",
-        samples: int | None = None,
         rays_per_pixel: int = 1,
+        skip: str = "auto",
+        support: Bool[Tensor, "d h w"] | None = None,
     ):
         if cameras.parallel:
             raise ValueError("The projector 'drr' needs central cameras, got a parallel rig; use 'radon'")
-        super().__init__(grid, cameras, method, backend, samples, rays_per_pixel)
+        super().__init__(grid, cameras, method, backend, rays_per_pixel, skip, support)

@@ -1,5 +1,8 @@
 """Parallel projection: the Radon transform of slices and the X-ray transform of volumes."""
 
+from jaxtyping import Bool
+from torch import Tensor
+
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.base import Projector
@@ -15,10 +18,11 @@ class Radon(Projector):
     Args:
         grid: where the voxels lie.
         cameras: a rig of parallel beams.
-        method: "joseph", "siddon" or "trilinear".
+        method: "joseph", "siddon", "trilinear" or "trilinear:<samples>".
         backend: "auto", "cpu", "cuda" or "reference".
-        samples: of "trilinear", on each ray.
         rays_per_pixel: rays each way over which a pixel is the mean.
+        skip: what is left out of a volume, "auto", "off", "box", "brick" or "verify".
+        support: the voxels that may be anything but zero.
 
     Raises:
         ValueError: a rig of central cameras, or as `Projector`.
@@ -30,9 +34,10 @@ class Radon(Projector):
         cameras: Cameras,
         method: str = "joseph",
         backend: str = "auto",
-        samples: int | None = None,
         rays_per_pixel: int = 1,
+        skip: str = "auto",
+        support: Bool[Tensor, "d h w"] | None = None,
     ):
         if not cameras.parallel:
             raise ValueError("The projector 'radon' needs a parallel rig, got central cameras; use 'drr'")
-        super().__init__(grid, cameras, method, backend, samples, rays_per_pixel)
+        super().__init__(grid, cameras, method, backend, rays_per_pixel, skip, support)

@@ -16,12 +16,14 @@ from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import reference, selfcheck
 from mvrecon.kernels.rays.lines import lines_of
+from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.projectors.rigs import GRID, PARALLEL, PINHOLES
 
 SIMULATED = os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
 DEVICE = "cuda" if torch.cuda.is_available() and not SIMULATED else "cpu"
 kernels = pytest.mark.skipif(not SIMULATED and DEVICE == "cpu", reason="no CUDA device and no simulator")
 
+whole = Occupancy.whole
 SMALL = Grid.centred((5, 4, 6), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
 BODY = Grid.centred((4, 5, 4), 45.0)
 RIGS = {
@@ -73,7 +75,7 @@ def test_project(kind, method):
 
     x, _, lines, window, detector = scene(kind)
     expected = reference.project(x, lines, window, detector, method)
-    assert close(cuda.project(x, lines, window, detector, method), expected)
+    assert close(cuda.project(x, lines, window, whole(x.shape[1:]), detector, method), expected)
 
 
 @kernels
@@ -84,8 +86,8 @@ def test_backproject(kind, method):
     x, y, lines, window, _ = scene(kind)
     shape = list(x.shape[1:])
     expected = reference.backproject(y, lines, window, shape, method)
-    assert close(cuda.scatter(y, lines, window, shape, method), expected)
-    assert close(cuda.backproject(y, lines, window, shape, method), expected)
+    assert close(cuda.scatter(y, lines, window, whole(shape), method), expected)
+    assert close(cuda.backproject(y, lines, window, whole(shape), method), expected)
 
 
 @kernels
@@ -96,7 +98,10 @@ def test_gather_in_pieces(kind, monkeypatch):
     x, y, lines, window, _ = scene(kind)
     shape = list(x.shape[1:])
     monkeypatch.setattr(cuda, "RAYS", 1)
-    assert close(cuda.gather(y, lines, window, shape, "joseph"), cuda.scatter(y, lines, window, shape, "joseph"))
+    assert close(
+        cuda.gather(y, lines, window, whole(shape), "joseph"),
+        cuda.scatter(y, lines, window, whole(shape), "joseph"),
+    )
 
 
 @kernels
@@ -108,7 +113,7 @@ def test_lines_vjp(kind, method, monkeypatch):
     monkeypatch.setattr(cuda, "THREADS", 16)  # several pixels a thread
     moving = lines.clone().requires_grad_()
     (expected,) = torch.autograd.grad((reference.project(x, moving, window, detector, method) * y).sum(), moving)
-    assert close(cuda.lines_vjp(x, y, lines, window, method), expected, 1e-9)
+    assert close(cuda.lines_vjp(x, y, lines, window, whole(x.shape[1:]), method), expected, 1e-9)
 
 
 @kernels
@@ -120,13 +125,14 @@ def test_several_volumes_share_their_rays(method):
     x, y, lines, window, detector = scene("dome", count=6)
     shape = list(x.shape[1:])
     assert close(
-        cuda.project(x, lines, window, detector, method), reference.project(x, lines, window, detector, method)
+        cuda.project(x, lines, window, whole(x.shape[1:]), detector, method),
+        reference.project(x, lines, window, detector, method),
     )
     expected = reference.backproject(y, lines, window, shape, method)
-    assert close(cuda.backproject(y, lines, window, shape, method), expected)
-    assert close(cuda.scatter(y, lines, window, shape, method), expected)
-    apart = sum(cuda.lines_vjp(x[i : i + 1], y[i : i + 1], lines, window, method) for i in range(6))
-    assert close(cuda.lines_vjp(x, y, lines, window, method), apart)
+    assert close(cuda.backproject(y, lines, window, whole(shape), method), expected)
+    assert close(cuda.scatter(y, lines, window, whole(shape), method), expected)
+    apart = sum(cuda.lines_vjp(x[i : i + 1], y[i : i + 1], lines, window, whole(x.shape[1:]), method) for i in range(6))
+    assert close(cuda.lines_vjp(x, y, lines, window, whole(x.shape[1:]), method), apart)
 
 
 @kernels
@@ -138,10 +144,10 @@ def test_single_precision_stays_single(dtype, method):
     x, y, lines, window, detector = scene("dome", dtype)
     shape = list(x.shape[1:])
     exact = reference.project(x.double(), lines, window, detector, method)
-    views = cuda.project(x, lines, window, detector, method)
+    views = cuda.project(x, lines, window, whole(x.shape[1:]), detector, method)
     assert views.dtype == torch.float32 and close(views.double(), exact, 3e-6)
     exact = reference.backproject(y.double(), lines, window, shape, method)
-    volume = cuda.backproject(y, lines, window, shape, method)
+    volume = cuda.backproject(y, lines, window, whole(shape), method)
     assert volume.dtype == torch.float32 and close(volume.double(), exact, 3e-6)
 
 
@@ -154,7 +160,7 @@ def test_tiles_cover_the_detector(method):
     x, _, lines, window, _ = scene("dome")
     detector = [9, 17]
     expected = reference.project(x, lines, window, detector, method)
-    assert close(cuda.project(x, lines, window, detector, method), expected)
+    assert close(cuda.project(x, lines, window, whole(x.shape[1:]), detector, method), expected)
 
 
 @kernels
@@ -165,9 +171,15 @@ def test_wide_indices_change_nothing(method, monkeypatch):
 
     x, y, lines, window, detector = scene("dome")
     shape = list(x.shape[1:])
-    short = cuda.project(x, lines, window, detector, method), cuda.scatter(y, lines, window, shape, method)
+    short = (
+        cuda.project(x, lines, window, whole(x.shape[1:]), detector, method),
+        cuda.scatter(y, lines, window, whole(shape), method),
+    )
     monkeypatch.setattr(cuda, "WIDE", 1)
-    long = cuda.project(x, lines, window, detector, method), cuda.scatter(y, lines, window, shape, method)
+    long = (
+        cuda.project(x, lines, window, whole(x.shape[1:]), detector, method),
+        cuda.scatter(y, lines, window, whole(shape), method),
+    )
     assert torch.equal(short[0], long[0]) and close(long[1], short[1], 1e-14)
 
 
@@ -181,12 +193,12 @@ def test_rays_given_one_by_one(method):
     lines = rays_as_views(grid, cameras)
     y = torch.randn(1, len(lines), 1, 1, dtype=torch.float64, device=DEVICE)
     window, shape = list(cameras.limits), list(x.shape[1:])
-    views = cuda.project(x, lines, window, [1, 1], method)
+    views = cuda.project(x, lines, window, whole(x.shape[1:]), [1, 1], method)
     expected = reference.project(x, lines_of(cameras, grid).to(DEVICE), window, list(cameras.shape), method)
     assert close(views.flatten(), expected.flatten())
-    volume = cuda.backproject(y, lines, window, shape, method)
+    volume = cuda.backproject(y, lines, window, whole(shape), method)
     assert torch.isclose((views * y).sum(), (x * volume).sum(), rtol=1e-11)
-    assert cuda.lines_vjp(x, y, lines, window, method).shape == lines.shape
+    assert cuda.lines_vjp(x, y, lines, window, whole(x.shape[1:]), method).shape == lines.shape
 
 
 @kernels

@@ -8,11 +8,12 @@ import pytest
 pytest.importorskip("numba")
 from numba import cuda, float32, float64, int32, int64, typeof, types  # noqa: E402
 
-from mvrecon.kernels import cuda as back_end  # noqa: E402
-from mvrecon.kernels import cuda_loops  # noqa: E402
+from mvrecon.kernels.rays import cuda as back_end  # noqa: E402
+from mvrecon.kernels.rays import cuda_loops  # noqa: E402
+from mvrecon.kernels.rays.occupancy import Occupancy  # noqa: E402
 from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR  # noqa: E402
 
-SCENE = typeof(back_end.scene_of((0.0, 1.0), (8, 8, 8), (16, 16), "trilinear:9"))
+SCENE = typeof(back_end.scene_of((0.0, 1.0), Occupancy.whole((8, 8, 8)), (16, 16), "trilinear:9"))
 LINES = float64[:, :, :, ::1]
 HOPPER = (9, 0)
 METHODS = (JOSEPH, SIDDON, TRILINEAR)

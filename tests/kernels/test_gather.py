@@ -10,9 +10,10 @@ from numba import njit
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays import cpu
+from mvrecon.kernels.rays import ops
 from mvrecon.kernels.rays.gather import camera, collect, record
 from mvrecon.kernels.rays.lines import lines_of
+from mvrecon.kernels.rays.trace import Space
 from tests.projectors.rigs import AXIAL, CONE, GRID, INSIDE, PARALLEL, PINHOLES
 
 BODY = Grid.centred((9, 8, 10), 22.0)
@@ -33,12 +34,13 @@ RIGS = {
 
 @njit
 def record_all(lines, window, sizes, detector, rays, frames):
+    space = Space(window, sizes, (0, 0, 0, sizes[0], sizes[1], sizes[2]))
     for m in range(len(lines)):
         camera(lines[m], frames[m])
         for v in range(detector[0]):
             for u in range(detector[1]):
                 here = (u - (detector[1] - 1) / 2, v - (detector[0] - 1) / 2)
-                record(lines[m], here, window, sizes, rays, (m * detector[0] + v) * detector[1] + u)
+                record(lines[m], here, space, rays, (m * detector[0] + v) * detector[1] + u)
 
 
 @njit
@@ -70,10 +72,10 @@ def test_voxels_gather_what_rays_spread(kind):
     views = torch.randn(2, len(cameras), *cameras.shape, dtype=torch.float64)
     volume, _ = gathered(views, lines, window, grid.shape)
     x = torch.randn(2, *grid.shape, dtype=torch.float64)
-    forward = cpu.project(x, lines, window, list(cameras.shape), "joseph")
+    forward = ops.project(x, lines, window, list(cameras.shape), "joseph")
     one, two = (forward * views).sum(), (x * volume).sum()
     assert forward.abs().max() > 0 and torch.isclose(one, two, rtol=1e-12, atol=1e-12)
-    expected = cpu.backproject(views, lines, window, list(grid.shape), "joseph")
+    expected = ops.backproject(views, lines, window, list(grid.shape), "joseph")
     assert torch.allclose(volume, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
 
 

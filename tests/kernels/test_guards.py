@@ -10,8 +10,9 @@ import torch
 from mvrecon.benchmarks.measure import once, threads, with_memory
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays import columns, cpu, plan, stores
+from mvrecon.kernels.rays import cpu, ops, plan, stores, upright
 from mvrecon.kernels.rays.loops import backproject_slabs, project_rows, room_of
+from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.parts import PROJECTORS
 from tests.projectors.cases import CASES, OPTIONS, Case, noise
 
@@ -43,7 +44,7 @@ def test_upright_columns_are_faster_than_rays(monkeypatch):
 
     def rays(act, values):
         with monkeypatch.context() as patch:
-            patch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
+            patch.setattr(plan, "columnar", lambda rig: upright.columnar(rig) & False)
             return act(values)
 
     assert ratio(lambda: rays(A, x), lambda: A(x), 1.2) > 1.2
@@ -70,8 +71,8 @@ def test_little_memory_is_taken_beyond_input_and_output(kind, dtype, n):
         assert forward < views.nbytes / 2**20 + 64
         volume, back = with_memory(lambda A=A, views=views: A.T(views), "cpu")
         assert back < volume.nbytes / 2**20 + 64
-        arguments = (x[:, 0], views[:, 0], A.lines, A.window, A._kernel)
-        _, vjp = with_memory(lambda arguments=arguments: cpu.lines_vjp(*arguments), "cpu")
+        arguments = (x[:, 0], views[:, 0], A.lines, A.window, A.kernel)
+        _, vjp = with_memory(lambda arguments=arguments: ops.lines_vjp(*arguments), "cpu")
         assert vjp < 64
 
 
@@ -81,13 +82,13 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
     case = CASES[kind]
     x, y = (each[:, 0] for each in noise(case, torch.float32))
     A = case.build(**OPTIONS[option])
-    y = y.reshape(2, len(A.lines), *A._detector)
+    y = y.reshape(2, len(A.lines), *A.detector)
 
     def results() -> list[torch.Tensor]:
-        back = cpu.backproject(y, A.lines, A.window, case.grid.shape, A._kernel)
+        back = ops.backproject(y, A.lines, A.window, list(case.grid.shape), A.kernel)
         return [
-            cpu.project(x, A.lines, A.window, A._detector, A._kernel),
-            cpu.lines_vjp(x, y, A.lines, A.window, A._kernel),
+            ops.project(x, A.lines, A.window, A.detector, A.kernel),
+            ops.lines_vjp(x, y, A.lines, A.window, A.kernel),
             back,
         ]
 
@@ -109,11 +110,11 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
     grid = Grid.centred((7000, 7200, 40), 1.0)
     rig = parallel(1, {"pixels": [1, 1], "pixel_mm": 1.0}, 60.0).moved(torch.eye(3), torch.tensor([0, 3599.5, 3499.5]))
     A = Case(grid, rig).build()
-    held = plan.rig_of(A.lines, A.window, grid.shape, [1, 1], method)
+    held = plan.rig_of(A.lines, A.window, Occupancy.whole(grid.shape), [1, 1], method)
     file = np.memmap(tmp_path / "holes", np.float32, "w+", shape=(1, 7203, 43, 7003, 1))
     volume = stores.store(file.view(np.ndarray), near=2)
     assert volume.size > 2**31 and volume.strides.dtype == np.int64
-    reads = np.arange(1), np.zeros(1, bool)
+    reads = np.arange(1), np.zeros(1, bool), np.array([[[0, 1]]], np.int32)
     row = file.view(np.ndarray)[0, 7200, 1:41, 7000, 0]
     row[:] = np.arange(40)
     views = np.zeros((1, 1, 1, 1), np.float32)

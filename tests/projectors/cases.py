@@ -16,7 +16,7 @@ from tests.projectors.rigs import AXIAL, GRID, INSIDE
 
 METHODS = ("joseph", "siddon", "trilinear")
 #: Each with the options that a projector takes; 5 samples miss most voxels, which no test here minds.
-OPTIONS = {**{method: {"method": method} for method in METHODS}, "samples": {"method": "trilinear", "samples": 5}}
+OPTIONS = {**{method: {"method": method} for method in METHODS}, "samples": {"method": "trilinear:5"}}
 
 
 @dataclass(frozen=True)

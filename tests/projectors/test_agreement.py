@@ -1,9 +1,13 @@
 """The compiled loops against the oracle, and one way through them against the other."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from mvrecon.kernels.rays import columns, plan
+from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.rays import plan, upright
+from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.projectors.cases import CASES, OPTIONS, UPRIGHT, Case, gap, noise
 
 #: Relative errors in float32. Siddon: where a ray passes from cell to cell under a small slope is known to few digits.
@@ -13,14 +17,14 @@ SINGLE = {option: 5e-6 if option == "siddon" else 2e-6 for option in OPTIONS}
 @pytest.fixture
 def oblique(monkeypatch):
     """Sends every view through the loops for any ray."""
-    return lambda: monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
+    return lambda: monkeypatch.setattr(plan, "columnar", lambda rig: upright.columnar(rig) & False)
 
 
 def test_the_cases_stand_upright_where_they_say_so():
     for kind, case in CASES.items():
         A = case.build()
-        rig = plan.rig_of(A.lines, A.window, case.grid.shape, A._detector, "joseph")
-        assert columns.columnar(rig).tolist() == [case.upright] * len(A.lines), kind
+        rig = plan.rig_of(A.lines, A.window, Occupancy.whole(case.grid.shape), A.detector, "joseph")
+        assert upright.columnar(rig).tolist() == [case.upright] * len(A.lines), kind
 
 
 @pytest.mark.parametrize("option", OPTIONS)
@@ -69,15 +73,18 @@ def test_upright_columns_give_what_rays_give(kind, method, oblique):
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", CASES)
 def test_pieces_of_the_volume_add_up(kind, option, monkeypatch):
-    """A volume read row by row, and in pieces of three rows or so."""
-    case = CASES[kind]
+    """A volume read in pieces of eight rows, the fewest, and in pieces of half its rows or so."""
+    grid = CASES[kind].grid
+    d, h, w = grid.shape
+    case = replace(CASES[kind], grid=Grid((d, 3 * h + 8, w), grid.affine))
     x, y = noise(case, channels=2)
     A = case.build(**OPTIONS[option])
     whole = A(x), A.T(y)
     for budget in (1, 4 * 8 * (whole[1][:1, :1].numel() + 300) // 2):
         monkeypatch.setattr(plan, "BUDGET", budget)
-        rig = plan.rig_of(A.lines, A.window, case.grid.shape, A._detector, A._kernel)
-        assert len(list(plan.pieces(rig, 4, 8))) > 1 or "trilinear" in A._kernel
+        held = Occupancy.whole(case.grid.shape)
+        rig = plan.rig_of(A.lines, A.window, held, A.detector, A.kernel)
+        assert len(list(plan.pieces(rig, held, 4, 8))) > 1 or "trilinear" in A.kernel
         assert gap(A(x), whole[0]) < 1e-12 and gap(A.T(y), whole[1]) < 1e-12
 
 

@@ -109,8 +109,8 @@ def test_bad_rays_are_refused(source, target, message):
 @pytest.mark.parametrize(
     ("rays", "options", "message"),
     [
-        (None, {"samples": 5}, "samples=5 goes with method 'trilinear', got 'joseph'"),
-        (None, {"method": "trilinear", "samples": 0}, "positive number of samples, got 0"),
+        (None, {"method": "joseph:5"}, "Samples go with method 'trilinear', got 'joseph:5'"),
+        (None, {"method": "trilinear:0"}, "positive number of samples, as in 'trilinear:300', got 'trilinear:0'"),
         (None, {"rays_per_pixel": 0}, "positive number of rays each way, got 0"),
         (curved(), {"rays_per_pixel": 2}, "one a pixel, got rays_per_pixel=2"),
         (None, {"backend": "gpu"}, "Unknown backend 'gpu'. Known: auto, cpu, cuda, reference"),

@@ -10,6 +10,7 @@ from math import floor
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays.march import samples_in
 from mvrecon.kernels.rays.trace import TRILINEAR
 
 
@@ -18,14 +19,15 @@ def steps_in(ray, steps, method):
     """The first step of a ray, and the one behind the last; small integers, which a GPU counts faster."""
     if method != TRILINEAR:
         return np.int32(ray.first), np.int32(ray.last)
-    return np.int32(0), np.int32(2 * steps.samples if ray.first < ray.last else 0)
+    first, last = samples_in(ray, steps.samples)
+    return np.int32(2 * first), np.int32(2 * last)
 
 
 @scalar
 def place(steps, k, iy, iz, whole):
-    """The flat index of a voxel: slab k counted from the volume, the others from the padding."""
+    """The flat index in the store of a voxel: slab k counted from the volume, the others from its padding."""
     slab, row = whole(whole(k + 1) * whole(steps.along)), whole(whole(iy) * whole(steps.far))
-    return whole(whole(slab + row) + whole(whole(iz) * whole(steps.near)))
+    return whole(whole(whole(slab + row) + whole(whole(iz) * whole(steps.near))) - whole(steps.origin))
 
 
 @scalar
@@ -69,9 +71,12 @@ def trilinear(ray, steps, k, real, whole):
     s = real(ray.begin) + (real(k // 2) + real(0.5)) * step
     px = s + real(ray.centre)
     below = max(np.int32(floor(px)), np.int32(-1))
-    x = px - real(below)
+    x, slab = px - real(below), below + k % 2
+    if not (real(ray.enter) <= s <= real(ray.leave) and ray.first <= slab < ray.last):
+        none, zero = whole(0), real(0)
+        return (none, none, none, none), (zero, zero, zero, zero)
     iy, iz, y, z = cell(ray, s, real)
-    return four(steps, (below + k % 2, iy, iz, y, z), step * (x if k % 2 else real(1) - x), whole)
+    return four(steps, (slab, iy, iz, y, z), step * (x if k % 2 else real(1) - x), whole)
 
 
 @scalar

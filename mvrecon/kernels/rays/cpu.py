@@ -17,29 +17,50 @@ from mvrecon.kernels.backends import wide
 from mvrecon.kernels.rays.columns import backproject_columns, column_of, project_columns
 from mvrecon.kernels.rays.lines import unshifted
 from mvrecon.kernels.rays.loops import Rig, backproject_slabs, project_rows, room_of, vary_rows
+from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.kernels.rays.plan import Plan, pieces, plan_of, ray_plan_of, rig_of
-from mvrecon.kernels.rays.stores import Store, add, empty, fill, inner, store
+from mvrecon.kernels.rays.stores import Store, add, empty, fill, part_of, store
 from mvrecon.kernels.threads import share
 
 #: Rows of a volume of half precision that are widened at a time.
 TOGETHER = 8
 
 
-def _copies(volume: Tensor, rig: Rig, plan: Plan) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
-    """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that read them, rows."""
+def _piece_sizes(piece: Rig) -> tuple[int, int, int]:
+    x, y, z = (high - low for low, high in zip(piece.box[:3], piece.box[3:], strict=True))
+    return x, y, z
+
+
+def _overlap(held: Occupancy, rows: slice, piece: Rig) -> tuple[slice, tuple[slice, slice, slice]]:
+    """The rows (along y) of what is held that lie in a piece, counted from the box; and where it lies in the store."""
+    first, last = max(held.box.low[1], rows.start), min(held.box.high[1], rows.stop)
+    low = (held.box.low[2] - piece.box[0], first - rows.start - piece.box[1], held.box.low[0] - piece.box[2])
+    size = (held.box.shape[2], last - first, held.box.shape[0])
+    x, y, z = (slice(start, start + n) for start, n in zip(low, size, strict=True))
+    return slice(first - held.box.low[1], last - held.box.low[1]), (x, y, z)
+
+
+def _copies(
+    volume: Tensor, rig: Rig, held: Occupancy, plan: Plan
+) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
+    """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that read them, rows.
+
+    `volume` is what is held.
+    """
     # grad mode belongs to a thread: in the pool's threads it would be on
     volume = volume.detach()
     into, real = None, wide(volume[:0]).numpy().dtype
     for near, axes in plan.layouts:
-        for rows, piece in pieces(rig, len(volume), real.itemsize):
-            into = empty(len(volume), piece.sizes, (near, plan.lanes), real, into)
+        for rows, piece in pieces(rig, held, len(volume), real.itemsize):
+            into = empty(len(volume), _piece_sizes(piece), (near, plan.lanes), real, into)
+            some, where = _overlap(held, rows, piece)
+            to, given = part_of(into, near, where), volume[:, :, some]
 
-            def copy(first: int, last: int, into=into, near=near, start=rows.start) -> None:
+            def copy(first: int, last: int, to=to, near=near, given=given) -> None:
                 for row in range(first, last, TOGETHER):
-                    part = volume[:, :, start + row : start + min(row + TOGETHER, last)]
-                    fill(wide(part).numpy(), near, inner(into), row)
+                    fill(wide(given[:, :, row : min(row + TOGETHER, last)]).numpy(), near, to, row)
 
-            share(copy, rows.stop - rows.start, into.size, 4)
+            share(copy, given.shape[2], given.numel(), 4)
             yield store(into, near), piece, axes, rows
 
 
@@ -47,25 +68,26 @@ def project(
     volume: Float[Tensor, "n d h w"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
+    held: Occupancy,
     detector: Sequence[int],
     method: str,
 ) -> Float[Tensor, "n m v u"]:
-    """Line integrals of volumes, in mm times their unit; see `reference.project`."""
-    rig = rig_of(lines, window, volume.shape[1:], detector, method)
-    plan = plan_of(rig, len(volume))
+    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is what is held."""
+    rig = rig_of(lines, window, held, detector, method)
+    plan = plan_of(rig, held, len(volume))
     views = np.zeros((len(volume), len(lines), *rig.detector), wide(volume[:0]).numpy().dtype)
+    reads, columns = {near: plan.reads(rig, near) for near, _ in plan.layouts}, plan.columns(rig)
     oblique, upright = len(plan.oblique) * max(rig.detector), len(plan.upright) * rig.detector[1]
-    for held, piece, axes, _ in _copies(volume, rig, plan):
+    for copy, piece, axes, _ in _copies(volume, rig, held, plan):
 
-        def add_rows(first: int, last: int, held=held, piece=piece, axes=axes) -> None:
-            project_rows(held, piece, room_of(piece, held), (*plan.reads(piece, held.near), axes), views, first, last)
+        def add_rows(first: int, last: int, copy=copy, piece=piece, axes=axes) -> None:
+            project_rows(copy, piece, room_of(piece, copy), (*reads[copy.near], axes), views, first, last)
 
-        def add_columns(first: int, last: int, held=held, piece=piece) -> None:
-            room = column_of(piece, held, len(views))
-            project_columns(held, piece, room, plan.upright, views, first, last)
+        def add_columns(first: int, last: int, copy=copy, piece=piece) -> None:
+            project_columns(copy, piece, column_of(piece, copy, len(views)), columns, views, first, last)
 
         share(add_rows, oblique, views.size * max(rig.sizes), 4)
-        share(add_columns, upright if held.near == 2 else 0, views.size * max(rig.sizes), 4)
+        share(add_columns, upright if copy.near == 2 else 0, views.size * max(rig.sizes), 4)
     return torch.from_numpy(views)
 
 
@@ -73,39 +95,42 @@ def backproject(
     views: Float[Tensor, "n m v u"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
-    shape: Sequence[int],
+    held: Occupancy,
     method: str,
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project`, the same to the last bit for any number of threads."""
-    rig = rig_of(lines, window, shape, views.shape[2:], method)
-    plan, given = plan_of(rig, len(views)), np.ascontiguousarray(views.numpy())
-    volume, into = np.zeros((len(views), *shape), given.dtype), None
+    rig = rig_of(lines, window, held, views.shape[2:], method)
+    plan, given = plan_of(rig, held, len(views)), np.ascontiguousarray(views.numpy())
+    volume, into = np.zeros((len(views), *held.box.shape), given.dtype), None
+    reads, columns = {near: plan.reads(rig, near) for near, _ in plan.layouts}, plan.columns(rig)
     for near, axes in plan.layouts:
-        for rows, piece in pieces(rig, len(views), given.itemsize):
-            into = empty(len(views), piece.sizes, (near, plan.lanes), given.dtype, into)
-            part = volume[:, :, rows]
+        for rows, piece in pieces(rig, held, len(views), given.itemsize):
+            into = empty(len(views), _piece_sizes(piece), (near, plan.lanes), given.dtype, into)
+            some, where = _overlap(held, rows, piece)
+            source, part = part_of(into, near, where), volume[:, :, some]
             for axis in range(3):
-                _spread(store(into, near), piece, plan, (axis, axes[axis]), given)
-            share(
-                lambda a, b, held=into, to=part, near=near: add(inner(held), near, to, a, b), part.shape[2], part.size
-            )
+                oblique = reads[near] if axes[axis] else None
+                upright = columns if near == 2 and axis < 2 and len(plan.upright) else None
+                _spread(store(into, near), piece, axis, (oblique, upright), given)
+            share(lambda a, b, source=source, to=part, near=near: add(source, near, to, a, b), part.shape[2], part.size)
     return torch.from_numpy(volume)
 
 
-def _spread(held: Store, piece: Rig, plan: Plan, axis: tuple[int, bool], views: np.ndarray) -> None:
-    """Spread views along the rays of one main axis, slab by slab, where it has oblique or upright ones."""
-    along, oblique = axis
+def _spread(held: Store, piece: Rig, axis: int, reads: tuple, views: np.ndarray) -> None:
+    """Spread views along the rays of one main axis, slab by slab, where reads = (oblique, upright) are not None."""
+    oblique, upright = reads
 
     def add_slabs(low: int, high: int) -> None:
-        backproject_slabs(held, piece, room_of(piece, held), (*plan.reads(piece, held.near), along), views, low, high)
+        span = piece.box[axis] + low, piece.box[axis] + high
+        backproject_slabs(held, piece, room_of(piece, held), (*oblique, axis), views, *span)
 
     def add_columns(low: int, high: int) -> None:
-        room = column_of(piece, held, len(views))
-        backproject_columns(held, piece, room, (plan.upright, along), views, low, high)
+        span = piece.box[axis] + low, piece.box[axis] + high
+        backproject_columns(held, piece, column_of(piece, held, len(views)), (*upright, axis), views, *span)
 
-    steps = views.size * max(piece.sizes)
-    share(add_slabs, piece.sizes[along] if oblique else 0, steps)
-    share(add_columns, piece.sizes[along] if held.near == 2 and along < 2 and len(plan.upright) else 0, steps)
+    slabs, steps = _piece_sizes(piece)[axis], views.size * max(piece.sizes)
+    share(add_slabs, slabs if oblique is not None else 0, steps)
+    share(add_columns, slabs if upright is not None else 0, steps)
 
 
 def lines_vjp(
@@ -113,20 +138,21 @@ def lines_vjp(
     views: Float[Tensor, "n m v u"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
+    held: Occupancy,
     method: str,
 ) -> Float[Tensor, "m 4 3 k"]:
     """The derivative of <views, project(volume, lines)> by the lines, all methods by hand; float64."""
-    rig = rig_of(lines, window, volume.shape[1:], views.shape[2:], method)
-    plan, given = ray_plan_of(rig), np.ascontiguousarray(views.numpy())
+    rig = rig_of(lines, window, held, views.shape[2:], method)
+    plan, given = ray_plan_of(rig, held), np.ascontiguousarray(views.numpy())
     total = torch.zeros(lines.shape, dtype=torch.float64)
-    for held, piece, axes, rows in _copies(volume, rig, plan):
+    reads = {near: plan.reads(rig, near) for near, _ in plan.layouts}
+    for copy, piece, axes, rows in _copies(volume, rig, held, plan):
         # a row or column of pixels has its own sum, so that threads change no bit
         change = np.zeros((len(lines), max(rig.detector), *lines.shape[1:]))
 
-        def vary(first: int, last: int, held=held, piece=piece, axes=axes, change=change) -> None:
-            vary_rows(
-                held, piece, room_of(piece, held), (*plan.reads(piece, held.near), axes), (given, change), first, last
-            )
+        def vary(first: int, last: int, copy=copy, piece=piece, axes=axes, change=change) -> None:
+            rays = *reads[copy.near], axes
+            vary_rows(copy, piece, room_of(piece, copy), rays, (given, change), first, last)
 
         share(vary, len(lines) * max(rig.detector), given.size * max(rig.sizes), 4)
         total += unshifted(torch.from_numpy(change).sum(dim=1), (rows.start + rows.stop - rig.sizes[1]) / 2)

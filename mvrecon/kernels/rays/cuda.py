@@ -15,10 +15,12 @@ from jaxtyping import Float
 from numba import cuda
 from torch import Tensor
 
+from mvrecon.geometry.box import Box
 from mvrecon.kernels.backends import wide
 from mvrecon.kernels.padding import INNER, PAD, padded_shape
 from mvrecon.kernels.rays import cuda_loops
 from mvrecon.kernels.rays.cuda_loops import BLOCK, GROUP, TILE, Scene
+from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.kernels.rays.trace import numbered
 
 #: Pixels per voxel, by area, up to which a voxel asks all pixels of its picture.
@@ -35,15 +37,16 @@ def project(
     volume: Float[Tensor, "n d h w"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
+    held: Occupancy,
     detector: Sequence[int],
     method: str,
 ) -> Float[Tensor, "n m v u"]:
-    """Line integrals of volumes, in mm times their unit; see `reference.project`."""
+    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is what is held."""
     x = wide(volume)
-    scene = scene_of(window, volume.shape[1:], detector, method)
+    scene = scene_of(window, held, detector, method)
     views = x.new_empty(len(x), len(lines), *detector)
     kernel = cuda_loops.project_kernel(numbered(method)[0], *_shares(len(x), scene))
-    launch(kernel, (_blocks(scene, len(lines)), _groups(len(x))), padded(x), maps(lines), scene, views)
+    launch(kernel, (_blocks(scene, len(lines)), _groups(len(x))), padded(x, held), maps(lines), scene, views)
     return views
 
 
@@ -51,13 +54,13 @@ def backproject(
     views: Float[Tensor, "n m v u"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
-    shape: Sequence[int],
+    held: Occupancy,
     method: str,
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project`."""
-    if gathers(shape, views.shape[2:], lines.shape[3], method):
-        return gather(views, lines, window, shape, method)
-    return scatter(views, lines, window, shape, method)
+    if gathers(held.shape, views.shape[2:], lines.shape[3], method):
+        return gather(views, lines, window, held, method)
+    return scatter(views, lines, window, held, method)
 
 
 def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method: str) -> bool:
@@ -69,13 +72,14 @@ def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method:
 
 
 def gather(
-    views: Tensor, lines: Tensor, window: Sequence[float], shape: Sequence[int], method: str
+    views: Tensor, lines: Tensor, window: Sequence[float], held: Occupancy, method: str
 ) -> Float[Tensor, "n d h w"]:
     """`backproject` of Joseph's method by voxels, the same to the last bit in every run."""
     y, given = wide(views).contiguous(), maps(lines)
-    scene = scene_of(window, shape, views.shape[2:], method)
-    volume = y.new_zeros(len(y), *shape)
-    pixels, blocks = math.prod(scene.detector), (-(-math.prod(shape) // BLOCK), _groups(len(y)))
+    scene = scene_of(window, held, views.shape[2:], method)
+    around = read_box(held)
+    volume = y.new_zeros(len(y), *around.shape)
+    pixels, blocks = math.prod(scene.detector), (-(-around.size // BLOCK), _groups(len(y)))
     record, collect = cuda_loops.record_kernel(), cuda_loops.gather_kernel(_group(len(y)))
     some = max(1, RAYS // pixels)
     for first in range(0, len(lines), some):
@@ -84,19 +88,21 @@ def gather(
         axes = torch.zeros(count, 3, dtype=torch.int32, device=y.device)
         launch(record, (-(-count * pixels // BLOCK),), given, scene, first, rays, frames, axes)
         launch(collect, blocks, y.flatten(1), rays, frames, axes, scene, first, volume)
-    return volume
+    return volume[:, *inside(held, around)]
 
 
 def scatter(
-    views: Tensor, lines: Tensor, window: Sequence[float], shape: Sequence[int], method: str
+    views: Tensor, lines: Tensor, window: Sequence[float], held: Occupancy, method: str
 ) -> Float[Tensor, "n d h w"]:
     """`backproject` of any method by rays, with atomic additions."""
     y = wide(views).contiguous()
-    scene = scene_of(window, shape, views.shape[2:], method)
+    scene = scene_of(window, held, views.shape[2:], method)
     flat = y.new_zeros(len(y) * scene.size)
     kernel = cuda_loops.scatter_kernel(numbered(method)[0], *_shares(len(y), scene))
     launch(kernel, (_blocks(scene, len(lines)), _groups(len(y))), y, maps(lines), scene, flat)
-    return flat.view(len(y), *padded_shape(shape))[:, INNER, INNER, INNER].contiguous()
+    around = read_box(held)
+    volume = flat.view(len(y), *padded_shape(around.shape))[:, INNER, INNER, INNER]
+    return volume[:, *inside(held, around)].contiguous()
 
 
 def lines_vjp(
@@ -104,15 +110,16 @@ def lines_vjp(
     views: Float[Tensor, "n m v u"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
+    held: Occupancy,
     method: str,
 ) -> Float[Tensor, "m 4 3 k"]:
     """The derivative of <views, project(volume, lines)> by the lines; float64."""
     x, y = wide(volume), wide(views).contiguous()
-    scene = scene_of(window, volume.shape[1:], views.shape[2:], method)
+    scene = scene_of(window, held, views.shape[2:], method)
     threads = min(math.prod(scene.detector), max(1, THREADS // max(1, len(lines))))
     change = lines.new_zeros(4, 3, lines.shape[3], len(lines), threads, dtype=torch.float64)
     kernel = cuda_loops.vary_kernel(numbered(method)[0])
-    launch(kernel, (-(-len(lines) * threads // BLOCK),), padded(x), y, maps(lines), scene, change)
+    launch(kernel, (-(-len(lines) * threads // BLOCK),), padded(x, held), y, maps(lines), scene, change)
     return change.sum(dim=4).permute(3, 0, 1, 2).contiguous()
 
 
@@ -134,25 +141,42 @@ def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
         kernel[blocks, BLOCK, stream](*given)
 
 
-def scene_of(window: Sequence[float], shape: Sequence[int], detector: Sequence[int], method: str) -> Scene:
+def scene_of(window: Sequence[float], held: Occupancy, detector: Sequence[int], method: str) -> Scene:
     """The numbers of a scene."""
-    depth, height, width = padded_shape(shape)
+    around = read_box(held)
+    depth, height, width = padded_shape(around.shape)
     rows, columns = (int(size) for size in detector)
     low, high = (min(max(float(end), -FAR), FAR) for end in window)
+    z, y, x = around.low
     return Scene(
-        sizes=(int(shape[2]), int(shape[1]), int(shape[0])),
+        sizes=held.shape[::-1],
         strides=(1, width, width * height),
         size=width * height * depth,
         detector=(rows, columns),
         tile=TILE if columns >= TILE[0] and rows >= TILE[1] else (1, 1),
         window=(low, high),
         samples=numbered(method)[1],
+        box=(*around.low[::-1], *around.high[::-1]),
+        origin=x + width * (y + height * z),
     )
 
 
-def padded(volume: Float[Tensor, "n d h w"]) -> Float[Tensor, " p"]:
-    """Volumes with their border of nothing, in one row."""
-    return F.pad(volume, PAD * 3).flatten()
+def read_box(held: Occupancy) -> Box:
+    """The box that rays are clipped to: a voxel larger than what is held, as rounding may move them a little."""
+    return held.box.grown(1, held.shape)
+
+
+def inside(held: Occupancy, around: Box) -> tuple[slice, slice, slice]:
+    """Where in a larger box that lies which is held."""
+    z, y, x = (slice(a - o, b - o) for a, b, o in zip(held.box.low, held.box.high, around.low, strict=True))
+    return z, y, x
+
+
+def padded(volume: Float[Tensor, "n d h w"], held: Occupancy) -> Float[Tensor, " p"]:
+    """Volumes, as much of them as is held, in the box that is read, with their border of nothing, in one row."""
+    low, high = held.box, read_box(held)
+    ends = zip(reversed(low.low), reversed(low.high), reversed(high.low), reversed(high.high), strict=True)
+    return F.pad(volume, [n for a, b, o, p in ends for n in (a - o + PAD[0], p - b + PAD[1])]).flatten()
 
 
 def maps(lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "m 4 3 k"]:

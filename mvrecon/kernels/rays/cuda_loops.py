@@ -23,16 +23,17 @@ BLOCK, TILE = 128, (16, 8)
 #: Volumes that share a thread.
 GROUP = 4
 
-#: What a kernel knows of the scene, all numbers: sizes (x, y, z), strides (x, y, z) of the padded volume and its size,
-#: detector (rows, columns), tile (columns, rows), window, samples a ray.
-Scene = namedtuple("Scene", ["sizes", "strides", "size", "detector", "tile", "window", "samples"])
+#: What a kernel knows of the scene, all numbers: sizes (x, y, z) of the volume; strides (x, y, z) and size of what is
+#: stored of it, padded; detector (rows, columns), tile (columns, rows), window, samples a ray; box, see `trace.Space`;
+#: how far its first voxel lies behind the volume's in the store.
+Scene = namedtuple("Scene", ["sizes", "strides", "size", "detector", "tile", "window", "samples", "box", "origin"])
 
 
 @scalar
 def steps_of(scene, axis):
     """How a ray of a main axis steps through the padded volume."""
     near = gather.near_of(axis)
-    return Steps(scene.strides[axis], scene.strides[3 - axis - near], scene.strides[near], scene.samples)
+    return Steps(scene.strides[axis], scene.strides[3 - axis - near], scene.strides[near], scene.samples, scene.origin)
 
 
 @scalar
@@ -58,7 +59,7 @@ def ray_of(scene, lines, place, method):
     here = pixel(scene, place[1], place[2])
     line = lines[place[0]]
     axis = main_axis(line, here[0], here[1])
-    return trace(line, axis, gather.near_of(axis), here, scene.window, scene.sizes, method), here
+    return trace(line, axis, gather.near_of(axis), here, scene, method), here
 
 
 def _corners(method):
@@ -149,7 +150,7 @@ def record_kernel():
         view, place = k // (rows * columns), k % (rows * columns)
         line = lines[first + view]
         here = pixel(scene, place % columns, place // columns)
-        axes[view, gather.record(line, here, scene.window, scene.sizes, rays, k)] = 1
+        axes[view, gather.record(line, here, scene, rays, k)] = 1
         if place == 0:
             exact = cuda.local.array((3, 4), np.float64)
             gather.camera(line, exact)
@@ -162,17 +163,19 @@ def record_kernel():
 
 @cache
 def gather_kernel(group):
-    """Kernel: add to volumes [n d h w] what some views give; a thread a voxel, always in the same order."""
+    """Kernel: add to the box of volumes [n d h w] what some views give; a thread a voxel, always in the same order."""
 
     @cuda.jit
     def collect(values, rays, frames, axes, scene, first_view, volumes):
-        w, h, d = scene.sizes
+        x, y, z = scene.box[0], scene.box[1], scene.box[2]
+        w, h, d = scene.box[3] - x, scene.box[4] - y, scene.box[5] - z
         voxel = np.int64(cuda.blockIdx.x) * BLOCK + cuda.threadIdx.x
         first = cuda.blockIdx.y * group
         if voxel >= np.int64(w) * h * d:
             return
         real = volumes.dtype.type
-        here = (voxel % w, voxel // w % h, voxel // (np.int64(w) * h))
+        column, row, slab = voxel % w, voxel // w % h, voxel // (np.int64(w) * h)
+        here = (x + column, y + row, z + slab)
         totals = cuda.local.array(group, volumes.dtype)
         for n in range(group):
             totals[n] = 0
@@ -185,7 +188,7 @@ def gather_kernel(group):
                     gather.collect(view, here, axis, first, totals, real)
         for n in range(group):
             if first + n < len(volumes):
-                volumes[first + n, here[2], here[1], here[0]] += totals[n]
+                volumes[first + n, slab, row, column] += totals[n]
 
     return collect
 

@@ -64,10 +64,10 @@ def camera(line, into):
 
 
 @scalar
-def record(line, here, window, sizes, into, k):
+def record(line, here, space, into, k):
     """Write into column k what `weight` needs of the ray of a pixel, and tell its main axis."""
     axis = main_axis(line, here[0], here[1])
-    ray = trace(line, axis, near_of(axis), here, window, sizes, JOSEPH)
+    ray = trace(line, axis, near_of(axis), here, space, JOSEPH)
     into[B, k], into[SLOPE_B, k] = ray.b - 1, ray.slope_b  # voxels here are counted without their padding
     into[C, k], into[SLOPE_C, k] = ray.c - 1, ray.slope_c
     into[BEGIN, k], into[END, k], into[LENGTH, k] = ray.begin, ray.end, ray.length

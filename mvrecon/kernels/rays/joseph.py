@@ -10,30 +10,26 @@ vectorises.
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.lanes import LANES, mix, more, put, take
+from mvrecon.kernels.rays.lanes import LANES, mix, more, plus, put, take, times
+from mvrecon.kernels.rays.order import fold
 
 
 @scalar
-def cells(ray, span, steps, room):
-    """Per slab in span = (first, last): flat index of a bilinear cell, place in it towards b and c, length, slab.
-
-    Returns:
-        the number of slabs.
-    """
+def cells(ray, count, steps, room):
+    """Per slab that `order.visit` has chosen: flat index of a bilinear cell, place in it towards b and c, length."""
     index, y, z, share, slab = room.index, room.one, room.two, room.three, room.four
     real, whole = y.dtype.type, index.dtype.type
     b, slope_b, c, slope_c = real(ray.b), real(ray.slope_b), real(ray.c), real(ray.slope_c)
-    begin, end, half = real(ray.begin), real(ray.end), real(0.5)
-    start, first, count = real(span[0] - ray.centre), whole(span[0] + 1), np.uint32(max(0, span[1] - span[0]))
-    along, far = whole(steps.along), whole(steps.far)
-    for i in range(count):
-        s = real(whole(i)) + start
+    begin, end, half, first = real(ray.begin), real(ray.end), real(0.5), real(ray.centre + 1)
+    along, far, origin = whole(steps.along), whole(steps.far), whole(steps.origin)
+    for i in range(np.uint32(count)):
+        s = slab[i]
         py, pz = b + s * slope_b, c + s * slope_c
         iy, iz = np.int32(py), np.int32(pz)
-        y[i], z[i], slab[i] = py - real(iy), pz - real(iz), s
+        y[i], z[i] = py - real(iy), pz - real(iz)
         share[i] = min(end, s + half) - max(begin, s - half)
-        index[i] = whole(whole(whole(first + whole(i)) * along) + whole(whole(whole(iy) * far) + whole(iz)))
-    return count
+        k = whole(np.int32(s + first))
+        index[i] = whole(whole(whole(k * along) - origin) + whole(whole(whole(iy) * far) + whole(iz)))
 
 
 @scalar
@@ -47,16 +43,17 @@ def fetch(pairs, offset, far, count, room):
 
 
 @scalar
-def sum(store, n, steps, count, room):
-    """The sum of volume n along a ray, in voxels of the main axis."""
+def sum(store, n, steps, visited, room):
+    """The sum of volume n along a ray, in voxels of the main axis; visited = (how many cells, lead of their terms)."""
+    count, lead = visited
     fetch(store.pairs, n * store.size, steps.far, count, room)
     y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
-    total = y.dtype.type(0)
+    terms = room.terms[lead:]
     for i in range(np.uint32(count)):
         lower = low[2 * i] + z[i] * (low[2 * i + 1] - low[2 * i])
         upper = high[2 * i] + z[i] * (high[2 * i + 1] - high[2 * i])
-        total += share[i] * (lower + y[i] * (upper - lower))
-    return total
+        terms[i] = share[i] * (lower + y[i] * (upper - lower))
+    return fold(room.terms, lead, count)
 
 
 @scalar
@@ -88,7 +85,7 @@ def sum_lanes(store, group, steps, count, room):
         k = np.uint64(index[i]) * four + first
         lower = mix(take(values, k), take(values, k + four), z[i])
         upper = mix(take(values, k + far), take(values, k + far + four), z[i])
-        totals = more(totals, share[i], mix(lower, upper, y[i]))
+        totals = plus(totals, times(share[i], mix(lower, upper, y[i])))
     put(room.totals, np.uint64(0), totals)
 
 

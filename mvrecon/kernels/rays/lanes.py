@@ -5,7 +5,7 @@ A loop over them would store the first before it loads the second, which forbids
 
 import numpy as np
 
-from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.compiling import ordered, scalar
 
 LANES = 4
 
@@ -31,6 +31,18 @@ def mix(low, high, share):
         low[2] + share * (high[2] - low[2]),
         low[3] + share * (high[3] - low[3]),
     )
+
+
+@scalar
+def times(weight, four):
+    """weight * four."""
+    return weight * four[0], weight * four[1], weight * four[2], weight * four[3]
+
+
+@ordered
+def plus(four, other):
+    """four + other, in this order: the sum of a ray must not depend on how many of its terms are zero."""
+    return four[0] + other[0], four[1] + other[1], four[2] + other[2], four[3] + other[3]
 
 
 @scalar

@@ -7,26 +7,35 @@ import numpy as np
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays import joseph, march, siddon, slopes
 from mvrecon.kernels.rays.lanes import LANES
+from mvrecon.kernels.rays.occupancy import EDGE
+from mvrecon.kernels.rays.order import visit
 from mvrecon.kernels.rays.stores import Store
 from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR, at, crossing, main_axis, trace, within
 
-#: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a ray (trilinear).
-Rig = namedtuple("Rig", ["lines", "window", "sizes", "detector", "method", "samples"])
-#: Flat strides along the ray's main, far and near axis; samples a ray.
-Steps = namedtuple("Steps", ["along", "far", "near", "samples"])
+#: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a ray (trilinear); the
+#: box of what may be there, see `trace.Space`; bricks, their strides and heights, see `occupancy.bricks_of_rig`.
+Rig = namedtuple(
+    "Rig", ["lines", "window", "sizes", "detector", "method", "samples", "box", "bricks", "strides", "heights"]
+)
+#: Flat strides along the ray's main, far and near axis; samples a ray; how far the box's first voxel lies behind the
+#: volume's in a store of the box alone.
+Steps = namedtuple("Steps", ["along", "far", "near", "samples", "origin"])
 
 
 @scalar
 def steps_of(rig, store, axis):
     """How the loops step through a store along rays of one main axis."""
-    return Steps(store.strides[axis], store.strides[3 - axis - store.near], 1, rig.samples)
+    x, y, z = store.strides[0], store.strides[1], store.strides[2]
+    origin = rig.box[0] * x + rig.box[1] * y + rig.box[2] * z
+    return Steps(store.strides[axis], store.strides[3 - axis - store.near], 1, rig.samples, origin)
 
 
 #: What is known of the cells of one ray: flat indices, four numbers each, pairs of corners whole and in their parts;
 #: one number for each of a group of volumes.
 Room = namedtuple(
     "Room",
-    ["index", "index_b", "index_c", "one", "two", "three", "four", "low", "high", "low_parts", "high_parts", "totals"],
+    ["index", "index_b", "index_c", "one", "two", "three", "four", "low", "high", "low_parts", "high_parts"]
+    + ["terms", "totals"],
 )
 
 
@@ -35,7 +44,8 @@ def room_of(rig: Rig, store: Store) -> Room:
     length = max(2 * rig.samples, max(rig.sizes))
     index, corners = np.empty((3, length), store.strides.dtype), np.empty((2, length), store.pairs.dtype)
     numbers = np.empty((4, length), store.values.dtype)
-    return Room._make((*index, *numbers, *corners, *corners.view(numbers.dtype), np.empty(LANES, numbers.dtype)))
+    own = np.empty(length + 2 * EDGE, numbers.dtype), np.empty(LANES, numbers.dtype)
+    return Room._make((*index, *numbers, *corners, *corners.view(numbers.dtype), *own))
 
 
 @scalar
@@ -46,50 +56,60 @@ def pixel(rig, u, v):
 
 
 @scalar
-def walk(rig, tall, unit):
-    """The part of the detector to go through as one unit: its view and place, and how many rays it has.
+def walk(rig, spans, unit):
+    """The part of the detector to go through as one unit: its view and place, the first of its rays and one behind.
 
     It is a row, or a column where a step from row to row goes along the near axis: rays in turn then meet again the
     voxels that the cache still holds.
     """
-    rows, columns = rig.detector
-    units = max(rows, columns)
+    units = max(rig.detector)
     view, place = unit // units, unit % units
-    if tall[view]:
-        return view, place, rows if place < columns else 0
-    return view, place, columns if place < rows else 0
+    return view, place, spans[view, place, 0], spans[view, place, 1]
 
 
 @scalar
 def _cells(rig, ray, span, steps, room):
+    if rig.method == TRILINEAR:
+        return march.cells(ray, span, steps, room)
+    visited = visit(rig, ray, span, room)
     if rig.method == JOSEPH:
-        return joseph.cells(ray, span, steps, room)
-    if rig.method == SIDDON:
-        return siddon.cells(ray, span, steps, room)
-    return march.cells(ray, span, steps, room)
+        joseph.cells(ray, visited[0], steps, room)
+    else:
+        siddon.cells(ray, visited[0], steps, room)
+    return visited
+
+
+@scalar
+def silent(views, m, v, u):
+    """Whether a pixel is zero in all views [n m v u]."""
+    for n in range(len(views)):
+        if views[n, m, v, u] != 0:
+            return False
+    return True
 
 
 @compiled
 def project_rows(store, rig, room, reads, views, first, last):
-    """Add to views [n m v u] the sums of the volumes along the rays of reads = (chosen views, tall ones, main axes).
+    """Add to views [n m v u] the sums of volumes along the rays of reads = (chosen views, tall ones, spans, main axes).
 
     Of all units of those views, see `walk`, these are the first to last.
     """
-    chosen, tall, axes = reads
+    chosen, tall, spans, axes = reads
     volumes = len(views)
     for unit in range(first, last):
-        view, place, rays = walk(rig, tall, unit)
+        view, place, start, stop = walk(rig, spans, unit)
         m = chosen[view]
         line = rig.lines[m]
-        for other in range(rays):
+        for other in range(start, stop):
             u, v = (place, other) if tall[view] else (other, place)
             here = pixel(rig, u, v)
             axis = main_axis(line, here[0], here[1])
             if not axes[axis]:
                 continue
-            ray = trace(line, axis, store.near, here, rig.window, rig.sizes, rig.method)
+            ray = trace(line, axis, store.near, here, rig, rig.method)
             steps = steps_of(rig, store, axis)
-            count = _cells(rig, ray, (ray.first, ray.last), steps, room)
+            visited = _cells(rig, ray, (ray.first, ray.last), steps, room)
+            count = visited[0]
             length = store.values.dtype.type(ray.length)
             if store.lanes > 1:
                 for n in range(0, volumes, store.lanes):
@@ -99,30 +119,33 @@ def project_rows(store, rig, room, reads, views, first, last):
                 continue
             for n in range(volumes):
                 if rig.method == SIDDON:
-                    views[n, m, v, u] += length * siddon.sum(store, n, count, room)
+                    views[n, m, v, u] += length * siddon.sum(store, n, visited, room)
                 else:
-                    views[n, m, v, u] += length * joseph.sum(store, n, steps, count, room)
+                    views[n, m, v, u] += length * joseph.sum(store, n, steps, visited, room)
 
 
 @compiled
 def backproject_slabs(store, rig, room, reads, views, low, high):
-    """Spread views [n m v u] into the slabs [low, high), along the rays of reads = (chosen views, tall ones, axis)."""
-    chosen, tall, axis = reads
+    """Spread views [n m v u] into slabs [low, high) along the rays of reads = (chosen views, tall ones, spans, axis).
+
+    A ray on which all views are zero is left out.
+    """
+    chosen, tall, spans, axis = reads
     volumes, steps = len(views), steps_of(rig, store, axis)
     for unit in range(len(chosen) * max(rig.detector)):
-        view, place, rays = walk(rig, tall, unit)
+        view, place, start, stop = walk(rig, spans, unit)
         m = chosen[view]
         line = rig.lines[m]
-        for other in range(rays):
+        for other in range(start, stop):
             u, v = (place, other) if tall[view] else (other, place)
             here = pixel(rig, u, v)
-            if main_axis(line, here[0], here[1]) != axis:
+            if silent(views, m, v, u) or main_axis(line, here[0], here[1]) != axis:
                 continue
-            ray = trace(line, axis, store.near, here, rig.window, rig.sizes, rig.method)
+            ray = trace(line, axis, store.near, here, rig, rig.method)
             span = within(ray, low, high)
             if span[0] >= span[1]:
                 continue
-            count = _cells(rig, ray, span, steps, room)
+            count, _ = _cells(rig, ray, span, steps, room)
             length = store.values.dtype.type(ray.length)
             if store.lanes > 1:
                 for n in range(0, volumes, store.lanes):
@@ -169,22 +192,22 @@ def pull_back(line, ray, p, window, value, change_of, change):
 @compiled
 def vary_rows(store, rig, room, reads, given, first, last):
     """For given = (views, change): into `change` [m unit 4 3 k], the derivative of sum(views * projections) by maps."""
-    chosen, tall, axes = reads
+    chosen, tall, spans, axes = reads
     views, change = given
     volumes = len(views)
     for unit in range(first, last):
-        view, place, rays = walk(rig, tall, unit)
+        view, place, start, stop = walk(rig, spans, unit)
         m = chosen[view]
         line = rig.lines[m]
-        for other in range(rays):
+        for other in range(start, stop):
             u, v = (place, other) if tall[view] else (other, place)
             here = pixel(rig, u, v)
             axis = main_axis(line, here[0], here[1])
             if not axes[axis]:
                 continue
-            ray = trace(line, axis, store.near, here, rig.window, rig.sizes, rig.method)
+            ray = trace(line, axis, store.near, here, rig, rig.method)
             steps = steps_of(rig, store, axis)
-            count = joseph.cells(ray, (ray.first, ray.last), steps, room) if rig.method == JOSEPH else 0
+            count = _cells(rig, ray, (ray.first, ray.last), steps, room)[0] if rig.method == JOSEPH else 0
             for n in range(volumes):
                 if rig.method == JOSEPH:
                     change_of = joseph.slopes(store, n, steps, count, room, ray)

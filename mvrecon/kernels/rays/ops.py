@@ -1,5 +1,7 @@
 """The compiled kernels as torch operators: opaque to `torch.compile`, each one's derivative made of the others.
 
+`held` says that a volume is the part of a larger one that alone may be there, see `occupancy.py`: the operators are
+then those of this part. `occupied` says where a volume is not zero: only that is read, and derivatives stay dense.
 Second derivatives in volume and views are exact. A second derivative in the geometry raises: the reference has it.
 """
 
@@ -8,74 +10,137 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from mvrecon.geometry.box import Box
 from mvrecon.kernels.mapping import batched, looped
+from mvrecon.kernels.rays.occupancy import Occupancy, code_size
 
 # numba is heavy, so the kernels are imported at their first call
 
 
 @torch.library.custom_op("mvrecon::project", mutates_args=(), device_types="cpu")
-def project(volume: Tensor, lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str) -> Tensor:
+def project(
+    volume: Tensor,
+    lines: Tensor,
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+    held: Tensor | None = None,
+    occupied: Tensor | None = None,
+) -> Tensor:
     """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`. Half volumes give float32."""
     from mvrecon.kernels.rays import cpu
 
-    return cpu.project(volume, lines, window, detector, method)
+    part, there = _read(volume, held, occupied)
+    return cpu.project(part, lines, window, there, detector, method)
 
 
 @torch.library.custom_op("mvrecon::backproject", mutates_args=(), device_types="cpu")
-def backproject(views: Tensor, lines: Tensor, window: Sequence[float], shape: Sequence[int], method: str) -> Tensor:
+def backproject(
+    views: Tensor,
+    lines: Tensor,
+    window: Sequence[float],
+    shape: Sequence[int],
+    method: str,
+    held: Tensor | None = None,
+) -> Tensor:
     """The exact transpose of `project`: views [n m v u] to volumes [n d h w]."""
     from mvrecon.kernels.rays import cpu
 
-    return cpu.backproject(views, lines, window, shape, method)
+    there = Occupancy.whole(shape) if held is None else Occupancy.decoded(held)
+    return cpu.backproject(views, lines, window, there, method)
 
 
 @torch.library.custom_op("mvrecon::lines_vjp", mutates_args=(), device_types="cpu")
-def lines_vjp(volume: Tensor, views: Tensor, lines: Tensor, window: Sequence[float], method: str) -> Tensor:
+def lines_vjp(
+    volume: Tensor,
+    views: Tensor,
+    lines: Tensor,
+    window: Sequence[float],
+    method: str,
+    held: Tensor | None = None,
+    occupied: Tensor | None = None,
+) -> Tensor:
     """The derivative of <views, project(volume, lines)> by the lines [m 4 3 3]."""
     from mvrecon.kernels.rays import cpu
 
-    return cpu.lines_vjp(volume, views, lines, window, method)
+    part, there = _read(volume, held, occupied)
+    return cpu.lines_vjp(part, views, lines, window, there, method)
+
+
+@torch.library.custom_op("mvrecon::occupied", mutates_args=(), device_types="cpu")
+def occupied(
+    volume: Tensor, lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str, skip: str
+) -> Tensor:
+    """Where volumes [n d h w] are not zero, in code; see `choice.occupancy_of`."""
+    from mvrecon.kernels.rays.choice import Scene, occupancy_of
+
+    return occupancy_of(volume, Scene(lines, window, detector, method), skip).encoded()
+
+
+@occupied.register_kernel("cuda")
+def _(volume, lines, window, detector, method, skip):
+    box = Box.around((volume != 0).any(dim=0))
+    return Occupancy(Box.whole(volume.shape[1:]).high, box).encoded()
+
+
+@occupied.register_fake
+def _(volume, lines, window, detector, method, skip):
+    return torch.empty(code_size(volume.shape[1:]), dtype=torch.int32)
+
+
+def _read(volume: Tensor, held: Tensor | None, occupied: Tensor | None) -> tuple[Tensor, Occupancy]:
+    """What is to be read of volumes, and where it lies in the whole."""
+    if held is not None:
+        return volume, Occupancy.decoded(held)
+    if occupied is None:
+        return volume, Occupancy.whole(volume.shape[1:])
+    there = Occupancy.decoded(occupied)
+    return volume[:, *there.box.slices], there
 
 
 @project.register_kernel("cuda")
-def _(volume, lines, window, detector, method):
+def _(volume, lines, window, detector, method, held=None, occupied=None):
     from mvrecon.kernels.rays import cuda
 
-    return cuda.project(volume, lines, window, detector, method)
+    part, there = _read(volume, held, occupied)
+    return cuda.project(part, lines, window, there, detector, method)
 
 
 @backproject.register_kernel("cuda")
-def _(views, lines, window, shape, method):
+def _(views, lines, window, shape, method, held=None):
     from mvrecon.kernels.rays import cuda
 
-    return cuda.backproject(views, lines, window, shape, method)
+    there = Occupancy.whole(shape) if held is None else Occupancy.decoded(held)
+    return cuda.backproject(views, lines, window, there, method)
 
 
 @lines_vjp.register_kernel("cuda")
-def _(volume, views, lines, window, method):
+def _(volume, views, lines, window, method, held=None, occupied=None):
     from mvrecon.kernels.rays import cuda
 
-    return cuda.lines_vjp(volume, views, lines, window, method)
+    part, there = _read(volume, held, occupied)
+    return cuda.lines_vjp(part, views, lines, window, there, method)
 
 
 @project.register_fake
-def _(volume, lines, window, detector, method):
+def _(volume, lines, window, detector, method, held=None, occupied=None):
     wide = torch.float64 if volume.dtype == torch.float64 else torch.float32
     return volume.new_empty(volume.shape[0], lines.shape[0], *detector, dtype=wide)
 
 
 @backproject.register_fake
-def _(views, lines, window, shape, method):
+def _(views, lines, window, shape, method, held=None):
     return views.new_empty(views.shape[0], *shape)
 
 
 @lines_vjp.register_fake
-def _(volume, views, lines, window, method):
+def _(volume, views, lines, window, method, held=None, occupied=None):
     return lines.new_empty(lines.shape)
 
 
 def _keep(ctx, inputs, output):
-    first, lines, ctx.window, ctx.size, ctx.method = inputs
+    first, lines, ctx.window, ctx.size, ctx.method, ctx.held, *occupied = inputs
+    ctx.occupied = occupied[0] if occupied else None
     ctx.save_for_backward(first if ctx.needs_input_grad[1] else None, lines)
     ctx.shape, ctx.dtype = first.shape, first.dtype
 
@@ -83,19 +148,23 @@ def _keep(ctx, inputs, output):
 def _project_back(ctx, views):
     volume, lines = ctx.saved_tensors
     needs_volume, needs_lines = ctx.needs_input_grad[:2]
-    by_volume = None
+    by_volume = by_lines = None
     if needs_volume:
-        by_volume = backproject(views, lines, ctx.window, list(ctx.shape[1:]), ctx.method).to(ctx.dtype)
-    by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method) if needs_lines else None
-    return by_volume, by_lines, None, None, None
+        by_volume = backproject(views, lines, ctx.window, list(ctx.shape[1:]), ctx.method, ctx.held).to(ctx.dtype)
+    if needs_lines:
+        by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method, ctx.held, ctx.occupied)
+    return by_volume, by_lines, None, None, None, None, None
 
 
 def _backproject_back(ctx, volume):
     views, lines = ctx.saved_tensors
     needs_views, needs_lines = ctx.needs_input_grad[:2]
-    by_views = project(volume, lines, ctx.window, list(ctx.shape[2:]), ctx.method) if needs_views else None
-    by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method) if needs_lines else None
-    return by_views, by_lines, None, None, None
+    by_views = by_lines = None
+    if needs_views:
+        by_views = project(volume, lines, ctx.window, list(ctx.shape[2:]), ctx.method, ctx.held)
+    if needs_lines:
+        by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method, ctx.held)
+    return by_views, by_lines, None, None, None, None
 
 
 def _no_second_order(ctx, grad):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.kernels.rays import reference
+from mvrecon.kernels.rays.occupancy import Occupancy
 
 logger = logging.getLogger(__name__)
 
@@ -66,6 +67,7 @@ def differences(device: str, method: str, dtype: torch.dtype, volumes: int) -> I
     from mvrecon.kernels.rays import cuda
 
     lines, window, detector, shape = tiny_scene(device)
+    held = Occupancy.whole(shape)
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(volumes, *shape, dtype=dtype, generator=generator).to(device)
     y = torch.rand(volumes, len(lines), *detector, dtype=dtype, generator=generator).to(device)
@@ -74,11 +76,11 @@ def differences(device: str, method: str, dtype: torch.dtype, volumes: int) -> I
         views = reference.project(x, moving, window, detector, method)
         (change,) = torch.autograd.grad((views * y).sum(), moving)
     volume = reference.backproject(y, lines, window, shape, method)
-    yield "project", _error(cuda.project(x, lines, window, detector, method), views)
-    yield "scatter", _error(cuda.scatter(y, lines, window, shape, method), volume)
+    yield "project", _error(cuda.project(x, lines, window, held, detector, method), views)
+    yield "scatter", _error(cuda.scatter(y, lines, window, held, method), volume)
     if method == "joseph":
-        yield "gather", _error(cuda.gather(y, lines, window, shape, method), volume)
-    yield "lines_vjp", _error(cuda.lines_vjp(x, y, lines, window, method), change)
+        yield "gather", _error(cuda.gather(y, lines, window, held, method), volume)
+    yield "lines_vjp", _error(cuda.lines_vjp(x, y, lines, window, held, method), change)
 
 
 def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:

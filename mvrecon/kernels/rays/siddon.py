@@ -9,6 +9,7 @@ sorting, no state from slab to slab. Cells are half-open: a ray on a face belong
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays.order import fold
 
 
 @scalar
@@ -19,22 +20,18 @@ def reach(low, high, before, per_slope, length):
 
 
 @scalar
-def cells(ray, span, steps, room):
-    """Per slab in span = (first, last): flat indices of the cells that the ray crosses in order, lengths in them.
-
-    Returns:
-        the number of slabs.
-    """
+def cells(ray, count, steps, room):
+    """Per slab that `order.visit` has chosen: flat indices of the cells that the ray crosses in order, lengths."""
     index0, index1, index2, part0, part1, part2 = room.index, room.index_b, room.index_c, room.one, room.two, room.three
     real, whole = part0.dtype.type, index0.dtype.type
     half = real(0.5)
     b, slope_b, c, slope_c = real(ray.b) + half, real(ray.slope_b), real(ray.c) + half, real(ray.slope_c)
     # a ray without slope stays in its cell, and this is never used
     per_b, per_c = real(1 / ray.slope_b if ray.slope_b else 0), real(1 / ray.slope_c if ray.slope_c else 0)
-    begin, end, start, first = real(ray.begin), real(ray.end), real(span[0] - ray.centre), whole(span[0] + 1)
-    along, far, count = whole(steps.along), whole(steps.far), np.uint32(max(0, span[1] - span[0]))
-    for i in range(count):
-        s = real(whole(i)) + start
+    begin, end, first = real(ray.begin), real(ray.end), real(ray.centre + 1)
+    along, far, origin = whole(steps.along), whole(steps.far), whole(steps.origin)
+    for i in range(np.uint32(count)):
+        s = room.four[i]
         s0, s1 = max(begin, s - half), min(end, s + half)
         length = s1 - s0
         y0, z0 = b + s0 * slope_b, c + s0 * slope_c
@@ -44,24 +41,24 @@ def cells(ray, span, steps, room):
         to_c = reach(real(c0), real(c1), z0, per_c, length)
         one, two = min(to_b, to_c), max(to_b, to_c)
         part0[i], part1[i], part2[i] = one, two - one, length - two
-        base = whole(whole(first + whole(i)) * along)
+        base = whole(whole(whole(np.int32(s + first)) * along) - origin)
         along_b0, along_b1 = whole(whole(b0) * far), whole(whole(b1) * far)
         index0[i] = whole(base + whole(along_b0 + whole(c0)))
         index1[i] = whole(base + whole(along_b1 + whole(c0) if to_b < to_c else along_b0 + whole(c1)))
         index2[i] = whole(base + whole(along_b1 + whole(c1)))
-    return count
 
 
 @scalar
-def sum(store, n, count, room):
-    """The sum of volume n along a ray, in voxels of the main axis."""
+def sum(store, n, visited, room):
+    """The sum of volume n along a ray, in voxels of the main axis; visited = (how many slabs, lead of their terms)."""
+    count, lead = visited
     index0, index1, index2, part0, part1, part2 = room.index, room.index_b, room.index_c, room.one, room.two, room.three
-    flat, offset, total = store.values, np.uint64(n * store.size), part0.dtype.type(0)
+    flat, offset, terms = store.values, np.uint64(n * store.size), room.terms[lead:]
     for i in range(np.uint32(count)):
         first, middle = flat[np.uint64(index0[i]) + offset], flat[np.uint64(index1[i]) + offset]
         last = flat[np.uint64(index2[i]) + offset]
-        total += part0[i] * first + part1[i] * middle + part2[i] * last
-    return total
+        terms[i] = part0[i] * first + part1[i] * middle + part2[i] * last
+    return fold(room.terms, lead, count)
 
 
 @scalar

@@ -24,7 +24,7 @@ def joseph(held, n, ray, steps):
     for k in range(ray.first, ray.last):
         s = real(k) - real(ray.centre)
         iy, iz, y, z = corners.cell(ray, s, real)
-        at = offset + np.int64(k + 1) * steps.along + np.int64(iy) * steps.far + np.int64(iz) * steps.near
+        at = offset + np.int64(corners.place(steps, k, iy, iz, np.int64))
         share = corners.share_of(ray, s, real)
         value, along_b, along_c = march.face(flat, at, steps, y, z)
         total += share * value

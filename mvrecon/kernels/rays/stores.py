@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled
-from mvrecon.kernels.padding import INNER, padded_shape
+from mvrecon.kernels.padding import PAD, padded_shape
 
 #: values [g p l] in one row, of g groups of l volumes; pairs, each value and the next as one complex number on the same
 #: memory; p, the voxels of a volume; strides in voxels of the axes (x, y, z); the contiguous axis; l.
@@ -36,9 +36,10 @@ def empty(count: int, sizes: Sequence[int], plan: tuple[int, int], dtype: np.dty
     return flat.reshape(shape)
 
 
-def inner(padded: np.ndarray) -> np.ndarray:
-    """The volumes without their padding."""
-    return padded[(slice(None), *[INNER] * 3)]
+def part_of(padded: np.ndarray, near: int, where: tuple[slice, slice, slice]) -> np.ndarray:
+    """The part of padded volumes at `where` along (x, y, z), counted without the padding."""
+    x, y, z = (slice(part.start + PAD[0], part.stop + PAD[0]) for part in where)
+    return padded[:, z, y, x] if near == 0 else padded[:, y, x, z]
 
 
 def store(volumes: np.ndarray, near: int) -> Store:

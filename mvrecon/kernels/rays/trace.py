@@ -16,12 +16,15 @@ METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
 
 #: One ray: main, far and near axis; padded coordinates along far (b) and near (c) at the centre slab, and their slopes;
 #: mm per slab; where it begins and ends (slab coordinate about the centre); what bounds the beginning and the end, see
-#: below; first slab and the one behind the last; the centre's slab coordinate.
+#: below; where it enters and leaves the box; its first slab there, one behind the last; the centre's slab coordinate.
 Ray = namedtuple(
     "Ray",
     ["axis", "far", "near", "b", "slope_b", "c", "slope_c", "length"]
-    + ["begin", "end", "from_", "to", "first", "last", "centre"],
+    + ["begin", "end", "from_", "to", "enter", "leave", "first", "last", "centre"],
 )
+#: What a ray is traced through: the part of it that counts (w0, w1), voxels along (x, y, z), and the box outside of
+#: which all is zero, (x0, y0, z0, x1, y1, z1).
+Space = namedtuple("Space", ["window", "sizes", "box"])
 #: What bounds a ray: a face across its main axis, its own end, or a face across its far or near axis.
 FACE, OWN, FAR, NEAR = 0, 1, 2, 3
 
@@ -65,54 +68,68 @@ def slab_length(line, axis, u, v):
 
 
 @scalar
-def transverse(value, slope, half, lower, upper):
-    """The part of (lower, upper) in which -half <= value + s slope < half."""
+def transverse(value, slope, low, high, lower, upper):
+    """The part of (lower, upper) in which low <= value + s slope < high."""
     if slope == 0:
-        return (lower, upper) if -half <= value < half else (0.0, -1.0)
-    one, two = (-half - value) / slope, (half - value) / slope
+        return (lower, upper) if low <= value < high else (0.0, -1.0)
+    one, two = (low - value) / slope, (high - value) / slope
     return max(lower, min(one, two)), min(upper, max(one, two))
 
 
 @scalar
-def trace(line, axis, near, pixel, window, sizes, method):
+def faces(space, axis, reach):
+    """Where the box begins and ends along an axis, from the volume's centre, with the reach of a voxel's values."""
+    half = space.sizes[axis] / 2.0
+    return space.box[axis] - half - reach, space.box[3 + axis] - half + reach
+
+
+@scalar
+def trace(line, axis, near, pixel, space, method):
     """Where the ray of a pixel runs; `first >= last` says that it misses. All in float64.
+
+    The box changes nothing but which slabs are met, so that leaving out what is zero changes no bit of a sum.
 
     Args:
         line: the view's maps [4 3 3], see `lines.py`.
         axis: the ray's main axis.
         near: the other axis that is contiguous in memory.
         pixel: the pixel (u, v), counted from the detector's centre.
-        window: the part of the ray that counts, as fractions of its direction.
-        sizes: voxels along (x, y, z).
+        space: window, sizes and box, of a `Space` or of what has more.
         method: JOSEPH, SIDDON or TRILINEAR.
     """
     (u, v), far = pixel, 3 - axis - near
     D = at(line, 0, axis, u, v)
     slope_b, slope_c = at(line, 0, far, u, v) / D, at(line, 0, near, u, v) / D
     value_b, value_c = crossing(line, axis, far, u, v), crossing(line, axis, near, u, v)
-    one = at(line, 2, axis, u, v) + window[0] * D
-    two = at(line, 2, axis, u, v) + window[1] * D
+    one = at(line, 2, axis, u, v) + space.window[0] * D
+    two = at(line, 2, axis, u, v) + space.window[1] * D
     # hat functions reach one voxel from the outermost centres, cells half a voxel
     reach = 0.0 if method == SIDDON else 0.5
-    half = sizes[axis] / 2.0 + (0.5 if method == TRILINEAR else 0.0)
+    half = space.sizes[axis] / 2.0 + (0.5 if method == TRILINEAR else 0.0)
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
     from_, to = OWN if begin > -half else FACE, OWN if end < half else FACE
-    # a slab counts where it overlaps the ray
-    slack, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5 if method == SIDDON else 1.0)
-    lower, upper = transverse(value_b, slope_b, sizes[far] / 2.0 + reach, begin - slack, end + slack)
-    far_lower, far_upper = lower, upper
-    lower, upper = transverse(value_c, slope_c, sizes[near] / 2.0 + reach, lower, upper)
-    centre, first, last = (sizes[axis] - 1) / 2.0, 0, 0
-    if begin < end and lower <= upper:
-        first = max(0, int(ceil(lower + centre - margin)))
-        last = min(sizes[axis], int(floor(upper + centre + margin)) + 1)
-    if method == TRILINEAR:
+    if method == TRILINEAR:  # its samples are spaced along its way through the whole volume
+        half_b, half_c = space.sizes[far] / 2.0 + reach, space.sizes[near] / 2.0 + reach
+        far_lower, far_upper = transverse(value_b, slope_b, -half_b, half_b, begin, end)
+        lower, upper = transverse(value_c, slope_c, -half_c, half_c, far_lower, far_upper)
         from_ = NEAR if lower > far_lower else FAR if far_lower > begin else from_
         to = NEAR if upper < far_upper else FAR if far_upper < end else to
         begin, end = lower, upper
-    b0, c0 = value_b + (sizes[far] - 1) / 2.0 + 1, value_c + (sizes[near] - 1) / 2.0 + 1
+    # a slab counts where it overlaps the ray
+    slack, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5 if method == SIDDON else 1.0)
+    low, high = faces(space, far, reach)
+    enter, leave = transverse(value_b, slope_b, low, high, begin - slack, end + slack)
+    low, high = faces(space, near, reach)
+    enter, leave = transverse(value_c, slope_c, low, high, enter, leave)
+    centre, first, last = (space.sizes[axis] - 1) / 2.0, 0, 0
+    if begin < end and enter <= leave:
+        first = max(space.box[axis], int(ceil(enter + centre - margin)))
+        last = min(space.box[3 + axis], int(floor(leave + centre + margin)) + 1)
+    b0, c0 = value_b + (space.sizes[far] - 1) / 2.0 + 1, value_c + (space.sizes[near] - 1) / 2.0 + 1
     length = slab_length(line, axis, u, v)
-    return Ray(axis, far, near, b0, slope_b, c0, slope_c, length, begin, end, from_, to, first, last, centre)
+    return Ray(
+        axis, far, near, b0, slope_b, c0, slope_c, length, begin, end, from_, to, enter, leave, first, last, centre
+    )
 
 
 @scalar

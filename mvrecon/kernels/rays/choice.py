@@ -1,0 +1,90 @@
+"""What to leave out of a volume: counted on some rays, so that nothing is skipped that does not pay."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from mvrecon.geometry.box import Box
+from mvrecon.kernels.compiling import compiled
+from mvrecon.kernels.rays.loops import pixel
+from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
+from mvrecon.kernels.rays.order import empty
+from mvrecon.kernels.rays.plan import rig_of
+from mvrecon.kernels.rays.scan import box_of, bricks_of, empty_share, readable
+from mvrecon.kernels.rays.shadow import spans_of
+from mvrecon.kernels.rays.trace import main_axis, trace
+
+#: Rays on which work is counted.
+RAYS = 1024
+#: What a ray costs before its first slab, and what it costs to ask for one layer of bricks, in slabs.
+SET_UP, ASK = 16.0, 3.0
+#: The share of empty bricks from which on all of them are looked at, and the part of the work that they must leave.
+WORTH, LESS = 0.35, 0.85
+
+
+class Scene(NamedTuple):
+    """The rays that a volume is met by, as the operators have them."""
+
+    lines: Tensor
+    window: Sequence[float]
+    detector: Sequence[int]
+    method: str
+
+
+def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
+    """Where volumes [n d h w] are not zero, as fine as `skip` says: "box", "brick", or "auto", what costs least."""
+    values = readable(volumes)
+    shape = Box.whole(values.shape[1:]).high
+    held = Occupancy(shape, box_of(values))
+    fine = "trilinear" not in scene.method and held.box.size > 0
+    if skip == "box" or not fine or (skip == "auto" and empty_share(values, held.box) < WORTH):
+        return held
+    bricked = Occupancy(shape, held.box, bricks_of(values, held.box))
+    if skip == "brick":
+        return bricked
+    return cheapest(held, bricked, scene)
+
+
+def cheapest(held: Occupancy, bricked: Occupancy, scene: Scene) -> Occupancy:
+    """The one of two occupancies by which rays have less to do, with the shares of the work that either leaves."""
+    whole, box, bricks = (work(each, scene) for each in (Occupancy.whole(held.shape), held, bricked))
+    chosen = bricked if bricks < LESS * box else held
+    return Occupancy(held.shape, held.box, chosen.bricks, (box / whole, bricks / whole))
+
+
+def work(held: Occupancy, scene: Scene) -> float:
+    """The mean work on a ray of the detector, in slabs."""
+    rig = rig_of(scene.lines, scene.window, held, scene.detector, scene.method)
+    # the same few rays each time: a choice must not change from call to call
+    places = np.random.default_rng(0).random((RAYS, 3)) * [len(rig.lines), *rig.detector]
+    chosen = places.astype(np.int64)
+    views, index = np.unique(chosen[:, 0], return_inverse=True)
+    chosen[:, 0] = index
+    rows = np.zeros(len(views), bool)
+    spans = spans_of(rig.lines[views], rig.detector, rows, boxes_of(held))
+    return float(count(rig._replace(lines=rig.lines[views]), spans, chosen)) / RAYS
+
+
+@compiled
+def count(rig, spans, chosen):
+    """The work on the rays `chosen` [r 3] = (view, row, column), in slabs."""
+    total = 0.0
+    for r in range(len(chosen)):
+        m, v, u = chosen[r]
+        if len(rig.lines[m, 0, 0]) == 3 and not spans[m, v, 0] <= u < spans[m, v, 1]:
+            continue
+        here = pixel(rig, u, v)
+        axis = main_axis(rig.lines[m], here[0], here[1])
+        ray = trace(rig.lines[m], axis, 0 if axis == 2 else 2, here, rig, rig.method)
+        total += SET_UP
+        low = ray.first
+        while low < ray.last:
+            high = min(ray.last, low // EDGE * EDGE + EDGE)
+            if len(rig.bricks):
+                total += ASK
+            if not len(rig.bricks) or not empty(rig, ray, low, high):
+                total += high - low
+            low = high
+    return total

@@ -1,0 +1,114 @@
+"""Which part of a volume may be anything but zero: a box, and where it pays, bricks of eight voxels a side.
+
+It travels through torch's operators as one small tensor of integers, so that they know nothing of it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from mvrecon.geometry.box import Box, Three, three
+
+#: Voxels along the edge of a brick.
+EDGE = 8
+#: How far beyond its centre a voxel's value is felt, in voxels, and a little for rounding.
+REACH = 1.01
+#: Numbers before the bricks in an occupancy's code, and what a share of one is in them.
+HEAD, WHOLE = 12, 10**6
+
+
+@dataclass(frozen=True, eq=False)
+class Occupancy:
+    """What may be there of a volume.
+
+    Args:
+        shape: voxels of the whole volume along (z, y, x).
+        box: outside of it all is zero.
+        bricks: which bricks hold a voxel that is not zero, or have one just behind their last ones; None: any.
+        shares: of the work on all of the volume, what is left with the box, and with bricks, as counted on some rays;
+            not a number where it was not counted.
+    """
+
+    shape: Three
+    box: Box
+    bricks: UInt8[np.ndarray, "z y x"] | None = None
+    shares: tuple[float, float] = (float("nan"), float("nan"))
+
+    @classmethod
+    def whole(cls, shape: Sequence[int]) -> "Occupancy":
+        """Anything may be anywhere."""
+        box = Box.whole(shape)
+        return cls(box.high, box)
+
+    def rows(self, low: int, high: int) -> "Occupancy":
+        """What is held of the rows (along y) from `low`, a multiple of a brick's edge, to one behind the last."""
+        if (low, high) == (0, self.shape[1]):
+            return self
+        y0, y1 = (min(max(y - low, 0), high - low) for y in (self.box.low[1], self.box.high[1]))
+        box = Box((self.box.low[0], y0, self.box.low[2]), (self.box.high[0], y1, self.box.high[2]))
+        bricks = None if self.bricks is None else self.bricks[:, low // EDGE : -(-high // EDGE)]
+        return replace(self, shape=(self.shape[0], high - low, self.shape[2]), box=box, bricks=bricks)
+
+    def encoded(self) -> Tensor:
+        """As integers: shape, box, shares, whether bricks are told apart, bricks."""
+        code = torch.zeros(code_size(self.shape), dtype=torch.int32)
+        shares = [-1 if share != share else round(share * WHOLE) for share in self.shares]
+        code[:HEAD] = torch.tensor([*self.shape, *self.box.low, *self.box.high, *shares, self.bricks is not None])
+        if self.bricks is not None:
+            code[HEAD:] = torch.from_numpy(self.bricks.reshape(-1))
+        return code
+
+    @classmethod
+    def decoded(cls, code: Tensor) -> "Occupancy":
+        """The inverse of `encoded`."""
+        numbers = code.numpy()
+        shape, low, high = (three(numbers[k : k + 3]) for k in (0, 3, 6))
+        one, two = (float(n) / WHOLE if n >= 0 else float("nan") for n in numbers[9:11])
+        bricks = numbers[HEAD:].astype(np.uint8).reshape(brick_shape(shape)) if numbers[11] else None
+        return cls(shape, Box(low, high), bricks, (one, two))
+
+
+def brick_shape(shape: Sequence[int]) -> Three:
+    """Bricks along (z, y, x) of a volume of `shape`."""
+    return three(-(-n // EDGE) for n in shape)
+
+
+def code_size(shape: Sequence[int]) -> int:
+    """How many integers tell of a volume of `shape`."""
+    z, y, x = brick_shape(shape)
+    return HEAD + z * y * x
+
+
+def bricks_of_rig(held: Occupancy) -> tuple[np.ndarray, Three, np.ndarray]:
+    """The bricks in one row, their strides (x, y, z), and from where to where along z a column [y x 2] of them holds.
+
+    All are empty where bricks are not told apart.
+    """
+    if held.bricks is None:
+        return np.zeros(0, np.uint8), (0, 0, 0), np.zeros((0, 0, 2), np.int32)
+    bricks = np.ascontiguousarray(held.bricks)
+    layers, rows, columns = bricks.shape
+    found = bricks.max(axis=0)
+    first, last = bricks.argmax(axis=0), layers - 1 - bricks[::-1].argmax(axis=0)
+    # a brick counts for the voxel just behind it
+    heights = np.stack([first * EDGE, last * EDGE + EDGE + 1], axis=-1) * found[..., None]
+    return bricks.reshape(-1), (1, columns, columns * rows), heights.astype(np.int32)
+
+
+def boxes_of(held: Occupancy) -> Float[np.ndarray, "n 6"] | None:
+    """Boxes (x0, y0, z0, x1, y1, z1), in voxels from the volume's centre, beside which a ray meets nothing.
+
+    None: the box is the whole volume.
+    """
+    if held.bricks is None and held.box == Box.whole(held.shape):
+        return None
+    low, high = np.array([held.box.low]), np.array([held.box.high]) - 1
+    if held.bricks is not None:
+        first = np.argwhere(held.bricks) * EDGE
+        low, high = np.maximum(first, low), np.minimum(first + EDGE, high)
+    centre = (np.array(held.shape) - 1) / 2
+    return np.concatenate([(low - centre - REACH)[:, ::-1], (high - centre + REACH)[:, ::-1]], axis=1)

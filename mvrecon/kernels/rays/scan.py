@@ -1,0 +1,90 @@
+"""Looking for what is not zero in volumes."""
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from mvrecon.geometry.box import Box, three
+from mvrecon.kernels.compiling import compiled
+from mvrecon.kernels.rays.occupancy import EDGE, brick_shape
+
+#: Bricks along an axis that are looked at to guess how many are empty.
+SOME = 6
+
+
+def readable(volumes: Tensor) -> np.ndarray:
+    """Volumes in which what is zero is zero; halves as the integers that their bits are, so that -0 counts as there."""
+    volumes = volumes.detach().cpu()
+    return (volumes.view(torch.int16) if volumes.element_size() == 2 else volumes).numpy()
+
+
+def box_of(volumes: np.ndarray) -> Box:
+    """The least box with every voxel of volumes [n d h w] that is not zero; NaN is not.
+
+    It comes from outside, so that a full volume costs next to nothing.
+    """
+    low, high = np.zeros(3, np.int64), np.array(volumes.shape[1:], np.int64)
+    shrink(volumes, low, high)
+    return Box(three(low), three(high))
+
+
+@compiled
+def shrink(volumes, low, high):
+    """Move the bounds [3] of a box inwards until every face of it holds something."""
+    for axis in range(3):
+        while low[axis] < high[axis] and not _face_holds(volumes, axis, low[axis], low, high):
+            low[axis] += 1
+        while low[axis] < high[axis] and not _face_holds(volumes, axis, high[axis] - 1, low, high):
+            high[axis] -= 1
+    if low[0] == high[0]:
+        low[:], high[:] = 0, 0
+
+
+@compiled
+def _face_holds(volumes, axis, place, low, high):
+    z0, z1 = (place, place + 1) if axis == 0 else (low[0], high[0])
+    y0, y1 = (place, place + 1) if axis == 1 else (low[1], high[1])
+    x0, x1 = (place, place + 1) if axis == 2 else (low[2], high[2])
+    for n in range(len(volumes)):
+        for z in range(z0, z1):
+            for y in range(y0, y1):
+                found = 0
+                for x in range(x0, x1):
+                    found |= np.int64(volumes[n, z, y, x] != 0)
+                if found:
+                    return True
+    return False
+
+
+@compiled
+def mark(volumes, low, high, bricks):
+    """Set the bricks [z y x] that hold a voxel of the box that is not zero, or have one just behind their last ones."""
+    for n in range(len(volumes)):
+        for z in range(low[0], high[0]):
+            for y in range(low[1], high[1]):
+                for i in range(max(0, low[2] - 1) // EDGE, (high[2] - 1) // EDGE + 1):
+                    found = 0
+                    for x in range(max(low[2], i * EDGE), min(high[2], i * EDGE + EDGE + 1)):
+                        found |= np.int64(volumes[n, z, y, x] != 0)
+                    if found:
+                        k, j = z // EDGE, y // EDGE
+                        for before_z in range(k - int(z % EDGE == 0 and z > 0), k + 1):
+                            for before_y in range(j - int(y % EDGE == 0 and y > 0), j + 1):
+                                bricks[before_z, before_y, i] = 1
+
+
+def empty_share(volumes: np.ndarray, box: Box) -> float:
+    """The share of bricks in a box that hold nothing, of at most a few hundred of them."""
+    first = [range(low - low % EDGE, high, EDGE) for low, high in zip(box.low, box.high, strict=True)]
+    z, y, x = ([*each[:: max(1, len(each) // SOME)]] for each in first)
+    found = [not volumes[:, k : k + EDGE, j : j + EDGE, i : i + EDGE].any() for k in z for j in y for i in x]
+    return sum(found) / max(1, len(found))
+
+
+def bricks_of(volumes: np.ndarray, box: Box) -> UInt8[np.ndarray, "z y x"]:
+    """The bricks of volumes [n d h w] as an `Occupancy` has them, where all that is not zero lies in a box."""
+    bricks = np.zeros(brick_shape(volumes.shape[1:]), np.uint8)
+    if box.size:
+        mark(volumes, np.array(box.low), np.array(box.high), bricks)
+    return bricks

@@ -1,0 +1,1 @@
+"""Where a scene can have anything in it, told from its views."""

@@ -1,0 +1,142 @@
+"""Where bricks of voxels are seen: rectangles of pixels, and sums of views over them in constant time.
+
+A brick is convex, so where all of it lies on one side of a camera's source its image lies between those of its corners.
+Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH 1984).
+
+Convention: bounds are half-open: of voxels (z, y, x) as in `Box`, of pixels (u, v) = (column, row).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+
+#: Part of a pixel by which a ray that was computed in float32 may be beside its place.
+ROUNDING = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Bricks:
+    """N boxes of voxels.
+
+    Args:
+        low: first voxel of each along (z, y, x).
+        high: one behind the last.
+    """
+
+    low: Int[Tensor, "n 3"]
+    high: Int[Tensor, "n 3"]
+
+    @classmethod
+    def at(cls, places: Int[Tensor, "n 3"], edge: int, shape: Sequence[int]) -> "Bricks":
+        """The bricks of that edge in these places (z, y, x) of the lattice of bricks; the grid's end cuts the last."""
+        low = places * edge
+        return cls(low, torch.minimum(low + edge, low.new_tensor(list(shape))))
+
+    def __len__(self) -> int:
+        return len(self.low)
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """The pixels of every camera whose rays may meet a brick.
+
+    Args:
+        low: first column and row (u, v), within the detector.
+        high: one behind the last; equal to `low` where the brick is not seen.
+        whole: the camera sees all of the brick: its footprint ends within the detector, and it lies in the part of the
+            rays that counts.
+    """
+
+    low: Int[Tensor, "2 m n"]
+    high: Int[Tensor, "2 m n"]
+    whole: Bool[Tensor, "m n"]
+
+
+def lattice_counts(shape: Sequence[int], edge: int) -> tuple[int, int, int]:
+    """Bricks along (z, y, x) that fill a grid of `shape`."""
+    d, h, w = (-(-int(n) // edge) for n in shape)
+    return d, h, w
+
+
+def footprints(cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5, gaps: bool = False) -> Footprints:
+    """The footprints of bricks in all views, in float64.
+
+    Args:
+        cameras: the rig.
+        grid: whose voxels the bricks hold.
+        bricks: N of them; all cameras' corners are held at once, 500 bytes a brick and camera.
+        reach: voxels by which interpolation carries a value beyond the faces of its voxel: 0.5 for joseph and trilinear
+            (a voxel from its centre), 0 for siddon.
+        gaps: grow them by what may lie between rays, too. The thin rays of a brick's own footprint may all miss the
+            bit of a body that is in it. Where every point of the body lies in a ball of it as wide as a pixel's
+            diagonal magnified to there, a ray of the grown footprint meets that ball.
+    """
+    images, w = _images(cameras, grid, bricks, reach)
+    margin, slack = _gaps(cameras) if gaps else (w.new_zeros(2, len(w), 1), w.new_zeros(len(w), 1))
+    near, far = w.amin(dim=1), w.amax(dim=1)
+    first, last = cameras.limits
+    across = (near <= 0) & (far >= 0) & (not cameras.parallel)  # such a brick may have an image anywhere
+    unseen = (far <= first) | (near >= last)
+    low = (images.amin(dim=2) - margin - ROUNDING).ceil()
+    high = (images.amax(dim=2) + margin + ROUNDING).floor() + 1
+    size = low.new_tensor(cameras.shape[::-1]).reshape(2, 1, 1)
+    whole = ((low >= 0) & (high <= size)).all(dim=0) & (near >= first + slack) & (far <= last - slack) & ~across
+    low = torch.where(across, 0, low).clamp(min=0).minimum(size)
+    high = torch.where(across, size, high).minimum(size)
+    return Footprints(low.long(), torch.where(unseen, low, torch.maximum(low, high)).long(), whole)
+
+
+def _images(
+    cameras: Cameras, grid: Grid, bricks: Bricks, reach: float
+) -> tuple[Float[Tensor, "2 m 8 n"], Float[Tensor, "m 8 n"]]:
+    """Pixels (u, v) of the corners of bricks grown by `reach`, not finite where w = 0; and their fraction w."""
+    inverse = torch.linalg.inv(cameras.frame.detach())
+    turn = inverse @ grid.affine[:3, :3].to(inverse)
+    shift = inverse @ (grid.centre.to(inverse) - cameras.source.detach())[..., None]
+    maps = torch.cat([turn, shift], dim=-1)  # from voxels about the grid's centre
+    centre = grid.centre_index.to(inverse)[:, None] + 0.5
+    faces = bricks.low.T.flip(0) - centre - reach, bricks.high.T.flip(0) - centre + reach
+    one = torch.ones_like(faces[0][0])
+    corners = [torch.stack([faces[i][0], faces[j][1], faces[k][2], one]) for i, j, k in product((0, 1), repeat=3)]
+    q = (maps.transpose(0, 1).reshape(-1, 4) @ torch.cat(corners, dim=1)).reshape(3, len(maps), 8, -1)
+    return (q[:2] if cameras.parallel else q[:2] / q[2]), q[2]
+
+
+def _gaps(cameras: Cameras) -> tuple[Float[Tensor, "2 m 1"], Float[Tensor, "m 1"]]:
+    """How far from the image of a point the nearest ray is through any ball that holds it and is a pixel's diagonal
+    wide: (u, v) in pixels; and that diagonal as a fraction of the way from source to detector.
+
+    The ball's centre is half a diagonal away at most, and half a pixel along each axis from a ray.
+    """
+    u, v = cameras.u.detach(), cameras.v.detach()
+    diagonal = torch.maximum((u + v).norm(dim=-1), (u - v).norm(dim=-1))
+    area = torch.linalg.cross(u, v).norm(dim=-1)
+    pitch = torch.stack([area / v.norm(dim=-1), area / u.norm(dim=-1)])  # between columns, between rows
+    return 0.5 + (diagonal / (2 * pitch))[..., None], (diagonal / cameras.distance.detach())[:, None]
+
+
+def tables(images: Shaped[Tensor, "*n v u"]) -> Int[Tensor, "*n v1 u1"]:
+    """Summed-area tables of whole numbers: the sum of all pixels above and left of a corner; exact."""
+    dtype = torch.int32 if images.dtype == torch.bool else torch.int64
+    sums = images.cumsum(dim=-1, dtype=dtype).cumsum(dim=-2, dtype=dtype)
+    return torch.nn.functional.pad(sums, (1, 0, 1, 0))
+
+
+def sums(table: Int[Tensor, "*b m v1 u1"], prints: Footprints) -> Int[Tensor, "*b m n"]:
+    """Sums of the views behind the tables over every footprint."""
+    width = table.shape[-1]
+    flat = table.flatten(-2)
+    (u0, v0), (u1, v1) = prints.low, prints.high
+
+    def corner(v: Tensor, u: Tensor) -> Tensor:
+        index = v * width + u
+        return flat.gather(-1, index.expand(*flat.shape[:-1], -1))
+
+    return corner(v1, u1) - corner(v0, u1) - corner(v1, u0) + corner(v0, u0)

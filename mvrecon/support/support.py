@@ -1,0 +1,121 @@
+"""The part of a grid that is worked on, told from the views of a case."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Grid
+from mvrecon.support.hull import expand, visual_hull
+from mvrecon.support.noise import WITNESSES, Evidence, bounded_hull, noise_threshold
+
+KINDS = ("auto", "hull", "box", "none")
+#: Share of the grid from which on a hull's box is not worth the work on it: "auto" then takes all of the grid.
+WORTH = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """Where a volume may be other than zero.
+
+    Args:
+        box: the least box of voxels that holds it in every item of the batch; never empty, so that a grid can always be
+            cropped to it.
+        mask: its voxels on the full grid; none where all of the box counts.
+        kind: "hull", "box" or "none", as asked for or as "auto" chose.
+        fraction: of the grid's voxels, those in the mask (the mean over the batch), or else in the box.
+        evidence: with what tolerance and probability the rest is empty; none where the hull is exact, or told by sigma.
+    """
+
+    box: Box
+    mask: Bool[Tensor, "b 1 d h w"] | None
+    kind: str
+    fraction: float
+    evidence: Evidence | None = None
+
+
+def support_from_views(
+    views: Float[Tensor, "b 1 m v u"],
+    cameras: Cameras | ExplicitRays,
+    grid: Grid,
+    kind: str = "auto",
+    noise: Mapping[str, Any] | None = None,
+    brick: int | None = None,
+    keep_unseen: bool = True,
+) -> Support:
+    """The support of the volumes that views show.
+
+    Views in which nothing is seen leave no brick: the mask is then empty, and the box is the brick at the grid's
+    centre, for want of a better place.
+
+    Args:
+        views: line integrals, or counts.
+        cameras: the rig.
+        grid: where the voxels lie.
+        kind: "none" all of the grid; "hull" the visual hull; "box" all of its box; "auto" the hull where its box holds
+            less than 0.7 of the grid, else all of the grid.
+        noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of `noise_threshold` and `witnesses`;
+            {sensitivity, tolerance} of counts, with `delta`, as of `bounded_hull`.
+        brick: edge in voxels; by default `brick_edge`.
+        keep_unseen: as of `visual_hull`; of counts, whether to keep bricks to which no view is sensitive. Without, the
+            support is of what the views show, and not of all that may be there.
+
+    Raises:
+        ValueError: an unknown kind or noise, explicit rays with a kind other than "none", views of another size than
+            the rig's or not finite.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"Unknown support {kind!r}. Known: {', '.join(KINDS)}")
+    if kind == "none":
+        return Support(Box.whole(grid.shape), None, "none", 1.0)
+    if isinstance(cameras, ExplicitRays):
+        raise ValueError(f"A support is told from cameras with frusta, got explicit rays and kind {kind!r}; use 'none'")
+    brick = brick_edge(grid) if brick is None else brick
+    bricks, evidence = _bricks((views, cameras, grid, brick), dict(noise or {}), keep_unseen)
+    return _chosen(kind, expand(bricks, brick, grid.shape), _middle(grid, brick), evidence)
+
+
+def _chosen(kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None) -> Support:
+    whole, box = Box.whole(mask.shape[2:]), Box.around(mask) if mask.any() else middle
+    held = box.size / whole.size
+    if kind == "box":
+        return Support(box, None, "box", held, evidence)
+    if kind == "auto" and held >= WORTH:
+        return Support(whole, None, "none", 1.0)
+    return Support(box, mask, "hull", int(mask.sum()) / mask.numel(), evidence)
+
+
+def brick_edge(grid: Grid) -> int:
+    """Edge of the bricks of a hull: about 32 of them fill the grid's longest axis, and they have 1 to 8 voxels.
+
+    A footprint is wider than its brick by more than a pixel on every side, so that bricks finer than a few voxels
+    sharpen a hull little, while their number grows with the third power; and the operators skip by bricks of 8.
+    """
+    return min(8, max(1, max(grid.shape) // 32))
+
+
+def _middle(grid: Grid, brick: int) -> Box:
+    d, h, w = (n // 2 for n in grid.shape)
+    return Box((d, h, w), (d + 1, h + 1, w + 1)).aligned(brick, grid.shape)
+
+
+def _bricks(
+    case: tuple[Float[Tensor, "b 1 m v u"], Cameras, Grid, int], noise: dict[str, Any], keep_unseen: bool
+) -> tuple[Bool[Tensor, "b z y x"], Evidence | None]:
+    if not noise:
+        return visual_hull(*case, keep_unseen=keep_unseen), None
+    if "photons" in noise and noise.keys() <= {"photons", "sigmas", "witnesses"}:
+        witnesses = noise.pop("witnesses", WITNESSES)
+        return visual_hull(*case, noise_threshold(case[0], **noise), witnesses, keep_unseen), None
+    if {"sensitivity", "tolerance"} <= noise.keys() <= {"sensitivity", "tolerance", "delta"}:
+        bricks, evidence = bounded_hull(*case, **noise)
+        return bricks & ((noise["sensitivity"] > 0).any(dim=0).to(bricks.device) | keep_unseen), evidence
+    raise ValueError(
+        "Noise is {photons} of X-rays (sigmas, witnesses) or {sensitivity, tolerance} of counts (delta), "
+        f"got {sorted(noise)}"
+    )
