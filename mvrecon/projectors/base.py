@@ -182,7 +182,8 @@ class Projector(nn.Module):
         if self.skip == "off":
             self._last = None
             return kernels.project(x, *rays)
-        self._last = kernels.occupied(x.detach(), lines.detach(), *rays[1:], self.skip.replace("verify", "auto"))
+        how = self.skip if self.skip in ("box", "brick") else "auto"
+        self._last = kernels.occupied(x.detach(), lines.detach(), *rays[1:], how)
         views = kernels.project(x, *rays, None, self._last)
         if self.skip == "verify":
             verify(views, kernels.project(x, *rays), self.skipped)
@@ -206,7 +207,7 @@ class Projector(nn.Module):
         held = Occupancy.whole(self.grid.shape)
         if self.support is not None and self.skip != "off" and backends.COMPILED:
             mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
-            how = self.skip.replace("verify", "auto")
+            how = self.skip if self.skip in ("box", "brick") else "once"
             held = Occupancy.decoded(ops.occupied(mask, rays, self.window, self.detector, self.kernel, how))
         return held.encoded(), held.box
 

@@ -13,6 +13,7 @@ import torch
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import reference, selfcheck
 from mvrecon.kernels.rays.lines import lines_of
@@ -88,6 +89,27 @@ def test_backproject(kind, method):
     expected = reference.backproject(y, lines, window, shape, method)
     assert close(cuda.scatter(y, lines, window, whole(shape), method), expected)
     assert close(cuda.backproject(y, lines, window, whole(shape), method), expected)
+
+
+@kernels
+@pytest.mark.parametrize(("kind", "method"), [(kind, method) for kind, method in CASES if kind in ("dome", "parallel")])
+def test_a_part_of_a_volume(kind, method):
+    """What is held of a volume is read and written as the rest of it would be, were it zero or left out."""
+    from mvrecon.kernels.rays import cuda
+
+    x, y, lines, window, detector = scene(kind)
+    box = Box((1, 0, 2), (4, 2, 5))
+    held, inside = Occupancy(whole(x.shape[1:]).shape, box), torch.zeros_like(x)
+    inside[:, *box.slices] = 1
+    part = x[:, *box.slices]
+    moving = lines.clone().requires_grad_()
+    views = reference.project(x * inside, moving, window, detector, method)
+    assert close(cuda.project(part, lines, window, held, detector, method), views.detach())
+    expected = reference.backproject(y, lines, window, list(x.shape[1:]), method)[:, *box.slices]
+    assert close(cuda.scatter(y, lines, window, held, method), expected)
+    assert close(cuda.backproject(y, lines, window, held, method), expected)
+    (change,) = torch.autograd.grad((views * y).sum(), moving)
+    assert close(cuda.lines_vjp(part, y, lines, window, held, method), change, 1e-9)
 
 
 @kernels

@@ -1,5 +1,6 @@
 """What to leave out of a volume: counted on some rays, so that nothing is skipped that does not pay."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,6 +17,8 @@ from mvrecon.kernels.rays.scan import box_of, bricks_of, empty_share, readable
 from mvrecon.kernels.rays.shadow import spans_of
 from mvrecon.kernels.rays.trace import main_axis, trace
 
+#: Slabs of all rays below which it costs more to look at a volume than to go through it.
+LITTLE = 2**21
 #: Rays on which work is counted.
 RAYS = 1024
 #: What a ray costs before its first slab, and what it costs to ask for one layer of bricks, in slabs.
@@ -32,14 +35,26 @@ class Scene(NamedTuple):
     detector: Sequence[int]
     method: str
 
+    def slabs(self, shape: Sequence[int]) -> int:
+        """Slabs of all rays, at most."""
+        return len(self.lines) * math.prod(self.detector) * max(shape)
+
 
 def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
-    """Where volumes [n d h w] are not zero, as fine as `skip` says: "box", "brick", or "auto", what costs least."""
+    """Where volumes [n d h w] are not zero, as fine as `skip` says.
+
+    Args:
+        volumes: what is looked at, or a mask.
+        scene: the rays.
+        skip: "box"; "brick"; "auto", what costs least if it is looked for in every call; "once", what costs least.
+    """
     values = readable(volumes)
     shape = Box.whole(values.shape[1:]).high
+    if skip == "auto" and scene.slabs(shape) < LITTLE:
+        return Occupancy.whole(shape)
     held = Occupancy(shape, box_of(values))
     fine = "trilinear" not in scene.method and held.box.size > 0
-    if skip == "box" or not fine or (skip == "auto" and empty_share(values, held.box) < WORTH):
+    if skip == "box" or not fine or (skip != "brick" and empty_share(values, held.box) < WORTH):
         return held
     bricked = Occupancy(shape, held.box, bricks_of(values, held.box))
     if skip == "brick":

@@ -17,7 +17,7 @@ from mvrecon.kernels.rays.loops import Rig, pixel, silent, steps_of
 from mvrecon.kernels.rays.stores import Store
 from mvrecon.kernels.rays.stores import store as store_of
 from mvrecon.kernels.rays.trace import main_axis, slab_length, within
-from mvrecon.kernels.rays.upright import extent, pieces, places, upright
+from mvrecon.kernels.rays.upright import extent, pieces, places, upright, within_held
 
 #: Rays in turn add to rows of their own, so that no addition waits for the one before.
 ROWS = 4
@@ -112,7 +112,7 @@ def project_columns(store, rig, room, reads, views, first, last):
         room.values[:] = 0
         for i in range(count):
             span = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
-            some = extent(height, room.pieces[2, i], rays, (room.held[0, i], room.held[1, i]))
+            some = within_held(rig, room, i, span)
             weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
             if not level or i == 0:
                 places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
@@ -216,7 +216,7 @@ def backproject_columns(store, rig, room, reads, views, low, high):
         for group in range(len(room.values)):
             for i in range(count):
                 span_z = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
-                some = extent(height, room.pieces[2, i], rays, (room.held[0, i], room.held[1, i]))
+                some = within_held(rig, room, i, span_z)
                 weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
                 if not level or i == 0:
                     places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)

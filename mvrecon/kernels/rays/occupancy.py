@@ -55,21 +55,21 @@ class Occupancy:
 
     def encoded(self) -> Tensor:
         """As integers: shape, box, shares, whether bricks are told apart, bricks."""
-        code = torch.zeros(code_size(self.shape), dtype=torch.int32)
+        code = np.zeros(code_size(self.shape), np.int32)
         shares = [-1 if share != share else round(share * WHOLE) for share in self.shares]
-        code[:HEAD] = torch.tensor([*self.shape, *self.box.low, *self.box.high, *shares, self.bricks is not None])
+        code[:HEAD] = *self.shape, *self.box.low, *self.box.high, *shares, self.bricks is not None
         if self.bricks is not None:
-            code[HEAD:] = torch.from_numpy(self.bricks.reshape(-1))
-        return code
+            code[HEAD:] = self.bricks.reshape(-1)
+        return torch.from_numpy(code)
 
     @classmethod
     def decoded(cls, code: Tensor) -> "Occupancy":
         """The inverse of `encoded`."""
         numbers = code.numpy()
-        shape, low, high = (three(numbers[k : k + 3]) for k in (0, 3, 6))
-        one, two = (float(n) / WHOLE if n >= 0 else float("nan") for n in numbers[9:11])
-        bricks = numbers[HEAD:].astype(np.uint8).reshape(brick_shape(shape)) if numbers[11] else None
-        return cls(shape, Box(low, high), bricks, (one, two))
+        d, h, w, z0, y0, x0, z1, y1, x1, one, two, told_apart = numbers[:HEAD].tolist()
+        bricks = numbers[HEAD:].astype(np.uint8).reshape(brick_shape((d, h, w))) if told_apart else None
+        shares = (one / WHOLE if one >= 0 else float("nan"), two / WHOLE if two >= 0 else float("nan"))
+        return cls((d, h, w), Box((z0, y0, x0), (z1, y1, x1)), bricks, shares)
 
 
 def brick_shape(shape: Sequence[int]) -> Three:

@@ -97,11 +97,12 @@ def ray_plan_of(rig: Rig, held: Occupancy) -> Plan:
 def _main_axes(rig: Rig, direction: Float[np.ndarray, "m 3 k"]) -> tuple[bool, bool, bool]:
     rows, columns = rig.detector
     corners = np.array([[u, v, 1] for u in (-1, 1) for v in (-1, 1)]) * [(columns - 1) / 2, (rows - 1) / 2, 1]
-    ends = direction @ corners[:, -direction.shape[2] :].T
+    corners = corners[:1] if direction.shape[2] == 1 else corners  # a ray given by itself is its own corner
+    # [corner axis view], so that numpy goes through many views in one loop
+    ends = np.stack([direction.transpose(1, 0, 2) @ corner for corner in corners[:, -direction.shape[2] :]])
     # the ray of a pixel lies between those of the corners
-    least = np.where(ends.min(axis=2) * ends.max(axis=2) > 0, np.abs(ends).min(axis=2), 0)
-    possible = np.abs(ends).max(axis=2) * (1 + 1e-9) >= least.max(axis=1, keepdims=True)
-    x, y, z = possible.any(axis=0) if len(possible) else (False, False, False)
+    least = np.where(ends.min(axis=0) * ends.max(axis=0) > 0, np.abs(ends).min(axis=0), 0)
+    x, y, z = (np.abs(ends).max(axis=0) * (1 + 1e-9) >= least.max(axis=0)).any(axis=1)
     return bool(x), bool(y), bool(z)
 
 

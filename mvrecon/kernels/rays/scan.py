@@ -6,7 +6,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from mvrecon.geometry.box import Box, three
-from mvrecon.kernels.compiling import compiled
+from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.occupancy import EDGE, brick_shape
 
 #: Bricks along an axis that are looked at to guess how many are empty.
@@ -76,10 +76,37 @@ def mark(volumes, low, high, bricks):
 
 def empty_share(volumes: np.ndarray, box: Box) -> float:
     """The share of bricks in a box that hold nothing, of at most a few hundred of them."""
-    first = [range(low - low % EDGE, high, EDGE) for low, high in zip(box.low, box.high, strict=True)]
-    z, y, x = ([*each[:: max(1, len(each) // SOME)]] for each in first)
-    found = [not volumes[:, k : k + EDGE, j : j + EDGE, i : i + EDGE].any() for k in z for j in y for i in x]
-    return sum(found) / max(1, len(found))
+    counts = np.zeros(2, np.int64)
+    look(volumes, np.array(box.low), np.array(box.high), counts)
+    return counts[0] / max(1, counts[1])
+
+
+@compiled
+def look(volumes, low, high, counts):
+    """Count some of the bricks in a box: how many are empty, and how many there are."""
+    steps = (_stride(low[0], high[0]), _stride(low[1], high[1]), _stride(low[2], high[2]))
+    for z in range(low[0] - low[0] % EDGE, high[0], steps[0]):
+        for y in range(low[1] - low[1] % EDGE, high[1], steps[1]):
+            for x in range(low[2] - low[2] % EDGE, high[2], steps[2]):
+                counts[0] += not _brick_holds(volumes, z, y, x)
+                counts[1] += 1
+
+
+@scalar
+def _stride(low, high):
+    return EDGE * max(1, (high - low) // EDGE // SOME)
+
+
+@compiled
+def _brick_holds(volumes, z0, y0, x0):
+    count, depth, height, width = volumes.shape
+    for n in range(count):
+        for z in range(z0, min(z0 + EDGE, depth)):
+            for y in range(y0, min(y0 + EDGE, height)):
+                for x in range(x0, min(x0 + EDGE, width)):
+                    if volumes[n, z, y, x] != 0:
+                        return True
+    return False
 
 
 def bricks_of(volumes: np.ndarray, box: Box) -> UInt8[np.ndarray, "z y x"]:

@@ -42,10 +42,19 @@ def _held(rig, axis, k, y):
 
 
 @scalar
-def _put(room, count, part, held):
+def _put(rig, room, count, part, held):
     room.index[count], room.pieces[0, count], room.pieces[1, count] = part[0], part[1], part[2]
     room.pieces[2, count], room.pieces[3, count] = part[3], part[4]
-    room.held[0, count], room.held[1, count] = held[0], held[1]
+    if rig.heights.size:
+        room.held[0, count], room.held[1, count] = held[0], held[1]
+
+
+@scalar
+def within_held(rig, room, i, span):
+    """The part of a span along z in which piece i may have anything."""
+    if not rig.heights.size:
+        return span
+    return min(max(span[0], room.held[0, i]), span[1]), max(min(span[1], room.held[1, i]), span[0])
 
 
 @scalar
@@ -60,7 +69,7 @@ def pieces(rig, ray, span, steps, room):
             held = _held(rig, ray.axis, k, int(y) - 1)
             if held[0] < held[1]:
                 row = (k + 1) * steps.along + int(y) * steps.far + 1 - steps.origin
-                _put(room, count, (row, (s1 - s0) * (1 - y + int(y)), (s1 - s0) * (y - int(y)), s, s), held)
+                _put(rig, room, count, (row, (s1 - s0) * (1 - y + int(y)), (s1 - s0) * (y - int(y)), s, s), held)
                 count += 1
             continue
         y0, y1 = int(ray.b + 0.5 + s0 * ray.slope_b), int(ray.b + 0.5 + s1 * ray.slope_b)
@@ -69,7 +78,7 @@ def pieces(rig, ray, span, steps, room):
             held = _held(rig, ray.axis, k, y - 1)
             if two > one and held[0] < held[1]:
                 row = (k + 1) * steps.along + y * steps.far + 1 - steps.origin
-                _put(room, count, (row, two - one, 0.0, one, two), held)
+                _put(rig, room, count, (row, two - one, 0.0, one, two), held)
                 count += 1
     return count
 

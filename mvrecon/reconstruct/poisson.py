@@ -1,0 +1,147 @@
+"""The Poisson likelihood of counts, at a cost that falls with the number of bins that hold any."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.kernels.backends import wide
+from mvrecon.projectors.base import Projector, check
+from mvrecon.projectors.subset import RaySubset, Subset, ViewSubset
+
+#: The share of bins with counts up to which a list of rays costs less than whole views, for all rigs and methods: a ray
+#: of a list takes up to three times as long, and the adjoint leaves out rays of zero in whole views as well.
+LIST = 0.2
+
+
+class PoissonLikelihood:
+    """The negative log-likelihood of counts under a volume x: sum(ybar - y log ybar) with ybar = A x + r.
+
+    Constants of the counts alone are left out. A bin without counts needs no ray: it has no part in the second sum,
+    and the first is <s, x> + sum(r), with the sensitivity s = A^T 1 made once. That is exact, for this likelihood and
+    no other (list-mode data have the same one: Barrett, White and Parra, JOSA A 14, 1997). Where most bins hold counts
+    whole views are cheaper than lists of rays, and are taken; `why` tells what was chosen, and for what reason.
+
+    Expected counts must be positive wherever counts are. A volume with negative voxels is let through as long as they
+    are. Make it anew when counts, projector or its device change; cameras that want a gradient may move.
+
+    Args:
+        A: the projector, in counts per unit of the volume.
+        counts: measured, [b c m v u]; rays are left out where no case of the batch has counts.
+        background: expected counts r of other origin, one number or views that broadcast to the counts.
+        views: indices of the only views that count; all by default.
+        skip_zero_bins: False takes all bins of those views.
+
+    Raises:
+        ValueError: a wrong rank, size or device; counts or background that are negative or not finite.
+    """
+
+    def __init__(
+        self,
+        A: Projector,
+        counts: Float[Tensor, "b c m v u"],
+        background: float | Float[Tensor, "b c m v u"] = 0.0,
+        views: Sequence[int] | None = None,
+        skip_zero_bins: bool = True,
+    ):
+        check(counts, "counts [b c m v u]", (len(A.rays), *A.rays.shape), A.fixed_lines.device)
+        self.A, self.every = A, ViewSubset(A, range(len(A.rays)) if views is None else views)
+        measured, added = wide(self.every.pick(counts)), self.every.pick(_spread(background, counts))
+        for what, values in (("counts", measured), ("background", added)):
+            bad = int((~(values >= 0) | ~values.isfinite()).sum())
+            if bad:
+                raise ValueError(f"Expected {what} that are finite and not negative, got {bad} bins that are not")
+        self.bins, self.why = self._choose(measured, skip_zero_bins)
+        self.counts, self.background = (self.bins.pick(self.every.place(each)) for each in (measured, added))
+        self._added = added.flatten(1).sum(dim=1, dtype=torch.float64)
+        self._sensitivity: dict[torch.dtype, Tensor] = {}
+
+    def _choose(self, measured: Float[Tensor, "b c k v u"], skip: bool) -> tuple[Subset, str]:
+        if not skip:
+            return self.every, "all bins: asked for"
+        if not self.every.alone:
+            return self.every, f"all bins: {type(self.A).__name__} does not compute rays one by one"
+        chosen = self.every.place((measured != 0).any(dim=0, keepdim=True).any(dim=1, keepdim=True))[0, 0]
+        share = int(chosen.sum()) / max(1, measured[:1, :1].numel())
+        told = f"{share:.1%} of the bins hold counts, a list of rays pays up to {LIST:.0%}"
+        if share > LIST:
+            return self.every, f"all bins: {told}"
+        return RaySubset(self.A, chosen), f"bins with counts: {told}"
+
+    def sensitivity(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
+        """s = A^T 1: the counts that one unit in each voxel brings; made anew where the cameras want a gradient."""
+        if self.A.poses or dtype not in self._sensitivity:
+            ones = torch.ones(1, 1, *self.every.shape, dtype=dtype, device=self.counts.device)
+            self._sensitivity[dtype] = self.every.T(ones)
+        return self._sensitivity[dtype]
+
+    def expected(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
+        """ybar, the counts to be expected in the bins that are computed.
+
+        Raises:
+            ValueError: a volume of another batch than the counts, or one that allows no counts where there are some.
+        """
+        self._check(volume)
+        expected = self.bins(volume) + self.background
+        impossible = int(((self.counts > 0) & ~(expected > 0)).sum())
+        if impossible:
+            raise ValueError(
+                f"{impossible} bins hold counts where the volume and the background allow none: their likelihood is "
+                "zero. Give a background > 0, a grid or support that reaches these rays, or a volume with values there"
+            )
+        return expected
+
+    def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, " b"]:
+        """The negative log-likelihood of each case, in float64; differentiable in the volume and in the cameras.
+
+        Raises:
+            ValueError: as `expected`.
+        """
+        expected = self.expected(volume)
+        held = self.counts > 0
+        # an unexpected bin without counts has part 0, but would have the derivative 0 / 0
+        logs = self.counts * torch.where(held, expected, 1).double().log()
+        total = (self.sensitivity(expected.dtype) * volume).flatten(1).sum(dim=1, dtype=torch.float64)
+        return total + self._added - logs.flatten(1).sum(dim=1)
+
+    @torch.no_grad()
+    def gradient(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
+        """The derivative of the negative log-likelihood by the volume, s - A^T (y / ybar).
+
+        Raises:
+            ValueError: as `expected`.
+        """
+        expected = self.expected(volume)
+        return self.sensitivity(expected.dtype) - self.bins.T(_ratio(self.counts, expected))
+
+    @torch.no_grad()
+    def explained(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
+        """A^T (y / ybar), for a volume that is nowhere negative; bins with no counts to expect are left out.
+
+        That changes no multiplicative step: all voxels on the ray of such a bin are zero, and stay so.
+        """
+        self._check(volume)
+        return self.bins.T(_ratio(self.counts, self.bins(volume) + self.background))
+
+    def _check(self, volume: Tensor) -> None:
+        if volume.shape[:2] != self.counts.shape[:2]:
+            batch = tuple(self.counts.shape[:2])
+            raise ValueError(f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got {tuple(volume.shape)}")
+
+
+def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
+    """y / ybar, and 0 where either is."""
+    held = (counts > 0) & (expected > 0)
+    return torch.where(held, counts / torch.where(held, expected, 1), 0)
+
+
+def _spread(background: float | Tensor, counts: Tensor) -> Tensor:
+    added = torch.as_tensor(background, dtype=wide(counts[:0]).dtype, device=counts.device)
+    try:
+        return added.expand(counts.shape)
+    except RuntimeError as error:
+        raise ValueError(
+            f"Expected a background of one number or views that broadcast to {tuple(counts.shape)}, "
+            f"got {tuple(added.shape)}"
+        ) from error
