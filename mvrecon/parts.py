@@ -6,6 +6,7 @@ SCENES = Registry(
     "scene",
     ellipsoids="mvrecon.scenes.ellipsoids:RandomEllipsoids",
     derenzo="mvrecon.scenes.derenzo:RandomDerenzo",
+    ventricle="mvrecon.scenes.ventricle:RandomVentricle",
     shepp_logan="mvrecon.scenes.shepp_logan:SheppLogan",
     mixture="mvrecon.scenes.mixture:Mixture",
     hdf5="mvrecon.data.volumes:Hdf5Volumes",

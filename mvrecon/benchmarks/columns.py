@@ -62,3 +62,42 @@ SCALING = {
     "threads": OPERATORS["threads"],
     **{name: OPERATORS[name] for name in ("status", "note", "forward_ms", "adjoint_ms", "calls", "load")},
 }
+
+SKIP_KEYS = ("scene", "rig", "method", "task", "mode", "n", "device", "threads")
+
+#: `bench=skip`.
+SKIP = {
+    "scene": "what is looked at, by its name in the configuration",
+    "source": "where its volume is from: a phantom, a file's case, or what stands in for it",
+    "rig": "the cameras, by their name in the configuration",
+    "method": "of the projector",
+    "task": "forward: A x of a volume that is another at every call; forward_static: A x, the support given once; "
+    "adjoint: A^T y inside the support, given once, y white noise; sirt20: 20 iterations of SIRT inside the hull of "
+    "the views; cross_view: the model end to end on scenes that are ever new; cross_view_static: on scenes that fill "
+    "the same box, whose geometry it has kept",
+    "mode": "off: nothing is skipped; cropped: nothing, on the volume cropped to the box around what is there; others: "
+    "`skip` of the projector, of the model its `support`",
+    "n": "voxels along each edge; none where a checkpoint brings its own grid",
+    "device": OPERATORS["device"],
+    "threads": OPERATORS["threads"],
+    "grid": "voxels along z, y, x of the whole volume",
+    "views": "cameras x rows x columns",
+    "status": OPERATORS["status"],
+    "chosen": "what the last call did, as the operator (of the model: the support) tells",
+    "why": "and why",
+    "occupancy": "part of the voxels that are not zero",
+    "box": "part of the volume that the box around them takes",
+    "support": "part of the voxels in the hull of the views, of sirt20 and the model",
+    "ms": "one call in ms: median of at least `repeats` taken in turns with the other modes; building the mask is part "
+    "of it but for forward_static and adjoint, and nothing is charged to off and cropped for theirs",
+    "over_full": "how many times as fast as off: its ms / ms",
+    "over_crop": "how many times as fast as cropped: its ms / ms",
+    "build_ms": "building the mask, in ms; blank where every call does so by itself",
+    "error": "greatest absolute difference of a value from that of off; of the adjoint inside the support",
+    "differing": "how many values differ from those of off in any bit",
+    "psnr": "against the truth in dB, mean over `cases`; blank for a model that is not trained",
+    "psnr_loss": "that of off less that of the mode, in dB",
+    "peak_mb": "most memory in 2^20 bytes of a call beyond what was in use before it, its result included",
+    "calls": "how many calls ms is the median of",
+    "load": OPERATORS["load"],
+}

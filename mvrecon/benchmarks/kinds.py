@@ -6,4 +6,5 @@ BENCHES = Registry(
     "bench",
     operators="mvrecon.benchmarks.operators:Operators",
     scaling="mvrecon.benchmarks.scaling:Scaling",
+    skip="mvrecon.benchmarks.skip:Skip",
 )

@@ -122,6 +122,61 @@ SCALING = (
 )
 
 
+def _greatest(
+    figure: Callable[[Row], float], scene: str, tasks: Sequence[str], modes: Sequence[str] = ("auto",)
+) -> Callable[[Measured], float]:
+    """The greatest figure of `bench=skip` on a scene, of all rigs and methods; NaN if none."""
+    wanted = (("scene", [scene]), ("task", tasks), ("mode", modes))
+
+    def found(at: Measured) -> float:
+        figures = [figure(row) for row in at.rows if all(row.get(name) in values for name, values in wanted)]
+        return max((f for f in figures if f == f), default=math.nan)
+
+    return found
+
+
+def _time_over(column: str) -> Callable[[Row], float]:
+    return lambda row: 1 / number(row, column)
+
+
+_CALLS = ("forward", "forward_static", "adjoint")
+_EXACT = ("auto", "box", "brick", "verify")
+
+#: Of `bench=skip`: mode auto, the worst of all rigs and methods; of the differing values every mode of skipping.
+SKIP = (
+    *(
+        Target(f"{scene}, {task}: time / off's on the {what}", _greatest(_time_over(column), scene, [task]), most)
+        for scene in ("derenzo", "ventricle")
+        for task in _CALLS
+        for what, column, most in (("full cube", "over_full", 1 / 8), ("cropped volume", "over_crop", 1 / 1.25))
+    ),
+    Target(
+        "head_neck, cross_view: time / off's on the full cube",
+        _greatest(_time_over("over_full"), "head_neck", ["cross_view"]),
+        1 / 3,
+    ),
+    Target(
+        "head_neck, cross_view_static: time / off's on the full cube",
+        _greatest(_time_over("over_full"), "head_neck", ["cross_view_static"]),
+        1 / 3,
+    ),
+    Target(
+        "head_neck, cross_view: PSNR lost, dB",
+        _greatest(lambda row: number(row, "psnr_loss"), "head_neck", ["cross_view"]),
+        0.1,
+    ),
+    Target("full, operators: time / off's", _greatest(_time_over("over_full"), "full", _CALLS), 1.05),
+    *(
+        Target(
+            f"{scene}, forward: values that differ from off's",
+            _greatest(lambda row: number(row, "differing"), scene, _CALLS[:2], _EXACT),
+            0,
+        )
+        for scene in ("derenzo", "ventricle", "head_neck", "torso35", "torso80", "full")
+    ),
+)
+
+
 def table(targets: Sequence[Target], rows: Sequence[Row], base: Mapping[str, Any]) -> str:
     """The targets as a Markdown table."""
     at = Measured(rows, base)

@@ -49,6 +49,28 @@ def scaling(panels: Mapping[str, Mapping[str, Points]], path: Path) -> None:
     _save(figure, axes, path)
 
 
+def speedups(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]], path: Path) -> None:
+    """How many times as fast, a panel for each task, a line where nothing is gained; the vertical axis logarithmic.
+
+    Args:
+        panels: title -> against what -> (scene, times as fast), scenes in the order in which they are first met.
+        path: of the PNG.
+    """
+    figure, axes = _figure(len(panels), None)
+    for ax, (title, kinds) in zip(axes, panels.items(), strict=True):
+        scenes = list(dict.fromkeys(scene for points in kinds.values() for scene, _ in points))
+        for n, (marker, (label, points)) in enumerate(zip(cycle(MARKERS), kinds.items(), strict=False)):
+            beside = 0.3 * (n - (len(kinds) - 1) / 2)
+            places = [(scenes.index(scene) + beside, times) for scene, times in points]
+            ax.plot(*zip(*places, strict=True), marker=marker, markersize=5, linestyle="", alpha=0.7, label=label)
+        ax.axhline(1, color="0.3", linewidth=1)
+        ax.set_xscale("linear")
+        ax.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right")
+        ax.set_title(title)
+        ax.set_ylabel("times as fast")
+    _save(figure, axes, path)
+
+
 def _figure(count: int, xlabel: str | None) -> tuple[Figure, list[Any]]:
     columns = min(3, count)
     rows = -(-count // columns)

@@ -84,6 +84,23 @@ def faces(space, axis, reach):
 
 
 @scalar
+def reach_of(method):
+    """How far beyond its own cell a voxel's value is felt: hat functions reach one voxel from the centre."""
+    return 0.0 if method == SIDDON else 0.5
+
+
+@scalar
+def shortened(across, begin, end, from_, to):
+    """The part of a ray between the faces across its far and near axis, and what bounds it; across: see `transverse`."""
+    (value_b, slope_b, half_b), (value_c, slope_c, half_c) = across
+    far_lower, far_upper = transverse(value_b, slope_b, -half_b, half_b, begin, end)
+    lower, upper = transverse(value_c, slope_c, -half_c, half_c, far_lower, far_upper)
+    from_ = NEAR if lower > far_lower else FAR if far_lower > begin else from_
+    to = NEAR if upper < far_upper else FAR if far_upper < end else to
+    return lower, upper, from_, to
+
+
+@scalar
 def trace(line, axis, near, pixel, space, method):
     """Where the ray of a pixel runs; `first >= last` says that it misses. All in float64.
 
@@ -103,18 +120,13 @@ def trace(line, axis, near, pixel, space, method):
     value_b, value_c = crossing(line, axis, far, u, v), crossing(line, axis, near, u, v)
     one = at(line, 2, axis, u, v) + space.window[0] * D
     two = at(line, 2, axis, u, v) + space.window[1] * D
-    # hat functions reach one voxel from the outermost centres, cells half a voxel
-    reach = 0.0 if method == SIDDON else 0.5
+    reach = reach_of(method)
     half = space.sizes[axis] / 2.0 + (0.5 if method == TRILINEAR else 0.0)
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
     from_, to = OWN if begin > -half else FACE, OWN if end < half else FACE
     if method == TRILINEAR:  # its samples are spaced along its way through the whole volume
-        half_b, half_c = space.sizes[far] / 2.0 + reach, space.sizes[near] / 2.0 + reach
-        far_lower, far_upper = transverse(value_b, slope_b, -half_b, half_b, begin, end)
-        lower, upper = transverse(value_c, slope_c, -half_c, half_c, far_lower, far_upper)
-        from_ = NEAR if lower > far_lower else FAR if far_lower > begin else from_
-        to = NEAR if upper < far_upper else FAR if far_upper < end else to
-        begin, end = lower, upper
+        across = (value_b, slope_b, space.sizes[far] / 2.0 + reach), (value_c, slope_c, space.sizes[near] / 2.0 + reach)
+        begin, end, from_, to = shortened(across, begin, end, from_, to)
     # a slab counts where it overlaps the ray
     slack, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5 if method == SIDDON else 1.0)
     low, high = faces(space, far, reach)

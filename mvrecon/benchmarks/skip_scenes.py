@@ -1,0 +1,133 @@
+"""What `bench=skip` looks at: volumes that fill from a part in three hundred of their cube to all of it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.data.attenuation import WATER
+from mvrecon.data.body import body, enclosed
+from mvrecon.data.volumes import TISSUE, FileScene
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.parts import CAMERAS, SCENES
+from mvrecon.projectors.base import Projector
+from mvrecon.scenes.analytic import AnalyticScene, generator
+from mvrecon.scenes.sample import Scene
+from mvrecon.scenes.voxelise import voxelise
+
+#: Edge of the cube in mm, where a scene does not say.
+FIELD = 256.0
+#: Wavelength in mm of the tissue's variation.
+WAVE = 120.0
+
+
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """A volume, and where it is from."""
+
+    volume: Float[Tensor, "d h w"]
+    grid: Grid
+    source: str
+
+
+def cube(config: Mapping[str, Any], n: int) -> Grid:
+    """The n^3 voxels of a scene's cube, `field_mm` long."""
+    return Grid.centred((n,) * 3, config.get("field_mm", FIELD) / n)
+
+
+def edge(grid: Grid) -> float:
+    """Length of a cube in mm."""
+    return grid.shape[0] * grid.spacing[0]
+
+
+def filled(config: Mapping[str, Any], grid: Grid) -> Filled:
+    """The volume of a scene.
+
+    Args:
+        config: `volume`: a scene of phantoms or of files in the registry, `{name: body, fill: ..., axes: ...}`, or
+            `{name: random}`; `instead`: the volume where the path of a file is null; `case`: which case.
+        grid: where its voxels lie.
+
+    Raises:
+        TypeError: another kind of scene.
+    """
+    options, case = _chosen(config), config.get("case", 0)
+    if options["name"] == "random":
+        return Filled(torch.rand(grid.shape, generator=generator(0, case)) + 0.5, grid, "random values in 0.5 .. 1.5")
+    if options["name"] == "body":
+        options.pop("name")
+        return Filled(phantom_body(grid, **options), grid, f"body of {options['fill']:.0%}")
+    scene = SCENES.from_config(options)
+    if isinstance(scene, AnalyticScene):
+        return Filled(voxelise(scene.phantom(generator(0, case), grid), grid), grid, options["name"])
+    if not isinstance(scene, FileScene):
+        raise TypeError(f"bench=skip needs a scene of phantoms or of files, got {options['name']!r}")
+    patient, fine = scene.finely(case, 0, grid)
+    truth = F.avg_pool3d(fine[None], scene.fine)[0]
+    return Filled(truth * enclosed(body(truth, TISSUE)), grid, f"{patient}, without couch and air")
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One case as a model sees it, and the truth behind it."""
+
+    views: Float[Tensor, "1 1 m v u"]
+    volume: Float[Tensor, "1 d h w"]
+    inside: Bool[Tensor, "1 d h w"]
+    source: str
+
+
+def seen(config: Mapping[str, Any], A: Projector, index: int = 0) -> Seen:
+    """A case of a scene by its own views, exact or from a finer grid; by A's, where it is not in the registry."""
+    options, case = _chosen(config), config.get("case", 0) + index
+    if options["name"] in ("random", "body"):
+        found = filled({**config, "case": case}, A.grid)
+        volume = found.volume[None]
+        return Seen(A(volume[None]), volume, volume > 0, found.source)
+    scene: Scene = SCENES.from_config(options)
+    sample = scene.sample(case, 0, A.grid, A.cameras)
+    return Seen(sample.views[None], sample.volume, sample.inside, sample.name)
+
+
+def _chosen(config: Mapping[str, Any]) -> dict[str, Any]:
+    volume = config["volume"]
+    return dict(config["instead"] if volume.get("path", "") is None else volume)
+
+
+def phantom_body(grid: Grid, fill: float, axes: Sequence[float | None] = (1.35, 1.0, None)) -> Float[Tensor, "d h w"]:
+    """Tissue of smoothly varying attenuation in the ellipsoid about the centre that holds a part of all voxels.
+
+    Args:
+        grid: of the volume, which cuts off what does not fit.
+        fill: that part.
+        axes: proportions of the semi-axes along x, y, z; null: it runs through the volume.
+
+    Raises:
+        ValueError: a fill that is not in (0, 1].
+    """
+    if not 0 < fill <= 1:
+        raise ValueError(f"A body's fill must be a part in (0, 1] of the volume, got {fill}")
+    xyz = voxel_centres(grid) - grid.centre
+    radius = (xyz * torch.tensor([1 / axis if axis else 0.0 for axis in axes], dtype=xyz.dtype)).norm(dim=-1)
+    edge = radius.flatten().kthvalue(max(1, round(fill * radius.numel()))).values
+    tissue = WATER * (1 + 0.2 * (2 * math.pi / WAVE * xyz).cos().prod(dim=-1))
+    return torch.where(radius <= edge, tissue, 0.0).float()
+
+
+def rig(config: Mapping[str, Any], field: float, n: int) -> Cameras:
+    """The cameras of a configuration in the registry.
+
+    With `cover` the detector is square, its edge so many times the field's, with `pixels` along it (n, where that is
+    null or absent), and `detector` is left out.
+    """
+    options = dict(config)
+    if (cover := options.pop("cover", None)) is not None:
+        pixels = options.pop("pixels", None) or n
+        options["detector"] = {"pixels": [pixels, pixels], "pixel_mm": cover * field / pixels}
+    return CAMERAS.from_config(options)
