@@ -1,21 +1,44 @@
 """Training losses, all relative to the data's value range so that one set of weights serves every unit."""
 
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.models.output import Reconstruction
 
 
-def edge_difference(a: Float[Tensor, "b 1 d h w"], b: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, ""]:
-    """Mean squared difference of the first differences along the three axes: edges count, offsets do not."""
-    error = a - b
-    return torch.stack([error.diff(dim=axis).square().mean() for axis in (2, 3, 4)]).mean()
+def edge_difference(
+    a: Float[Tensor, "b 1 d h w"], b: Float[Tensor, "b 1 d h w"], support: Bool[Tensor, "b 1 d h w"] | None = None
+) -> Float[Tensor, ""]:
+    """Mean squared difference of the first differences along the three axes: edges count, offsets do not.
+
+    With a support only differences between two of its voxels count.
+    """
+    error, each = a - b, []
+    for axis in (2, 3, 4):
+        pairs = None if support is None else _neighbours(support, axis)
+        each.append(mean_where(error.diff(dim=axis).square(), pairs))
+    return torch.stack(each).mean()
+
+
+def mean_where(values: Float[Tensor, "*n"], where: Bool[Tensor, "*n"] | None) -> Float[Tensor, ""]:
+    """The mean of the values that count; zero where none does."""
+    if where is None:
+        return values.mean()
+    where = where.expand_as(values)
+    return (values * where).sum() / where.sum().clamp_min(1)
+
+
+def _neighbours(support: Bool[Tensor, "b 1 d h w"], axis: int) -> Tensor:
+    count = support.shape[axis] - 1
+    return support.narrow(axis, 0, count) & support.narrow(axis, 1, count)
 
 
 class ReconstructionLoss(nn.Module):
     """Error of the volume, of each camera's own volume, and of what each predicts for the others.
+
+    Where a model works on a support, the means of the volumes' errors are over its voxels: all others are 0 by
+    definition, and nothing could be learnt there. The figures of merit see the whole grid.
 
     Args:
         data_range: value range of the volumes, in their unit.
@@ -43,14 +66,20 @@ class ReconstructionLoss(nn.Module):
         """Each term unweighted, and their weighted sum as "total"."""
         truth, views = batch["volume"] / self.data_range, batch["views"]
         volume = out.volume / self.data_range
-        terms = {"volume": F.mse_loss(volume, truth)}
+        terms = {"volume": mean_where((volume - truth).square(), out.support)}
         if self.weights["edges"]:
-            terms["edges"] = edge_difference(volume, truth)
+            terms["edges"] = edge_difference(volume, truth, out.support)
         if out.opinions is not None and out.visible is not None and self.weights["opinions"]:
-            error = (out.opinions / self.data_range - truth[:, None]).square() * out.visible
-            terms["opinions"] = error.mean() / out.visible.float().mean()
+            error = (out.opinions / self.data_range - truth[:, None]).square()
+            terms["opinions"] = self._opinions(error, out.visible, out.support)
         if out.cross_views is not None and self.weights["cross_view"]:
             power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
             terms["cross_view"] = (out.cross_views - views).square().mean() / power
         total = sum(self.weights[name] * value for name, value in terms.items())
         return {**terms, "total": torch.as_tensor(total)}
+
+    @staticmethod
+    def _opinions(error: Tensor, visible: Tensor, support: Tensor | None) -> Float[Tensor, ""]:
+        if support is None:
+            return (error * visible).mean() / visible.float().mean()
+        return mean_where(error, visible & support[:, None])

@@ -9,8 +9,10 @@ from typing import Any
 
 import lightning.pytorch as L
 import torch
+from jaxtyping import Bool, Float
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
+from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.engine.export import save_png
 from mvrecon.engine.record import versions
@@ -100,9 +102,13 @@ class BoardReview(L.Callback):
     def on_validation_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
     ) -> None:
-        """Keep the first batch and its reconstruction."""
+        """Log the support's share of the grid; keep the first batch and its reconstruction."""
+        out = outputs["out"]
+        if out.support is not None:
+            share = out.support.float().mean()
+            pl_module.log("val/support_fraction", share, on_epoch=True, batch_size=len(out.volume))
         if batch_idx == 0 and not trainer.sanity_checking:
-            self._shown = batch, outputs["out"]
+            self._shown = batch, out
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Draw, at every `every`-th validation."""
@@ -132,9 +138,10 @@ class BoardReview(L.Callback):
         truth, top, spacing = batch["volume"][case, 0], module.hparams["data_range"], module.projector.grid.spacing
         volumes = {module.hparams["model"]["name"]: out.volume[case, 0]}
         volumes |= {name: v[case, 0] for name, v in self._baselines(module, batch["views"]).items()}
+        support = {} if out.support is None else {"support": outlined(truth, out.support[case, 0], top)}
         predicted = module.projector(out.volume[case][None])[0, 0]
         shown = {
-            "planes": montage.planes(truth, volumes, top, spacing),
+            "planes": montage.planes(truth, volumes | support, top, spacing),
             "mip": montage.projections(truth, volumes, top, spacing),
             "views": montage.views(batch["views"][case, 0], predicted),
         }
@@ -149,6 +156,13 @@ class BoardReview(L.Callback):
             models = {name: MODELS.build(name, projector=module.projector).to(views.device) for name in self.baselines}
             self._fixed = {name: model(views).volume for name, model in models.items()}
         return self._fixed
+
+
+def outlined(volume: Float[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], value: float) -> Float[Tensor, "d h w"]:
+    """A volume with the outermost voxels of a mask set to a value; the grid's faces count as outside."""
+    outside = pad((~mask).to(volume.dtype)[None, None], [1] * 6, value=1.0)
+    rim = mask & (max_pool3d(outside, 3, stride=1)[0, 0] > 0)
+    return torch.where(rim, value, volume)
 
 
 def _boards(trainer: L.Trainer) -> list[Any]:

@@ -7,9 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, content_scale
+from mvrecon.models.consistency import Consistency, content_scale, normalised
 from mvrecon.models.model import CrossView
 from mvrecon.models.output import Reconstruction
+from mvrecon.models.regions import Regions
+from mvrecon.models.skip import Skip
 from mvrecon.models.unet3d import UNet3d
 from mvrecon.projectors.base import Projector, check_views
 from mvrecon.reconstruct.iterative import sirt
@@ -19,7 +21,10 @@ class MeanFusion(CrossView):
     """The mean of the M cameras' networks, as first proposed: no weighting, no refinement.
 
     Args:
-        projector, head, opinion, start, consistency: as in `CrossView`.
+        projector, head, opinion, start, consistency, skip: as in `CrossView`.
+
+    Raises:
+        ValueError: `refine_where`, since nothing is refined.
     """
 
     def __init__(
@@ -29,8 +34,12 @@ class MeanFusion(CrossView):
         opinion: Mapping[str, Any] | None = None,
         start: int = 12,
         consistency: int = 3,
+        **skip: Any,
     ):
-        super().__init__(projector, head, opinion, fusion="mean", refine=0, start=start, consistency=consistency)
+        super().__init__(
+            projector, head, opinion, fusion="mean", refine=0, start=start, consistency=consistency, **skip
+        )
+        _refuse_where(self.skip)
 
 
 class BackprojectionUNet(nn.Module):
@@ -41,19 +50,34 @@ class BackprojectionUNet(nn.Module):
         width: channels of the finest level.
         start: SIRT iterations of the classical start.
         consistency: learned gradient steps towards the data at the end.
+        skip: options of `Skip` (support, masked, ...): what is left out; nothing by default.
+
+    Raises:
+        ValueError: `refine_where`, since no opinions could disagree.
     """
 
-    def __init__(self, projector: Projector, width: int = 18, start: int = 12, consistency: int = 3):
+    def __init__(self, projector: Projector, width: int = 18, start: int = 12, consistency: int = 3, **skip: Any):
         super().__init__()
-        self.projector = projector
+        self.skip = Skip.of(skip)
+        _refuse_where(self.skip)
+        self.regions = Regions(projector, self.skip)
         self.iterations = start
         self.net = UNet3d(3, 1, width, zero=True)
-        self.consistency = Consistency(projector, consistency)
+        self.consistency = Consistency(consistency)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        y, x0, scale = self.consistency.normalised(views, self.iterations)
-        seen = torch.cat([x0, self.consistency.back(y), self.consistency.residual(x0, y)], dim=1)
-        return Reconstruction(volume=self.consistency(x0 + self.net(seen), y) * scale)
+        region = self.regions(views)
+        y, x0, scale = normalised(region, views, self.iterations)
+        seen = torch.cat([x0, region.back(y), region.residual(x0, y)], dim=1)
+        volume = x0 + region.within(self.net(seen, region.net_mask, region.bricks))
+        sigma = None if self.skip.sigma is None else self.skip.sigma / scale
+        volume = self.consistency(region, volume, y, sigma) * scale
+        return Reconstruction(volume=region.pasted(volume), support=region.support)
+
+
+def _refuse_where(skip: Skip) -> None:
+    if skip.refine_where != "all":
+        raise ValueError(f"refine_where={skip.refine_where!r} needs opinions and their refinement, as in 'cross_view'")
 
 
 class GeometryFree(nn.Module):
@@ -107,8 +131,7 @@ class Backprojection(nn.Module):
 
     def __init__(self, projector: Projector):
         super().__init__()
-        self.consistency = Consistency(projector, 0)
+        self.regions = Regions(projector, Skip())
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        check_views(views, self.consistency.projector.cameras)
-        return Reconstruction(volume=self.consistency.back(views))
+        return Reconstruction(volume=self.regions(views).back(views))

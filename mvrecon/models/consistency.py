@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.projectors.base import Projector, check_views
-from mvrecon.reconstruct.iterative import correction, sirt, sirt_weights
+from mvrecon.models.region import Region
+from mvrecon.reconstruct.iterative import sirt
 
 
 class Consistency(nn.Module):
@@ -15,55 +15,48 @@ class Consistency(nn.Module):
     every rig. The steps' lengths are learned, as in ItNet (Genzel et al. 2022).
 
     Args:
-        projector: A.
         steps: how many; none leaves the volume as it is.
     """
 
-    row: Tensor
-    column: Tensor
-
-    def __init__(self, projector: Projector, steps: int):
+    def __init__(self, steps: int):
         super().__init__()
-        self.projector = projector
-        row, column = sirt_weights(projector)
-        self.register_buffer("row", row, persistent=False)
-        self.register_buffer("column", column, persistent=False)
         self.lengths = nn.Parameter(torch.ones(steps))
 
-    def start(self, views: Float[Tensor, "b 1 m v u"], iterations: int) -> Float[Tensor, "b 1 d h w"]:
-        """The classical start: SIRT with momentum from zero, non-negative, not differentiated."""
-        with torch.no_grad():
-            return sirt(self.projector, views, iterations, weights=(self.row, self.column), momentum=True)
-
-    def normalised(
-        self, views: Float[Tensor, "b 1 m v u"], iterations: int
-    ) -> tuple[Float[Tensor, "b 1 m v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
-        """Checked views and their classical start, both divided by the content's scale, and that scale.
-
-        Raises:
-            ValueError: views whose shape, device or values do not fit.
-        """
-        check_views(views, self.projector.cameras)
-        start = self.start(views, iterations)
-        scale = content_scale(start)
-        return views / scale, start / scale, scale
-
-    def residual(
-        self, volume: Float[Tensor, "b c d h w"], views: Float[Tensor, "b c m v u"]
-    ) -> Float[Tensor, "b c d h w"]:
-        """How each voxel should change for the views to be met: C A^T R (y - A x), in the unit of x."""
-        return self.back(views - self.projector(volume))
-
-    def back(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
-        """Residual views as a correction of the volume, C A^T R r."""
-        return correction(self.projector, residual, (self.row, self.column))
-
     def forward(
-        self, volume: Float[Tensor, "b 1 d h w"], views: Float[Tensor, "b 1 m v u"]
+        self,
+        region: Region,
+        volume: Float[Tensor, "b 1 d h w"],
+        views: Float[Tensor, "b 1 m v u"],
+        sigma: Float[Tensor, "b 1 1 1 1"] | None = None,
     ) -> Float[Tensor, "b 1 d h w"]:
+        """The volume after the steps.
+
+        With `sigma`, the noise of the views in their unit, a sample takes no further step once chi^2 per measurement,
+        the mean of ((y - A x) / sigma)^2, is at most 1. In training every sample takes every step.
+        """
         for length in self.lengths:
-            volume = volume + length * self.residual(volume, views)
+            wrong = views - region.A(volume)
+            if sigma is None or self.training:
+                volume = volume + length * region.back(wrong)
+                continue
+            unmet = (wrong / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
+            if not unmet.any():
+                break
+            volume = volume + length * unmet * region.back(wrong)
         return volume
+
+
+def normalised(
+    region: Region, views: Float[Tensor, "b 1 m v u"], iterations: int
+) -> tuple[Float[Tensor, "b 1 m v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
+    """Views and their classical start, both divided by the content's scale, and that scale.
+
+    The start is SIRT with momentum from zero, non-negative, not differentiated.
+    """
+    with torch.no_grad():
+        start = sirt(region.A, views, iterations, weights=region.weights, momentum=True)
+    scale = content_scale(start)
+    return views / scale, start / scale, scale
 
 
 def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:

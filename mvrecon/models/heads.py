@@ -2,14 +2,14 @@
 
 A head says by `keeps_views` whether its density reproduces the camera's own view exactly.
 It is called with logits [b m 1 D v u] (zero logits mean: nothing to add to the prior), the prior density of the
-same shape, the measured views and the frusta, and returns a density [b m 1 D v u] in the unit of (views / mm).
+same shape, the measured views and the frusta's bins, and returns a density [b m 1 D v u] in the unit of (views / mm).
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.lift import Frusta
+from mvrecon.models.bins import Bins
 
 #: A prior of exactly zero could never be raised by a finite logit; relative to the prior's mean along the ray.
 FLOOR = 1e-2
@@ -29,10 +29,10 @@ class SoftmaxDepth(nn.Module):
         logits: Float[Tensor, "b m 1 D v u"],
         prior: Float[Tensor, "b m 1 D v u"],
         views: Float[Tensor, "b 1 m v u"],
-        frusta: Frusta,
+        frusta: Bins,
     ) -> Float[Tensor, "b m 1 D v u"]:
         prior = prior.clamp_min(0) * frusta.occupied
-        level = prior.sum(dim=3, keepdim=True) / frusta.occupied.sum(dim=2, keepdim=True).clamp_min(1)
+        level = prior.sum(dim=3, keepdim=True) / frusta.occupied.sum(dim=-3, keepdim=True).clamp_min(1)
         relative = prior / level.clamp_min(torch.finfo(prior.dtype).tiny)
         # Finite, not -inf: a ray with no bin in the region must not turn into NaN.
         masked = torch.where(frusta.occupied, logits + (relative + FLOOR).log(), -1e4)
@@ -50,7 +50,7 @@ class Density(nn.Module):
         logits: Float[Tensor, "b m 1 D v u"],
         prior: Float[Tensor, "b m 1 D v u"],
         views: Float[Tensor, "b 1 m v u"],
-        frusta: Frusta,
+        frusta: Bins,
     ) -> Float[Tensor, "b m 1 D v u"]:
         lifted = frusta.spread(views)
         scale = lifted.abs().mean(dim=(1, 2, 3, 4, 5), keepdim=True).clamp_min(torch.finfo(prior.dtype).tiny)

@@ -5,7 +5,7 @@ divides by the step conserves every ray's integral exactly. A warp is one trilin
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
@@ -16,9 +16,13 @@ from mvrecon.geometry.lattice import grid_lattice, lattice_maps
 from mvrecon.geometry.sample import inside
 from mvrecon.kernels.warps.reference import normalised_places
 from mvrecon.kernels.warps.warp import warp
+from mvrecon.models.bins import Bins
+
+#: Of a voxel: a smaller share is a rounding error, of a bin and a voxel at equal places.
+TOUCH = 1e-5
 
 
-class Frusta(nn.Module):
+class Frusta(Bins, nn.Module):
     """The frusta of M cameras over one grid, cut tightly to its box.
 
     Args:
@@ -36,20 +40,27 @@ class Frusta(nn.Module):
 
     def __init__(self, grid: Grid, cameras: Cameras, depth: int, spacing: Spacing = "z"):
         super().__init__()
-        self.grid_shape, self.shape = grid.shape, (depth, *cameras.shape)
         edges = depth_edges(cameras.depth_range(grid), depth, spacing)
-        world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges, spacing)
-        of_voxels, of_bins = lattice_maps(frusta, world), lattice_maps(world, frusta)
+        self._place(grid, cameras, edges, spacing)
+        ahead = frusta_lattice(cameras, grid, edges, spacing).ahead[:, None, :, None, None]
+        held = inside(normalised_places(self.world_from_frusta, grid.shape, self.shape)).transpose(0, 1)
+        visible = inside(normalised_places(self.frusta_from_world, self.shape, grid.shape))
         start, end = cameras.rays()
         per_mm = (end - start).norm(dim=-1) / cameras.distance[:, None, None]  # mm of ray per mm of depth
         step = (edges[:, 1:] - edges[:, :-1]).abs()[:, :, None, None] * per_mm[:, None]
-        self.register_buffer("frusta_from_world", of_voxels, persistent=False)
-        self.register_buffer("world_from_frusta", of_bins, persistent=False)
-        self.register_buffer("visible", inside(normalised_places(of_voxels, self.shape, grid.shape)), persistent=False)
-        held = inside(normalised_places(of_bins, grid.shape, self.shape)).transpose(0, 1)
-        ahead = frusta.ahead[:, None, :, None, None]
-        self.register_buffer("occupied", held & ahead, persistent=False)
-        self.register_buffer("step", step[:, None].float(), persistent=False)
+        self._hold(visible, held & ahead, step[:, None].float())
+
+    def _place(self, grid: Grid, cameras: Cameras, edges: Float[Tensor, "m e"], spacing: Spacing) -> None:
+        self.grid_shape, self.shape = grid.shape, (edges.shape[1] - 1, *cameras.shape)
+        self.spacing: Spacing = spacing
+        world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges, spacing)
+        self.register_buffer("frusta_from_world", lattice_maps(frusta, world), persistent=False)
+        self.register_buffer("world_from_frusta", lattice_maps(world, frusta), persistent=False)
+
+    def _hold(self, visible: Tensor, occupied: Tensor, step: Tensor) -> None:
+        self.register_buffer("visible", visible, persistent=False)
+        self.register_buffer("occupied", occupied, persistent=False)
+        self.register_buffer("step", step, persistent=False)
 
     def _apply(self, fn, recurse: bool = True):
         exact = self.frusta_from_world, self.world_from_frusta
@@ -57,19 +68,13 @@ class Frusta(nn.Module):
         self.frusta_from_world, self.world_from_frusta = (maps.to(self.step.device) for maps in exact)
         return self
 
-    def spread(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b m c D v u"]:
-        """Uniform lift: each pixel's integral spread evenly along its ray's chord of the grid's box."""
-        share = self.occupied / self.chord.clamp_min(torch.finfo(views.dtype).tiny)
-        return views.transpose(1, 2)[:, :, :, None] * share
+    def part_of(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:
+        """The pixels that the frusta have: all."""
+        return views
 
-    @property
-    def chord(self) -> Float[Tensor, "m 1 1 v u"]:
-        """Length in mm of each ray inside the grid's box, as the frustum's bins see it."""
-        return (self.occupied * self.step).sum(dim=2, keepdim=True)
-
-    def integrate(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b c m v u"]:
-        """Each camera's own view of its own frustum: the sum along every ray, exactly."""
-        return (frusta * self.step).sum(dim=3).transpose(1, 2)
+    def ramp(self, like: Tensor) -> Float[Tensor, "*m D 1 1"]:
+        """The bins' depth, from -1 to 1."""
+        return torch.linspace(-1, 1, self.shape[0], device=like.device, dtype=like.dtype)[:, None, None]
 
     def to_world(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
         """Each frustum's density at the voxels of the grid; zero where the camera does not see."""
@@ -80,3 +85,12 @@ class Frusta(nn.Module):
         if volumes.shape[1] == 1:
             return warp(volumes, self.world_from_frusta, self.shape)[:, 0]
         return warp(volumes, self.world_from_frusta.transpose(0, 1), self.shape)[:, :, 0]
+
+    def touched(self, mask: Bool[Tensor, "b 1 d h w"]) -> Bool[Tensor, "b m 1 D v u"]:
+        """Every bin that reads a voxel of the mask, or that one reads: none that holds a part of it is left out."""
+        with torch.inference_mode(False), torch.enable_grad():
+            volume = mask.to(self.step.dtype, copy=True)[:, None]
+            m = len(self.step)
+            bins = self.step.new_zeros(len(mask), m, 1, *self.shape, requires_grad=True)
+            (read,) = torch.autograd.grad(self.to_world(bins), bins, volume.expand(-1, m, -1, -1, -1, -1))
+        return (self.to_frusta(volume) > TOUCH) | (read > TOUCH)

@@ -8,16 +8,24 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
 
-from mvrecon.models.consistency import Consistency
+from mvrecon.models.consistency import Consistency, normalised
 from mvrecon.models.cross_view import pooled
+from mvrecon.models.geometry import MULTIPLE
 from mvrecon.models.opinion import Opinions
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.unet3d import UNet3d
+from mvrecon.models.region import Region
+from mvrecon.models.regions import Regions
+from mvrecon.models.skip import Skip
+from mvrecon.models.unet3d import UNet3d, on_its_box
 from mvrecon.models.weighting import Weighting, fuse
 from mvrecon.projectors.base import Projector
+
+#: Edge in voxels of the bricks that the refinement looks at or not; crops keep them in place.
+BRICK = MULTIPLE
 
 
 class CrossView(nn.Module):
@@ -32,8 +40,10 @@ class CrossView(nn.Module):
             no camera holds.
         start: SIRT iterations of the classical start.
         consistency: learned gradient steps towards the data at the end.
+        skip: options of `Skip` (support, masked, ...): what is left out; nothing by default.
 
     Raises:
+        TypeError: an option that there is not.
         ValueError: an unknown fusion; views whose shape, device or values do not fit (at the call).
     """
 
@@ -46,57 +56,74 @@ class CrossView(nn.Module):
         refine: int = 16,
         start: int = 12,
         consistency: int = 3,
+        **skip: Any,
     ):
         super().__init__()
         if fusion not in ("weighted", "mean"):
             raise ValueError(f"fusion must be 'weighted' or 'mean', got {fusion!r}")
-        self.projector = projector
+        self.skip = Skip.of(skip)
         self.iterations = start
         self.opinions = Opinions(projector, head, **(opinion or {}))
+        self.regions = Regions(projector, self.skip, self.opinions.binning)
         self.weighting = Weighting(5) if fusion == "weighted" else None
         self.refine = UNet3d(5 + self.opinions.features, 1, refine, zero=True) if refine else None
-        self.consistency = Consistency(projector, consistency)
+        self.consistency = Consistency(consistency)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        y, x0, scale = self.consistency.normalised(views, self.iterations)
-        opinions, features = self.opinions(y, x0, y - self.projector(x0))
-        visible = self.opinions.fine.visible
-        cross_views = self.cross(opinions)
+        region = self.regions(views)
+        y, x0, scale = normalised(region, views, self.iterations)
+        opinions, features = self.opinions(region, y, x0, y - region.A(x0))
+        cross_views = region.A(opinions[:, :, 0])  # every camera's opinion as every camera would have seen it
         logits = torch.zeros_like(opinions)
         if self.weighting is not None:
-            logits = self.weighting(self._compare(opinions, x0, y, cross_views))
-        volume, weights = fuse(opinions, logits, visible)
+            seen = self._compare(region, opinions, x0, y - cross_views)
+            logits = self.weighting(seen, region.net_mask, region.bricks)
+        volume, weights = fuse(opinions, logits, region.seen())
         if self.refine is not None:
-            volume = volume + self.refine(self._evidence(volume, opinions, features, weights, x0, y))
-        volume = self.consistency(volume, y)
+            volume = volume + self._correction(region, volume, (opinions, features, weights), x0, y)
+        volume = self.consistency(region, volume, y, None if self.skip.sigma is None else self.skip.sigma / scale)
         return Reconstruction(
-            volume=volume * scale,
-            opinions=opinions * scale[:, None],
-            visible=visible,
-            weights=weights,
+            volume=region.pasted(volume * scale),
+            opinions=region.pasted(opinions * scale[:, None]),
+            visible=self.regions.whole.fine.visible,
+            weights=region.pasted(weights),
             cross_views=cross_views * scale,
+            support=region.support,
         )
 
-    def cross(self, opinions: Float[Tensor, "b m 1 d h w"]) -> Float[Tensor, "b m n v u"]:
-        """Every camera's opinion as every camera would have seen it."""
-        return self.projector(opinions.flatten(0, 1)).squeeze(1).unflatten(0, opinions.shape[:2])
-
-    def _compare(self, opinions: Tensor, x0: Tensor, y: Tensor, cross_views: Tensor) -> Float[Tensor, "b m 5 d h w"]:
+    def _compare(self, region: Region, opinions: Tensor, x0: Tensor, wrong: Tensor) -> Float[Tensor, "b m 5 d h w"]:
         """What the weighting sees: own opinion, pooled mean and spread, own disagreement with the views, the start."""
-        mean, variance = pooled(opinions, self.opinions.fine.visible)
+        mean, variance = pooled(opinions, region.geometry.fine.visible)
         with torch.no_grad():  # a hint for the weights; its gradient costs more than it teaches
-            wrong = self.consistency.back((y - cross_views).flatten(0, 1)[:, None]).reshape(opinions.shape)
+            wrong = region.back(wrong)[:, :, None]
         shared = torch.cat([mean, _root(variance), x0[:, None]], dim=2).expand(-1, opinions.shape[1], -1, -1, -1, -1)
         return torch.cat([opinions, wrong, shared], dim=2)
 
-    def _evidence(
-        self, fused: Tensor, opinions: Tensor, features: Tensor, weights: Tensor, x0: Tensor, y: Tensor
-    ) -> Float[Tensor, "b c d h w"]:
-        """What the refinement sees: the fused volume, its residual, the spread, the start, the cameras' features."""
-        mean, variance = pooled(opinions, self.opinions.fine.visible)
-        wrong = self.consistency.residual(fused, y)
-        said = (weights * features).sum(dim=1)
-        return torch.cat([fused, wrong, mean[:, 0], _root(variance)[:, 0], x0, said], dim=1)
+    def _correction(
+        self, region: Region, fused: Tensor, said: tuple[Tensor, Tensor, Tensor], x0: Tensor, y: Tensor
+    ) -> Float[Tensor, "b 1 d h w"]:
+        """What the refinement adds where it looks, from the fused volume, its residual, the cameras' mean, spread and
+        features, and the start; `said` are opinions, features and weights."""
+        assert self.refine is not None
+        opinions, features, weights = said
+        mean, variance = pooled(opinions, region.geometry.fine.visible)
+        wrong, heard = region.residual(fused, y), (weights * features).sum(dim=1)
+        evidence = torch.cat([fused, wrong, mean[:, 0], _root(variance)[:, 0], x0, heard], dim=1)
+        if self.skip.refine_where == "all":
+            return region.within(self.refine(evidence, region.net_mask, region.bricks))
+        where = disagreement(variance[:, 0].sqrt(), self.skip.tolerance)
+        where = where if region.net_mask is None else where & region.net_mask
+        return region.within(on_its_box(self.refine, evidence, where, self.skip.bricks))
+
+
+def disagreement(spread: Float[Tensor, "b 1 d h w"], tolerance: float) -> Bool[Tensor, "b 1 d h w"]:
+    """Bricks of 4 voxels in which the opinions' spread passes a tolerance somewhere, and the bricks around them."""
+    with torch.no_grad():
+        bricks = (max_pool3d(spread, BRICK, ceil_mode=True) > tolerance).to(spread.dtype)
+        near = max_pool3d(bricks, 3, stride=1, padding=1) > 0
+    for axis, size in enumerate(spread.shape[2:], start=2):
+        near = near.repeat_interleave(BRICK, dim=axis).narrow(axis, 0, size)
+    return near
 
 
 def _root(variance: Tensor) -> Tensor:

@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.models.bins import Bins
 from mvrecon.models.cross_view import leave_one_out
-from mvrecon.models.lift import Frusta
+from mvrecon.models.masks import upsampled
+from mvrecon.models.region import Region
 from mvrecon.models.unet3d import UNet3d
 from mvrecon.parts import HEADS
 from mvrecon.projectors.base import Projector
@@ -45,56 +47,74 @@ class Opinions(nn.Module):
         super().__init__()
         if prior not in ("learned", "uniform"):
             raise ValueError(f"depth prior must be 'learned' or 'uniform', got {prior!r}")
-        grid, cameras = projector.grid, projector.cameras
-        depth = max(grid.shape)
-        self.fine = Frusta(grid, cameras, depth)
-        self.coarse = Frusta(grid, cameras.binned(binning), depth // 2)
+        self.binning = binning
         self.head = HEADS.from_config(head)
         self.learned = prior == "learned"
         self.features = features if self.learned else 0
         if self.learned:
             self.pixels = nn.Conv2d(2, width, binning, stride=binning)
-            nets = [UNet3d(width + 6, 1 + features, width) for _ in range(1 if shared else len(cameras))]
+            nets = [UNet3d(width + 6, 1 + features, width) for _ in range(1 if shared else len(projector.cameras))]
             for net in nets:
                 nn.init.zeros_(net.last.weight[:1])  # start from the prior
             self.nets = nn.ModuleList(nets)
 
     def forward(
-        self, views: Float[Tensor, "b 1 m v u"], start: Float[Tensor, "b 1 d h w"], residual: Float[Tensor, "b 1 m v u"]
+        self,
+        region: Region,
+        views: Float[Tensor, "b 1 m v u"],
+        start: Float[Tensor, "b 1 d h w"],
+        residual: Float[Tensor, "b 1 m v u"],
     ) -> tuple[Float[Tensor, "b m 1 d h w"], Float[Tensor, "b m f d h w"]]:
         """Opinions and features in the world.
 
         Args:
+            region: where in the world.
             views: measured.
             start: a classical reconstruction.
             residual: measured less the re-projected start.
         """
-        prior = self.fine.to_frusta(start[:, None])
+        frusta, (fine, coarse) = region.geometry.fine, region.bins()
+        seen = frusta.part_of(views)
+        prior = frusta.to_frusta(start[:, None])
         if not self.learned:
-            density = self.head(torch.zeros_like(prior), torch.ones_like(prior), views, self.fine)
-            opinions = self.fine.to_world(density)
+            density = self.head(torch.zeros_like(prior), torch.ones_like(prior), seen, fine)
+            opinions = region.within(frusta.to_world(density))
             return opinions, opinions[:, :, :0]
-        answer = self._listen(views, start, residual)  # [b m 1+f D v u], coarse
-        logits = nn.functional.interpolate(answer[:, :, :1].flatten(0, 1), size=self.fine.shape, mode="trilinear")
-        density = self.head(logits.unflatten(0, answer.shape[:2]), prior, views, self.fine)
+        answer = self._listen(region, coarse, torch.stack([seen, frusta.part_of(residual)], dim=3), start)
+        density = self.head(_refined(answer[:, :, :1], region, coarse, fine), prior, seen, fine)
         # The change is carried to the world, not the density: what the start holds already is not blurred by two warps.
-        change = self.fine.to_world(density - prior * self.fine.occupied)
-        return start[:, None] + change, self.coarse.to_world(answer[:, :, 1:])
+        change = frusta.to_world(density - prior * fine.occupied)
+        features = region.geometry.coarse.to_world(answer[:, :, 1:])
+        return start[:, None] + region.within(change), region.within(features)
 
-    def _listen(self, views: Tensor, start: Tensor, residual: Tensor) -> Float[Tensor, "b m f D v u"]:
-        b, _, m = views.shape[:3]
-        pixels = self.pixels(torch.stack([views, residual], dim=3).flatten(0, 2))  # [b*m c v u]
-        pixels = pixels[:, :, None].expand(-1, -1, self.coarse.shape[0], -1, -1).unflatten(0, (b, m))
-        binned = nn.functional.avg_pool2d(views.flatten(0, 1), self.pixels.kernel_size).unflatten(0, (b, 1))
-        lifted = self.coarse.spread(binned)
-        world = self.coarse.to_world(lifted)
-        mean, variance, _ = leave_one_out(world, self.coarse.visible)
+    def _listen(self, region: Region, bins: Bins, pixels: Tensor, start: Tensor) -> Float[Tensor, "b m f D v u"]:
+        """The networks' answers in the coarse frusta, from the pixels [b 1 m 2 v u] of views and residuals."""
+        coarse, (b, m) = region.geometry.coarse, (len(pixels), pixels.shape[2])
+        binned = nn.functional.avg_pool2d(pixels[:, :, :, 0].flatten(0, 1), self.pixels.kernel_size).unflatten(
+            0, (b, 1)
+        )
+        pixels = self.pixels(pixels.flatten(0, 2))  # [b*m c v u]
+        pixels = pixels[:, :, None].expand(-1, -1, coarse.shape[0], -1, -1).unflatten(0, (b, m))
+        lifted = bins.spread(binned)
+        world = region.within(coarse.to_world(lifted))
+        mean, variance, _ = leave_one_out(world, coarse.visible)
         ours = start[:, None].expand(-1, m, -1, -1, -1, -1)
-        others = self.coarse.to_frusta(torch.cat([mean, variance.sqrt(), ours], dim=2))
-        where = self.coarse.occupied.expand(b, -1, -1, -1, -1, -1).to(views.dtype)
-        ramp = torch.linspace(-1, 1, where.shape[3], device=views.device, dtype=views.dtype)
-        depth = where * ramp[:, None, None]
-        inputs = torch.cat([pixels, lifted, others, where, depth], dim=2)
+        others = coarse.to_frusta(torch.cat([mean, variance.sqrt(), ours], dim=2))
+        where = bins.occupied.expand(b, -1, -1, -1, -1, -1).to(pixels.dtype)
+        inputs = torch.cat([pixels, lifted, others, where, where * coarse.ramp(where)], dim=2)
+        mask = bins.occupied if region.seen_by_nets else None
         if len(self.nets) == 1:
-            return self.nets[0](inputs.flatten(0, 1)).unflatten(0, (b, m))
-        return torch.stack([net(inputs[:, k]) for k, net in enumerate(self.nets)], dim=1)
+            mask = None if mask is None else mask.flatten(0, 1)
+            return self.nets[0](inputs.flatten(0, 1), mask, region.bricks).unflatten(0, (b, m))
+        each = [None if mask is None else mask[:, k] for k in range(m)]
+        answers = [net(inputs[:, k], each[k], region.bricks) for k, net in enumerate(self.nets)]
+        return torch.stack(answers, dim=1)
+
+
+def _refined(logits: Tensor, region: Region, coarse: Bins, fine: Bins) -> Float[Tensor, "b m 1 D v u"]:
+    """Logits of coarse bins at the fine ones; by a mask's definition, from its bins alone."""
+    flat, size = logits.flatten(0, 1), region.geometry.fine.shape
+    if region.seen_by_nets:
+        held, onto = (bins.occupied.flatten(0, 1).to(flat.dtype) for bins in (coarse, fine))
+        return upsampled(flat, held, onto, size).unflatten(0, logits.shape[:2])
+    return nn.functional.interpolate(flat, size=size, mode="trilinear").unflatten(0, logits.shape[:2])

@@ -16,6 +16,7 @@ class Reconstruction:
         visible: which voxels each camera's frustum holds.
         weights: how much each camera counts at each voxel; they sum to one over the cameras that see it.
         cross_views: opinion m projected into camera n, in the unit of the views.
+        support: where the volume may differ from zero; none for everywhere.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -23,3 +24,4 @@ class Reconstruction:
     visible: Bool[Tensor, "m 1 d h w"] | None = None
     weights: Float[Tensor, "b m 1 d h w"] | None = None
     cross_views: Float[Tensor, "b m n v u"] | None = None
+    support: Bool[Tensor, "b 1 d h w"] | None = None

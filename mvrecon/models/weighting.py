@@ -1,9 +1,10 @@
 """Fusion: how much each camera's opinion counts at each voxel."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from mvrecon.models.masks import pooled, upsampled
 from mvrecon.models.unet3d import UNet3d
 
 
@@ -34,8 +35,22 @@ class Weighting(nn.Module):
         super().__init__()
         self.net = UNet3d(inputs, 1, width, levels=2, zero=True)
 
-    def forward(self, features: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m 1 d h w"]:
+    def forward(
+        self,
+        features: Float[Tensor, "b m c d h w"],
+        mask: Bool[Tensor, "b 1 d h w"] | None = None,
+        bricks: str = "never",
+    ) -> Float[Tensor, "b m 1 d h w"]:
+        """Logits; with a mask, from its voxels alone and zero outside it."""
         b, m = features.shape[:2]
+        if mask is not None:
+            return self._masked(features.flatten(0, 1), mask.repeat_interleave(m, dim=0), bricks).unflatten(0, (b, m))
         coarse = nn.functional.avg_pool3d(features.flatten(0, 1), 2, ceil_mode=True)
         logits = nn.functional.interpolate(self.net(coarse), size=features.shape[-3:], mode="trilinear")
         return logits.unflatten(0, (b, m))
+
+    def _masked(self, features: Tensor, mask: Tensor, bricks: str) -> Tensor:
+        fine = mask.to(features.dtype)
+        coarse, held = pooled(features * fine, fine)
+        logits = self.net(coarse, held > 0, bricks)
+        return upsampled(logits, held, fine, [2 * n for n in held.shape[2:]])

@@ -91,7 +91,7 @@ def reach_of(method):
 
 @scalar
 def shortened(across, begin, end, from_, to):
-    """The part of a ray between the faces across its far and near axis, and what bounds it; across: see `transverse`."""
+    """The part of a ray between the faces across its far and near axis, and what bounds it; across as `transverse`."""
     (value_b, slope_b, half_b), (value_c, slope_c, half_c) = across
     far_lower, far_upper = transverse(value_b, slope_b, -half_b, half_b, begin, end)
     lower, upper = transverse(value_c, slope_c, -half_c, half_c, far_lower, far_upper)
@@ -125,22 +125,20 @@ def trace(line, axis, near, pixel, space, method):
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
     from_, to = OWN if begin > -half else FACE, OWN if end < half else FACE
     if method == TRILINEAR:  # its samples are spaced along its way through the whole volume
-        across = (value_b, slope_b, space.sizes[far] / 2.0 + reach), (value_c, slope_c, space.sizes[near] / 2.0 + reach)
+        across = (value_b, slope_b, space.sizes[far] / 2 + reach), (value_c, slope_c, space.sizes[near] / 2 + reach)
         begin, end, from_, to = shortened(across, begin, end, from_, to)
     # a slab counts where it overlaps the ray
     slack, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5 if method == SIDDON else 1.0)
-    low, high = faces(space, far, reach)
-    enter, leave = transverse(value_b, slope_b, low, high, begin - slack, end + slack)
-    low, high = faces(space, near, reach)
-    enter, leave = transverse(value_c, slope_c, low, high, enter, leave)
+    enter, leave = transverse(value_b, slope_b, *faces(space, far, reach), begin - slack, end + slack)
+    enter, leave = transverse(value_c, slope_c, *faces(space, near, reach), enter, leave)
     centre, first, last = (space.sizes[axis] - 1) / 2.0, 0, 0
     if begin < end and enter <= leave:
         first = max(space.box[axis], int(ceil(enter + centre - margin)))
         last = min(space.box[3 + axis], int(floor(leave + centre + margin)) + 1)
     b0, c0 = value_b + (space.sizes[far] - 1) / 2.0 + 1, value_c + (space.sizes[near] - 1) / 2.0 + 1
-    length = slab_length(line, axis, u, v)
     return Ray(
-        axis, far, near, b0, slope_b, c0, slope_c, length, begin, end, from_, to, enter, leave, first, last, centre
+        *(axis, far, near, b0, slope_b, c0, slope_c, slab_length(line, axis, u, v)),
+        *(begin, end, from_, to, enter, leave, first, last, centre),
     )
 
 

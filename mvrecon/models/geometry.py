@@ -1,0 +1,115 @@
+"""What depends on the grid and the rig alone: the operator, the cameras' frusta, the weights of SIRT.
+
+It is made once for the grid, and once for every crop of it that a scene needs.
+"""
+
+import inspect
+
+import torch
+from torch import Tensor, nn
+
+from mvrecon.geometry.box import Box
+from mvrecon.models.cropped import CroppedFrusta
+from mvrecon.models.lift import Frusta
+from mvrecon.models.window import window_of
+from mvrecon.projectors.base import Projector
+from mvrecon.reconstruct.iterative import sirt_weights
+
+#: Coarse bins, along each axis, that the coarsest level of the depth U-Net joins into one.
+MULTIPLE = 4
+
+
+class Geometry(nn.Module):
+    """A projector, the fine and the coarse frusta of its cameras, and SIRT's inverse row and column sums.
+
+    Args:
+        projector: A.
+        weights: (R, C) of A.
+        frusta: (fine, coarse), where a model has cameras' opinions.
+    """
+
+    row: Tensor
+    column: Tensor
+
+    def __init__(
+        self, projector: Projector, weights: tuple[Tensor, Tensor], frusta: tuple[Frusta, Frusta] | None = None
+    ):
+        super().__init__()
+        self.projector = projector
+        self.register_buffer("row", weights[0], persistent=False)
+        self.register_buffer("column", weights[1], persistent=False)
+        self.frusta = None if frusta is None else nn.ModuleList(frusta)
+
+    @property
+    def fine(self) -> Frusta:
+        """Frusta of the detectors' own pixels."""
+        return self._frusta(0)
+
+    @property
+    def coarse(self) -> Frusta:
+        """Frusta of binned pixels and bins twice as deep."""
+        return self._frusta(1)
+
+    def _frusta(self, which: int) -> Frusta:
+        found = None if self.frusta is None else self.frusta[which]
+        if not isinstance(found, Frusta):
+            raise ValueError("This geometry was made without frusta")
+        return found
+
+
+def whole_geometry(projector: Projector, binning: int | None = None) -> Geometry:
+    """The geometry of a projector's own grid, with frusta of pixels binned by `binning`."""
+    if binning is None:
+        return Geometry(projector, sirt_weights(projector))
+    grid, cameras = projector.grid, projector.cameras
+    depth = max(grid.shape)
+    frusta = Frusta(grid, cameras, depth), Frusta(grid, cameras.binned(binning), depth // 2)
+    return Geometry(projector, sirt_weights(projector), frusta)
+
+
+def cropped_geometry(whole: Geometry, box: Box) -> Geometry:
+    """The same for the voxels in a box: what is equal to them is taken over, the rest made for them alone."""
+    projector = cropped_projector(whole.projector, box)
+    weights = whole.row, whole.column[..., *box.slices]
+    if whole.frusta is None:
+        return Geometry(projector, weights)
+    fine, coarse = whole.fine, whole.coarse
+    grid, cameras, binning = whole.projector.grid, projector.cameras, fine.shape[1] // coarse.shape[1]
+    binned = cameras.binned(binning)
+    window = window_of(projector.grid, grid, binned, coarse.shape[0], MULTIPLE)
+    finer = window.scaled(2, binning)
+    if fine.shape[0] % 2:  # coarse bins are no pairs of fine ones: both keep all of them
+        window, finer = window.deep(coarse.shape[0]), finer.deep(fine.shape[0])
+    frusta = (
+        CroppedFrusta(fine, grid, cameras, box, finer),
+        CroppedFrusta(coarse, grid, binned, box, window),
+    )
+    return Geometry(projector, weights, frusta).to(fine.step.device)
+
+
+def cropped_projector(A: Projector, box: Box) -> Projector:
+    """The projector with the same options for the voxels in a box; a support is cropped with it.
+
+    Raises:
+        TypeError: a projector that does not keep its options as attributes of the same names.
+    """
+    names: set[str] = set()
+    for kind in type(A).__mro__:
+        if "__init__" in vars(kind):
+            parameters = inspect.signature(kind).parameters.values()
+            names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
+            if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+                break
+    names -= {"grid", "cameras"}
+    if lost := sorted(name for name in names if not hasattr(A, name)):
+        raise TypeError(f"{type(A).__name__} cannot be made for a crop: it does not keep its {', '.join(lost)}")
+    options = {name: getattr(A, name) for name in names}
+    if isinstance(options.get("support"), Tensor):
+        options["support"] = options["support"][box.slices]
+    return type(A)(grid=A.grid.cropped(box), cameras=A.rays, **options).to(A.lines.device)
+
+
+def crop_of(whole: Geometry, box: Box) -> Geometry:
+    """`cropped_geometry` that training may use although evaluation asked for it first."""
+    with torch.inference_mode(False), torch.no_grad():
+        return cropped_geometry(whole, box)

@@ -1,0 +1,66 @@
+"""What a model may leave out: the options that its skipping is told by, checked once."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+from mvrecon.registry import hint
+from mvrecon.support.support import KINDS
+
+Bricks = Literal["auto", "always", "never"]
+
+
+@dataclass(frozen=True)
+class Skip:
+    """Which work is skipped. All of it is off by default.
+
+    Args:
+        support: where the density may differ from zero, told from the views: the visual "hull", its "box", "auto" for
+            the hull of a sample if its box is small and else everything, or "none" to ask for nothing. Work is done on
+            a crop around it, and outside it the density is 0 by definition.
+        noise: of the views, as `support_from_views` wants it; none for exact views.
+        halo: voxels around the support's box that the crop holds, at least 1. With `masked` they change nothing.
+        masked: the support belongs to the networks too: features are zero and normalisation does not look outside it.
+        bricks: masked convolutions at active bricks alone: "never", "always", or "auto" where that was measured to pay.
+        sigma: standard deviation of the views' noise, in their unit; the consistency steps stop where it explains what
+            is left. None: every step.
+        refine_where: "all" of the support, or bricks of "disagreement" between the opinions.
+        tolerance: the opinions' standard deviation, relative to the content's scale, from which on they disagree.
+
+    Raises:
+        ValueError: an unknown choice, a halo below 1, a sigma or a tolerance that is not positive.
+    """
+
+    support: str = "none"
+    noise: Mapping[str, Any] | None = None
+    halo: int = 4
+    masked: bool = True
+    bricks: Bricks = "never"
+    sigma: float | None = None
+    refine_where: Literal["all", "disagreement"] = "all"
+    tolerance: float = 0.1
+
+    def __post_init__(self) -> None:
+        known = {"support": KINDS, "bricks": ("auto", "always", "never"), "refine_where": ("all", "disagreement")}
+        for name, choices in known.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
+        if self.halo < 1:
+            raise ValueError(f"A crop needs a halo of at least one voxel, got {self.halo}")
+        for name in ("sigma", "tolerance"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> "Skip":
+        """From a model's options.
+
+        Raises:
+            TypeError: an option that no model has; the message names the nearest.
+        """
+        known = {field.name for field in fields(cls)}
+        for option in options:
+            if option not in known:
+                raise TypeError(f"The model has no option {option!r}{hint(option, known)}")
+        return cls(**options)

@@ -1,0 +1,126 @@
+"""A masked network does not depend on the empty space around its mask, nor on how its convolutions are done."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from mvrecon.models.blocks import ALONE, ConvBlock, convolution
+from mvrecon.models.bricks import EDGE, active_bricks, brick_convolution
+from mvrecon.models.unet3d import UNet3d, on_its_box
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
+
+
+def _net(dtype: torch.dtype = torch.float32) -> UNet3d:
+    torch.manual_seed(0)
+    net = UNet3d(3, 2, 4).to(dtype)
+    for parameter in net.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    return net
+
+
+def _blob(shape: tuple[int, int, int] = (12, 16, 12)) -> torch.Tensor:
+    """Two different masks that reach the faces of their box."""
+    torch.manual_seed(1)
+    mask = F.max_pool3d((torch.rand(2, 1, *shape) > 0.97).double(), 3, stride=1, padding=1) > 0
+    assert mask[..., 0, :, :].any() and mask[..., -1].any() and not mask.all()
+    return mask
+
+
+def _close(a: torch.Tensor, b: torch.Tensor, tolerance: float) -> bool:
+    return bool(b.abs().max() > 0.1) and bool((a - b).abs().max() <= tolerance * b.abs().max())
+
+
+@pytest.mark.parametrize("dtype", list(TOLERANCE))
+def test_empty_space_around_the_mask_changes_nothing(dtype):
+    net, mask = _net(dtype), _blob()
+    x = torch.randn(2, 3, *mask.shape[2:], dtype=dtype)
+    alone = net(x, mask)
+    for before, behind in ((4, 0), (4, 8), (8, 3)):  # 2^(levels - 1) = 4; behind, any number
+        wide = [before, behind] * 3
+        larger = net(F.pad(x, wide, value=7.0), F.pad(mask, wide))
+        inner = larger[:, :, *(slice(before, before + n) for n in mask.shape[2:])]
+        assert _close(inner, alone, TOLERANCE[dtype])
+        assert not (alone * ~mask).any() and torch.count_nonzero(larger) == torch.count_nonzero(inner)
+
+
+def test_a_shift_that_moves_coarse_voxels_does_change_it():
+    net, mask = _net(), _blob()
+    x = torch.randn(2, 3, *mask.shape[2:])
+    moved = net(F.pad(x, [1] * 6), F.pad(mask, [1] * 6))[:, :, 1:-1, 1:-1, 1:-1]
+    assert not _close(moved, net(x, mask), 1e-3)
+
+
+def test_a_batch_is_its_samples():
+    net, mask = _net(), _blob()
+    x = torch.randn(2, 3, *mask.shape[2:])
+    single = torch.cat([net(x[i : i + 1], mask[i : i + 1]) for i in range(2)])
+    assert _close(net(x, mask), single, 1e-5)
+
+
+def test_a_mask_of_ones_is_no_mask():
+    net, x = _net(), torch.randn(2, 3, 12, 8, 16)
+    assert _close(net(x, torch.ones(2, 1, 12, 8, 16, dtype=torch.bool)), net(x), 1e-5)
+
+
+def test_the_least_box_is_as_good_as_everything():
+    net, mask = _net(), F.pad(_blob((7, 6, 5)), [5, 9, 6, 4, 3, 8])
+    x = torch.randn(2, 3, *mask.shape[2:])
+    assert _close(on_its_box(net, x, mask), net(x, mask), 1e-5)
+    assert not on_its_box(net, x, torch.zeros_like(mask)).any()
+
+
+def test_bricks_are_the_dense_masked_network_with_its_gradients():
+    net, mask = _net(), F.pad(_blob((9, 8, 7)), [0, 17, 4, 4, 10, 5])
+    x = torch.randn(2, 3, *mask.shape[2:])
+    found = []
+    for how in ("never", "always"):
+        net.zero_grad()
+        given = x.clone().requires_grad_()
+        out = net(given, mask, how)
+        out.square().mean().backward()
+        found.append([out, given.grad, *(p.grad for p in net.parameters())])
+    for bricks, dense in zip(found[1], found[0], strict=True):
+        assert dense.any() and (bricks - dense).abs().max() <= 1e-5 * dense.abs().max()
+
+
+def test_a_convolution_by_bricks_is_exact_in_them_and_zero_elsewhere():
+    torch.manual_seed(0)
+    x, weight = torch.randn(2, 3, 11, 17, 8), torch.randn(5, 3, 3, 3, 3)
+    mask = torch.zeros(2, 1, 11, 17, 8)
+    mask[0, 0, 9, 16, 3] = mask[1, 0, 0, 0, 0] = 1
+    bricks = active_bricks(mask, "always")
+    assert bricks is not None and bricks.tolist() == [[0, 1, 2, 0], [1, 0, 0, 0]]
+    expected = torch.zeros(2, 5, 11, 17, 8)
+    dense = F.conv3d(x, weight, padding=1)
+    expected[0, :, EDGE:, 2 * EDGE :] = dense[0, :, EDGE:, 2 * EDGE :]
+    expected[1, :, :EDGE, :EDGE] = dense[1, :, :EDGE, :EDGE]
+    assert torch.allclose(brick_convolution(x, weight, bricks), expected, atol=1e-5)
+
+
+def test_bricks_are_chosen_where_few_are_active_and_nothing_is_learnt():
+    mask = torch.zeros(1, 1, 32, 32, 32)
+    mask[..., :8, :8, :8] = 1
+    with torch.no_grad():
+        assert active_bricks(mask, "auto") is not None and active_bricks(mask, "never") is None
+        assert active_bricks(torch.ones_like(mask), "auto") is None
+    assert active_bricks(mask, "auto") is None
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 9, 5, 6), (1, 3, 2, 4, 4), (1, 3, 1, 4, 4), (2, 3, 6, 6, 6)])
+def test_a_small_volume_alone_is_convolved_as_any_other(shape):
+    torch.manual_seed(0)
+    x, weight = torch.randn(shape, dtype=torch.float64, requires_grad=True), torch.randn(4, 3, 3, 3, 3).double()
+    assert shape[1] * shape[2] * shape[3] <= ALONE
+    assert torch.allclose(convolution(x, weight), F.conv3d(x, weight, padding=1), atol=1e-12)
+    (found,), (dense,) = (
+        torch.autograd.grad(f.square().sum(), x) for f in (convolution(x, weight), F.conv3d(x, weight, padding=1))
+    )
+    assert torch.allclose(found, dense, atol=1e-10)
+
+
+def test_without_a_mask_a_block_is_its_layers():
+    torch.manual_seed(0)
+    block, x = ConvBlock(3, 4), torch.randn(1, 3, 8, 8, 8)
+    first = block.first(x)
+    assert torch.equal(block(x), first + block.second(first))

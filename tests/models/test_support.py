@@ -1,0 +1,330 @@
+"""Models that work on a support: what it may change, what it must not, and what it saves."""
+
+import pytest
+import torch
+from torch.nn.functional import max_pool3d
+
+from mvrecon.geometry.box import Box
+from mvrecon.losses import ReconstructionLoss
+from mvrecon.models import regions
+from mvrecon.models.geometry import cropped_geometry, cropped_projector, whole_geometry
+from mvrecon.models.model import disagreement
+from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
+from mvrecon.support.support import Support
+from tests.models.rig import small_rig
+
+HEAD = {"name": "softmax_depth"}
+MODEL_OPTIONS = {
+    "cross_view": {"head": HEAD, "opinion": {"width": 4}, "refine": 4, "start": 3, "consistency": 1},
+    "mean_fusion": {"head": HEAD, "opinion": {"width": 4}, "start": 3, "consistency": 1},
+    "backprojection_unet": {"width": 4, "start": 3, "consistency": 1},
+}
+NAMES = list(MODEL_OPTIONS)
+FIELDS = ("volume", "opinions", "weights", "cross_views")
+
+
+@pytest.fixture(scope="module")
+def projector():
+    grid, cameras = small_rig(size=24, pixels=36)
+    return PROJECTORS.build("drr", grid=grid, cameras=cameras)
+
+
+@pytest.fixture(scope="module")
+def scenes(projector):
+    """Two objects in different corners of the middle, their views, and masks a voxel wider."""
+    torch.manual_seed(1)
+    volume = torch.zeros(2, 1, 24, 24, 24)
+    volume[0, 0, 9:12, 7:11, 9:13] = 1 + torch.rand(3, 4, 4)
+    volume[1, 0, 11:14, 12:15, 8:11] = 1 + torch.rand(3, 3, 3)
+    return volume, projector(volume), max_pool3d((volume > 0).float(), 3, stride=1, padding=1) > 0
+
+
+def _build(name: str, projector: torch.nn.Module, dtype: torch.dtype = torch.float32, **options) -> torch.nn.Module:
+    torch.manual_seed(0)
+    model = MODELS.build(name, projector, **{**MODEL_OPTIONS[name], **options}).to(dtype)
+    torch.manual_seed(2)
+    for parameter in model.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    return model.eval()
+
+
+def _with_mask(monkeypatch, mask: torch.Tensor) -> None:
+    """As if the views told this mask."""
+    found = Support(Box.around(mask), mask, "hull", float(mask.float().mean()))
+    monkeypatch.setattr(regions, "support_from_views", lambda *_args, **_options: found)
+
+
+def _close(a: torch.Tensor, b: torch.Tensor, relative: float) -> bool:
+    return bool(b.any()) and bool((a - b).abs().max() <= relative * b.abs().max())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_the_crop_does_not_matter_to_a_masked_model(name, dtype, projector, scenes, monkeypatch):
+    _, views, mask = scenes
+    _with_mask(monkeypatch, mask)
+    models = [_build(name, projector, dtype, support="hull", halo=halo) for halo in (1, 5, 24)]
+    found = [model(views.to(dtype)) for model in models]
+    shapes = [next(iter(model.regions.crops.values())).projector.grid.shape for model in models]
+    assert len(set(shapes)) == 3 and shapes[-1] == (24, 24, 24)
+    for other in found[1:]:
+        for field in FIELDS:
+            one, two = getattr(found[0], field), getattr(other, field)
+            assert (one is None and two is None) or _close(two, one, 1e-5 if dtype == torch.float32 else 1e-10)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_a_sample_does_not_depend_on_the_others_of_its_batch(name, projector, scenes, monkeypatch):
+    _, views, mask = scenes
+    model, single = _build(name, projector, support="hull"), []
+    for i in range(2):
+        _with_mask(monkeypatch, mask[i : i + 1])
+        single.append(model(views[i : i + 1]).volume)
+    _with_mask(monkeypatch, mask)
+    assert _close(model(views).volume, torch.cat(single), 1e-5)
+
+
+@pytest.mark.parametrize("masked", [True, False])
+@torch.no_grad()
+def test_everything_returned_has_the_grid_and_is_zero_outside(masked, projector, scenes, monkeypatch):
+    volume, views, mask = scenes
+    _with_mask(monkeypatch, mask)
+    out = _build("cross_view", projector, support="hull", masked=masked)(views)
+    assert torch.equal(out.support, mask) and out.visible.shape == (4, 1, 24, 24, 24)
+    assert out.volume.shape == volume.shape and not (out.volume * ~mask).any() and out.volume.any()
+    for field in (out.opinions, out.weights):
+        assert field.shape == (2, 4, 1, 24, 24, 24) and not (field * ~mask[:, None]).any()
+    seen = (out.visible & mask[:, None]).any(dim=1)
+    assert torch.allclose(out.weights.sum(dim=1), seen.float(), atol=1e-6)
+
+
+@torch.no_grad()
+def test_cross_views_are_the_projected_opinions(projector, scenes, monkeypatch):
+    _, views, mask = scenes
+    _with_mask(monkeypatch, mask)
+    out = _build("cross_view", projector, support="hull")(views)
+    assert _close(out.cross_views[:, 1], projector(out.opinions[:, 1])[:, 0], 1e-4)
+
+
+@pytest.mark.parametrize("kind", ["hull", "box", "auto"])
+@torch.no_grad()
+def test_the_support_of_real_views_holds_the_object(kind, projector, scenes):
+    volume, views, _ = scenes
+    out = _build("cross_view", projector, support=kind)(views)
+    assert not (volume * ~out.support).any() and not out.support.all()
+    if kind == "box":
+        assert all(mask.sum() == Box.around(mask).size for mask in out.support)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_views_of_nothing_give_nothing(name, projector):
+    out = _build(name, projector, support="hull")(torch.zeros(2, 1, 4, 36, 36))
+    assert out.volume.shape == (2, 1, 24, 24, 24) and not out.volume.any() and not out.support.any()
+
+
+@torch.no_grad()
+def test_an_empty_scene_in_a_batch_leaves_the_other_alone(projector, scenes):
+    _, views, _ = scenes
+    model = _build("cross_view", projector, support="hull")
+    both = model(torch.cat([views[:1], torch.zeros_like(views[:1])])).volume
+    assert not both[1].any() and _close(both[:1], model(views[:1]).volume, 1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_are_the_same_with_and_without(name, projector):
+    off, on = _build(name, projector), _build(name, projector, support="hull", bricks="always")
+    on.load_state_dict(off.state_dict())
+    assert not any("crops" in key or "whole" in key for key in off.state_dict())
+
+
+@torch.no_grad()
+def test_a_support_of_everything_is_no_support_in_the_world(projector, scenes, monkeypatch):
+    _, views, mask = scenes
+    _with_mask(monkeypatch, torch.ones_like(mask))
+    models = [_build("backprojection_unet", projector, torch.float64, support=kind) for kind in ("hull", "none")]
+    on, off = (model(views.double()) for model in models)
+    assert off.support is None and _close(on.volume, off.volume, 1e-6)  # as exact as R, which is kept in float32
+
+
+def test_auto_takes_everything_where_the_hull_holds_most_of_it():
+    hull = torch.zeros(1, 1, 10, 10, 10, dtype=torch.bool)
+    hull[..., 1:7, :, 0] = hull[..., 1, :, 9] = True
+    assert torch.equal(regions.worked_on(hull, "auto"), hull)
+    hull[..., 8, 5, 5] = True  # now its box holds 0.8 of the voxels
+    assert regions.worked_on(hull, "auto").all() and torch.equal(regions.worked_on(hull, "hull"), hull)
+
+
+def test_every_parameter_learns_on_a_support_met_first_in_evaluation(projector, scenes, monkeypatch):
+    volume, views, mask = scenes
+    _with_mask(monkeypatch, mask)
+    model = _build("cross_view", projector, support="hull")
+    with torch.inference_mode():
+        model(views)
+    out = model.train()(views)
+    ReconstructionLoss(1.0, edges=0.1)(out, {"volume": volume, "views": views})["total"].backward()
+    assert not [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
+    assert len(model.regions.crops) == 1
+
+
+@torch.no_grad()
+def test_few_crops_are_kept_and_made_once(projector, monkeypatch):
+    found = regions.Regions(projector, regions.Skip(support="hull"))
+    monkeypatch.setattr(regions, "KEPT", 2)
+    boxes = [Box((0, 0, 0), (n, 8, 8)) for n in (4, 8, 12)]
+    first = found.crop(boxes[0])
+    assert found.crop(boxes[0]) is first
+    found.crop(boxes[1])
+    found.crop(boxes[0])
+    found.crop(boxes[2])
+    assert [key[0] for key in found.crops] == [boxes[0], boxes[2]]
+
+
+def test_a_crop_is_the_operator_on_it(projector):
+    box = Box((4, 8, 12), (16, 20, 24))
+    x = torch.rand(1, 1, *box.shape)
+    whole = torch.zeros(1, 1, 24, 24, 24)
+    whole[..., *box.slices] = x
+    crop = cropped_projector(projector, box)
+    assert _close(crop(x), projector(whole), 1e-5)
+    views = torch.rand(1, 1, 4, 36, 36)
+    assert _close(crop.T(views), projector.T(views)[..., *box.slices], 1e-5)
+    geometry = cropped_geometry(whole_geometry(projector, 3), box)
+    columns = projector.T(torch.ones(1, 1, 4, 36, 36))[..., *box.slices]
+    assert torch.allclose(geometry.column * columns, torch.ones_like(columns), atol=1e-4)
+
+
+@pytest.mark.parametrize("rig", ["circular", "dome", "parallel"])
+def test_the_windows_of_a_crop_hold_all_that_its_inner_voxels_read(rig):
+    grid, cameras = small_rig(size=24, pixels=36)
+    detector = {"pixels": [36, 36], "pixel_mm": 1.0}
+    if rig == "dome":
+        cameras = CAMERAS.build("dome", views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector)
+    if rig == "parallel":
+        cameras = CAMERAS.build("parallel", views=3, detector=detector)
+    A = PROJECTORS.build("radon" if rig == "parallel" else "drr", grid=grid, cameras=cameras)
+    whole, box = whole_geometry(A, 3), Box((8, 4, 12), (16, 12, 20))
+    crop, inner = cropped_geometry(whole, box), (..., *[slice(1, -1)] * 3)
+    mask = torch.zeros(1, 1, *grid.shape, dtype=torch.bool)
+    mask[..., *box.slices][inner] = True
+    smaller = 0
+    for full, part in ((whole.fine, crop.fine), (whole.coarse, crop.coarse)):
+        values = torch.rand(1, len(cameras), 1, *full.shape)
+        index = [part.window.first[:, k, None] + torch.arange(n) for k, n in enumerate(part.shape)]
+        z, v, u = index[0][:, :, None, None], index[1][:, None, :, None], index[2][:, None, None, :]
+        m = torch.arange(len(cameras))[:, None, None, None]
+        cut = values[0, m, 0, z, v, u][None, :, None]
+        assert _close(part.to_world(cut)[inner], full.to_world(values)[..., *box.slices][inner], 1e-5)
+        touched = full.touched(mask)[0, m, 0, z, v, u][None, :, None]
+        assert torch.equal(part.touched(mask[..., *box.slices]), touched)
+        assert touched.sum() == full.touched(mask).sum(), "touched bins were cut off"
+        assert torch.equal(part.occupied[:, 0], full.occupied[m, 0, z, v, u])
+        smaller += part.shape != full.shape
+    assert smaller == 2
+
+
+def test_touched_bins_are_those_that_hold_part_of_the_mask_and_no_others(projector):
+    """A mask in frusta and back again loses no voxel of what was there, and is zero a bin and a voxel away from it."""
+    fine = whole_geometry(projector, 3).fine
+    mask = torch.zeros(1, 1, 24, 24, 24, dtype=torch.bool)
+    mask[..., 11, 12, 13] = True
+    touched = fine.touched(mask)
+    held = fine.to_world(touched.float())
+    assert torch.allclose(held[..., 11, 12, 13], torch.ones(1, 4, 1), atol=1e-5)
+    far = torch.ones_like(mask)
+    far[..., 8:15, 9:16, 10:17] = False
+    assert not (held * far[:, None]).any() and touched.sum() < 4 * 100
+
+
+@torch.no_grad()
+def test_bricks_change_nothing(projector, scenes, monkeypatch):
+    _, views, mask = scenes
+    _with_mask(monkeypatch, mask)
+    options = {"support": "hull", "halo": 24}
+    found = [_build("cross_view", projector, bricks=how, **options)(views).volume for how in ("never", "always")]
+    assert _close(found[1], found[0], 1e-5)
+
+
+def test_disagreement_is_bricks_and_those_around_them():
+    spread = torch.zeros(2, 1, 16, 16, 18)
+    spread[0, 0, 9, 1, 17] = 0.2
+    near = disagreement(spread, 0.1)
+    expected = torch.zeros(2, 1, 16, 16, 18, dtype=torch.bool)
+    expected[0, 0, 4:16, 0:8, 12:18] = True
+    assert torch.equal(near, expected) and not disagreement(spread, 0.3).any()
+
+
+#: A tolerance that the opinions' spread passes in some bricks and not in others.
+MIDDLE = {"none": 0.3, "hull": 0.1}
+
+
+@pytest.mark.parametrize("support", ["none", "hull"])
+@torch.no_grad()
+def test_refinement_where_opinions_disagree(support, projector, scenes, monkeypatch):
+    _, views, mask = scenes
+    _with_mask(monkeypatch, mask)
+    options = {"support": support, "consistency": 0}
+    plain = _build("cross_view", projector, refine=0, **options)
+    volumes = {}
+    for tolerance in (1e-9, MIDDLE[support], 1e9):
+        model = _build("cross_view", projector, refine_where="disagreement", tolerance=tolerance, **options)
+        plain.load_state_dict(model.state_dict(), strict=False)
+        volumes[tolerance] = model(views).volume
+    unrefined = plain(views).volume
+    changed = {key: (volume != unrefined).float().mean().item() for key, volume in volumes.items()}
+    assert torch.equal(volumes[1e9], unrefined) and 0 < changed[MIDDLE[support]] <= changed[1e-9]
+    assert support == "hull" or changed[MIDDLE[support]] < changed[1e-9]
+
+
+@torch.no_grad()
+def test_steps_stop_for_each_sample_where_noise_explains_what_is_left(projector, scenes):
+    volume, views, _ = scenes
+    model = _build("backprojection_unet", projector, consistency=3)
+    region = model.regions(views)
+    start = torch.cat([volume[:1] * 1.001, volume[1:] * 0.5])
+    sigma = 0.01 * views.square().mean().sqrt().expand(2, 1, 1, 1, 1)
+    after = model.consistency(region, start, views, sigma)
+    assert torch.equal(after[0], start[0]) and not torch.equal(after[1], start[1])
+    assert torch.equal(model.consistency(region, start, views, sigma / 1e6), model.consistency(region, start, views))
+    always = model.train().consistency(region, start, views, sigma)
+    assert torch.equal(always, model.consistency(region, start, views))
+
+
+def test_losses_count_what_is_in_the_support(projector, scenes, monkeypatch):
+    volume, views, mask = scenes
+    _with_mask(monkeypatch, mask)
+    with torch.no_grad():
+        out = _build("cross_view", projector, support="hull")(views)
+    loss = ReconstructionLoss(1.0, edges=1.0)
+    terms = loss(out, {"volume": volume, "views": views})
+    error = (out.volume - volume)[mask]
+    assert terms["volume"].item() == pytest.approx(error.square().mean().item(), rel=1e-4)
+    outside = loss(out, {"volume": volume + 5.0 * ~mask, "views": views})
+    assert all(torch.equal(outside[name], terms[name]) for name in ("volume", "edges", "opinions"))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"support": "hulk"}, "support must be one of"),
+        ({"bricks": "some"}, "bricks must be one of"),
+        ({"halo": 0}, "halo of at least one"),
+        ({"sigma": 0.0}, "sigma must be positive"),
+    ],
+)
+def test_unknown_choices_are_refused(options, said, projector):
+    with pytest.raises(ValueError, match=said):
+        _build("backprojection_unet", projector, **options)
+
+
+def test_a_mistyped_option_is_named_with_the_nearest(projector):
+    with pytest.raises(TypeError, match="no option 'suport'; did you mean 'support'"):
+        _build("cross_view", projector, suport="hull")
+
+
+def test_a_model_that_refines_nothing_refuses_to_choose_where(projector):
+    for name in ("mean_fusion", "backprojection_unet"):
+        with pytest.raises(ValueError, match="refine_where"):
+            _build(name, projector, refine_where="disagreement")
