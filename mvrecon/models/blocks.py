@@ -35,16 +35,15 @@ class ConvBlock(nn.Module):
     def forward(
         self, x: Float[Tensor, "n i d h w"], mask: Mask | None = None, bricks: Int[Tensor, "k 4"] | None = None
     ) -> Float[Tensor, "n o d h w"]:
-        if mask is None:
-            x = self.first(x)
-            return x + self.second(x)
-        x = _masked(self.first, x, mask, bricks)
-        return x + _masked(self.second, x, mask, bricks)
+        x = _step(self.first, x, mask, bricks)
+        return x + _step(self.second, x, mask, bricks)
 
 
-def _masked(steps: nn.Sequential, x: Tensor, mask: Mask, bricks: Tensor | None) -> Tensor:
+def _step(steps: nn.Sequential, x: Tensor, mask: Mask | None, bricks: Tensor | None) -> Tensor:
     conv, norm = cast(nn.Conv3d, steps[0]), cast(nn.GroupNorm, steps[1])
     x = convolution(x, conv.weight) if bricks is None else brick_convolution(x, conv.weight, bricks)
+    if mask is None:
+        return F.silu(norm(x))
     return F.silu(group_norm(x, mask, norm.num_groups, (norm.weight, norm.bias), norm.eps))
 
 

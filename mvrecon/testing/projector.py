@@ -9,6 +9,7 @@ from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.base import Projector
 
 #: Relative to |A x| |y|.
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
@@ -19,8 +20,9 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
 
     Views and volumes of the right shape; A.T the transpose of A in float32 and float64; linear, nothing from nothing;
     volumes of a batch seen each alone, twice the same to the last bit; moving the object is un-moving the cameras;
-    gradients in volume and pose that differences confirm (on a small grid and rig in a generic pose; `gradients=False`
-    leaves them out), that in the volume being the adjoint, and second ones in volume and views.
+    with a support M it is A diag(M), and diag(M) A^T its transpose; gradients in volume and pose that differences
+    confirm (on a small grid and rig in a generic pose; `gradients=False` leaves them out), that in the volume being
+    the adjoint, and second ones in volume and views.
     """
     torch.manual_seed(seed)
     A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)
@@ -39,6 +41,7 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
         assert not A(torch.zeros_like(x)).any(), "views of nothing"
         assert torch.equal(A(x), views) and torch.equal(A.T(y), volume), "not the same twice"
         assert _close(A(x[1:]), views[1:], tolerance), "a volume's views depend on the others of its batch"
+    _check_support(A)
     _check_motion(name, grid, cameras, **options)
     if gradients:
         _check_gradients(name, grid, cameras, **options)
@@ -50,6 +53,16 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 def _close(a: Tensor, b: Tensor, tolerance: float) -> bool:
     return bool((a - b).norm() <= tolerance * b.norm())
+
+
+def _check_support(A: Projector) -> None:
+    """A support is part of the operator and of its adjoint."""
+    M = torch.rand(A.grid.shape) < 0.3
+    masked, x = A.with_support(M), torch.randn(1, 1, *A.grid.shape, dtype=torch.float64)
+    views = A(x * M)
+    y = torch.randn_like(views)
+    assert _close(masked(x), views, 1e-12), "with a support M it is not A diag(M)"
+    assert _close(masked.T(y), A.T(y) * M, 1e-12), "with a support M its adjoint is not diag(M) A^T"
 
 
 def _check_motion(name: str, grid: Grid, cameras: Cameras, **options) -> None:
