@@ -47,7 +47,7 @@ def told(code: Tensor | None, asked: str, shape: Sequence[int]) -> Skipped:
     elif asked in ("box", "brick"):
         why = f"{asked!r} was asked for"
     else:
-        why = "it is small work, or the volume is full" if whole else "too few of the box's bricks are empty"
+        why = "it is small work, or the volume is full" if whole else "bricks are full, or too small work to count them"
     return Skipped(mode, held.box, why, fractions)
 
 

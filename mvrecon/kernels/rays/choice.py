@@ -17,8 +17,8 @@ from mvrecon.kernels.rays.scan import box_of, bricks_of, empty_share, readable
 from mvrecon.kernels.rays.shadow import spans_of
 from mvrecon.kernels.rays.trace import main_axis, trace
 
-#: Slabs of all rays below which it costs more to look at a volume than to go through it.
-LITTLE = 2**21
+#: Slabs of all rays from which on it is worth while to look for a volume's box, and for its bricks.
+SOME, MUCH = 2**21, 2**25
 #: Rays on which work is counted.
 RAYS = 1024
 #: What a ray costs before its first slab, and what it costs to ask for one layer of bricks, in slabs.
@@ -50,10 +50,10 @@ def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
     """
     values = readable(volumes)
     shape = Box.whole(values.shape[1:]).high
-    if skip == "auto" and scene.slabs(shape) < LITTLE:
+    if skip == "auto" and scene.slabs(shape) < SOME:
         return Occupancy.whole(shape)
     held = Occupancy(shape, box_of(values))
-    fine = "trilinear" not in scene.method and held.box.size > 0
+    fine = "trilinear" not in scene.method and held.box.size > 0 and (skip != "auto" or scene.slabs(shape) >= MUCH)
     if skip == "box" or not fine or (skip != "brick" and empty_share(values, held.box) < WORTH):
         return held
     bricked = Occupancy(shape, held.box, bricks_of(values, held.box))

@@ -8,6 +8,7 @@ from torch import Tensor
 from mvrecon.geometry.box import Box, three
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.occupancy import EDGE, brick_shape
+from mvrecon.kernels.threads import share
 
 #: Bricks along an axis that are looked at to guess how many are empty.
 SOME = 6
@@ -22,23 +23,31 @@ def readable(volumes: Tensor) -> np.ndarray:
 def box_of(volumes: np.ndarray) -> Box:
     """The least box with every voxel of volumes [n d h w] that is not zero; NaN is not.
 
-    It comes from outside, so that a full volume costs next to nothing.
+    It comes from outside, from both sides at once, so that a full volume costs next to nothing.
     """
     low, high = np.zeros(3, np.int64), np.array(volumes.shape[1:], np.int64)
-    shrink(volumes, low, high)
+    for axis in range(3):
+        ends = np.zeros(2, np.int64)
+
+        def find(first: int, last: int, axis: int = axis, ends: np.ndarray = ends) -> None:
+            for side in range(first, last):
+                ends[side] = inward(volumes, axis, side, low, high)
+
+        share(find, 2, volumes.size)
+        low[axis], high[axis] = ends
+        if low[axis] >= high[axis]:
+            return Box((0, 0, 0), (0, 0, 0))
     return Box(three(low), three(high))
 
 
 @compiled
-def shrink(volumes, low, high):
-    """Move the bounds [3] of a box inwards until every face of it holds something."""
-    for axis in range(3):
-        while low[axis] < high[axis] and not _face_holds(volumes, axis, low[axis], low, high):
-            low[axis] += 1
-        while low[axis] < high[axis] and not _face_holds(volumes, axis, high[axis] - 1, low, high):
-            high[axis] -= 1
-    if low[0] == high[0]:
-        low[:], high[:] = 0, 0
+def inward(volumes, axis, side, low, high):
+    """The bound of a box along an axis, moved inwards until its face holds something; side 0: the lower one."""
+    for step in range(high[axis] - low[axis]):
+        place = high[axis] - 1 - step if side else low[axis] + step
+        if _face_holds(volumes, axis, place, low, high):
+            return place + side
+    return low[axis] if side else high[axis]
 
 
 @compiled
