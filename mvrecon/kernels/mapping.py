@@ -34,3 +34,15 @@ def looped(operator: Callable[..., Tensor], tensors: int) -> Mapped:
         return torch.stack([operator(*one, *inputs[tensors:]) for one in zip(*each, strict=True)]), 0
 
     return mapped
+
+
+def joined(operator: Callable[..., Tensor]) -> Callable[..., tuple[Tensor, None]]:
+    """How `torch.func.vmap` maps what is asked of all volumes at once, for the first of the geometries."""
+
+    def mapped(info, in_dims, values, geometry, *rest):
+        where, of_geometry = in_dims[:2]
+        every = values if where is None else values.movedim(where, 0).flatten(0, 1)
+        first = geometry if of_geometry is None else geometry.select(of_geometry, 0)
+        return operator(every, first, *rest), None
+
+    return mapped

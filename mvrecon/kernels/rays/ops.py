@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.geometry.box import Box
-from mvrecon.kernels.mapping import batched, looped
+from mvrecon.kernels.mapping import batched, joined, looped
 from mvrecon.kernels.rays.occupancy import Occupancy, code_size
 
 # numba is heavy, so the kernels are imported at their first call
@@ -177,3 +177,4 @@ lines_vjp.register_autograd(_no_second_order)
 project.register_vmap(batched(project))
 backproject.register_vmap(batched(backproject))
 lines_vjp.register_vmap(looped(lines_vjp, 3))
+occupied.register_vmap(joined(occupied))
