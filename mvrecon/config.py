@@ -4,8 +4,9 @@ Below this door everything is a plain dict of names and numbers, so that checkpo
 and no loop pays for a config object. Importing this file imports neither torch nor Lightning.
 """
 
+import ast
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -19,9 +20,13 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from mvrecon.guard import guarded
+from mvrecon.limits import shown
 from mvrecon.registry import installed, locate
 
-ALLOWED = ("lightning.pytorch", "torch.optim", "mvrecon.engine")
+#: Where the classes that a `_target_` may name are defined, and what they must be.
+ALLOWED = ("lightning.pytorch", "mvrecon.engine")
+BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.loggers.Logger")
 VERSION_BASE = "1.3"
 
 
@@ -92,12 +97,19 @@ def prepare_hydra() -> None:
 
 
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
-    """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once."""
+    """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once.
+
+    Raises:
+        PermissionError: the flag of Hydra's that unpickles a file.
+    """
     if {"-h", "--help"} & set(sys.argv[1:]):
         sys.stdout.write(help_text(config_name))
         return
+    if any(argument.startswith("--e") for argument in sys.argv[1:]):
+        raise PermissionError("--experimental-rerun unpickles a file, which can run anything; use resume=<run folder>")
     prepare_hydra()
-    hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(task)()
+    with guarded(conf_dir(), plugin_conf_dirs()):
+        hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(task)()
 
 
 def help_text(config_name: str) -> str:
@@ -125,7 +137,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
     if GlobalHydra.instance().is_initialized():
         raise RuntimeError("Hydra is in use already in this process: compose() must be called outside a Hydra app")
     prepare_hydra()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+    own = guarded(conf_dir(), plugin_conf_dirs())
+    with own, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
         return to_plain(hydra.compose(config_name, list(overrides)))
 
 
@@ -146,45 +159,75 @@ def to_plain(config: DictConfig) -> dict[str, Any]:
 def import_plugins(modules: Iterable[str]) -> None:
     """Import the modules that the setting `plugins` names; they add parts by `@REGISTRY.register`.
 
+    A setting can come from anywhere, so only a module that was written for mvrecon is imported: one whose source, read
+    and not run, imports it.
+
     Raises:
         ImportError: a module does not import; the message names it.
+        PermissionError: a module that is not a plugin.
     """
     for module in modules:
+        if not _for_mvrecon(module):
+            raise PermissionError(
+                f"The setting 'plugins' names {shown(module)}; expected a module on Python's path whose own source "
+                "imports mvrecon"
+            )
         try:
             import_module(module)
         except Exception as error:  # whatever a plugin's import raises must name the plugin
             raise ImportError(f"The plugin module {module!r} (setting 'plugins') does not import: {error}") from error
 
 
+def _for_mvrecon(module: str) -> bool:
+    if not all(part.isidentifier() for part in str(module).split(".")):
+        return False
+    spec = locate(module)
+    if spec is None or not spec.origin or not spec.origin.endswith(".py"):
+        return False
+    nodes = list(ast.walk(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))))
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom) and not node.level]
+    return any(name.split(".")[0] == "mvrecon" for name in names)
+
+
 def instantiate(node: Mapping[str, Any], **given: Any) -> Any:
-    """Build the object of another library that a node's `_target_` names.
+    """Build the callback or the logger that a node's `_target_` names, with the node's other entries as options.
 
     Raises:
-        PermissionError: the target, or one nested in it, is not defined below one of `ALLOWED`.
+        PermissionError: the target is not a class of that kind that is defined below one of `ALLOWED`, or the options
+            hold instructions of Hydra's such as another target.
     """
-    for target in _targets(node):
-        _check(target)
-    own_policy = hasattr(hydra.utils, "execution_whitelist")  # Hydra 1.4 and later
-    policy = {"_execution_whitelist_": [f"{prefix}.*" for prefix in ALLOWED]} if own_policy else {}
-    return hydra.utils.instantiate(node, _convert_="all", **given, **policy)
+    options = {key: value for key, value in node.items() if key != "_target_"}
+    if instructions := _instructions(options):
+        raise PermissionError(
+            f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain values"
+        )
+    return _allowed(str(node["_target_"]))(**options, **given)
 
 
-def _targets(node: Any) -> Iterator[str]:
+def _instructions(node: Any) -> list[str]:
     if isinstance(node, Mapping):
-        if "_target_" in node:
-            yield str(node["_target_"])
-        node = list(node.values())
-    if isinstance(node, list | tuple):
-        for child in node:
-            yield from _targets(child)
+        keys = [str(key) for key in node if str(key).startswith("_")]
+        return keys + [found for value in node.values() for found in _instructions(value)]
+    return [found for value in node for found in _instructions(value)] if isinstance(node, list | tuple) else []
 
 
-def _check(target: str) -> None:
-    """A name below an allowed module may still lead out of it (`a.b.os.system`): ask where it was defined."""
-    inside = _below(target) and _below(str(getattr(hydra.utils.get_object(target), "__module__", "")))
-    if not inside:
-        raise PermissionError(f"_target_ {target!r} is not allowed; expected something from {', '.join(ALLOWED)}")
+def _allowed(target: str) -> type:
+    """A class by its name. What it is decides, not how it is called: a name may lead out of a module (`a.b.os.system`),
+    and a function of an allowed library may call whatever it is told to."""
+    found = _found(target) if target.startswith(tuple(f"{name}." for name in ALLOWED)) else None
+    if isinstance(found, type) and issubclass(found, tuple(map(_found, BASES))):
+        if found.__module__.startswith(tuple(f"{name}." for name in ALLOWED)):
+            return found
+    raise PermissionError(
+        f"_target_ {target!r} is not allowed; expected a class from {' or '.join(ALLOWED)} derived from "
+        f"{' or '.join(BASES)}"
+    )
 
 
-def _below(name: str) -> bool:
-    return any(name.startswith(f"{prefix}.") for prefix in ALLOWED)
+def _found(target: str) -> Any:
+    module, _, name = target.rpartition(".")
+    try:
+        return getattr(import_module(module), name, None)
+    except ModuleNotFoundError:
+        return None

@@ -17,18 +17,23 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Train every method of `settings` in a run folder, go on where it was left, and return its results.
 
     The folder then holds `config.yaml`, `versions.txt`, logs, `checkpoints/`, `review/` and `results.json`.
+
+    Raises:
+        RuntimeError: another process is at work in the folder.
     """
     import_plugins(settings["plugins"])
+    from mvrecon.durable import claimed
     from mvrecon.engine import evaluation, fit, record
 
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    record.start(folder, settings)
-    data = fit.build_data(settings)
-    for method in fit.methods(settings):
-        fit.fit(method, settings, data, folder)
-    device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
-    found = evaluation.results(settings, folder, data, device)
-    record.write_results(folder, found)
+    with claimed(folder):
+        record.start(folder, settings)
+        data = fit.build_data(settings)
+        for method in fit.methods(settings):
+            fit.fit(method, settings, data, folder)
+        device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
+        found = evaluation.results(settings, folder, data, device)
+        record.write_results(folder, found)
     return found
 
 

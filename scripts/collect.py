@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mvrecon.durable import written_whole
+
 FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside", "view_nrmse")
 
 
@@ -28,12 +30,10 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="CSV file to write")
     given = parser.parse_args()
     table = rows(json.loads((given.run / "results.json").read_text(encoding="utf-8")))
-    part = given.out.with_suffix(".part")
-    with part.open("w", newline="", encoding="utf-8") as file:
+    with written_whole(given.out) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table[0].keys(), lineterminator="\n")
         writer.writeheader()
         writer.writerows(table)
-    part.replace(given.out)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from torch.utils.data import Dataset, Sampler
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import generator
+from mvrecon.scenes.analytic import generator, mixed
 from mvrecon.scenes.sample import Sample, Scene
 
 TENSORS = ("views", "volume", "inside")
@@ -61,7 +61,9 @@ class SceneDataset(Dataset[dict[str, Any]]):
         return self._ready
 
     def _made(self, item: int) -> dict[str, Any]:
-        sample: Sample = self.scene.sample(self.indices[item], self.seed, self.grid, self.cameras)
+        with torch.random.fork_rng(devices=[]):  # a scene that draws from the global numbers is a pure function, too
+            torch.default_generator.manual_seed(mixed(self.seed, self.indices[item]))
+            sample: Sample = self.scene.sample(self.indices[item], self.seed, self.grid, self.cameras)
         made = {key: getattr(sample, key) for key in TENSORS}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
@@ -75,11 +77,15 @@ class EpochOrder(Sampler[int]):
     Args:
         count: of items.
         seed: of the orders.
+
+    Attributes:
+        generator: for the loader, which seeds its worker processes from it; (seed, epoch) alone decide that, too.
     """
 
     def __init__(self, count: int, seed: int):
         self.count, self.seed = count, seed
-        self.epoch, self.resumed = 0, (0, 0)
+        self.resumed, self.generator = (0, 0), torch.Generator()
+        self.set_epoch(0)
 
     def __len__(self) -> int:
         return self.count
@@ -92,7 +98,12 @@ class EpochOrder(Sampler[int]):
     def set_epoch(self, epoch: int) -> None:
         """Which epoch the next order is for; Lightning calls it."""
         self.epoch = epoch
+        self.generator.manual_seed(mixed(self.seed, epoch))
 
     def resume(self, epoch: int, seen: int) -> None:
-        """Leave out the first `seen` items of one epoch: the run had them before it broke off."""
+        """Go on in an epoch and leave out its first `seen` items: the run had them before it broke off.
+
+        Worker processes ask for their first items before Lightning tells the epoch.
+        """
         self.resumed = (epoch, seen)
+        self.set_epoch(epoch)

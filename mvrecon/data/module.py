@@ -135,7 +135,7 @@ class SceneData(L.LightningDataModule):
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
             pin_memory=torch.cuda.is_available(),
-            generator=torch.Generator().manual_seed(self.seed),  # or every epoch would draw from the global one
+            generator=order.generator if order else torch.Generator(),  # or each epoch draws from the global one
         )
 
     def state_dict(self) -> dict[str, int]:
@@ -143,8 +143,10 @@ class SceneData(L.LightningDataModule):
         loop = self.trainer.fit_loop if self.trainer else None
         if loop is None or self._order is None:
             return {}
-        done = loop.epoch_loop.batch_progress.current.completed
-        return {"epoch": self._order.epoch, "seen": min(done * self.batch_size, len(self._order))}
+        done = int(loop.epoch_loop.batch_progress.current.processed)  # pyright: ignore[reportAttributeAccessIssue]
+        seen = done * self.batch_size
+        whole = seen >= len(self._order)  # the epoch: then the next one goes on
+        return {"epoch": self._order.epoch + whole, "seen": 0 if whole else seen}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         """Go on from a checkpoint with the cases that the broken epoch has not seen."""

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
+from mvrecon.engine.archive import check_archive, check_settings
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.record import SETTINGS
+from mvrecon.engine.storage import read
+from mvrecon.limits import blaming, plain_name
 
 
 @dataclass
@@ -26,12 +27,12 @@ class Trained:
 
 def finished(folder: Path, method: str) -> Path:
     """The checkpoint of a method whose training has ended."""
-    return folder / "checkpoints" / f"{method}.ckpt"
+    return folder / "checkpoints" / f"{plain_name(method, 'a method')}.ckpt"
 
 
 def unfinished(folder: Path, method: str) -> Path:
     """The last checkpoint of a method in training."""
-    return folder / "checkpoints" / method / "last.ckpt"
+    return folder / "checkpoints" / plain_name(method, "a method") / "last.ckpt"
 
 
 def run_folder(path: str | Path) -> Path:
@@ -50,13 +51,20 @@ def run_folder(path: str | Path) -> Path:
 
 
 def load(path: Path) -> Trained:
-    """A method from its checkpoint.
+    """A method from its checkpoint. Nothing in the file is run: it holds tensors, and the names of registered parts.
 
     Raises:
         FileNotFoundError: the method's training has not ended.
+        DamagedCheckpoint: the file is not what was written.
+        Refused: more than tensors and plain values, or not the weights of the method that it describes.
     """
     if not path.is_file():
         raise FileNotFoundError(f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it")
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    module = ReconstructionModule.load_from_checkpoint(path, map_location="cpu", weights_only=True).eval()
-    return Trained(module, state["callbacks"].get("Clock", {}).get("seconds", 0.0), state["global_step"])
+    check_archive(path)
+    with blaming(path, "cannot be read"):
+        state = read(path)
+    with blaming(path, "does not fit this version's method", "was it written by another version?"):
+        module = ReconstructionModule(**check_settings(path, state["hyper_parameters"]))
+        module.load_state_dict(state["state_dict"])
+        seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
+        return Trained(module.eval(), seconds, int(state["global_step"]))

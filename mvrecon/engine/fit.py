@@ -5,13 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
-from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import ProgressBar
 
 from mvrecon.config import instantiate
 from mvrecon.data.module import SceneData
 from mvrecon.engine.callbacks import Clock
 from mvrecon.engine.checkpoints import finished, unfinished
+from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
+from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest
+from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
@@ -54,11 +57,13 @@ def trainable(module: L.LightningModule) -> bool:
 def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     """Train one method of a run and leave `checkpoints/<method>.ckpt`, unless it is there or nothing can be learnt.
 
-    Goes on from the method's last checkpoint where there is one. Every method starts from the same seed and sees the
-    same scenes in the same order.
+    Goes on from the method's last checkpoint where there is one, and on the CPU ends with the same bits as a run that
+    never broke off. Every method starts from the same seed and sees the same scenes in the same order.
 
     Raises:
         FloatingPointError: a loss that is not finite.
+        DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
+        SystemExit: SIGTERM came; the checkpoint of that step is written.
     """
     done, last = finished(folder, method), unfinished(folder, method)
     models = methods(settings)
@@ -71,8 +76,13 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     L.seed_everything(settings["seed"], workers=True, verbose=False)  # initial weights have used up random numbers
     board = folder if method == next(iter(models)) else folder / method
     trainer = build_trainer(settings, board, last)
-    trainer.fit(module, datamodule=data, ckpt_path=str(last) if last.exists() else None, weights_only=True)
-    trainer.save_checkpoint(done)
+    begun = last.exists() or previous(last).exists()
+    for logger in trainer.loggers:
+        if isinstance(logger, Board | MetricsFile):
+            logger.rewind(read_newest(last)["global_step"] if begun else 0)
+    with remembered(last):
+        trainer.fit(module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True)
+        trainer.save_checkpoint(done)
     shutil.rmtree(last.parent, ignore_errors=True)
 
 
@@ -80,7 +90,8 @@ def build_trainer(settings: Settings, board: Path, last: Path) -> L.Trainer:
     """Lightning's trainer, its logs and pictures flat in `board`, its last checkpoint at every validation in `last`."""
     board.mkdir(parents=True, exist_ok=True)
     callbacks: list[Any] = [instantiate(node) for node in (settings["callbacks"] or {}).values() if node]
-    keep = ModelCheckpoint(last.parent, last.stem, save_top_k=1, enable_version_counter=False)
+    callbacks += [Clock(), RandomNumbers(), KeepLast(last)]
     loggers = [instantiate(node, save_dir=str(board)) for node in (settings["logger"] or {}).values() if node]
     options = {"enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks), **settings["trainer"]}
-    return L.Trainer(**options, callbacks=[*callbacks, Clock(), keep], logger=loggers, default_root_dir=board)
+    given = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board, "plugins": [DurableCheckpoints()]}
+    return L.Trainer(**options, **given)

@@ -9,6 +9,8 @@ from lightning.fabric.loggers.tensorboard import TensorBoardLogger as FabricBoar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
+from mvrecon.durable import written_whole
+
 
 class _Continuing(ExperimentWriter):
     """Goes on with a `metrics.csv` that is there already, where Lightning's own would delete it."""
@@ -17,6 +19,27 @@ class _Continuing(ExperimentWriter):
         if os.path.isfile(self.metrics_file_path):
             with open(self.metrics_file_path, newline="") as file:
                 self.metrics_keys = next(csv.reader(file), [])
+
+    def _rewrite_with_new_header(self, fieldnames: list[str]) -> None:
+        """Lightning's own loses what was there when it is killed meanwhile."""
+        with open(self.metrics_file_path, newline="") as file:
+            rows = list(csv.DictReader(file))
+        self._write(fieldnames, rows)
+
+    def rewind(self, step: int) -> None:
+        """Drop what was logged from a step on, and a last line that a kill cut off."""
+        if not os.path.isfile(self.metrics_file_path):
+            return
+        with open(self.metrics_file_path, newline="") as file:
+            lines = [line for line in file if line.endswith("\n")]
+        rows = [row for row in csv.DictReader(lines) if int(row["step"]) < step]
+        self._write(next(csv.reader(lines), []), rows)
+
+    def _write(self, names: list[str], rows: list[dict[str, Any]]) -> None:
+        with written_whole(self.metrics_file_path) as part, open(part, "w", newline="") as file:
+            writer = csv.DictWriter(file, names)
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 class MetricsFile(CSVLogger):
@@ -38,6 +61,10 @@ class MetricsFile(CSVLogger):
             self._experiment = _Continuing(log_dir=self.log_dir)
         return self._experiment
 
+    def rewind(self, step: int) -> None:
+        """Forget what a broken run logged from a step on: a resumed one comes by again."""
+        self.experiment.rewind(step)
+
 
 class Board(TensorBoardLogger):
     """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has them.
@@ -48,6 +75,10 @@ class Board(TensorBoardLogger):
 
     def __init__(self, save_dir: str):
         super().__init__(save_dir, name="", version="", default_hp_metric=False)
+
+    def rewind(self, step: int) -> None:
+        """Let the board leave out what a broken run logged from a step on: a resumed one comes by again."""
+        self._kwargs["purge_step"] = step
 
     def save(self) -> None:
         """Write what is waiting."""

@@ -11,7 +11,8 @@ from typing import Any
 import yaml
 
 from mvrecon import __version__
-from mvrecon.data.hdf5 import written_whole
+from mvrecon.durable import written_whole
+from mvrecon.limits import yaml_of
 
 PACKAGES = ("torch", "lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 SETTINGS, VERSIONS, RESULTS = "config.yaml", "versions.txt", "results.json"
@@ -43,7 +44,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     path = folder / SETTINGS
     if not path.is_file():
         raise FileNotFoundError(f"Expected a run folder with {SETTINGS} in it, got {folder}")
-    return yaml.safe_load(path.read_text(encoding="utf-8"))
+    return yaml_of(path)
 
 
 def anchored(value: Any) -> Any:

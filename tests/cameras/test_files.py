@@ -33,7 +33,7 @@ def test_the_file_is_plain_json_with_a_line_for_each_camera(rig):
 
 def test_writing_is_all_or_nothing(rig, monkeypatch):
     before = rig.read_text()
-    monkeypatch.setattr("pathlib.Path.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         save(random_cameras(seed=1), rig)
     assert rig.read_text() == before and list(rig.parent.iterdir()) == [rig]

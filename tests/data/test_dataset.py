@@ -126,3 +126,36 @@ def test_a_resumed_epoch_leaves_out_what_was_seen_and_the_next_is_whole():
     assert list(sampler) == order(3, 1)[20:]
     sampler.set_epoch(2)
     assert list(sampler) == order(3, 2)
+
+
+def test_a_scene_that_draws_from_the_global_random_numbers_is_a_pure_function_and_leaves_them_alone(grid, cameras):
+    class Forgetful(Counting):
+        def sample(self, index, seed, grid, cameras):
+            made = super().sample(index, seed, grid, cameras)
+            return Sample(torch.rand_like(made.views), made.volume, made.inside, made.name)
+
+    def items(order):
+        data = SceneDataset(Forgetful(), grid, cameras, [4, 2, 9], seed=3, cache=False)
+        return [dict(sorted((k, data[k]) for k in order))[k] for k in range(3)]
+
+    torch.manual_seed(1)
+    expected = torch.rand(2)
+    torch.manual_seed(1)
+    first = items([0, 1, 2])
+    assert torch.equal(torch.rand(2), expected)
+    assert all(same(a, b) for a, b in zip(first, items([2, 0, 1]), strict=True))
+    assert not torch.equal(first[0]["views"], first[1]["views"])
+
+
+def test_what_workers_are_seeded_from_depends_on_seed_and_epoch_alone():
+    def seeds(epochs):
+        sampler = EpochOrder(4, 3)
+        for epoch in epochs:
+            sampler.set_epoch(epoch)
+            drawn = torch.rand(2, generator=sampler.generator).tolist()
+        return drawn
+
+    assert seeds([0, 1, 2]) == seeds([2]) != seeds([1])
+    resumed = EpochOrder(4, 3)
+    resumed.resume(epoch=2, seen=1)
+    assert list(resumed) == order(3, 2, count=4)[1:], "before Lightning tells the epoch"

@@ -7,7 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes, written_whole
+from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
+from mvrecon.durable import written_whole
 from tests.data.conftest import SPACING, head, stored
 
 
@@ -23,7 +24,10 @@ def test_what_is_written_is_read(tmp_path):
         assert found.name == f"pt_ä{k}" and found.spacing == (3.0, 2.0, 1.0 + k)
         assert found.ct.dtype == np.int16 and np.array_equal(found.ct, volumes[k].ct)
     with h5py.File(path) as raw:
-        assert raw.attrs["axes"] == "z, y, x" and raw.attrs["units"] == "HU" and raw.attrs["source"] == "a test"
+        assert {key: value.decode() for key, value in raw.attrs.items()} == {
+            **{"axes": "z, y, x", "units": "HU"},
+            **{"orientation": "LPI", "source": "a test"},
+        }
         assert np.array_equal(raw["label"][1], labels)
 
 

@@ -56,7 +56,7 @@ def test_a_clone_becomes_volume_files(openkbp, tmp_path):
     assert (ct > -400).sum() == 20 * 40 * 30 - 1
     label = file.file["label"][0]
     assert label[70, 60, 60] == 1 and label[71, 60, 60] == 10 and (label > 0).sum() == 2
-    assert file.file.attrs["labels"].startswith("1=Brainstem,2=SpinalCord") and "MIT" in file.file.attrs["source"]
+    assert file.file.attrs["labels"].startswith(b"1=Brainstem,2=SpinalCord") and b"MIT" in file.file.attrs["source"]
     assert Hdf5Volumes(path=str(out / "openkbp_val.h5")).length == 1
 
 

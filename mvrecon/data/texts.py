@@ -1,0 +1,67 @@
+"""Texts of variable length in an HDF5 file, read by a process of its own with little memory and time.
+
+libhdf5 2.0 trusts the lengths and the heaps of such texts: a damaged one asks for gigabytes, or is walked for ever.
+Files that mvrecon writes have texts of fixed length instead, and need no such process.
+"""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+
+#: Of the process: bytes; seconds of computing once it has started; seconds in all, of a slow disk.
+MEMORY, COMPUTING, SECONDS = 2 * 2**30, 1, 60
+
+
+def variable(dtype: object) -> bool:
+    """Whether values of a type are texts of variable length."""
+    text = h5py.check_string_dtype(dtype)
+    return text is not None and text.length is None
+
+
+def texts_of(path: Path) -> dict[str, list[str]]:
+    """The attributes that are one text each, under "@<name>", and the dataset of texts `id`, where it is there.
+
+    Raises:
+        ValueError: the process was ended by its limits, or the file is damaged.
+    """
+    command = [sys.executable, "-P", __file__, str(path)]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=SECONDS, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise ValueError(f"its texts cannot be read within {SECONDS} s") from error
+    if done.returncode:
+        last = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        raise ValueError(f"its texts cannot be read: {''.join(last) or f'exit status {done.returncode}'}")
+    return json.loads(done.stdout)
+
+
+def read(path: str) -> dict[str, list[str]]:
+    """What `texts_of` returns, in this process."""
+    with h5py.File(path, "r", locking="best-effort") as file:
+        kinds = {name: file.attrs.get_id(name) for name in list(file.attrs)[:64]}
+        short = [name for name, kind in kinds.items() if kind.shape == () and variable(kind.dtype)]
+        found = {f"@{name}": [str(file.attrs[name])] for name in short}
+        names = file["id"] if isinstance(file.get("id", getlink=True), h5py.HardLink) else None
+        if isinstance(names, h5py.Dataset) and variable(names.dtype):
+            found["id"] = [text.decode() for text in names[:]]
+        return found
+
+
+def limit() -> None:
+    """Take little memory and little time."""
+    if sys.platform != "win32":
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        computing = int(time.process_time()) + 1 + COMPUTING
+        resource.setrlimit(resource.RLIMIT_CPU, (computing, computing))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+if __name__ == "__main__":
+    limit()
+    sys.stdout.write(json.dumps(read(sys.argv[1])))

@@ -1,0 +1,83 @@
+"""Files that are there whole or not at all, and folders that one process at a time writes to."""
+
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks: a folder is not guarded there
+    fcntl = None
+
+LOCK, PART = ".lock", ".part"
+
+
+@contextmanager
+def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place once all is written: a crash leaves what was there before.
+
+    The contents reach the disk before the name does, so that a loss of power cannot leave half a file either. The
+    temporary file of a killed process, `.<name>.<process>.part`, is cleared away by the next `claimed`.
+
+    Args:
+        path: of the file.
+        previous: where the file that was there goes; none: nowhere. At any moment one of both paths holds a whole file.
+
+    Raises:
+        OSError: no space, no permission; the message names `path`.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
+    try:
+        yield part
+        _flush(part, os.O_RDWR)
+        if previous is not None and path.exists():
+            os.replace(path, previous)
+        os.replace(part, path)
+        if os.name == "posix":
+            _flush(path.parent, os.O_RDONLY)
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """A folder that no other process writes to meanwhile; what killed writers left half done in it is cleared away.
+
+    The claim ends with the process, however that ends; worker processes do not inherit it.
+
+    Raises:
+        RuntimeError: another process has the folder; the message names it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / LOCK, "a+", encoding="utf-8") as lock:
+        if fcntl is not None:
+            try:
+                fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except (BlockingIOError, PermissionError) as error:
+                lock.seek(0)
+                owner = lock.read().strip() or "another process"
+                raise RuntimeError(
+                    f"{folder} is in use by {owner}; choose another folder by hydra.run.dir=..."
+                ) from error
+        lock.truncate(0)
+        lock.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        lock.flush()
+        for left in folder.rglob(f".*{PART}"):
+            left.unlink(missing_ok=True)
+        yield
+
+
+def _flush(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

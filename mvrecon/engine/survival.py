@@ -1,0 +1,103 @@
+"""What a training needs to go on after a break as if there had been none, and what it says when it breaks off."""
+
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+from mvrecon.engine.storage import previous
+
+
+class KeepLast(Checkpoint):
+    """Writes the checkpoint to go on from: after every validation, every epoch without one, and at SIGTERM.
+
+    Args:
+        path: of the checkpoint; the one before stays beside it.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Save."""
+        if not trainer.sanity_checking:
+            self._save(trainer)
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        """Save where nothing is ever validated, and before Lightning breaks off."""
+        unjudged = trainer.is_last_batch and not sum(trainer.num_val_batches)
+        if unjudged or trainer.received_sigterm:
+            self._save(trainer)
+
+    def _save(self, trainer: L.Trainer) -> None:
+        for logger in trainer.loggers:  # or what they hold back is lost, though the training does not come by again
+            logger.save()
+        trainer.save_checkpoint(self.path)
+
+
+class RandomNumbers(L.Callback):
+    """Takes the global random numbers of Python, NumPy and torch along in checkpoints: for layers that draw from them.
+
+    Data, its order and its augmentation do not: they are pure functions of seed, epoch and index.
+    """
+
+    def __init__(self) -> None:
+        self._loaded: dict[str, Any] | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the generators are."""
+        version, words, gauss = random.getstate()
+        kind, keys, place, has, cached = np.random.get_state(legacy=True)
+        return {
+            "python": [version, torch.tensor(words), gauss],
+            "numpy": [kind, torch.tensor(np.asarray(keys, np.int64)), int(place), int(has), float(cached)],
+            "torch": torch.get_rng_state(),
+            "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Put them there once all is set up, which may use up random numbers."""
+        self._loaded = state_dict
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Go on with the numbers of the broken run."""
+        if self._loaded is None:
+            return
+        state, self._loaded = self._loaded, None
+        version, words, gauss = state["python"]
+        random.setstate((version, tuple(words.tolist()), gauss))
+        kind, keys, *rest = state["numpy"]
+        np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
+        torch.set_rng_state(state["torch"])
+        if len(state["cuda"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state["cuda"])
+
+
+@contextmanager
+def remembered(last: Path) -> Iterator[None]:
+    """Whatever breaks a training off also tells where its last good checkpoint is; SIGTERM ends with an error too.
+
+    Raises:
+        SystemExit: SIGTERM came. Lightning's own would end the process as if all had gone well.
+    """
+    try:
+        yield
+    except SIGTERMException as stop:
+        raise SystemExit(f"Stopped by SIGTERM. {_kept(last)}") from stop
+    except Exception as error:
+        error.add_note(_kept(last))
+        raise
+
+
+def _kept(last: Path) -> str:
+    found = next((path for path in (last, previous(last)) if path.exists()), None)
+    if found is None:
+        return "There is no checkpoint yet: resume=<run folder> begins again"
+    return f"The last good checkpoint is {found}: resume=<run folder> goes on from it"

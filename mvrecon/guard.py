@@ -1,0 +1,104 @@
+"""What configs from elsewhere may tell Hydra: their own settings, and nothing about how Hydra itself runs.
+
+Before it calls a task, Hydra builds callbacks, launchers and log handlers from its own section, sets environment
+variables and makes folders. A file that a user fetched must not choose these; the command line may.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
+from omegaconf import DictConfig, OmegaConf
+
+from mvrecon.limits import plain_name, shown, yaml_of
+
+#: Keys of the section `hydra` that may come from anywhere, and those that tell of a composition.
+OPEN = {"mode", "verbose", "help", "sweeper.params", "runtime", "overrides", "job.override_dirname"}
+
+
+@contextmanager
+def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
+    """Check every config that Hydra composes meanwhile, before Hydra acts on it.
+
+    Args:
+        main: the folder of mvrecon's own configs.
+        others: further folders that are trusted: those of installed plugins.
+
+    Raises:
+        PermissionError: a file from elsewhere sets what only the command line may, or reads environment variables.
+        Refused: a YAML file that is too large, or a `name` that leads out of the folder of outputs.
+    """
+    Plugins.instance()  # fills the registry with classes of its own, other than those that an import gives
+    files: Any = SourcesRegistry.instance().resolve("file")
+    load, read = ConfigLoaderImpl.load_configuration, files.load_config
+    trusted = {str(folder) for folder in (main, *others)}
+
+    def loaded(loader: Any, config_name: str, overrides: list[str], **options: Any) -> DictConfig:
+        def composed(of: list[str]) -> DictConfig:
+            return load(loader, config_name, of, **options)
+
+        config = composed(overrides)
+        foreign = [s.path for s in config.hydra.runtime.config_sources if s.schema == "file" and s.path not in trusted]
+        if foreign:
+            if not (main / f"{config_name}.yaml").is_file():
+                raise PermissionError(f"--config-name={config_name} is no app of mvrecon's; choose an experiment=...")
+            check_foreign(config, foreign, overrides, composed)
+        return _named(config)
+
+    def bounded(source: Any, config_path: str) -> Any:
+        path = Path(source.path) / source._normalize_file_name(config_path)
+        if source.path not in trusted and path.is_file():
+            yaml_of(path)
+        return read(source, config_path)
+
+    ConfigLoaderImpl.load_configuration, files.load_config = loaded, bounded  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        ConfigLoaderImpl.load_configuration, files.load_config = load, read
+
+
+def _named(config: DictConfig) -> DictConfig:
+    for part in [] if OmegaConf.is_missing(config, "name") else str(config.name).split("/"):
+        plain_name(part, f"The setting name={config.name}")
+    return config
+
+
+def check_foreign(
+    config: DictConfig, folders: list[str], overrides: list[str], compose: Callable[[list[str]], DictConfig]
+) -> None:
+    """Compare Hydra's own section with what it is without the folders' files.
+
+    Raises:
+        PermissionError: they differ, or the folders' files cannot be told apart.
+    """
+    if any((Path(folder) / "hydra").exists() for folder in folders):
+        raise PermissionError(f"{shown(folders)} has configs of Hydra's own; expected none in a folder of experiments")
+    if not any(
+        source.provider == "main" and source.path not in folders for source in config.hydra.runtime.config_sources
+    ):
+        raise PermissionError("--config-path and --config-name of other apps are not allowed; use --config-dir")
+    own = compose([line for line in overrides if line.lstrip("+~").startswith("hydra")])
+    found, expected = (dict(_leaves(OmegaConf.to_container(c.hydra, resolve=False))) for c in (config, own))
+    changed = sorted(key for key in {**found, **expected} if found.get(key) != expected.get(key) and not _open(key))
+    if changed:
+        raise PermissionError(f"A config sets {shown([f'hydra.{key}' for key in changed])}; only a command line may")
+    settings = OmegaConf.to_yaml(OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"]))
+    if "oc.env" in settings and not any("oc.env" in line for line in overrides):
+        raise PermissionError("A config reads environment variables by ${oc.env:...}; only a command line may")
+
+
+def _open(key: str) -> bool:
+    return any(f"{key}.".startswith(f"{prefix}.") for prefix in OPEN)
+
+
+def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(node, dict) and node:
+        for key, value in node.items():
+            yield from _leaves(value, f"{prefix}.{key}".lstrip("."))
+    else:
+        yield prefix, node

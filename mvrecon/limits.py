@@ -1,0 +1,102 @@
+"""How far a file from elsewhere is believed: its size, its text and its names are looked at before they are used."""
+
+import reprlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+#: Bytes: the most that are read of a text file, of a YAML file (whose parser is slow), and that one volume or one chunk
+#: of a file may unfold to.
+TEXT, YAML, VOLUME = 16 * 2**20, 64 * 2**10, 8 * 2**30
+#: Bytes that a name may have; values of a YAML file.
+NAME, NODES = 200, 100_000
+#: A deflate stream yields at most this many bytes for each of its own: 258 for two bits (RFC 1951).
+DEFLATE = 1032
+#: mm that a voxel may measure.
+SPACING = (1e-6, 1e6)
+
+
+class Refused(ValueError):
+    """A file that is damaged, or not what is expected of it. The message names it."""
+
+
+@contextmanager
+def blaming(path: str | Path, what: str, hint: str = "is it cut short or damaged?") -> Iterator[None]:
+    """Whatever a library raises over a file's contents names the file: a damaged one makes libraries raise anything.
+
+    Raises:
+        Refused: in place of any error but these: a `Refused`, a missing import.
+    """
+    try:
+        yield
+    except (Refused, ImportError):
+        raise
+    except Exception as error:
+        raise Refused(f"{path}: {what} ({type(error).__name__}: {error}); {hint}") from error
+
+
+def text_of(path: str | Path, limit: int = TEXT) -> str:
+    """The UTF-8 text of a file.
+
+    Raises:
+        OSError: it cannot be read.
+        Refused: more bytes than `limit`, or not UTF-8.
+    """
+    with Path(path).open("rb") as file:
+        raw = file.read(limit + 1)
+    if len(raw) > limit:
+        raise Refused(f"{path}: is larger than {limit} bytes, the most that is read of such a file")
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise Refused(f"{path}: is not UTF-8 text ({error})") from error
+
+
+def yaml_of(path: str | Path) -> Any:
+    """The plain values of a YAML file whose aliases, written out, make no more than `NODES` of them.
+
+    Raises:
+        OSError: it cannot be read.
+        Refused: too large, not UTF-8, not YAML, a tag that asks for an object, or lines that unfold to a mountain.
+    """
+    import yaml
+
+    text = text_of(path, YAML)
+    with blaming(path, "is not YAML"):
+        loader = yaml.SafeLoader(text)
+        root = loader.get_single_node()
+        if root is not None and _unfolded(root, {}) > NODES:
+            raise Refused(f"{path}: unfolds to more than {NODES} values")
+        return None if root is None else loader.construct_document(root)
+
+
+def _unfolded(node: Any, sizes: dict[int, float]) -> float:
+    """How many values a node has once its aliases are written out; one that holds itself has no end."""
+    if id(node) not in sizes:
+        sizes[id(node)] = float("inf")  # until its parts are known
+        parts = node.value if isinstance(node.value, list) else []
+        flat = [part for pair in parts for part in (pair if isinstance(pair, tuple) else (pair,))]
+        sizes[id(node)] = 1 + sum(_unfolded(part, sizes) for part in flat)
+    return sizes[id(node)]
+
+
+def plain_name(name: Any, where: str | Path) -> str:
+    """A name that may become a file's or a folder's: it leads nowhere else.
+
+    Args:
+        name: as found.
+        where: it was found, for the message.
+
+    Raises:
+        Refused: not printable text of 1 to 200 bytes, or one with / \\ or :, or of dots alone.
+    """
+    if isinstance(name, str) and name.isprintable() and not set(name) & set("/\\:") and name.strip(". "):
+        if len(name.encode()) <= NAME:
+            return name
+    raise Refused(f"{where}: has the name {shown(name)}; expected at most {NAME} bytes of text without / \\ and :")
+
+
+def shown(value: Any) -> str:
+    """A value from a file, short enough for a message."""
+    return reprlib.repr(value)

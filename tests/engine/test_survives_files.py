@@ -1,0 +1,136 @@
+"""Checkpoint files: whole, checked when they are read, and the one before at hand."""
+
+import errno
+import os
+import random
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.durable import claimed, written_whole
+from mvrecon.engine import storage
+from mvrecon.engine.survival import RandomNumbers
+
+SEED = int(os.environ.get("MVRECON_SEED", "0"))
+
+
+def checkpoint(step):
+    return {"global_step": step, "state_dict": {"w": torch.full((64,), float(step))}, "note": [1, (2.0, "x"), None]}
+
+
+@pytest.fixture
+def last(tmp_path):
+    path = tmp_path / "last.ckpt"
+    for step in (3, 6):
+        storage.write(path, checkpoint(step))
+    return path
+
+
+def step(path):
+    return storage.read_newest(path)["global_step"]
+
+
+def test_what_is_written_is_read_and_the_one_before_stays(last):
+    assert step(last) == 6 and step(storage.previous(last)) == 3
+    assert {path.name for path in last.parent.iterdir()} == {"last.ckpt", "last.previous.ckpt"}
+    assert storage.read(last)["note"] == [1, (2.0, "x"), None]
+
+
+def test_other_programs_read_the_file_as_any_checkpoint_of_torch(last):
+    assert torch.equal(torch.load(last)["state_dict"]["w"], torch.full((64,), 6.0))
+    with zipfile.ZipFile(last) as archive:
+        assert archive.testzip() is None and archive.comment.startswith(storage.TAG)
+    plain = last.with_name("plain.ckpt")
+    torch.save(checkpoint(9), plain)
+    assert step(plain) == 9, "nor does a checkpoint need a checksum"
+
+
+def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
+    whole, rng = last.read_bytes(), random.Random(SEED)
+    for place in [0, 21, *rng.sample(range(len(whole) - storage.COMMENT), 60), len(whole) - 1, len(whole) - 20]:
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << rng.randrange(8)
+        last.write_bytes(damaged)
+        with pytest.warns(RuntimeWarning, match=r"last\.ckpt is damaged.*last\.previous\.ckpt"):
+            assert step(last) == 3, f"seed {SEED}, byte {place}"
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.99, 1.0])
+def test_a_file_cut_short_leads_to_the_one_before(last, kept):
+    whole = last.read_bytes()
+    last.write_bytes(whole[: min(int(kept * len(whole)), len(whole) - 1)])
+    with pytest.warns(RuntimeWarning, match=r"last\.ckpt is (damaged|cut short).*last\.previous\.ckpt"):
+        assert step(last) == 3
+
+
+def test_a_kill_between_the_two_renames_leaves_the_one_before(last):
+    last.unlink()
+    with pytest.warns(RuntimeWarning, match=r"last\.ckpt is missing.*last\.previous\.ckpt"):
+        assert step(last) == 3
+    storage.previous(last).unlink()
+    with pytest.raises(FileNotFoundError):
+        step(last)
+
+
+def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
+    for path in (last, storage.previous(last)):
+        path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with (
+        pytest.warns(RuntimeWarning),
+        pytest.raises(storage.DamagedCheckpoint, match=r"last\.previous\.ckpt is damaged"),
+    ):
+        step(last)
+
+
+@pytest.mark.parametrize(("owner", "name"), [("os", "fsync"), ("pathlib.Path", "write_bytes"), ("torch", "save")])
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), MemoryError("no memory left")])
+def test_what_goes_wrong_in_writing_is_told_and_leaves_both(last, monkeypatch, owner, name, error):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(f"{owner}.{name}", fail)
+    with pytest.raises(type(error), match=str(error.args[-1])):
+        storage.write(last, checkpoint(9))
+    monkeypatch.undo()
+    assert step(last) == 6 and step(storage.previous(last)) == 3
+    assert len(list(last.parent.iterdir())) == 2
+
+
+def test_weights_that_are_not_finite_take_no_good_ones_place(last):
+    bad = checkpoint(9)
+    bad["state_dict"]["w"][3] = float("nan")
+    with pytest.raises(FloatingPointError, match=r"last\.ckpt is not written: 1 weights are not finite, w among them"):
+        storage.write(last, bad)
+    assert step(last) == 6
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "results.json"
+    path.write_text("before")
+    with pytest.raises(RuntimeError, match="power cut"), written_whole(path) as part:
+        part.write_text("half")
+        raise RuntimeError("power cut")
+    assert path.read_text() == "before" and [p.name for p in tmp_path.iterdir()] == ["results.json"]
+
+
+def test_a_claim_clears_away_what_a_killed_writer_left(tmp_path):
+    left = tmp_path / "checkpoints" / ".last.ckpt.123.part"
+    left.parent.mkdir()
+    left.write_text("half")
+    with claimed(tmp_path):
+        assert not left.exists() and str(os.getpid()) in (tmp_path / ".lock").read_text()
+
+
+def test_global_random_numbers_go_on_where_they_were():
+    def drawn():
+        return random.random(), np.random.standard_normal(), torch.rand(3).tolist()
+
+    drawn()
+    state, first = RandomNumbers().state_dict(), drawn()
+    again = RandomNumbers()
+    again.load_state_dict(state)
+    assert drawn() != first, "until training starts, nothing is put back"
+    again.on_train_start(None, None)
+    assert drawn() == first

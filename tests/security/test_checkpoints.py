@@ -1,0 +1,169 @@
+"""A checkpoint is a list of numbers: whatever is in it, nothing runs."""
+
+import io
+import pickle
+import struct
+import subprocess
+import sys
+import zipfile
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+import torch
+
+from mvrecon.engine.archive import check_archive
+from mvrecon.engine.checkpoints import finished, load, unfinished
+from mvrecon.limits import Refused
+from tests.security.samples import checkpoint, pickle_of, saved, with_pickle
+from tests.security.test_configs import Payload
+
+
+@pytest.fixture
+def sentinel(tmp_path: Path) -> Path:
+    """A file that only a hostile sample makes."""
+    return tmp_path / "sentinel"
+
+
+@pytest.fixture(scope="module")
+def kept() -> dict:
+    """A valid checkpoint."""
+    return checkpoint()
+
+
+def written(path: Path, raw: bytes) -> Path:
+    path.write_bytes(raw)
+    return path
+
+
+def repacked(archive: bytes, **changes: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(archive)) as old:
+        return {**{name: old.read(name) for name in old.namelist()}, **changes}
+
+
+def zipped(members: dict[str, bytes], packing: int = zipfile.ZIP_STORED) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", packing) as file:
+        for name, content in members.items():
+            file.writestr(name, content)
+    return buffer.getvalue()
+
+
+def test_a_valid_checkpoint_loads(kept: dict, tmp_path: Path):
+    found = load(written(tmp_path / "a.ckpt", saved(kept)))
+    assert found.steps == 3 and found.seconds == 1.5
+    weights = found.module.state_dict()
+    assert all(torch.equal(weights[name], value) for name, value in kept["state_dict"].items())
+
+
+def pickles(sentinel: Path) -> dict[str, bytes]:
+    """Pickles of every protocol that would make the sentinel, or take what torch's own list allows."""
+    payload, text = Payload(f"touch {sentinel}"), f"touch {sentinel}".encode()
+    found = {f"protocol {k}": pickle.dumps(payload, protocol=k) for k in range(6)}
+    return found | {
+        "instance": b"(S'" + text + b"'\nios\nsystem\n.",
+        "obj": b"(cos\nsystem\nS'" + text + b"'\no.",
+        "a dictionary's factory": pickle.dumps(defaultdict(print), protocol=2),
+        "numpy": b"cnumpy._core.multiarray\n_reconstruct\n.",
+        "a great many bytes": b"c__builtin__\nbytearray\n(L" + b"9" * 12 + b"L\ntR.",
+        "torch's own loader": b"ctorch.storage\n_load_from_bytes\n(C\x00tR.",
+        "an extension": b"\x82\x01.",
+    }
+
+
+@pytest.mark.parametrize("name", sorted(pickles(Path("sentinel"))))
+def test_a_pickle_builds_tensors_and_plain_values_only(name: str, kept: dict, sentinel: Path, tmp_path: Path):
+    evil = pickles(sentinel)[name]
+    for raw in (with_pickle(saved(kept), evil), evil):
+        with pytest.raises(Refused, match=r"evil\.ckpt: (its pickle names|is cut short or no checkpoint)"):
+            load(written(tmp_path / "evil.ckpt", raw))
+    assert not sentinel.exists()
+
+
+def test_a_library_that_widens_torchs_list_does_not_widen_ours(kept: dict, sentinel: Path, tmp_path: Path):
+    path = written(tmp_path / "evil.ckpt", saved({**kept, "x": Payload(f"touch {sentinel}")}))
+    with (
+        torch.serialization.safe_globals([__import__("os").system]),
+        pytest.raises(Refused, match="its pickle names .*system"),
+    ):
+        load(path)
+    assert not sentinel.exists()
+
+
+def test_the_sample_would_work_if_it_were_unpickled(sentinel: Path, tmp_path: Path):
+    path = written(tmp_path / "evil.ckpt", saved({"x": Payload(f"touch {sentinel}")}))
+    code = f"import torch; torch.load({str(path)!r}, weights_only=False)"
+    subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[2], capture_output=True)
+    assert sentinel.exists()
+
+
+SETTINGS = {
+    "an instantiator": {"_instantiator": "os.system", "_class_path": "os.system"},
+    "another key": {"checkpoint_path": "x"},
+    "a target": {"model": {"name": "backprojection_unet", "_target_": "os.system"}},
+    "an object": {"loss": {"volume": torch.zeros(2)}},
+    "a class": {"loss": {"volume": torch.float32}},
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_settings_in_a_checkpoint_are_names_and_numbers(name: str, kept: dict, tmp_path: Path):
+    evil = {**kept, "hyper_parameters": {**kept["hyper_parameters"], **SETTINGS[name]}}
+    with pytest.raises(Refused, match=r"evil\.ckpt: has the settings .*expected names and numbers"):
+        load(written(tmp_path / "evil.ckpt", saved(evil)))
+
+
+def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: Path):
+    evil = {**kept, "hyper_parameters": {**kept["hyper_parameters"], "model": {"name": "os.system"}}}
+    with pytest.raises(Refused, match="No model is named 'os.system'"):
+        load(written(tmp_path / "evil.ckpt", saved(evil)))
+
+
+def test_an_archive_does_not_unfold(kept: dict, tmp_path: Path):
+    members = repacked(saved(kept), **{"archive/data/0": bytes(2**26)})
+    raw = zipped(members, zipfile.ZIP_DEFLATED)
+    with pytest.raises(Refused, match="packed or overlap"):
+        load(written(tmp_path / "bomb.ckpt", raw))
+
+
+def test_members_that_share_their_bytes_are_refused(kept: dict, tmp_path: Path):
+    raw = saved({**kept, "x": torch.zeros(2**16)})
+    start, entries = raw.index(b"PK\x01\x02"), []
+    while raw[start : start + 4] == b"PK\x01\x02":
+        name, extra, comment = struct.unpack("<3H", raw[start + 28 : start + 34])
+        entries.append(raw[start : start + 46 + name + extra + comment])
+        start += len(entries[-1])
+    large = max(entries, key=lambda entry: struct.unpack("<I", entry[24:28]))
+    overlapping = raw[: raw.index(b"PK\x01\x02")] + b"".join([*entries, *[large] * 60])
+    end = struct.pack("<4s4H2IH", b"PK\x05\x06", 0, 0, len(entries) + 60, len(entries) + 60,
+                      len(overlapping) - raw.index(b"PK\x01\x02"), raw.index(b"PK\x01\x02"), 0)  # fmt: skip
+    with pytest.raises(Refused, match="packed or overlap"):
+        check_archive(written(tmp_path / "bomb.ckpt", overlapping + end))
+
+
+@pytest.mark.parametrize("name", ["../evil", "/etc/evil", "archive/../../evil", "archive/code/evil.py", "evil"])
+def test_members_lead_nowhere(name: str, kept: dict, tmp_path: Path):
+    raw = zipped(repacked(saved(kept), **{name: b"x"}))
+    with pytest.raises(Refused, match="which no checkpoint does"):
+        load(written(tmp_path / "evil.ckpt", raw))
+
+
+@pytest.mark.parametrize("method", ["../../evil", "/etc/evil", "..", "a/b"])
+def test_a_methods_name_leads_nowhere(method: str, tmp_path: Path):
+    for place in (finished, unfinished):
+        with pytest.raises(Refused, match="has the name"):
+            place(tmp_path, method)
+
+
+def test_a_storage_is_no_longer_than_its_file(kept: dict, tmp_path: Path):
+    archive = saved({**kept, "x": torch.zeros(300)})
+    longer = pickle_of(archive).replace(b"M\x2c\x01", b"J" + struct.pack("<i", 2**30))
+    with pytest.raises(ValueError, match=r"evil\.ckpt"):
+        load(written(tmp_path / "evil.ckpt", with_pickle(archive, longer)))
+
+
+def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
+    first = next(iter(kept["state_dict"]))
+    weights = {**kept["state_dict"], first: torch.zeros(3, 3)}
+    with pytest.raises(Refused, match=rf"a\.ckpt: does not fit (.|\n)*{first}"):
+        load(written(tmp_path / "a.ckpt", saved({**kept, "state_dict": weights})))

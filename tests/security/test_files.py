@@ -1,0 +1,270 @@
+"""Files made to harm: what they ask for is refused, with their name, in little time and memory."""
+
+import gzip
+import json
+import re
+import resource
+import struct
+import time
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import nibabel
+import numpy as np
+import pytest
+
+from mvrecon.cameras.files import from_file, save
+from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
+from mvrecon.data.nifti import read_nifti
+from mvrecon.limits import Refused, plain_name, text_of
+from mvrecon.parts import CAMERAS
+from tests.data.conftest import RIG, stored
+
+
+def refused(read: Callable[[], object], message: str, megabytes: float = 64) -> None:
+    """Reading raises within a second of computing and without holding much."""
+    begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    tracemalloc.start()
+    try:
+        with pytest.raises(Refused, match=message):
+            read()
+        taken, peak = time.process_time() - begun, tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert taken < 1
+    assert max(peak / 2**20, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**10) < megabytes
+
+
+def volume_file(path: Path, change: Callable[[h5py.File], object]) -> VolumeFile:
+    write_volumes(path, stored(2))
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return VolumeFile(path)
+
+
+def instead(name: str, **made) -> Callable[[h5py.File], object]:
+    def change(file: h5py.File) -> None:
+        del file[name]
+        file.create_dataset(name, **made)
+
+    return change
+
+
+HUGE = {"shape": (2, 2**14, 2**14, 2**14), "dtype": "i2"}
+DECLARED = {
+    "a huge contiguous shape": (instead("ct", **HUGE), "'/ct' declares"),
+    "a huge chunked shape": (instead("ct", **HUGE, chunks=(1, 64, 64, 64), compression="gzip"), "'/ct' declares"),
+    "more than 2^63 bytes": (
+        instead("ct", shape=(2, 2**20, 2**20, 2**20), dtype="f8", chunks=(1, 8, 8, 8), compression="gzip"),
+        "'/ct' declares",
+    ),
+    "too few bytes": (instead("ct", shape=(2, 256, 256, 256), dtype="i2", chunks=(1, 256, 256, 256)), "'/ct' declares"),
+    "a plugin's filter": (
+        instead("ct", shape=(2, 4, 4, 4), dtype="i2", chunks=(1, 4, 4, 4), compression="lzf"),
+        "has the filters .*expected gzip",
+    ),
+    "an object": (instead("ct", shape=(2, 4, 4, 4), dtype=h5py.vlen_dtype("i2")), "ct object"),
+    "references": (instead("ct", shape=(2, 4, 4, 4), dtype=h5py.ref_dtype), "ct object"),
+    "a compound": (instead("ct", shape=(2, 4, 4, 4), dtype=np.dtype([("a", "i2")])), "ct .*expected numbers"),
+    "an empty space": (instead("ct", data=h5py.Empty("i2")), "'/ct' is empty"),
+    "a named type": (lambda f: (f.pop("ct"), f.__setitem__("ct", np.dtype("i2"))), "is a link, a group or stored"),
+    "infinite spacing": (instead("spacing", data=np.full((2, 3), np.inf)), "expected positive mm"),
+    "tiny spacing": (instead("spacing", data=np.full((2, 3), 1e-300)), "expected positive mm"),
+    "many spacings": (instead("spacing", shape=(2**40, 3), dtype="f8", chunks=(8, 3)), "'/spacing' declares"),
+    "attributes of numbers": (lambda f: f.attrs.update(units=np.arange(1000)), "attribute 'units' is int64"),
+    "many attributes": (lambda f: f.attrs.update(axes=["z", "y", "x"]), r"attribute 'axes' is object \(3,\)"),
+    "bytes that are no text": (lambda f: f.attrs.create("axes", b"\xff\xfe\xff", dtype="S3"), "UnicodeDecodeError"),
+}
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_a_volume_file_gets_no_more_than_it_holds(name: str, tmp_path: Path):
+    change, message = DECLARED[name]
+    refused(lambda: len(volume_file(tmp_path / "evil.h5", change)), rf"(?s)evil\.h5: .*{message}")
+
+
+def test_a_volume_that_was_never_written_is_not_zeros(tmp_path: Path):
+    made = {"shape": (2, 20, 30, 30), "dtype": "i2", "chunks": (1, 20, 30, 30), "compression": "gzip"}
+    file = volume_file(tmp_path / "a.h5", instead("ct", **made))
+    refused(lambda: file.read(0), r"a\.h5: '/ct' has 0 bytes for the chunk")
+
+
+def bomb(file: h5py.File) -> None:
+    """A chunk whose stream unfolds to 256 MiB in place of 36 kB."""
+    packed = zlib.compressobj(1)
+    raw = b"".join(packed.compress(bytes(2**20)) for _ in range(2**8)) + packed.flush()
+    file["ct"].id.write_direct_chunk((0, 0, 0, 0), raw)
+
+
+def test_a_chunk_does_not_unfold_to_more_than_it_declares(tmp_path: Path):
+    file = volume_file(tmp_path / "bomb.h5", bomb)
+    refused(lambda: file.read(0), r"bomb\.h5: has|bomb\.h5: .*(unfolds to more|bytes for the chunk)")
+    assert file.read(1).name == "pt_1"
+
+
+def test_a_chunk_of_allowed_size_does_not_unfold_to_more_either(tmp_path: Path):
+    noise = np.random.default_rng(0).integers(-1000, 1000, (20, 30, 30)).astype("i2")
+    path = tmp_path / "bomb.h5"
+    write_volumes(path, [Stored("a", noise, (1.0, 1.0, 1.0))])
+    raw = zlib.compress(bytes(2**25), 9)  # 32 MiB in 32 kB, as many as the noise takes
+    with h5py.File(path, "r+") as file:
+        assert len(raw) < noise.nbytes
+        file["ct"].id.write_direct_chunk((0, 0, 0, 0), raw)
+    refused(lambda: VolumeFile(path).read(0), r"bomb\.h5: a chunk of \d+ bytes unfolds to more than", megabytes=16)
+
+
+@pytest.mark.parametrize("name", ["../../evil", "/etc/evil", "..", "a\\b", "c:evil", "a\0b", "a\nb", "", "x" * 300])
+def test_a_volumes_name_leads_nowhere(name: str, tmp_path: Path):
+    with pytest.raises(Refused, match="has the name"):
+        plain_name(name, "a.h5")
+    with pytest.raises((Refused, ValueError)):
+        write_volumes(tmp_path / "w.h5", [Stored(name, np.zeros((2, 2, 2), "i2"), (1.0, 1.0, 1.0))])
+    assert not (tmp_path / "w.h5").exists()
+    if "\0" not in name:
+        file = volume_file(tmp_path / "r.h5", instead("id", data=[name, "b"], dtype=h5py.string_dtype("utf-8", 400)))
+        refused(lambda: file.read(0), r"r\.h5: has the name")
+
+
+def legacy(path: Path, damage: Callable[[bytearray], None]) -> VolumeFile:
+    """A file whose texts have no fixed length, as others write them."""
+    text = h5py.string_dtype()
+    file = volume_file(path, instead("id", data=["pt_0", "pt_1"], dtype=text))
+    with h5py.File(path, "r+") as raw:
+        raw.attrs.create("axes", "z, y, x", dtype=text)
+    contents = bytearray(path.read_bytes())
+    damage(contents)
+    path.write_bytes(contents)
+    return file
+
+
+def test_texts_of_no_fixed_length_are_read(tmp_path: Path):
+    file = legacy(tmp_path / "a.h5", lambda raw: None)
+    assert [file.read(k).name for k in range(2)] == ["pt_0", "pt_1"]
+
+
+def endless(raw: bytearray) -> None:
+    """Every object of the heap of texts becomes a hole of no size: libhdf5 2.0 walks it for ever."""
+    heap = raw.index(b"GCOL\x01")
+    raw[heap + 16 : heap + 32] = bytes(16)
+
+
+def gigantic(raw: bytearray) -> None:
+    """A text of nearly 4 GiB: libhdf5 2.0 makes room for it before it looks for it."""
+    heaps = [found.start() for found in re.finditer(rb"GCOL\x01", raw)]
+    references = [raw.find(struct.pack("<IQ", length, heap)) for heap in heaps for length in (4, 7, 8)]
+    for place in (place for place in references if place >= 0):
+        raw[place : place + 4] = b"\xf0\xff\xff\xff"
+
+
+@pytest.mark.parametrize("damage", [endless, gigantic])
+def test_texts_that_libhdf5_believes_do_not_harm(damage, tmp_path: Path):
+    file = legacy(tmp_path / "evil.h5", damage)
+    refused(lambda: len(file), r"evil\.h5: cannot be opened .*its texts cannot be read")
+
+
+def nifti(path: Path, tail: bytes = b"", **header) -> Path:
+    """A header that says what it likes, and what follows it."""
+    image = nibabel.Nifti1Image(np.zeros((4, 4, 4), "i2"), np.eye(4))
+    for key, value in header.items():
+        image.header[key] = value
+    raw = image.header.binaryblock[:344] + b"n+1\0" + bytes(4) + tail
+    path.write_bytes(gzip.compress(raw) if path.suffix == ".gz" else raw)
+    return path
+
+
+DIMS = [3, 32767, 32767, 32767, 1, 1, 1, 1]
+HEADERS = {
+    "a huge shape": ({"dim": DIMS, "vox_offset": 352}, "declares"),
+    "no voxels": ({"dim": [3, 0, 4, 4, 1, 1, 1, 1], "vox_offset": 352}, "shape"),
+    "negative voxels": ({"dim": [3, -4, 4, 4, 1, 1, 1, 1], "vox_offset": 352}, "shape"),
+    "data far away": ({"vox_offset": 1e30}, "declares"),
+    "data nowhere": ({"vox_offset": np.nan}, "cannot be read"),
+    "colours": ({"datatype": 128, "bitpix": 24, "vox_offset": 352}, "shape"),
+    "complex values": ({"datatype": 32, "bitpix": 64, "vox_offset": 352}, "shape"),
+    "no such type": ({"datatype": 7777, "vox_offset": 352}, "cannot be read"),
+    "no affine": ({"sform_code": 1, "srow_x": [np.nan] * 4, "vox_offset": 352}, "finite one"),
+    "voxels of a light year": (
+        {
+            "sform_code": 1,
+            "vox_offset": 352,
+            **{f"srow_{a}": row for a, row in zip("xyz", 1e19 * np.eye(4), strict=False)},
+        },
+        "voxels of",
+    ),
+}
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+@pytest.mark.parametrize("name", HEADERS)
+def test_a_nifti_header_is_not_believed(name: str, suffix: str, tmp_path: Path):
+    header, message = HEADERS[name]
+    path = nifti(tmp_path / f"evil{suffix}", bytes(4 * 4 * 4 * 2), **header)
+    refused(lambda: read_nifti(path), rf"(?s)evil\{suffix}.*{message}")
+
+
+def test_a_few_bytes_of_gzip_do_not_unfold(tmp_path: Path):
+    path = nifti(tmp_path / "bomb.nii.gz", bytes(2**26), dim=[3, 1024, 1024, 1024, 1, 1, 1, 1], vox_offset=352)
+    refused(lambda: read_nifti(path), r"bomb\.nii\.gz: cannot be read .*declares")
+
+
+def test_extensions_of_a_nifti_header_are_not_parsed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    image = nibabel.Nifti1Image(np.zeros((4, 4, 4), "i2"), np.eye(4))
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", b"x" * 64))
+    nibabel.save(image, tmp_path / "a.nii")
+    monkeypatch.setattr(nibabel.nifti1.Nifti1Extensions, "from_fileobj", lambda *_: pytest.fail("was parsed"))
+    assert read_nifti(tmp_path / "a.nii")[1].shape == (4, 4, 4)
+
+
+def rig(path: Path) -> dict:
+    save(CAMERAS.from_config(RIG), path)
+    return json.loads(path.read_text())
+
+
+NUMBERS = ["NaN", "Infinity", "-Infinity", "1e999", "1" + "0" * 400, "1e300", '"1"', "null", "true", "[1]", "{}"]
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize("vector", ["source", "origin", "u", "v"])
+def test_a_cameras_numbers_are_finite(number: str, vector: str, tmp_path: Path):
+    record = rig(tmp_path / "evil.json")
+    record["cameras"][1][vector][2] = "HERE"
+    (tmp_path / "evil.json").write_text(json.dumps(record).replace('"HERE"', number))
+    refused(lambda: from_file(tmp_path / "evil.json"), r"evil\.json is not valid")
+
+
+TEXTS = {
+    "digits without end": (b"1" * 10_000, "truncated or not JSON"),
+    "brackets without end": (b"[" * 200_000, "truncated or not JSON"),
+    "not UTF-8": (b'{"format": "\xff\xfe"}', "truncated or not JSON"),
+    "zeros": (bytes(1000), "truncated or not JSON"),
+    "a list of lists": (b"[" + b"[]," * 10_000 + b"[]]", "not valid"),
+    "a long word": (b'{"format": "' + b"x" * 100_000 + b'"}', "not valid"),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_camera_file_of_nonsense_is_refused_in_few_words(name: str, tmp_path: Path):
+    raw, message = TEXTS[name]
+    (tmp_path / "evil.json").write_bytes(raw)
+    with pytest.raises(ValueError, match=message) as error:
+        from_file(tmp_path / "evil.json")
+    assert "evil.json" in str(error.value) and len(str(error.value)) < 1000
+
+
+@pytest.mark.parametrize("shape", [[10**9, 10**9], [2**63, 1], [10**400, 1], [True, 7], [7.0, 9]])
+def test_a_detector_has_no_more_pixels_than_can_be(shape: list, tmp_path: Path):
+    record = {**rig(tmp_path / "evil.json"), "shape": shape}
+    (tmp_path / "evil.json").write_text(json.dumps(record))
+    refused(lambda: from_file(tmp_path / "evil.json"), "'shape' as")
+
+
+def test_a_text_file_is_read_up_to_a_limit(tmp_path: Path):
+    path = tmp_path / "large.json"
+    with path.open("wb") as file:
+        file.truncate(2**40)  # a hole: a terabyte on no disk
+    refused(lambda: text_of(path), r"large\.json: is larger than 16777216 bytes")
+    with pytest.raises(ValueError, match="larger than"):
+        from_file(path)

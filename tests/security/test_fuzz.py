@@ -1,0 +1,70 @@
+"""Damaged files of every kind: a reader reads them or says what is wrong, in time, within memory, and lives."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from mvrecon.testing.fuzz import mutations, tally
+
+COUNT = 240
+READERS = [
+    *("HDF5 volumes", "NIfTI", "NIfTI, then packed", "NIfTI, packed", "cameras", "settings"),
+    *("checkpoint", "checkpoint's pickle"),
+]
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
+    """What became of every reader, in a process of its own, and how to do it again.
+
+    The seed is random at night only: set MVRECON_FUZZ_SEED, and MVRECON_FUZZ_COUNT for more cases.
+    """
+    seed, count = os.environ.get("MVRECON_FUZZ_SEED", "5"), os.environ.get("MVRECON_FUZZ_COUNT", str(COUNT))
+    out = tmp_path_factory.mktemp("fuzz") / "found.json"
+    command = [sys.executable, "-m", "tests.security.fuzzing", seed, count, str(out)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+    found = json.loads(out.read_text()) if out.exists() else {}
+    said = f"seed {seed}, exit status {done.returncode}\n{done.stderr[-2000:]}"
+    return found, said
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_reader_survives_damaged_files(reader: str, survey: tuple[dict, str]):
+    found, said = survey
+    assert reader in found, said
+    result = found[reader]
+    assert not result["failures"], f"{said}\n" + "\n".join(result["failures"][:10])
+    assert result["inputs"] >= COUNT and result["read"] < result["inputs"]
+    assert result["seconds"] < 1 and result["peak"] < 2**28
+
+
+def test_every_reader_is_fuzzed_and_the_process_ends_well(survey: tuple[dict, str]):
+    found, said = survey
+    assert sorted(found) == sorted(READERS) and "exit status 0" in said
+
+
+def test_the_same_seed_damages_alike_and_another_otherwise():
+    data = bytes(range(256)) * 8
+    first, again, other = (list(mutations(data, Random(seed), 60)) for seed in (1, 1, 2))
+    assert first == again != other
+    assert sum(case != data for case in first) > 50
+
+
+def test_whatever_a_bad_reader_does_is_found(tmp_path: Path):
+    def bad(path: Path) -> bytes:
+        raw = path.read_bytes()
+        if len(raw) < 100:
+            raise ValueError("cut short")
+        if len(raw) > 10_000:
+            raise TypeError(f"{path} is long")
+        return raw
+
+    found = tally(bad, mutations(bytes(2000), Random(0), 60), tmp_path / "a.bin")
+    kinds = {line.split(": ")[1].split()[0] for line in found.failures}
+    assert found.inputs == 60 and kinds == {"ValueError", "TypeError"}
+    assert 0 < found.read < 60
