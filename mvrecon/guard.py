@@ -63,7 +63,7 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
 
 
 def _named(config: DictConfig) -> DictConfig:
-    for part in [] if OmegaConf.is_missing(config, "name") else str(config.name).split("/"):
+    for part in str(config.name).split("/") if "name" in config else []:
         plain_name(part, f"The setting name={config.name}")
     return config
 
