@@ -59,11 +59,12 @@ def _read(room, lanes, group, rays):
         _read_lanes(room, group, rays)
         return
     first = group * room.width
-    places, pairs, row, parts = room.places, room.pairs, room.row_pairs, room.parts
-    shares, sums = room.shares, room.values[group]
-    for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
+    start, count = rays[0], np.uint32(rays[1] - rays[0])  # loops from zero on: compilers make vectors of these
+    places, pairs, row, parts = room.places[start:], room.pairs[start:], room.row_pairs, room.parts[2 * start :]
+    shares, sums = room.shares[start:], room.values[group][start:]
+    for v in range(count):
         pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
-    for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
+    for v in range(count):
         sums[v] += parts[2 * v] + shares[v] * (parts[2 * v + 1] - parts[2 * v])
 
 
@@ -147,12 +148,14 @@ def _write(room, lanes, group, rays):
     if lanes > 1:
         _write_lanes(room, group, rays)
         return
-    places, pairs, row, parts = room.places, room.pairs, room.row_pairs, room.parts
-    shares, values, one, width = room.shares, room.values[group], room.shares.dtype.type(1), np.uint32(room.width)
-    for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
+    start, count = rays[0], np.uint32(rays[1] - rays[0])
+    places, pairs, row, parts = room.places[start:], room.pairs[start:], room.row_pairs, room.parts[2 * start :]
+    shares, values = room.shares[start:], room.values[group][start:]
+    one, width, lane = room.shares.dtype.type(1), np.uint32(room.width), np.uint32(start)
+    for v in range(count):
         parts[2 * v], parts[2 * v + 1] = values[v] * (one - shares[v]), values[v] * shares[v]
-    for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
-        row[np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width)] += pairs[v]
+    for v in range(count):
+        row[np.uint64(places[v] + np.uint32(np.uint32(v + lane) % np.uint32(ROWS)) * width)] += pairs[v]
 
 
 @scalar
