@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mvrecon.geometry.box import bricks_along
+
 EDGE = 8
 WORTH = 0.2
 
@@ -28,7 +30,7 @@ def brick_convolution(
 ) -> Float[Tensor, "n o d h w"]:
     """A 3x3x3 convolution without bias, zero beyond the volume, in the bricks that are named; zero in all others."""
     n, (d, h, w) = len(x), x.shape[2:]
-    counts = [-(-size // EDGE) for size in (d, h, w)]
+    counts = bricks_along((d, h, w), EDGE)
     behind = [count * EDGE - size + 1 for count, size in zip(counts, (d, h, w), strict=True)]
     padded = F.pad(x.permute(0, 2, 3, 4, 1), (0, 0, 1, behind[2], 1, behind[1], 1, behind[0]))
     windows = padded.unfold(1, EDGE + 2, EDGE).unfold(2, EDGE + 2, EDGE).unfold(3, EDGE + 2, EDGE)

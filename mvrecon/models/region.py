@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import adaptive_max_pool3d, pad
+from torch.nn.functional import adaptive_max_pool3d
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, placed
 from mvrecon.models.bins import Bins, SomeBins
 from mvrecon.models.geometry import Geometry
 from mvrecon.projectors.base import Projector
@@ -81,10 +81,7 @@ class Region:
 
     def pasted(self, volume: Float[Tensor, "*b d h w"]) -> Float[Tensor, "*b D H W"]:
         """A volume of the crop in zeros of the whole grid."""
-        if self.box is None:
-            return volume
-        margins = [(low, n - high) for low, high, n in zip(self.box.low, self.box.high, self.shape, strict=True)]
-        return pad(volume, [side for pair in reversed(margins) for side in pair])
+        return volume if self.box is None else placed(volume, self.box, self.shape)
 
     @property
     def support(self) -> Bool[Tensor, "b 1 D H W"] | None:

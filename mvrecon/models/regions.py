@@ -12,7 +12,7 @@ from mvrecon.models.geometry import MULTIPLE, Geometry, crop_of, whole_geometry
 from mvrecon.models.region import Region
 from mvrecon.models.skip import Skip
 from mvrecon.projectors.base import Projector, check_views
-from mvrecon.reconstruct.iterative import _inverse
+from mvrecon.reconstruct.iterative import inverse_sums
 from mvrecon.support.support import WORTH, support_from_views
 
 #: Crops whose geometry is kept; a fixed rig's scenes share few.
@@ -69,7 +69,7 @@ def masked_weights(geometry: Geometry, mask: Bool[Tensor, "b 1 d h w"], dtype: t
     """SIRT's (R, C) of the operator A diag(M), for each sample: R from rays through the mask, C zero outside it."""
     with torch.no_grad():
         rows = geometry.projector(mask.to(dtype))
-    return torch.cat([_inverse(own) for own in rows.split(1)]), geometry.column * mask
+    return torch.cat([inverse_sums(own) for own in rows.split(1)]), geometry.column * mask
 
 
 def worked_on(hull: Bool[Tensor, "1 1 d h w"], kind: str) -> Bool[Tensor, "1 1 d h w"]:

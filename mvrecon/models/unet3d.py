@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, placed
 from mvrecon.models.blocks import ConvBlock
 from mvrecon.models.bricks import active_bricks
 from mvrecon.models.masks import pooled, upsampled
@@ -81,5 +81,4 @@ def on_its_box(
     if not box.size:
         return x.new_zeros(len(x), net.last.out_channels, *shape)
     part = net(x[..., *box.slices], mask[..., *box.slices], bricks)
-    margins = [(low, n - high) for low, high, n in zip(box.low, box.high, shape, strict=True)]
-    return nn.functional.pad(part, [side for pair in reversed(margins) for side in pair])
+    return placed(part, box, shape)

@@ -12,14 +12,15 @@ from torch.nn.functional import avg_pool2d
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.geometry.box import Box
+from mvrecon.cameras.views import check_finite
+from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
 from mvrecon.kernels.backends import wide
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.projectors.skipping import SKIPS, Skipped, check_support, placed, told, verify, within
+from mvrecon.projectors.skipping import SKIPS, Skipped, check_support, told, verify, within
 
 METHODS = ("joseph", "siddon", "trilinear")
 
@@ -248,6 +249,4 @@ def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
         ValueError: a wrong rank or size, or values that are not finite.
     """
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
-    if not views.isfinite().all():
-        bad = int((~views.isfinite()).sum())
-        raise ValueError(f"Views must be finite, got {bad} of {views.numel()} values that are NaN or infinite")
+    check_finite(views)

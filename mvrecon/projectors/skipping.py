@@ -70,12 +70,6 @@ def within(volumes: Float[Tensor, "n d h w"], support: Bool[Tensor, "d h w"]) ->
     return torch.where(support, volumes, 0)
 
 
-def placed(part: Float[Tensor, "n a b c"], box: Box, shape: Sequence[int]) -> Float[Tensor, "n d h w"]:
-    """A part of volumes in its place, with zeros around it."""
-    ends = zip(reversed(box.low), reversed(box.high), reversed(shape), strict=True)
-    return torch.nn.functional.pad(part, [n for low, high, size in ends for n in (low, size - high)])
-
-
 def verify(views: Tensor, dense: Tensor, skipped: Skipped) -> None:
     """Raise RuntimeError unless views are those without skipping, to the last bit."""
     same = (views == dense) | (views.isnan() & dense.isnan())

@@ -22,12 +22,12 @@ def sirt_weights(A: Projector, dtype: torch.dtype = torch.float32) -> tuple[Tens
         mirror = _mirror(A)
         if mirror is None:
             rows = A(ones)
-            return _inverse(rows), _inverse(A.T(torch.ones_like(rows)))
+            return inverse_sums(rows), inverse_sums(A.T(torch.ones_like(rows)))
         share = mirror.share.to(ones)[:, None, None]
         half = ViewSubset(A, share.flatten().nonzero()[:, 0].tolist())
         rows = share * half.place(half(ones))
         columns = half.T(half.pick(share.expand_as(rows)))
-        return _inverse(rows + mirror.views(rows)), _inverse(columns + mirror.volume(columns))
+        return inverse_sums(rows + mirror.views(rows)), inverse_sums(columns + mirror.volume(columns))
 
 
 def _mirror(A: Projector) -> Mirror | None:
@@ -42,7 +42,8 @@ def _mirror(A: Projector) -> Mirror | None:
     return mirror if A.support is None or torch.equal(mirror.volume(A.support), A.support) else None
 
 
-def _inverse(sums: Tensor) -> Tensor:
+def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """1 / sums of an operator's rows or columns, zero where a ray or voxel is empty."""
     # a ray that grazes a corner would otherwise be weighted by the inverse of a rounding error
     counts = sums > 1e-6 * sums.max()
     return torch.where(counts, 1 / torch.where(counts, sums, 1), 0)

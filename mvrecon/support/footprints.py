@@ -59,12 +59,6 @@ class Footprints:
     whole: Bool[Tensor, "m n"]
 
 
-def lattice_counts(shape: Sequence[int], edge: int) -> tuple[int, int, int]:
-    """Bricks along (z, y, x) that fill a grid of `shape`."""
-    d, h, w = (-(-int(n) // edge) for n in shape)
-    return d, h, w
-
-
 def footprints(cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5, gaps: bool = False) -> Footprints:
     """The footprints of bricks in all views, in float64.
 

@@ -7,8 +7,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.views import check_finite
+from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.support.footprints import Bricks, footprints, lattice_counts, sums, tables
+from mvrecon.support.footprints import Bricks, footprints, sums, tables
 
 #: Views at a time, of all items of a batch: what some of them saw to be empty is not looked at in the next.
 VIEWS = 8
@@ -51,7 +53,7 @@ def visual_hull(
     cameras, limit = cameras.to(views.device), _limit(threshold, views)
     kept = views.new_ones((len(views), 1, 1, 1), dtype=torch.bool)
     for edge in _edges(brick, grid.shape):
-        counts = lattice_counts(grid.shape, edge)
+        counts = bricks_along(grid.shape, edge)
         kept = _repeated(kept, COARSER, counts) if kept[0].numel() > 1 else kept.expand(-1, *counts)
         places = kept.any(dim=0).nonzero()
         empty, dark = _witnesses(views[:, 0], limit[:, 0], cameras, grid, (places, edge, witnesses))
@@ -74,10 +76,7 @@ def check_measured(views: Float[Tensor, "b 1 m v u"], cameras: Cameras) -> None:
     expected = (1, len(cameras), *cameras.shape)
     if views.ndim != 5 or tuple(views.shape[1:]) != expected:
         raise ValueError(f"Expected views [b 1 m v u] with last sizes {expected}, got {tuple(views.shape)}")
-    low, high = views.detach().aminmax()  # a NaN is both
-    if not (low.isfinite() and high.isfinite()):
-        bad = int((~views.isfinite()).sum())
-        raise ValueError(f"Views must be finite, got {bad} of {views.numel()} values that are NaN or infinite")
+    check_finite(views)
 
 
 def _limit(threshold: float | Float[Tensor, "b 1 m v u"], views: Float[Tensor, "b 1 m v u"]) -> Tensor:

@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.support.footprints import Bricks, footprints, lattice_counts, sums, tables
+from mvrecon.support.footprints import Bricks, footprints, sums, tables
 from mvrecon.support.hull import AT_ONCE, check_measured
 
 #: Views in a group whose counts are added.
@@ -113,7 +114,7 @@ def activity_bound(
             or negative; a delta not between 0 and 1.
     """
     check_measured(counts, cameras)
-    _check_counts(counts, sensitivity, (len(cameras), *lattice_counts(grid.shape, brick)), delta)
+    _check_counts(counts, sensitivity, (len(cameras), *bricks_along(grid.shape, brick)), delta)
     lattice, sets = sensitivity.shape[1:], view_sets(len(cameras)).to(counts.device)
     places = torch.ones(lattice, dtype=torch.bool, device=counts.device).nonzero()
     share, expected = delta / (len(places) * len(sets)), sensitivity.to(counts.device, torch.float64).flatten(1)

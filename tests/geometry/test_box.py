@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid, voxel_centres
 
 
@@ -37,3 +37,12 @@ def test_a_cropped_grid_keeps_its_voxels_where_they_are():
 def test_a_grid_is_not_cropped_to_nothing_or_beyond(box):
     with pytest.raises(ValueError, match="cannot be cropped"):
         Grid.centred((6, 7, 8), 1.0).cropped(box)
+
+
+def test_a_part_is_put_back_where_it_was_cut_out():
+    whole, outer, box = torch.rand(2, 7, 8, 9), Box((1, 1, 2), (6, 7, 9)), Box((2, 3, 2), (4, 7, 8))
+    part = whole[:, *box.slices]
+    assert torch.equal(whole[:, *outer.slices][:, *box.within(outer)], part)
+    back = placed(part, box, (7, 8, 9))
+    assert torch.equal(back[:, *box.slices], part) and back.sum() == pytest.approx(part.sum().item())
+    assert box.margins(outer) == [0, 1, 2, 0, 1, 2]

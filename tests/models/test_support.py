@@ -7,11 +7,9 @@ from torch.nn.functional import max_pool3d
 from mvrecon.geometry.box import Box
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import regions
-from mvrecon.models.geometry import cropped_geometry, cropped_projector, whole_geometry
 from mvrecon.models.model import disagreement
-from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
+from mvrecon.parts import MODELS
 from mvrecon.support.support import Support
-from tests.models.rig import small_rig
 
 HEAD = {"name": "softmax_depth"}
 MODEL_OPTIONS = {
@@ -21,12 +19,6 @@ MODEL_OPTIONS = {
 }
 NAMES = list(MODEL_OPTIONS)
 FIELDS = ("volume", "opinions", "weights", "cross_views")
-
-
-@pytest.fixture(scope="module")
-def projector():
-    grid, cameras = small_rig(size=24, pixels=36)
-    return PROJECTORS.build("drr", grid=grid, cameras=cameras)
 
 
 @pytest.fixture(scope="module")
@@ -167,75 +159,6 @@ def test_every_parameter_learns_on_a_support_met_first_in_evaluation(projector, 
     ReconstructionLoss(1.0, edges=0.1)(out, {"volume": volume, "views": views})["total"].backward()
     assert not [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
     assert len(model.regions.crops) == 1
-
-
-@torch.no_grad()
-def test_few_crops_are_kept_and_made_once(projector, monkeypatch):
-    found = regions.Regions(projector, regions.Skip(support="hull"))
-    monkeypatch.setattr(regions, "KEPT", 2)
-    boxes = [Box((0, 0, 0), (n, 8, 8)) for n in (4, 8, 12)]
-    first = found.crop(boxes[0])
-    assert found.crop(boxes[0]) is first
-    found.crop(boxes[1])
-    found.crop(boxes[0])
-    found.crop(boxes[2])
-    assert [key[0] for key in found.crops] == [boxes[0], boxes[2]]
-
-
-def test_a_crop_is_the_operator_on_it(projector):
-    box = Box((4, 8, 12), (16, 20, 24))
-    x = torch.rand(1, 1, *box.shape)
-    whole = torch.zeros(1, 1, 24, 24, 24)
-    whole[..., *box.slices] = x
-    crop = cropped_projector(projector, box)
-    assert _close(crop(x), projector(whole), 1e-5)
-    views = torch.rand(1, 1, 4, 36, 36)
-    assert _close(crop.T(views), projector.T(views)[..., *box.slices], 1e-5)
-    geometry = cropped_geometry(whole_geometry(projector, 3), box)
-    columns = projector.T(torch.ones(1, 1, 4, 36, 36))[..., *box.slices]
-    assert torch.allclose(geometry.column * columns, torch.ones_like(columns), atol=1e-4)
-
-
-@pytest.mark.parametrize("rig", ["circular", "dome", "parallel"])
-def test_the_windows_of_a_crop_hold_all_that_its_inner_voxels_read(rig):
-    grid, cameras = small_rig(size=24, pixels=36)
-    detector = {"pixels": [36, 36], "pixel_mm": 1.0}
-    if rig == "dome":
-        cameras = CAMERAS.build("dome", views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector)
-    if rig == "parallel":
-        cameras = CAMERAS.build("parallel", views=3, detector=detector)
-    A = PROJECTORS.build("radon" if rig == "parallel" else "drr", grid=grid, cameras=cameras)
-    whole, box = whole_geometry(A, 3), Box((8, 4, 12), (16, 12, 20))
-    crop, inner = cropped_geometry(whole, box), (..., *[slice(1, -1)] * 3)
-    mask = torch.zeros(1, 1, *grid.shape, dtype=torch.bool)
-    mask[..., *box.slices][inner] = True
-    smaller = 0
-    for full, part in ((whole.fine, crop.fine), (whole.coarse, crop.coarse)):
-        values = torch.rand(1, len(cameras), 1, *full.shape)
-        index = [part.window.first[:, k, None] + torch.arange(n) for k, n in enumerate(part.shape)]
-        z, v, u = index[0][:, :, None, None], index[1][:, None, :, None], index[2][:, None, None, :]
-        m = torch.arange(len(cameras))[:, None, None, None]
-        cut = values[0, m, 0, z, v, u][None, :, None]
-        assert _close(part.to_world(cut)[inner], full.to_world(values)[..., *box.slices][inner], 1e-5)
-        touched = full.touched(mask)[0, m, 0, z, v, u][None, :, None]
-        assert torch.equal(part.touched(mask[..., *box.slices]), touched)
-        assert touched.sum() == full.touched(mask).sum(), "touched bins were cut off"
-        assert torch.equal(part.occupied[:, 0], full.occupied[m, 0, z, v, u])
-        smaller += part.shape != full.shape
-    assert smaller == 2
-
-
-def test_touched_bins_are_those_that_hold_part_of_the_mask_and_no_others(projector):
-    """A mask in frusta and back again loses no voxel of what was there, and is zero a bin and a voxel away from it."""
-    fine = whole_geometry(projector, 3).fine
-    mask = torch.zeros(1, 1, 24, 24, 24, dtype=torch.bool)
-    mask[..., 11, 12, 13] = True
-    touched = fine.touched(mask)
-    held = fine.to_world(touched.float())
-    assert torch.allclose(held[..., 11, 12, 13], torch.ones(1, 4, 1), atol=1e-5)
-    far = torch.ones_like(mask)
-    far[..., 8:15, 9:16, 10:17] = False
-    assert not (held * far[:, None]).any() and touched.sum() < 4 * 100
 
 
 @torch.no_grad()

@@ -6,16 +6,17 @@ import pytest
 import torch
 
 from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.solids import Phantom
-from mvrecon.support.footprints import Bricks, Footprints, footprints, lattice_counts, sums, tables
+from mvrecon.support.footprints import Bricks, Footprints, footprints, sums, tables
 from tests.support.cases import KINDS, World, operator, random_world
 
 DETECTOR = {"pixels": [9, 12], "pixel_mm": 1.0}
 
 
 def bricks_of(grid: Grid, edge: int) -> Bricks:
-    return Bricks.at(torch.ones(lattice_counts(grid.shape, edge)).nonzero(), edge, grid.shape)
+    return Bricks.at(torch.ones(bricks_along(grid.shape, edge)).nonzero(), edge, grid.shape)
 
 
 def covered(prints: Footprints, shape: tuple[int, int]) -> torch.Tensor:

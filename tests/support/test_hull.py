@@ -7,13 +7,14 @@ import torch
 from torch.nn.functional import max_pool3d
 
 from mvrecon.cameras.rigs import parallel
+from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.scenes.derenzo import derenzo
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon.support import hull
-from mvrecon.support.footprints import Bricks, footprints, lattice_counts
+from mvrecon.support.footprints import Bricks, footprints
 from mvrecon.support.hull import expand, visual_hull
 from tests.support.cases import KINDS, World, moved, operator, random_world
 
@@ -96,7 +97,7 @@ def test_it_moves_with_the_world(kind: str):
 def test_what_no_view_sees_whole_stays_and_all_else_goes_when_nothing_is_seen():
     for kind in KINDS:
         world = random_world(kind, 4)
-        lattice = lattice_counts(world.grid.shape, EDGE)
+        lattice = bricks_along(world.grid.shape, EDGE)
         bricks = Bricks.at(torch.ones(lattice).nonzero(), EDGE, world.grid.shape)
         seen = footprints(world.cameras, world.grid, bricks, gaps=True).whole.any(dim=0).reshape(lattice)
         stays = kept(world, torch.zeros_like(world.views))[0]

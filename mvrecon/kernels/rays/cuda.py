@@ -15,7 +15,6 @@ from jaxtyping import Float
 from numba import cuda
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
 from mvrecon.kernels.backends import wide
 from mvrecon.kernels.padding import INNER, PAD, padded_shape
 from mvrecon.kernels.rays import cuda_loops
@@ -77,7 +76,7 @@ def gather(
     """`backproject` of Joseph's method by voxels, the same to the last bit in every run."""
     y, given = wide(views).contiguous(), maps(lines)
     scene = scene_of(window, held, views.shape[2:], method)
-    around = read_box(held)
+    around = held.read
     volume = y.new_zeros(len(y), *around.shape)
     pixels, blocks = math.prod(scene.detector), (-(-around.size // BLOCK), _groups(len(y)))
     record, collect = cuda_loops.record_kernel(), cuda_loops.gather_kernel(_group(len(y)))
@@ -88,7 +87,7 @@ def gather(
         axes = torch.zeros(count, 3, dtype=torch.int32, device=y.device)
         launch(record, (-(-count * pixels // BLOCK),), given, scene, first, rays, frames, axes)
         launch(collect, blocks, y.flatten(1), rays, frames, axes, scene, first, volume)
-    return volume[:, *inside(held, around)]
+    return volume[:, *held.box.within(around)]
 
 
 def scatter(
@@ -100,9 +99,9 @@ def scatter(
     flat = y.new_zeros(len(y) * scene.size)
     kernel = cuda_loops.scatter_kernel(numbered(method)[0], *_shares(len(y), scene))
     launch(kernel, (_blocks(scene, len(lines)), _groups(len(y))), y, maps(lines), scene, flat)
-    around = read_box(held)
+    around = held.read
     volume = flat.view(len(y), *padded_shape(around.shape))[:, INNER, INNER, INNER]
-    return volume[:, *inside(held, around)].contiguous()
+    return volume[:, *held.box.within(around)].contiguous()
 
 
 def lines_vjp(
@@ -143,7 +142,7 @@ def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
 
 def scene_of(window: Sequence[float], held: Occupancy, detector: Sequence[int], method: str) -> Scene:
     """The numbers of a scene."""
-    around = read_box(held)
+    around = held.read
     depth, height, width = padded_shape(around.shape)
     rows, columns = (int(size) for size in detector)
     low, high = (min(max(float(end), -FAR), FAR) for end in window)
@@ -161,22 +160,10 @@ def scene_of(window: Sequence[float], held: Occupancy, detector: Sequence[int], 
     )
 
 
-def read_box(held: Occupancy) -> Box:
-    """The box that rays are clipped to: a voxel larger than what is held, as rounding may move them a little."""
-    return held.box.grown(1, held.shape)
-
-
-def inside(held: Occupancy, around: Box) -> tuple[slice, slice, slice]:
-    """Where in a larger box that lies which is held."""
-    z, y, x = (slice(a - o, b - o) for a, b, o in zip(held.box.low, held.box.high, around.low, strict=True))
-    return z, y, x
-
-
 def padded(volume: Float[Tensor, "n d h w"], held: Occupancy) -> Float[Tensor, " p"]:
     """Volumes, as much of them as is held, in the box that is read, with their border of nothing, in one row."""
-    low, high = held.box, read_box(held)
-    ends = zip(reversed(low.low), reversed(low.high), reversed(high.low), reversed(high.high), strict=True)
-    return F.pad(volume, [n for a, b, o, p in ends for n in (a - o + PAD[0], p - b + PAD[1])]).flatten()
+    margins = held.box.margins(held.read)
+    return F.pad(volume, [n + border for n, border in zip(margins, PAD * 3, strict=True)]).flatten()
 
 
 def maps(lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "m 4 3 k"]:

@@ -3,6 +3,7 @@
 It travels through torch's operators as one small tensor of integers, so that they know nothing of it.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, Three, three
+from mvrecon.geometry.box import Box, Three, bricks_along
 
 #: Voxels along the edge of a brick.
 EDGE = 8
@@ -44,6 +45,11 @@ class Occupancy:
         box = Box.whole(shape)
         return cls(box.high, box)
 
+    @property
+    def read(self) -> Box:
+        """The box that rays are clipped to: a voxel larger than what is held, as rounding may move them a little."""
+        return self.box.grown(1, self.shape)
+
     def rows(self, low: int, high: int) -> "Occupancy":
         """What is held of the rows (along y) from `low`, a multiple of a brick's edge, to one behind the last."""
         if (low, high) == (0, self.shape[1]):
@@ -67,20 +73,14 @@ class Occupancy:
         """The inverse of `encoded`."""
         numbers = code.numpy()
         d, h, w, z0, y0, x0, z1, y1, x1, one, two, told_apart = numbers[:HEAD].tolist()
-        bricks = numbers[HEAD:].astype(np.uint8).reshape(brick_shape((d, h, w))) if told_apart else None
+        bricks = numbers[HEAD:].astype(np.uint8).reshape(bricks_along((d, h, w), EDGE)) if told_apart else None
         shares = (one / WHOLE if one >= 0 else float("nan"), two / WHOLE if two >= 0 else float("nan"))
         return cls((d, h, w), Box((z0, y0, x0), (z1, y1, x1)), bricks, shares)
 
 
-def brick_shape(shape: Sequence[int]) -> Three:
-    """Bricks along (z, y, x) of a volume of `shape`."""
-    return three(-(-n // EDGE) for n in shape)
-
-
 def code_size(shape: Sequence[int]) -> int:
     """How many integers tell of a volume of `shape`."""
-    z, y, x = brick_shape(shape)
-    return HEAD + z * y * x
+    return HEAD + math.prod(bricks_along(shape, EDGE))
 
 
 def bricks_of_rig(held: Occupancy) -> tuple[np.ndarray, Three, np.ndarray]:

@@ -75,9 +75,8 @@ def rig_of(lines: Tensor, window: Sequence[float], held: Occupancy, detector: Se
 
 
 def bounds_of(held: Occupancy) -> tuple[int, ...]:
-    """The box (x0, y0, z0, x1, y1, z1) that rays are clipped to: a voxel larger, as rounding may move them a little."""
-    box = held.box.grown(1, held.shape)
-    return (*box.low[::-1], *box.high[::-1])
+    """The box (x0, y0, z0, x1, y1, z1) that rays are clipped to."""
+    return (*held.read.low[::-1], *held.read.high[::-1])
 
 
 def plan_of(rig: Rig, held: Occupancy, volumes: int) -> Plan:

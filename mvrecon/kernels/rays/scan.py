@@ -5,9 +5,9 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, three
+from mvrecon.geometry.box import Box, bricks_along, three
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rays.occupancy import EDGE, brick_shape
+from mvrecon.kernels.rays.occupancy import EDGE
 from mvrecon.kernels.threads import share
 
 #: Bricks along an axis that are looked at to guess how many are empty.
@@ -120,7 +120,7 @@ def _brick_holds(volumes, z0, y0, x0):
 
 def bricks_of(volumes: np.ndarray, box: Box) -> UInt8[np.ndarray, "z y x"]:
     """The bricks of volumes [n d h w] as an `Occupancy` has them, where all that is not zero lies in a box."""
-    bricks = np.zeros(brick_shape(volumes.shape[1:]), np.uint8)
+    bricks = np.zeros(bricks_along(volumes.shape[1:], EDGE), np.uint8)
     if box.size:
         mark(volumes, np.array(box.low), np.array(box.high), bricks)
     return bricks
