@@ -4,6 +4,8 @@ Convention: coordinates are voxel indices in the order (x, y, z) = (last, middle
 voxel centres. Outside the outermost centres the values fade to zero over one voxel.
 """
 
+from itertools import product
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -23,8 +25,27 @@ def sample(volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"
     Order of accuracy: second in the voxel size. Coordinates stay float32 or wider whatever the volume's dtype.
     """
     if points.dtype != volume.dtype:
-        return F.grid_sample(volume.to(points.dtype), points, align_corners=False).to(volume.dtype)
+        return sample(volume.to(points.dtype), points).to(volume.dtype)
+    if torch.are_deterministic_algorithms_enabled() and not volume.is_cpu:
+        return gathered(volume, points)
     return F.grid_sample(volume, points, align_corners=False)
+
+
+def gathered(volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"]) -> Float[Tensor, "b c k v u"]:
+    """What `grid_sample` gives, whose derivative on a GPU adds up in no fixed order; that of `gather` can."""
+    sizes = torch.tensor(volume.shape[:1:-1], device=points.device)
+    places = ((points + 1) * sizes - 1) / 2
+    low, flat = places.detach().floor(), volume.flatten(2)
+    found = volume.new_zeros(*volume.shape[:2], *points.shape[1:4])
+    for corner in product((0, 1), repeat=3):
+        at = (low + low.new_tensor(corner)).long()
+        held = ((at >= 0) & (at < sizes)).all(dim=-1)
+        x, y, z = at.where(held[..., None], 0).unbind(dim=-1)
+        index = ((z * sizes[1] + y) * sizes[0] + x).flatten(1)[:, None].expand(-1, flat.shape[1], -1)
+        along_x, along_y, along_z = (1 - (places - at).abs()).unbind(dim=-1)
+        share = along_x * along_y * along_z * held
+        found = found + flat.gather(2, index).unflatten(2, held.shape[1:]) * share[:, None]
+    return found
 
 
 def inside(points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:

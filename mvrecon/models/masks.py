@@ -6,6 +6,7 @@ Masks are numbers 0 and 1 in the features' type; features are zero outside them.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +14,35 @@ from jaxtyping import Float
 from torch import Tensor
 
 Mask = Float[Tensor, "n 1 d h w"]
+
+
+class _Halved(torch.autograd.Function):
+    """torch's own derivative of `avg_pool3d` adds up in no fixed order on a GPU; this one, the same to the last bit,
+    adds up nothing."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor) -> Tensor:
+        return F.avg_pool3d(x, 2, ceil_mode=True)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.shape = inputs[0].shape[2:]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        share = gradient / 8
+        for axis, size in enumerate(ctx.shape, start=2):
+            if size % 2:  # the last mean is of half as many
+                share = torch.cat([share.narrow(axis, 0, size // 2), 2 * share.narrow(axis, size // 2, 1)], dim=axis)
+        d, h, w = ctx.shape
+        return F.interpolate(share, scale_factor=2.0, mode="nearest")[:, :, :d, :h, :w]
+
+
+def halved(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
+    """Means of 2x2x2 voxels; at odd ends, of as many as there are. Its derivative has the same bits in every run."""
+    return _Halved.apply(x)
 
 
 def group_norm(
@@ -43,9 +73,9 @@ def group_norm(
 
 def pooled(x: Float[Tensor, "n c d h w"], mask: Mask) -> tuple[Float[Tensor, "n c e i x"], Mask]:
     """Means of 2x2x2 voxels over those in the mask, and the max-pooled mask."""
-    share = F.avg_pool3d(mask, 2, ceil_mode=True)
+    share = halved(mask)
     some = (share > 0).to(x.dtype)
-    return F.avg_pool3d(x, 2, ceil_mode=True) / (share + (1 - some)), some
+    return halved(x) / (share + (1 - some)), some
 
 
 def upsampled(x: Float[Tensor, "n c e i x"], mask: Mask, onto: Mask, size: Sequence[int]) -> Float[Tensor, "n c d h w"]:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from mvrecon.geometry.box import Box, placed
 from mvrecon.models.blocks import ConvBlock
 from mvrecon.models.bricks import active_bricks
-from mvrecon.models.masks import pooled, upsampled
+from mvrecon.models.masks import halved, pooled, upsampled
 
 
 class UNet3d(nn.Module):
@@ -47,7 +47,7 @@ class UNet3d(nn.Module):
         for level, block in enumerate(self.down):
             if level:
                 skips.append(x)
-                x = nn.functional.avg_pool3d(x, 2, ceil_mode=True)
+                x = halved(x)
             x = block(x)
         for level in reversed(range(len(self.up))):
             skip = skips[level]

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.models.masks import pooled, upsampled
+from mvrecon.models.masks import halved, pooled, upsampled
 from mvrecon.models.unet3d import UNet3d
 
 
@@ -45,7 +45,7 @@ class Weighting(nn.Module):
         b, m = features.shape[:2]
         if mask is not None:
             return self._masked(features.flatten(0, 1), mask.repeat_interleave(m, dim=0), bricks).unflatten(0, (b, m))
-        coarse = nn.functional.avg_pool3d(features.flatten(0, 1), 2, ceil_mode=True)
+        coarse = halved(features.flatten(0, 1))
         logits = nn.functional.interpolate(self.net(coarse), size=features.shape[-3:], mode="trilinear")
         return logits.unflatten(0, (b, m))
 

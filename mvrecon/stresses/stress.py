@@ -44,7 +44,9 @@ class Stress:
         LookupError: an unknown part, or an unknown dtype.
     """
 
-    columns, keys, charts = COLUMNS, KEYS, ("measured",)
+    columns: Mapping[str, str] = COLUMNS
+    keys: Sequence[str] = KEYS
+    charts: Sequence[str] = ("measured",)
 
     def __init__(
         self,

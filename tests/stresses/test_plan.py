@@ -21,7 +21,7 @@ def rows():
                     yield pytest.param(case, subject, id=f"{case.number}-{case.name}-{subject.label}-{dtype}")
 
 
-@pytest.mark.parametrize(("case", "subject"), rows())
+@pytest.mark.parametrize(("case", "subject"), list(rows()))
 def test_the_plan_holds(case, subject):
     row = judge(case, subject)
     assert row["verdict"] != FAIL, f"{case.holds}: {row['measured']} > {row['tolerance']} {row['note']}"
