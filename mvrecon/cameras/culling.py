@@ -41,13 +41,15 @@ def seen_depth_range(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 2"]:
     """The least and the greatest depth z in mm of what each camera sees of the grid's box, detectors' edges included.
 
     `Cameras.depth_range` less what lies beside the field of view or outside the part of the ray that counts. A camera
-    that sees nothing of the box has the box's whole range.
+    that sees nothing of the box has the box's whole range, and one that sees all of it has it to the last bit.
     """
     whole = cameras.depth_range(grid)
     z, kept = _cut(cameras, grid, 0.0)
     nearest = torch.where(kept, z, torch.inf).amin(dim=1).clamp(*whole.T)
     farthest = torch.where(kept, z, -torch.inf).amax(dim=1).clamp(*whole.T)
-    return torch.where(kept.any(dim=1)[:, None], torch.stack([nearest, farthest], dim=1), whole)
+    seen = torch.stack([nearest, farthest], dim=1)
+    less = (seen - whole).abs() > SLACK * (whole[:, 1:] - whole[:, :1])
+    return torch.where(kept.any(dim=1)[:, None] & less, seen, whole)
 
 
 def _cut(cameras: Cameras, grid: Grid, margin: float) -> tuple[Float[Tensor, "m k"], Bool[Tensor, "m k"]]:

@@ -48,11 +48,12 @@ class Consistency(nn.Module):
 
 def normalised(
     region: Region, views: Float[Tensor, "b 1 m v u"], iterations: int
-) -> tuple[Float[Tensor, "b 1 m v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
-    """Views and their classical start, both divided by the content's scale, and that scale.
+) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
+    """The region's views and their classical start, both divided by the content's scale, and that scale.
 
     The start is SIRT with momentum from zero, non-negative, not differentiated.
     """
+    views = region.measured(views)
     with torch.no_grad():
         start = sirt(region.A, views, iterations, weights=region.weights, momentum=True)
     scale = content_scale(start)

@@ -1,10 +1,11 @@
 """Frusta over a crop of the grid: some bins of the whole frusta, with all that is known of them taken over."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.culling import seen_depth_range
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.grid import Grid
@@ -18,17 +19,19 @@ class CroppedFrusta(Frusta):
     Args:
         whole: the frusta over the grid.
         grid: that grid.
-        cameras: their rig.
+        cameras: of the rig, those that see the crop.
         box: the voxels of the crop.
         window: the bins.
+        views: which of the rig's cameras these are.
     """
 
-    def __init__(self, whole: Frusta, grid: Grid, cameras: Cameras, box: Box, window: Window):
+    def __init__(self, whole: Frusta, grid: Grid, cameras: Cameras, box: Box, window: Window, views: Int[Tensor, " k"]):
         nn.Module.__init__(self)
         self.window, self.depth = window, whole.shape[0]
-        edges = depth_edges(cameras.depth_range(grid), self.depth, whole.spacing)
+        edges = depth_edges(seen_depth_range(cameras, grid), self.depth, whole.spacing)
         self._place(grid.cropped(box), window.cameras(cameras), window.edges(edges), whole.spacing)
-        self._hold(whole.visible[..., *box.slices], window.bins(whole.occupied), window.bins(whole.step))
+        visible, occupied, step = (part[views] for part in (whole.visible, whole.occupied, whole.step))
+        self._hold(visible[..., *box.slices], window.bins(occupied), window.bins(step))
 
     def part_of(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:
         """The pixels that the frusta have."""

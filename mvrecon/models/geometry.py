@@ -6,9 +6,13 @@ It is made once for the grid, and once for every crop of it that a scene needs.
 import inspect
 
 import torch
+from jaxtyping import Int
 from torch import Tensor, nn
 
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.culling import views_that_see
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Grid
 from mvrecon.models.cropped import CroppedFrusta
 from mvrecon.models.lift import Frusta
 from mvrecon.models.window import window_of
@@ -26,16 +30,24 @@ class Geometry(nn.Module):
         projector: A.
         weights: (R, C) of A.
         frusta: (fine, coarse), where a model has cameras' opinions.
+        views: which of the rig's cameras the projector has, those that see its grid; all, by default.
     """
 
     row: Tensor
     column: Tensor
+    views: Tensor
 
     def __init__(
-        self, projector: Projector, weights: tuple[Tensor, Tensor], frusta: tuple[Frusta, Frusta] | None = None
+        self,
+        projector: Projector,
+        weights: tuple[Tensor, Tensor],
+        frusta: tuple[Frusta, Frusta] | None = None,
+        views: Int[Tensor, " k"] | None = None,
     ):
         super().__init__()
         self.projector = projector
+        every = torch.arange(len(projector.cameras), device=weights[0].device)
+        self.register_buffer("views", every if views is None else views, persistent=False)
         self.register_buffer("row", weights[0], persistent=False)
         self.register_buffer("column", weights[1], persistent=False)
         self.frusta = None if frusta is None else nn.ModuleList(frusta)
@@ -68,11 +80,15 @@ def whole_geometry(projector: Projector, binning: int | None = None) -> Geometry
 
 
 def cropped_geometry(whole: Geometry, box: Box) -> Geometry:
-    """The same for the voxels in a box: what is equal to them is taken over, the rest made for them alone."""
-    projector = cropped_projector(whole.projector, box)
-    weights = whole.row, whole.column[..., *box.slices]
+    """The same for the voxels in a box, and the cameras that see any of it.
+
+    What is equal to them is taken over, the rest made for them alone.
+    """
+    views = _seeing(whole.projector.cameras, whole.projector.grid.cropped(box)).to(whole.row.device)
+    projector = cropped_projector(whole.projector, box, views)
+    weights = whole.row[:, :, views], whole.column[..., *box.slices]
     if whole.frusta is None:
-        return Geometry(projector, weights)
+        return Geometry(projector, weights, views=views)
     fine, coarse = whole.fine, whole.coarse
     grid, cameras, binning = whole.projector.grid, projector.cameras, fine.shape[1] // coarse.shape[1]
     binned = cameras.binned(binning)
@@ -81,14 +97,20 @@ def cropped_geometry(whole: Geometry, box: Box) -> Geometry:
     if fine.shape[0] % 2:  # coarse bins are no pairs of fine ones: both keep all of them
         window, finer = window.deep(coarse.shape[0]), finer.deep(fine.shape[0])
     frusta = (
-        CroppedFrusta(fine, grid, cameras, box, finer),
-        CroppedFrusta(coarse, grid, binned, box, window),
+        CroppedFrusta(fine, grid, cameras, box, finer, views),
+        CroppedFrusta(coarse, grid, binned, box, window, views),
     )
-    return Geometry(projector, weights, frusta).to(fine.step.device)
+    return Geometry(projector, weights, frusta, views).to(fine.step.device)
 
 
-def cropped_projector(A: Projector, box: Box) -> Projector:
-    """The projector with the same options for the voxels in a box; a support is cropped with it.
+def _seeing(cameras: Cameras, grid: Grid) -> Int[Tensor, " k"]:
+    """Which cameras see any of a grid; all of them, where none does."""
+    seen = views_that_see(cameras, grid)
+    return (seen if seen.any() else ~seen).nonzero()[:, 0]
+
+
+def cropped_projector(A: Projector, box: Box, views: Int[Tensor, " k"]) -> Projector:
+    """The projector with the same options for the voxels in a box and some cameras; a support is cropped with it.
 
     Raises:
         TypeError: a projector that does not keep its options as attributes of the same names.
@@ -106,7 +128,8 @@ def cropped_projector(A: Projector, box: Box) -> Projector:
     options = {name: getattr(A, name) for name in names}
     if isinstance(options.get("support"), Tensor):
         options["support"] = options["support"][box.slices]
-    return type(A)(grid=A.grid.cropped(box), cameras=A.rays, **options).to(A.lines.device)
+    cameras = A.cameras[views.to(A.cameras.source.device)]
+    return type(A)(grid=A.grid.cropped(box), cameras=cameras, **options).to(A.lines.device)
 
 
 def crop_of(whole: Geometry, box: Box) -> Geometry:

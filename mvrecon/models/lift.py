@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.culling import seen_depth_range
 from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import Spacing, depth_edges
 from mvrecon.geometry.grid import Grid
@@ -23,7 +24,7 @@ TOUCH = 1e-5
 
 
 class Frusta(Bins, nn.Module):
-    """The frusta of M cameras over one grid, cut tightly to its box.
+    """The frusta of M cameras over one grid, cut tightly to what each sees of its box.
 
     Args:
         grid: the region of interest, and where `to_world` puts its volumes.
@@ -40,7 +41,7 @@ class Frusta(Bins, nn.Module):
 
     def __init__(self, grid: Grid, cameras: Cameras, depth: int, spacing: Spacing = "z"):
         super().__init__()
-        edges = depth_edges(cameras.depth_range(grid), depth, spacing)
+        edges = depth_edges(seen_depth_range(cameras, grid), depth, spacing)
         self._place(grid, cameras, edges, spacing)
         ahead = frusta_lattice(cameras, grid, edges, spacing).ahead[:, None, :, None, None]
         held = inside(normalised_places(self.world_from_frusta, grid.shape, self.shape)).transpose(0, 1)

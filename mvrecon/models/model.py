@@ -72,7 +72,8 @@ class CrossView(nn.Module):
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         region = self.regions(views)
         y, x0, scale = normalised(region, views, self.iterations)
-        opinions, features = self.opinions(region, y, x0, y - region.A(x0))
+        expected = region.A(x0)
+        opinions, features = self.opinions(region, y, x0, y - expected)
         cross_views = region.A(opinions[:, :, 0])  # every camera's opinion as every camera would have seen it
         logits = torch.zeros_like(opinions)
         if self.weighting is not None:
@@ -84,10 +85,10 @@ class CrossView(nn.Module):
         volume = self.consistency(region, volume, y, None if self.skip.sigma is None else self.skip.sigma / scale)
         return Reconstruction(
             volume=region.pasted(volume * scale),
-            opinions=region.pasted(opinions * scale[:, None]),
+            opinions=region.pasted(region.of_all(opinions, x0[:, None]) * scale[:, None]),
             visible=self.regions.whole.fine.visible,
-            weights=region.pasted(weights),
-            cross_views=cross_views * scale,
+            weights=region.pasted(region.of_all(weights)),
+            cross_views=_of_all(region, cross_views, expected) * scale,
             support=region.support,
         )
 
@@ -114,6 +115,13 @@ class CrossView(nn.Module):
         where = disagreement(variance[:, 0].sqrt(), self.skip.tolerance)
         where = where if region.net_mask is None else where & region.net_mask
         return region.within(on_its_box(self.refine, evidence, where, self.skip.bricks))
+
+
+def _of_all(
+    region: Region, cross_views: Float[Tensor, "b k k v u"], expected: Float[Tensor, "b 1 k v u"]
+) -> Float[Tensor, "b m m v u"]:
+    """Cross-views of all cameras: of those that are left out, opinions are the start, and views are of nothing."""
+    return region.of_all(region.of_all(cross_views, expected).transpose(1, 2)).transpose(1, 2)
 
 
 def disagreement(spread: Float[Tensor, "b 1 d h w"], tolerance: float) -> Bool[Tensor, "b 1 d h w"]:

@@ -107,7 +107,8 @@ class Opinions(nn.Module):
             mask = None if mask is None else mask.flatten(0, 1)
             return self.nets[0](inputs.flatten(0, 1), mask, region.bricks).unflatten(0, (b, m))
         each = [None if mask is None else mask[:, k] for k in range(m)]
-        answers = [net(inputs[:, k], each[k], region.bricks) for k, net in enumerate(self.nets)]
+        nets = [self.nets[k] for k in region.geometry.views.tolist()]
+        answers = [net(inputs[:, k], each[k], region.bricks) for k, net in enumerate(nets)]
         return torch.stack(answers, dim=1)
 
 

@@ -5,7 +5,7 @@ Convention: inside a model every volume is the crop's; only what a model returns
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import adaptive_max_pool3d
 
@@ -23,6 +23,7 @@ class Region:
     Args:
         geometry: of the crop.
         shape: voxels of the whole grid.
+        cameras: of the whole rig; those that see nothing of the crop are left out, which changes nothing.
         weights: SIRT's (R, C); C is zero outside the mask and R is made of rays through it.
         box: the crop; none for the whole grid.
         mask: where the density may differ from zero; none for everywhere.
@@ -32,6 +33,7 @@ class Region:
 
     geometry: Geometry
     shape: tuple[int, int, int]
+    cameras: int
     weights: tuple[Tensor, Tensor]
     box: Box | None = None
     mask: Bool[Tensor, "b 1 d h w"] | None = None
@@ -47,6 +49,23 @@ class Region:
     def net_mask(self) -> Bool[Tensor, "b 1 d h w"] | None:
         """The mask of the world's networks."""
         return self.mask if self.seen_by_nets else None
+
+    def measured(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c k v u"]:
+        """The views of the cameras that see the crop."""
+        return views[:, :, self.geometry.views] if self.culled else views
+
+    @property
+    def culled(self) -> int:
+        """How many cameras see nothing of the crop, and are left out."""
+        return self.cameras - len(self.geometry.views)
+
+    def of_all(self, values: Shaped[Tensor, "b k *n"], otherwise: Shaped[Tensor, "b 1 *n"] | None = None) -> Tensor:
+        """Values of the cameras that see the crop among the whole rig's; zero for the others, or as given."""
+        if not self.culled:
+            return values
+        size = [len(values), self.cameras, *values.shape[2:]]
+        whole = values.new_zeros(size) if otherwise is None else otherwise.expand(size)
+        return whole.index_copy(1, self.geometry.views, values)
 
     def back(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """Residual views as a correction of the volume, C A^T R r."""

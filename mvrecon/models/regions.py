@@ -42,7 +42,7 @@ class Regions(nn.Module):
         """
         A, skip = self.whole.projector, self.skip
         check_views(views, A.cameras)
-        everything = Region(self.whole, A.grid.shape, (self.whole.row, self.whole.column))
+        everything = Region(self.whole, A.grid.shape, len(A.cameras), (self.whole.row, self.whole.column))
         if skip.support == "none":
             return everything
         found = support_from_views(views, A.cameras, A.grid, "hull", skip.noise)
@@ -52,7 +52,7 @@ class Regions(nn.Module):
         box = (box if box.size else found.box).grown(skip.halo, A.grid.shape).aligned(MULTIPLE, A.grid.shape)
         geometry, mask = self.crop(box), mask[..., *box.slices]
         weights = masked_weights(geometry, mask, views.dtype)
-        return Region(geometry, A.grid.shape, weights, box, mask, skip.masked, skip.bricks)
+        return Region(geometry, A.grid.shape, len(A.cameras), weights, box, mask, skip.masked, skip.bricks)
 
     def crop(self, box: Box) -> Geometry:
         """The geometry of a crop, made at most once while it is kept."""

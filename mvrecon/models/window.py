@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.culling import seen_depth_range
 from mvrecon.geometry.frustum import depth_edges, depth_index
 from mvrecon.geometry.grid import Grid
 
@@ -81,7 +82,7 @@ def window_of(crop: Grid, whole: Grid, cameras: Cameras, depth: int, multiple: i
         multiple: that number.
     """
     seen = cameras.project(crop.corners().to(cameras.source)).cpu()  # [m 8 3]
-    edges = depth_edges(cameras.depth_range(whole), depth).cpu()
+    edges = depth_edges(seen_depth_range(cameras, whole), depth).cpu()
     place = torch.stack([depth_index(seen[..., 2], edges), seen[..., 1], seen[..., 0]], dim=-1)
     sizes = torch.tensor([depth, *cameras.shape])
     across = (seen[..., 2].amin(dim=1) * seen[..., 2].amax(dim=1) <= 0) & (not cameras.parallel)

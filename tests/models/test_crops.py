@@ -1,11 +1,18 @@
 """What is made for a crop of the grid: its operator, its frusta, and how long they are kept."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.box import Box
-from mvrecon.models import regions
+from mvrecon.geometry.grid import Grid
+from mvrecon.losses import ReconstructionLoss
+from mvrecon.models import geometry, regions
 from mvrecon.models.geometry import cropped_geometry, cropped_projector, whole_geometry
+from mvrecon.models.model import CrossView
 from mvrecon.parts import CAMERAS, PROJECTORS
 from tests.models.rig import small_rig
 from tests.models.test_support import _close
@@ -29,7 +36,7 @@ def test_a_crop_is_the_operator_on_it(projector):
     x = torch.rand(1, 1, *box.shape)
     whole = torch.zeros(1, 1, 24, 24, 24)
     whole[..., *box.slices] = x
-    crop = cropped_projector(projector, box)
+    crop = cropped_projector(projector, box, torch.arange(4))
     assert _close(crop(x), projector(whole), 1e-5)
     views = torch.rand(1, 1, 4, 36, 36)
     assert _close(crop.T(views), projector.T(views)[..., *box.slices], 1e-5)
@@ -78,3 +85,49 @@ def test_touched_bins_are_those_that_hold_part_of_the_mask_and_no_others(project
     far = torch.ones_like(mask)
     far[..., 8:15, 9:16, 10:17] = False
     assert not (held * far[:, None]).any() and touched.sum() < 4 * 100
+
+
+def helix() -> tuple[Grid, Cameras]:
+    """A tall grid, and a detector that climbs along it: no camera sees all of it."""
+    grid = Grid.centred((40, 16, 16), 1.0)
+    detector = {"pixels": [12, 24], "pixel_mm": 2.4}
+    turns = [circular(1, 60.0, 100.0, detector, start_degrees=50.0 * k) for k in range(8)]
+    lifted = [rig.moved(torch.eye(3), torch.tensor([0.0, 0.0, 4.5 * k - 15.75])) for k, rig in enumerate(turns)]
+    vectors = {name: torch.cat([getattr(rig, name) for rig in lifted]) for name in VECTORS}
+    return grid, replace(lifted[0], **vectors)
+
+
+def helical_model(shared: bool = True):
+    torch.manual_seed(0)
+    grid, cameras = helix()
+    projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
+    opinion = {"width": 4, "features": 2, "binning": 3, "shared": shared}
+    model = CrossView(projector, {"name": "softmax_depth"}, opinion, refine=4, start=3, consistency=1, support="hull")
+    for parameter in model.parameters():  # the last layers start from zero, and would hide the rest
+        torch.nn.init.normal_(parameter, std=0.1)
+    volume = torch.zeros(1, 1, *grid.shape)
+    volume[..., 3:9, 4:12, 4:11] = torch.rand(6, 8, 7)
+    return model, volume, projector(volume)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_cameras_that_see_nothing_of_the_crop_are_left_out_and_change_nothing(shared, monkeypatch):
+    model, volume, views = helical_model(shared)
+    batch = {"volume": volume, "views": views}
+
+    def done():
+        model.zero_grad()
+        region, out = model.regions(views), model(views)
+        ReconstructionLoss(1.0)(out, batch)["total"].backward()
+        return region, out, [torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in model.parameters()]
+
+    region, out, gradients = done()
+    assert region.culled >= 3 and len(region.A.cameras) == 8 - region.culled
+    model.regions.crops.clear()
+    monkeypatch.setattr(geometry, "views_that_see", lambda cameras, grid: torch.ones(len(cameras)).bool())
+    dense, expected, others = done()
+    assert dense.culled == 0
+    for name in ("volume", "opinions", "weights", "cross_views"):
+        assert _close(getattr(out, name), getattr(expected, name), 1e-5), name
+    assert all(torch.allclose(a, b, rtol=1e-3, atol=1e-6) for a, b in zip(gradients, others, strict=True))
+    assert any(g.any() for g in gradients)
