@@ -101,3 +101,24 @@ SKIP = {
     "calls": "how many calls ms is the median of",
     "load": OPERATORS["load"],
 }
+
+PRECISION_KEYS = ("task", "precision", "n", "device", "threads")
+
+#: `bench=precision`.
+PRECISION = {
+    "task": "what is computed",
+    "precision": "in which volumes, views and weights are stored; autocast: in which networks compute",
+    "n": "voxels along each edge; of a checkpoint's model its own",
+    "device": OPERATORS["device"],
+    "threads": OPERATORS["threads"],
+    "status": OPERATORS["status"],
+    "error": "|y - t| / |t|, t the same in float64 from operands that were never rounded",
+    "worst": "greatest absolute error / greatest absolute value of t",
+    "not_finite": "values that are NaN or infinite",
+    "ms": "one call in ms: median of at least `repeats` taken in turns with the other precisions",
+    "ratio": "ms / that of float32",
+    "peak_mb": "most memory in 2^20 bytes of a call beyond what was in use before it, its result included",
+    "psnr": "against the truth in dB; blank for a model that is not trained",
+    "calls": "how many calls ms is the median of",
+    "load": OPERATORS["load"],
+}

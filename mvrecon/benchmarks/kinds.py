@@ -6,5 +6,6 @@ BENCHES = Registry(
     "bench",
     operators="mvrecon.benchmarks.operators:Operators",
     scaling="mvrecon.benchmarks.scaling:Scaling",
+    precision="mvrecon.benchmarks.precision:Precision",
     skip="mvrecon.benchmarks.skip:Skip",
 )
