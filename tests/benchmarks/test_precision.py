@@ -5,6 +5,7 @@ import math
 import pytest
 
 from mvrecon.benchmarks.precision import TRUTH, USUAL
+from mvrecon.benchmarks.rows import value
 from tests.benchmarks.test_app import call
 
 MODEL = (
@@ -26,7 +27,8 @@ STORED = {"bfloat16 stored": 2**-8, "float16 stored": 2**-11}
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
-    return call(tmp_path_factory.mktemp("bench") / "precision", *TINY)
+    texts = call(tmp_path_factory.mktemp("bench") / "precision", *TINY)
+    return [{name: value(text) for name, text in row.items()} for row in texts]
 
 
 def of(rows, precision):
