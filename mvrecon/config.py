@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from mvrecon.guard import guarded
 from mvrecon.limits import shown
-from mvrecon.registry import installed, locate
+from mvrecon.registry import importing, installed, locate
 
 #: Where the classes that a `_target_` may name are defined, and what they must be.
 ALLOWED = ("lightning.pytorch", "mvrecon.engine")
@@ -107,6 +108,8 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         return
     if any(argument.startswith("--e") for argument in sys.argv[1:]):
         raise PermissionError("--experimental-rerun unpickles a file, which can run anything; use resume=<run folder>")
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: a path that it cannot write must not end a run
     prepare_hydra()
     with guarded(conf_dir(), plugin_conf_dirs()):
         hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(task)()
@@ -172,10 +175,8 @@ def import_plugins(modules: Iterable[str]) -> None:
                 f"The setting 'plugins' names {shown(module)}; expected a module on Python's path whose own source "
                 "imports mvrecon"
             )
-        try:
+        with importing(f"The plugin module {module!r} (setting 'plugins')"):
             import_module(module)
-        except Exception as error:  # whatever a plugin's import raises must name the plugin
-            raise ImportError(f"The plugin module {module!r} (setting 'plugins') does not import: {error}") from error
 
 
 def _for_mvrecon(module: str) -> bool:

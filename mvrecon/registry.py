@@ -10,7 +10,8 @@ A part comes from one of three places: mvrecon's own tables (`parts.py`), the de
 
 import difflib
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.machinery import ModuleSpec, PathFinder
@@ -19,6 +20,8 @@ from importlib.util import find_spec
 from typing import Any
 
 GROUP = "mvrecon.plugins"
+#: What was registered, in turn: the table, the name, and what had it before.
+_REGISTERED: list[tuple[dict[str, Any], str, Any]] = []
 
 
 @cache
@@ -44,6 +47,23 @@ def hint(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, names, n=1)
     nearest = f"; did you mean {close[0]!r}?" if close else "."
     return f"{nearest} Known: {', '.join(names)}"
+
+
+@contextmanager
+def importing(what: str) -> Iterator[None]:
+    """Imports something of a plugin's: what breaks it off is told, and the parts that it had registered are gone.
+
+    Raises:
+        ImportError: in place of whatever the import raised, an exit included; the message begins with `what`.
+    """
+    mark = len(_REGISTERED)
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        for parts, name, before in reversed(_REGISTERED[mark:]):
+            parts.pop(name) if before is None else parts.update({name: before})
+        del _REGISTERED[mark:]
+        raise ImportError(f"{what} does not import: {error}") from error
 
 
 class Registry:
@@ -84,11 +104,18 @@ class Registry:
         return claims.pop()
 
     def register(self, name: str) -> Callable[[Any], Any]:
-        """Decorator that adds a class or a factory under a name that is still free."""
-        if name in self.names():
-            raise LookupError(f"The {self.kind} {name!r} exists already: {self.origin(name)}")
+        """Decorator that adds a class or a factory under a name that is still free.
+
+        One that is defined anew at the same place, as by a notebook's cell that is run again, takes its own place.
+
+        Raises:
+            LookupError: another part has the name.
+        """
 
         def add(part: Any) -> Any:
+            if name in self.names() and self.origin(name) != _where(part):
+                raise LookupError(f"The {self.kind} {name!r} exists already: {self.origin(name)}")
+            _REGISTERED.append((self._parts, name, self._parts.get(name)))
             self._parts[name] = part
             return part
 
@@ -106,10 +133,8 @@ class Registry:
         if callable(part):
             return part
         module, _, attribute = where.partition(":")
-        try:
+        with importing(f"The {self.kind} {name!r} ({where})"):
             return getattr(import_module(module), attribute)
-        except Exception as error:  # whatever a plugin's import raises must name the plugin
-            raise ImportError(f"The {self.kind} {name!r} ({where}) does not import: {error}") from error
 
     def build(self, name: str, /, *args: Any, **options: Any) -> Any:
         """Construct one part.

@@ -20,7 +20,8 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     from mvrecon.engine import record
     from mvrecon.stresses.stress import Stress
 
-    plan = Stress(settings["parts"], settings["cases"] or (), settings["device"], settings["dtypes"])
+    chosen = (settings["parts"], settings["cases"] or (), settings["device"], settings["dtypes"])
+    plan = Stress(*chosen, settings["limit_s"])
     record.start(folder, settings)
     return runner.run(plan, folder)
 

@@ -6,7 +6,7 @@ import pytest
 
 from mvrecon import registry
 from mvrecon.parts import REGISTRIES
-from mvrecon.registry import Registry
+from mvrecon.registry import Registry, importing
 
 
 def ring(views: int = 8, radius: float = 400.0) -> tuple[int, float]:
@@ -62,10 +62,19 @@ def test_a_config_without_a_name_says_so(cameras: Registry):
 
 def test_a_taken_name_is_refused(cameras: Registry, plugins):
     with pytest.raises(LookupError, match="exists already: test_registry:ring|exists already: .*ring"):
-        cameras.register("ring")
+        cameras.register("ring")(dome)
     plugins(camera__ring="other.module:Ring")
     with pytest.raises(LookupError, match="2 parts of kind 'camera' are named 'ring'.*other.module:Ring"):
         cameras.get("ring")
+
+
+def test_a_part_that_is_defined_anew_takes_its_own_place(cameras: Registry):
+    def again(views: int = 9, radius: float = 1.0) -> tuple[int, float]:
+        return views, radius
+
+    again.__module__, again.__qualname__ = ring.__module__, ring.__qualname__
+    cameras.register("ring")(again)
+    assert cameras.build("ring") == (9, 1.0)
 
 
 def test_two_plugins_with_one_name_are_refused_but_one_seen_twice_is_not(cameras: Registry, monkeypatch):
@@ -94,6 +103,15 @@ def test_a_broken_plugin_disturbs_only_whoever_asks(cameras: Registry, plugins):
         cameras.get("broken")
     with pytest.raises(ImportError, match="camera 'hollow' .* has no attribute 'NoSuchClass'"):
         cameras.get("hollow")
+
+
+def test_a_plugin_that_breaks_off_leaves_none_of_its_parts(cameras: Registry):
+    for error in (ValueError("no"), SystemExit(3)):
+        with pytest.raises(ImportError, match="The plugin does not import: (no|3)"), importing("The plugin"):
+            cameras.register("half")(dome)
+            cameras.register("ring")(ring)
+            raise error
+        assert cameras.names() == ["dome", "ring", "text"] and cameras.get("ring") is ring
 
 
 @pytest.mark.parametrize(("kind", "name"), [(k, n) for k, r in REGISTRIES.items() for n in r.names()])

@@ -109,7 +109,7 @@ class Trial:
         return with_memory(getattr(self, call), self.device)
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """An exception in one short line."""
     text = next((line for line in str(error).splitlines() if line.strip()), "no message")
     return f"{type(error).__name__}: {text.strip()}"[:240]

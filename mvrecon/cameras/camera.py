@@ -17,10 +17,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid, pixel_centres
+from mvrecon.geometry.rigid import check_rotation, unit
 
 Extent = Literal["segment", "behind", "ahead", "line"]
 
@@ -85,12 +86,13 @@ class Cameras:
         self._check_handedness()
 
     def _check_handedness(self) -> None:
-        axes = torch.nn.functional.normalize(self.frame.detach(), dim=-2)
+        axes = unit(self.frame.detach(), dim=-2)
         look = torch.linalg.det(axes) * (-1 if self.extent == "behind" else 1)
         if not (look.abs() > 1e-9).all():
             flat = int(look.abs().argmin())
             raise ValueError(
-                f"Cameras must not be flat, but u, v and origin - source of camera {flat} lie in one plane"
+                f"Cameras must not be flat, but u, v and origin - source of camera {flat} lie in one plane: the "
+                f"determinant of their directions is {look[flat]:.2g}, expected more than 1e-9"
             )
         if not (look > 0).all():
             raise ValueError(
@@ -129,7 +131,7 @@ class Cameras:
     @property
     def distance(self) -> Float[Tensor, " m"]:
         """Distance from the source to the detector's plane in mm (SDD; the collimator length of a pinhole)."""
-        normal = torch.nn.functional.normalize(torch.linalg.cross(self.u, self.v), dim=-1)
+        normal = unit(torch.linalg.cross(self.u, self.v))
         return (normal * (self.origin - self.source)).sum(-1).abs()
 
     @property
@@ -145,20 +147,33 @@ class Cameras:
         """Pixel coordinates and depth (u, v, z) of world points, z in mm along the detector's normal.
 
         z has the sign of w: negative for points on the far side of a pinhole from its detector. A point in the plane
-        of a central source has no image: its u and v are not finite.
+        of a central source has no image: its u and v are NaN. All three are NaN of a point that is not finite. `valid`
+        tells which images there are; their gradients are finite, whatever points are beside them.
         """
-        flat = (xyz.reshape(1, -1, 3).to(self.source) - self.source[:, None]) @ torch.linalg.inv(self.frame).mT
-        w = flat[..., 2:]
-        uv = flat[..., :2] if self.parallel else flat[..., :2] / w
-        uvz = torch.cat([uv, w * self.distance[:, None, None]], dim=-1)
+        points, known = _known(xyz.reshape(1, -1, 3).to(self.source))
+        flat = (points - self.source[:, None]) @ torch.linalg.inv(self.frame).mT
+        uv, w = flat[..., :2], flat[..., 2:]
+        if not self.parallel:
+            uv = torch.where(w == 0, torch.nan, uv / torch.where(w == 0, 1.0, w))
+        uvz = torch.where(known, torch.cat([uv, w * self.distance[:, None, None]], dim=-1), torch.nan)
         return uvz.reshape(len(self), *xyz.shape[:-1], 3).to(xyz.dtype)
 
+    def valid(self, uvz: Float[Tensor, "m *n 3"]) -> Bool[Tensor, "m *n"]:
+        """Which of the images that `project` gives there are: finite, on the part of a ray that counts (`extent`).
+
+        They may lie beside the detector.
+        """
+        least, most = self.limits
+        w = uvz[..., 2] / self.distance.to(uvz).reshape(-1, *[1] * (uvz.ndim - 2))
+        return uvz.isfinite().all(dim=-1) & (least <= w) & (w <= most)
+
     def unproject(self, uvz: Float[Tensor, "m *n 3"]) -> Float[Tensor, "m *n 3"]:
-        """World points in mm of pixel coordinates and depth; the inverse of `project`."""
-        flat = uvz.reshape(len(self), -1, 3).to(self.source)
+        """World points in mm of pixel coordinates and depth, NaN where these are not finite; undoes `project`."""
+        flat, known = _known(uvz.reshape(len(self), -1, 3).to(self.source))
         w = flat[..., 2:] / self.distance[:, None, None]
         across = flat[..., :2] if self.parallel else flat[..., :2] * w
         xyz = torch.cat([across, w], dim=-1) @ self.frame.mT + self.source[:, None]
+        xyz = torch.where(known, xyz, torch.nan)
         return xyz.reshape(uvz.shape).to(uvz.dtype)
 
     def rays(self) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
@@ -194,6 +209,19 @@ class Cameras:
         return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
 
     def moved(self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> "Cameras":
-        """The rig after the rigid motion X -> R X + t of the world."""
+        """The rig after the rigid motion X -> R X + t of the world.
+
+        Raises:
+            ValueError: R is not a rotation, or t is not finite.
+        """
         R, t = rotation.to(self.source), translation.to(self.source)
+        check_rotation(R)
+        if not t.isfinite().all():
+            raise ValueError(f"A translation must be finite mm, got {t.tolist()}")
         return replace(self, source=self.source @ R.T + t, origin=self.origin @ R.T + t, u=self.u @ R.T, v=self.v @ R.T)
+
+
+def _known(points: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n 1"]]:
+    """Points, zero in place of those that are not finite, and which are: a NaN that went in would spoil gradients."""
+    known = points.isfinite().all(dim=-1, keepdim=True)
+    return torch.where(known, points, 0.0), known

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras, Extent
 from mvrecon.geometry.frustum import homography_jacobian
+from mvrecon.geometry.rigid import check_rotation, unit
 
 KRt = tuple[Float[Tensor, "m 3 3"], Float[Tensor, "m 3 3"], Float[Tensor, "m 3"]]
 
@@ -28,8 +29,8 @@ def to_krt(cameras: Cameras) -> KRt:
     """
     _check_central(cameras, "K, R, t")
     frame = cameras.frame * (-1 if cameras.extent == "behind" else 1)
-    right = torch.nn.functional.normalize(frame[..., 0], dim=-1)
-    forward = torch.nn.functional.normalize(torch.linalg.cross(frame[..., 0], frame[..., 1]), dim=-1)
+    right = unit(frame[..., 0])
+    forward = unit(torch.linalg.cross(frame[..., 0], frame[..., 1]))
     R = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-2)
     K = torch.linalg.inv((R @ frame).triu()) * cameras.distance[:, None, None]
     return K, R, -(R @ cameras.source[..., None])[..., 0]
@@ -60,8 +61,7 @@ def from_krt(
     K, R, t = _checked("K", K, 3, 3), _checked("R", R, 3, 3), _checked("t", t, 3)
     if not torch.allclose(K[:, 2], K.new_tensor([0, 0, 1]).expand(len(K), 3)):
         raise ValueError(f"K must have the last row (0, 0, 1), got {K[:, 2].tolist()}")
-    if not torch.allclose(R @ R.mT, torch.eye(3).to(R).expand_as(R), atol=1e-5) or (torch.linalg.det(R) < 0).any():
-        raise ValueError(f"R must be rotations, got {R.tolist()}")
+    check_rotation(R)
     frame = R.mT @ torch.linalg.inv(K) * _distances(distance, K)
     source = -(R.mT @ t[..., None])[..., 0]
     return _from_frame(source, -frame if extent == "behind" else frame, shape, extent)
@@ -83,7 +83,7 @@ def from_matrix(
     """
     P = _checked("P", P, 3, 4)
     left = P[:, :, :3]
-    if not (torch.linalg.det(torch.nn.functional.normalize(left, dim=-1)).abs() > 1e-12).all():
+    if not (torch.linalg.det(unit(left)).abs() > 1e-12).all():
         raise ValueError("P must have a left 3x3 that can be inverted; parallel beams have no source to find")
     frame = torch.linalg.inv(left)
     source = -(frame @ P[:, :, 3:])[..., 0]

@@ -150,6 +150,10 @@ def _about_z(
 
 def _angles(views: int, arc: float, start: float, angles: Sequence[float] | None) -> Sequence[float]:
     _check_positive(views=views)
+    given = {"arc_degrees": [arc], "start_degrees": [start], "angles": [] if angles is None else angles}
+    for name, degrees in given.items():
+        if not all(math.isfinite(each) for each in degrees):
+            raise ValueError(f"A rig's {name} must be finite degrees, got {degrees}")
     if angles is None:
         return [start + arc * k / views for k in range(views)]
     if len(angles) != views:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import unit
 
 #: Axes of views that a mirror reverses.
 ROWS, COLUMNS = -2, -1
@@ -57,7 +58,7 @@ def mirror_pairs(cameras: Cameras, grid: Grid, tolerance: float = 1e-9) -> Mirro
             corner may miss its mirror image.
     """
     places = _places(cameras, grid)
-    axes = torch.nn.functional.normalize(grid.affine[:3, :3], dim=0).T
+    axes = unit(grid.affine[:3, :3], dim=0).T
     oblique = (axes @ axes.T).fill_diagonal_(0).abs().amax(dim=1) > tolerance
     found = [
         Mirror(-1 - column, *matched)

@@ -46,13 +46,14 @@ def read_nifti(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
         stored = ArrayProxy(str(path), header, mmap=False)
         kind = nibabel.Nifti2Image if isinstance(header, nibabel.Nifti2Header) else nibabel.Nifti1Image
         image = nibabel.as_closest_canonical(kind(stored, header.get_best_affine(), header))
-        values = torch.from_numpy(image.get_fdata(dtype="float32", caching="unchanged"))
+        # reversed axes of values that are single precision already are strides backwards, which torch does not take
+        values = torch.from_numpy(image.get_fdata(dtype="float32", caching="unchanged").T.copy())
         affine = torch.from_numpy(image.affine).double().clone()
         affine[:3] *= MILLIMETRES[image.header.get_xyzt_units()[0]]
-        grid = Grid(tuple(values.shape[::-1]), affine)  # type: ignore[arg-type]
+        grid = Grid(tuple(values.shape), affine)  # type: ignore[arg-type]
         if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
             raise Refused(f"{path}: has voxels of {grid.spacing} mm, expected {SPACING[0]} to {SPACING[1]}")
-        return values.permute(2, 1, 0).contiguous(), grid
+        return values, grid
 
 
 def _header(path: Path) -> Any:

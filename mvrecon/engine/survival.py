@@ -9,7 +9,7 @@ from typing import Any
 import lightning.pytorch as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.callbacks import Checkpoint, EMAWeightAveraging
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from mvrecon.engine.storage import previous
@@ -40,6 +40,30 @@ class KeepLast(Checkpoint):
         for logger in trainer.loggers:  # or what they hold back is lost, though the training does not come by again
             logger.save()
         trainer.save_checkpoint(self.path)
+
+
+class AveragedWeights(EMAWeightAveraging):
+    """Lightning's exponential moving average of the weights, which also remembers the last epoch that it took in.
+
+    A checkpoint of an epoch's last step is from before that epoch's end, which Lightning does not come back to.
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the averages."""
+        return super().state_dict() | {"latest_update_epoch": self._latest_update_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        super().load_state_dict(state_dict)
+        self._latest_update_epoch = state_dict["latest_update_epoch"]
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take in the weights of an epoch whose end was broken off."""
+        last = trainer.current_epoch - 1
+        if last > self._latest_update_epoch and self.should_update(epoch_idx=last):
+            assert self._average_model is not None
+            self._average_model.update_parameters(pl_module)
+            self._latest_update_epoch = last
 
 
 class RandomNumbers(L.Callback):

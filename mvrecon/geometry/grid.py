@@ -30,8 +30,7 @@ class Grid:
     affine: Float[Tensor, "4 4"]
 
     def __post_init__(self) -> None:
-        if len(self.shape) != 3 or min(self.shape) < 1:
-            raise ValueError(f"A grid's shape must be three positive sizes (z, y, x), got {tuple(self.shape)}")
+        _check_shape(self.shape)
         affine = torch.as_tensor(self.affine, dtype=torch.float64).cpu()
         if affine.shape != (4, 4) or not affine.isfinite().all():
             raise ValueError(f"A grid's affine must be a finite 4x4 matrix, got {self.affine}")
@@ -59,14 +58,19 @@ class Grid:
             centre: world position of the grid's centre in mm (x, y, z).
 
         Raises:
-            ValueError: a spacing that is not positive.
+            ValueError: a shape that is not three positive sizes, a spacing that is not positive and finite, or a centre
+                that is not finite.
         """
+        _check_shape(shape)
         steps = torch.as_tensor(spacing, dtype=torch.float64).expand(3).clone()
-        if not (steps > 0).all():
-            raise ValueError(f"A grid's spacing must be positive mm, got {spacing}")
+        if not ((steps > 0) & steps.isfinite()).all():
+            raise ValueError(f"A grid's spacing must be positive, finite mm, got {spacing}")
+        middle = torch.as_tensor(centre, dtype=torch.float64)
+        if not middle.isfinite().all():
+            raise ValueError(f"A grid's centre must be finite mm, got {centre}")
         affine = torch.diag(torch.cat([steps, steps.new_ones(1)]))
         counts = torch.tensor(list(shape)[::-1], dtype=torch.float64)
-        affine[:3, 3] = torch.as_tensor(centre, dtype=torch.float64) - steps * (counts - 1) / 2
+        affine[:3, 3] = middle - steps * (counts - 1) / 2
         return cls(tuple(shape), affine)  # type: ignore[arg-type]
 
     @property
@@ -120,6 +124,11 @@ class Grid:
         first = torch.full((3,), (1 - factor) / (2 * factor), dtype=torch.float64)
         affine[:3, 3] = self.to_world(first)
         return Grid(tuple(n * factor for n in self.shape), affine)  # type: ignore[arg-type]
+
+
+def _check_shape(shape: Sequence[int]) -> None:
+    if len(shape) != 3 or min(shape) < 1:
+        raise ValueError(f"A grid's shape must be three positive sizes (z, y, x), got {tuple(shape)}")
 
 
 def voxel_centres(grid: Grid, dtype: torch.dtype = torch.float64) -> Float[Tensor, "d h w 3"]:

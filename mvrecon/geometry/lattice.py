@@ -65,7 +65,7 @@ def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:
 
 
 def lifted_maps(
-    H: Float[Tensor, "*n 4 4"], of: Float[Tensor, "*n 2"] | None = None, to: Float[Tensor, "*n 2"] | None = None
+    H: Float[Tensor, "*n 4 4"], of: Float[Tensor, "*#n 2"] | None = None, to: Float[Tensor, "*#n 2"] | None = None
 ) -> Float[Tensor, "*n 5 2 3"]:
     """The maps of a homography between lifted indices; without lifts H relates the centred indices themselves."""
     plain = H.new_tensor([1.0, 0.0])

@@ -55,6 +55,23 @@ def inverse(
     return R.mT, -(R.mT @ t[..., None])[..., 0]
 
 
+def unit(vectors: Float[Tensor, "*n"], dim: int = -1) -> Float[Tensor, "*n"]:
+    """Vectors made one long; however short they are, where torch leaves those below 1e-12 short. Zero stays zero."""
+    return torch.nn.functional.normalize(vectors, dim=dim, eps=torch.finfo(vectors.dtype).tiny)
+
+
+def check_rotation(R: Float[Tensor, "*n 3 3"]) -> None:
+    """The door for rotations.
+
+    Raises:
+        ValueError: R R^T is further than 1e-5 from 1 (float32's rounding is not), or det R is not +1.
+    """
+    off = (R.detach() @ R.detach().mT - torch.eye(3).to(R)).abs().amax()
+    if not (off < 1e-5 and (torch.linalg.det(R.detach()) > 0).all()):
+        what = "one is left-handed" if off < 1e-5 else f"R R^T is off by {off:.2g}"
+        raise ValueError(f"R must be rotations, with R R^T = 1 and det R = +1, but {what}, got {R.tolist()}")
+
+
 def look_at(
     source: Float[Tensor, "*n 3"],
     target: Float[Tensor, "*n 3"],
@@ -66,16 +83,22 @@ def look_at(
     `up` is the line of sight itself, the world axis most across the line of sight takes its place.
 
     Raises:
-        ValueError: the camera is at its target.
+        ValueError: the camera is at its target, or one of the three is not finite.
     """
     forward = target.to(torch.float64) - source.to(torch.float64)
     distance = forward.norm(dim=-1, keepdim=True)
-    if not (distance > 0).all():
-        raise ValueError(f"A camera must not be at the point it looks at, got {source.tolist()} and {target.tolist()}")
+    if not ((distance > 0) & distance.isfinite()).all():
+        raise ValueError(
+            "A camera must not be at the point it looks at, and both must be finite, "
+            f"got {source.tolist()} and {target.tolist()}"
+        )
     forward = forward / distance
-    vertical = torch.nn.functional.normalize(forward.new_tensor(up), dim=0).expand_as(forward)
+    vertical = unit(forward.new_tensor(up)).expand_as(forward)
+    if not vertical.isfinite().all():
+        raise ValueError(f"A camera's up must be finite, got {up}")
     across = torch.eye(3).to(forward)[forward.abs().argmin(dim=-1)]
     along = torch.linalg.cross(forward, vertical).norm(dim=-1, keepdim=True) < math.sqrt(torch.finfo(forward.dtype).eps)
     right = torch.linalg.cross(forward, torch.where(along, across, vertical))
-    right = torch.nn.functional.normalize(right, dim=-1)
-    return torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-2)
+    # close to the line of sight `up` leaves `right` few digits: it is squared with the other two
+    down = unit(torch.linalg.cross(forward, unit(right)))
+    return torch.stack([torch.linalg.cross(down, forward), down, forward], dim=-2)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, content_scale, normalised
+from mvrecon.models.consistency import Consistency, anything, content_scale, normalised
 from mvrecon.models.model import CrossView
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.regions import Regions
@@ -98,10 +98,12 @@ class GeometryFree(nn.Module):
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         check_views(views, self.projector.cameras)
+        views = views.contiguous()  # other strides are rounded in another order
         scale = content_scale(views) / self.chord
         depth, *across = self.projector.grid.shape
         flat = nn.functional.interpolate((views / scale)[:, 0] / self.chord, size=across, mode="bilinear")
-        return Reconstruction(volume=self.net(flat[:, :, None].expand(-1, -1, depth, -1, -1)) * scale)
+        volume = self.net(flat[:, :, None].expand(-1, -1, depth, -1, -1))
+        return Reconstruction(volume=volume * scale * anything(views))
 
 
 class Sirt(nn.Module):

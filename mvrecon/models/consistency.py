@@ -51,20 +51,28 @@ def normalised(
 ) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
     """The region's views and their classical start, both divided by the content's scale, and that scale.
 
-    The start is SIRT with momentum from zero, non-negative, not differentiated.
+    The start is SIRT with momentum from zero, non-negative, not differentiated. The scale of views of nothing is zero.
     """
     views = region.measured(views)
     with torch.no_grad():
         start = sirt(region.A, views, iterations, weights=region.weights, momentum=True)
     scale = content_scale(start)
-    return views / scale, start / scale, scale
+    return views / scale, start / scale, scale * anything(views)
 
 
 def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:
-    """The value of what is there, sum x^2 / sum x: v for any object of one value v, however small.
+    """The value of what is there, sum x^2 / sum |x|: v for any object of one value v, however small.
 
-    Dividing by it makes a network's answer scale with its input: f(a y) = a f(y). One for an empty volume.
+    Dividing by it makes a network's answer scale with its input: f(a y) = a f(y). One for an empty volume. Relative to
+    the largest value, whose square may be no number of the dtype.
     """
-    total = volume.sum(dim=(1, 2, 3, 4), keepdim=True)
-    scale = volume.square().sum(dim=(1, 2, 3, 4), keepdim=True) / total.clamp_min(torch.finfo(volume.dtype).tiny)
-    return torch.where(scale > 0, scale, torch.ones_like(scale))
+    peak = volume.abs().amax(dim=(1, 2, 3, 4), keepdim=True)
+    peak = torch.where(peak > 0, peak, 1.0)
+    part = (volume / peak).abs()
+    scale = part.square().sum(dim=(1, 2, 3, 4), keepdim=True) / part.sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
+    return torch.where(scale > 0, scale * peak, 1.0)
+
+
+def anything(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:
+    """One where views show anything, zero where they show nothing: f(0) = 0."""
+    return views.flatten(1).any(dim=1).to(views.dtype).reshape(-1, 1, 1, 1, 1)

@@ -34,8 +34,9 @@ class SoftmaxDepth(nn.Module):
         prior = prior.clamp_min(0) * frusta.occupied
         level = prior.sum(dim=3, keepdim=True) / frusta.occupied.sum(dim=-3, keepdim=True).clamp_min(1)
         relative = prior / level.clamp_min(torch.finfo(prior.dtype).tiny)
+        logits = logits + (relative + FLOOR).log()
         # Finite, not -inf: a ray with no bin in the region must not turn into NaN.
-        masked = torch.where(frusta.occupied, logits + (relative + FLOOR).log(), -1e4)
+        masked = torch.where(frusta.occupied, logits, torch.finfo(logits.dtype).min)
         share = masked.softmax(dim=3) * frusta.occupied
         return share * views.transpose(1, 2)[:, :, :, None] / frusta.step
 

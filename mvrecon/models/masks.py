@@ -71,14 +71,16 @@ def group_norm(
     return torch.addcmul(shift[:, None, None, None] * mask, about, slope)
 
 
-def pooled(x: Float[Tensor, "n c d h w"], mask: Mask) -> tuple[Float[Tensor, "n c e i x"], Mask]:
+def pooled(x: Float[Tensor, "n c d h w"], mask: Mask) -> tuple[Float[Tensor, "n c e i x"], Float[Tensor, "n 1 e i x"]]:
     """Means of 2x2x2 voxels over those in the mask, and the max-pooled mask."""
     share = halved(mask)
     some = (share > 0).to(x.dtype)
     return halved(x) / (share + (1 - some)), some
 
 
-def upsampled(x: Float[Tensor, "n c e i x"], mask: Mask, onto: Mask, size: Sequence[int]) -> Float[Tensor, "n c d h w"]:
+def upsampled(
+    x: Float[Tensor, "n c e i x"], mask: Float[Tensor, "n 1 e i x"], onto: Mask, size: Sequence[int]
+) -> Float[Tensor, "n c d h w"]:
     """Trilinear interpolation between the voxels of a coarse mask, on those of a fine one.
 
     Args:

@@ -16,7 +16,7 @@ def fuse(
     Zero logits give the plain mean. The result is equivariant to a permutation of the cameras.
     """
     # Finite, not -inf: a voxel that no camera sees must not turn into NaN.
-    weights = torch.where(visible, logits, -1e4).softmax(dim=1) * visible
+    weights = torch.where(visible, logits, torch.finfo(logits.dtype).min).softmax(dim=1) * visible
     return (weights * volumes).sum(dim=1), weights
 
 

@@ -81,7 +81,7 @@ class Projector(nn.Module):
         self.last_backend: str | None = None
         self.window = list(cameras.limits)
         lines = self._lines()
-        self.poses = lines.requires_grad
+        self.poses = lines.requires_grad or backends.forwards(lines)
         self.register_buffer("fixed_lines", lines.detach(), persistent=False)
         self.register_buffer("support", check_support(support, grid), persistent=False)
         self._held = self._hold()
@@ -140,7 +140,7 @@ class Projector(nn.Module):
         """Views of volumes.
 
         Raises:
-            ValueError: a wrong rank, size or device.
+            ValueError: a wrong rank, size, device or dtype.
             RuntimeError: skip is "verify", and a view is not the same without skipping.
         """
         views = self.project_along(volume, self.lines, self.detector)
@@ -157,9 +157,10 @@ class Projector(nn.Module):
         """Volumes from views: every value spread along its ray with the weights of `forward`; zeros cost nothing.
 
         Raises:
-            ValueError: a wrong rank, size or device.
+            ValueError: a wrong rank, size, device or dtype.
         """
         check(views, "views [b c m v u]", (len(self.rays), *self.rays.shape), self.fixed_lines.device)
+        check_floating(views, "views")
         y, r = wide(views).flatten(0, 1), self.rays_per_pixel
         if r > 1:
             y = (y / r**2).repeat_interleave(r, dim=2).repeat_interleave(r, dim=3)
@@ -171,21 +172,23 @@ class Projector(nn.Module):
     ) -> Float[Tensor, "n r v u"]:
         """Integrals along rays in voxel space, see `kernels/rays/lines.py`; a detector has so many (rows, columns)."""
         check(volume, "a volume [b c d h w]", self.grid.shape, self.fixed_lines.device)
-        x, kernels = volume.flatten(0, 1), self._kernels(volume)
+        check_floating(volume, "a volume")
+        x, kernels = volume.flatten(0, 1), self._kernels(volume, lines)
         rays = lines, self.window, list(detector), self.kernel
         if kernels is reference:
             self._last = None
             return kernels.project(wide(x if self.support is None else within(x, self.support)), *rays)
         if self.support is not None:
-            self._last, box = self._held
+            self._last, box = held = self._held
             part = within(x[:, *box.slices], self.support[box.slices])
-            return kernels.project(part, *rays, self._last)
+            return kernels.project(part, *rays, held[0])
         if self.skip == "off":
             self._last = None
             return kernels.project(x, *rays)
         how = self.skip if self.skip in ("box", "brick") else "auto"
-        self._last = kernels.occupied(x.detach(), lines.detach(), *rays[1:], how)
-        views = kernels.project(x, *rays, None, self._last)
+        # not read from self again: another thread may project another volume meanwhile
+        self._last = there = kernels.occupied(x.detach(), lines.detach(), *rays[1:], how)
+        views = kernels.project(x, *rays, None, there)
         if self.skip == "verify":
             verify(views, kernels.project(x, *rays), self.skipped)
         return views
@@ -194,13 +197,13 @@ class Projector(nn.Module):
         self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]
     ) -> Float[Tensor, "n d h w"]:
         """The transpose of `project_along`; views in the precision of arithmetic."""
-        kernels, shape = self._kernels(views[:, None]), list(self.grid.shape)
+        kernels, shape = self._kernels(views[:, None], lines), list(self.grid.shape)
         if self.support is None:
             return kernels.backproject(views, lines, self.window, shape, self.kernel)
         if kernels is reference:
             return within(kernels.backproject(views, lines, self.window, shape, self.kernel), self.support)
-        self._last, box = self._held
-        part = kernels.backproject(views, lines, self.window, list(box.shape), self.kernel, self._last)
+        self._last, box = held = self._held
+        part = kernels.backproject(views, lines, self.window, list(box.shape), self.kernel, held[0])
         return placed(within(part, self.support[box.slices]), box, self.grid.shape)
 
     def _hold(self) -> tuple[Tensor, Box]:
@@ -212,8 +215,8 @@ class Projector(nn.Module):
             held = Occupancy.decoded(ops.occupied(mask, rays, self.window, self.detector, self.kernel, how))
         return held.encoded(), held.box
 
-    def _kernels(self, tensor: Tensor) -> ModuleType:
-        chosen, kernels = backends.kernels_for(tensor, self.backend, self.kernel)
+    def _kernels(self, tensor: Tensor, lines: Tensor) -> ModuleType:
+        chosen, kernels = backends.kernels_for(tensor, self.backend, self.kernel, lines)
         self.last_backend = chosen
         return kernels
 
@@ -236,10 +239,18 @@ def _kernel(method: str, grid: Grid) -> str:
 
 def check(tensor: Tensor, what: str, sizes: tuple[int, ...], device: torch.device) -> None:
     """Raise ValueError unless a tensor [b c ...] has these last sizes and lies on the device."""
+    if not isinstance(tensor, Tensor):
+        raise TypeError(f"Expected {what} as a tensor, got {type(tensor).__name__}")
     if tensor.ndim != 5 or tuple(tensor.shape[2:]) != tuple(sizes):
         raise ValueError(f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}")
     if tensor.device != device:
         raise ValueError(f"Expected {what} on {device}, where the projector is, got {tensor.device}")
+
+
+def check_floating(tensor: Tensor, what: str) -> None:
+    """Raise ValueError for integers and masks: they would be rounded to float32 unasked, and have no gradient."""
+    if not tensor.is_floating_point():
+        raise ValueError(f"Expected {what} of floating point, got {tensor.dtype}; convert it, as by .float()")
 
 
 def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:

@@ -10,7 +10,7 @@ from torch.nn.functional import avg_pool2d
 
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.kernels.backends import wide
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.base import Projector, check_floating
 
 
 class Subset(ABC):
@@ -58,7 +58,8 @@ class Subset(ABC):
             return self.pick(self.A(volume))
         r = self.A.rays_per_pixel
         rays = self.A.project_along(volume, self.lines, [n * r for n in self.detector])
-        rays = avg_pool2d(rays, r) if r > 1 else rays
+        # as a batch, which may be empty
+        rays = avg_pool2d(rays.flatten(0, 1)[:, None], r) if r > 1 else rays
         return self._sorted(rays.reshape(*volume.shape[:2], *self.shape))
 
     @property
@@ -70,10 +71,11 @@ class Subset(ABC):
         """Volumes from the chosen entries, as if all others were zero.
 
         Raises:
-            ValueError: a wrong rank or size.
+            ValueError: a wrong rank, size or dtype.
         """
         if values.ndim != 2 + len(self.shape) or tuple(values.shape[2:]) != self.shape:
             raise ValueError(f"Expected values [b c ..] with last sizes {self.shape}, got {tuple(values.shape)}")
+        check_floating(values, "values")
         if not self.alone:
             return self.A.T(self.place(values))
         lines, r = self.lines, self.A.rays_per_pixel

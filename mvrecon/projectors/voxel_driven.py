@@ -51,7 +51,7 @@ def backproject(
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     maps = image_maps(cameras, grid).to(views.device)
     values = wide(views).flatten(0, 1)
-    compiled = kernels_for(views, backend)[0] == "cpu" and not (backend == "auto" and maps.requires_grad)
+    compiled = kernels_for(views, backend, None, maps)[0] == "cpu" and not (backend == "auto" and maps.requires_grad)
     kernels = voxel_ops if compiled else voxel_reference
     volumes = kernels.look(values, maps, list(cameras.limits), weight == "distance", list(grid.shape))
     return volumes.unflatten(0, views.shape[:2])

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.cameras.symmetry import Mirror, mirror_pairs
+from mvrecon.cameras.views import check_finite
 from mvrecon.projectors.base import Projector
 from mvrecon.projectors.subset import ViewSubset
 
@@ -80,7 +81,11 @@ def sirt(
         nonnegative: clip each iterate at zero.
         weights: (R, C) from `sirt_weights`, where they are known already.
         momentum: carry each step on into the next.
+
+    Raises:
+        ValueError: views that are not finite, such as logarithms of no intensity.
     """
+    check_finite(views)
     weights = weights or sirt_weights(A, views.dtype if views.dtype == torch.float64 else torch.float32)
     x = weights[0].new_zeros(*views.shape[:2], *A.grid.shape) if start is None else start
     ahead, t = x, 1.0

@@ -72,8 +72,14 @@ class PoissonLikelihood:
     def sensitivity(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
         """s = A^T 1: the counts that one unit in each voxel brings; made anew where the cameras want a gradient."""
         if self.A.poses or dtype not in self._sensitivity:
-            ones = torch.ones(1, 1, *self.every.shape, dtype=dtype, device=self.counts.device)
-            self._sensitivity[dtype] = self.every.T(ones)
+            held, ones = (
+                torch.ones(1, 1, *s.shape, dtype=dtype, device=self.counts.device) for s in (self.bins, self.every)
+            )
+            if self.bins is self.every:
+                self._sensitivity[dtype] = self.every.T(ones)
+            else:  # a list of rays rounds otherwise than whole views, and MLEM divides what a list explains by this
+                rest = ones - self.every.pick(self.bins.place(held))
+                self._sensitivity[dtype] = self.bins.T(held) + self.every.T(rest)
         return self._sensitivity[dtype]
 
     def expected(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:

@@ -12,7 +12,24 @@ from mvrecon.stresses.case import KINDS, Case
 from mvrecon.stresses.subject import Subject, subject_of
 
 #: The files of cases, in the plan's order.
-FILES = ("rays",)
+FILES = (
+    "rays",
+    "scales",
+    "algebra",
+    "cameras",
+    "poses",
+    "heads",
+    "models",
+    "counts",
+    "settings",
+    "files",
+    "runs",
+    "tensors",
+    "values",
+    "sizes",
+    "repeats",
+    "gpu",
+)
 DTYPES = {"float64": torch.float64, "float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 #: Projectors come with each of their methods, where a plan asks for all parts.
 METHODS = ("joseph", "siddon", "trilinear")

@@ -13,6 +13,7 @@ from mvrecon.stresses import plan
 from mvrecon.stresses.case import Case
 from mvrecon.stresses.subject import Subject
 from mvrecon.stresses.verdict import COLUMNS, FAIL, LEFT_OUT, PASS, identity, judge
+from mvrecon.stresses.watchdog import LIMIT
 
 SHOWN = ("number", "case", "holds", "measured", "tolerance", "verdict", "note")
 KEYS = ("number", "part", "case", "device", "dtype")
@@ -39,6 +40,7 @@ class Stress:
         cases: numbers of the plan; none: all.
         device: on which it is done.
         dtypes: of volumes and views.
+        limit_s: seconds that a case may take.
 
     Raises:
         LookupError: an unknown part, or an unknown dtype.
@@ -54,8 +56,9 @@ class Stress:
         cases: Sequence[int] = (),
         device: str = "cpu",
         dtypes: Sequence[str] = ("float64", "float32"),
+        limit_s: float = LIMIT,
     ):
-        self.subjects, self.cases = plan.subjects(parts, device, dtypes), cases
+        self.subjects, self.cases, self.limit_s = plan.subjects(parts, device, dtypes), cases, limit_s
 
     def groups(self) -> list[list[Job]]:
         """The cases of each subject."""
@@ -69,7 +72,7 @@ class Stress:
         """A verdict for each job."""
         for job in jobs:
             say(f"{job.subject.label}: {job.case.name}")
-            yield judge(job.case, job.subject)
+            yield judge(job.case, job.subject, self.limit_s)
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """The table, and all rows as JSON."""

@@ -1,15 +1,16 @@
 """What is put under stress: a part by name, with its options, on a device and in a dtype."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras, Extent
+from mvrecon.cameras.camera import VECTORS, Cameras, Extent
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import REGISTRIES
@@ -89,6 +90,15 @@ class ProjectorSubject(Subject):
         expected = 16 * float((2 * start).norm()) / 60
         return abs(float(length) - expected) / expected
 
+    @cached_property
+    def of_cells(self) -> bool:
+        """Whether a voxel counts where a ray is in it and nowhere else, so that any ray's length in a box is exact."""
+        grid = Grid.centred((4, 4, 4), 1.0)
+        start, end = torch.tensor([[[-9.0, -2.3, 0.7]], [[9.0, 5.9, -0.9]]], dtype=torch.float64)
+        enter, leave = 7 / 18, (2 + 2.3) / 8.2  # by the face x = -2, and by y = 2
+        length = (leave - enter) * float((end - start).norm())
+        return abs(float(self.values(grid, start, end)) / length - 1) < 1e-4
+
     def need_lines(self) -> None:
         """Raise DoesNotApply unless its views are line integrals in mm, with no other factor."""
         if not self.error_of_ones < 0.02:
@@ -112,12 +122,29 @@ class ProjectorSubject(Subject):
     def rays(self, start: Float[Tensor, "m 3"], end: Float[Tensor, "m 3"]) -> Cameras:
         """One camera of one pixel for each ray from `start` to `end` (mm); a pinhole's ray goes on beyond `end`."""
         is_parallel, extent = self.beam
-        way = end - start
-        axis = torch.nn.functional.one_hot(way.abs().argmin(dim=-1), 3).to(way)
-        u = torch.nn.functional.normalize(torch.linalg.cross(axis, way), dim=-1)
-        v = torch.nn.functional.normalize(torch.linalg.cross(way, u), dim=-1)
-        target = start - way if extent == "behind" else end
+        look = (end - start) / (end - start).abs().amax(dim=-1, keepdim=True)  # of any length, however small
+        axis = torch.nn.functional.one_hot(look.abs().argmin(dim=-1), 3).to(look)
+        u = torch.nn.functional.normalize(torch.linalg.cross(axis, look), dim=-1)
+        v = torch.nn.functional.normalize(torch.linalg.cross(look, u), dim=-1)
+        target = start - (end - start) if extent == "behind" else end
         return Cameras(start, target, u, v, (1, 1), is_parallel, extent)
+
+    def posed(self, grid: Grid, cameras: Cameras) -> tuple[Callable[..., Tensor], list[Tensor]]:
+        """Views as a function of volumes and the cameras' vectors, and these, of which gradients are wanted.
+
+        Raises:
+            DoesNotApply: it takes no cameras that require a gradient.
+        """
+        vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
+
+        def views(volume: Tensor, *vectors: Tensor) -> Tensor:
+            return self.projector(grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True))))(volume)
+
+        try:
+            self.projector(grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True))))
+        except ValueError as error:
+            raise DoesNotApply(str(error)) from error
+        return views, vectors
 
     def values(self, grid: Grid, start: Tensor, end: Tensor, volume: Tensor | None = None) -> Float[Tensor, " m"]:
         """What each ray sees of a volume [d h w], in float64; of ones, unless given."""
@@ -152,19 +179,26 @@ def _radius(grid: Grid) -> float:
     return float((grid.corners() - grid.centre).norm(dim=-1).max())
 
 
-SUBJECTS: Mapping[str, Callable[..., Subject]] = {"projector": ProjectorSubject}
+#: The subjects that are more than a part, as strings, since their files import this one.
+SUBJECTS = {
+    "projector": "mvrecon.stresses.subject:ProjectorSubject",
+    "camera": "mvrecon.stresses.rig:CameraSubject",
+    "head": "mvrecon.stresses.learned:HeadSubject",
+    "model": "mvrecon.stresses.learned:ModelSubject",
+}
 
 
 def subject_of(kind: str, *arguments: Any) -> Subject:
     """A subject of that kind; arguments as `Subject`."""
-    return SUBJECTS.get(kind, Subject)(kind, *arguments)
+    module, _, name = SUBJECTS.get(kind, "mvrecon.stresses.subject:Subject").partition(":")
+    return getattr(import_module(module), name)(kind, *arguments)
 
 
 def gap(found: Tensor, expected: Tensor) -> float:
-    """Relative L2 error in float64; of expected zeros, the norm itself."""
+    """Relative L2 error in float64; of expected zeros, the norm itself; infinite, not NaN, where a number is none."""
     a, b = found.detach().double().cpu(), expected.detach().double().cpu()
     norm = float(b.norm())
-    return float((a - b).norm()) / (norm if norm > 0 else 1.0)
+    return float((a - b).norm().nan_to_num(torch.inf)) / (norm if 0 < norm < torch.inf else 1.0)
 
 
 def bits(found: Tensor, expected: Tensor) -> float:
@@ -173,3 +207,8 @@ def bits(found: Tensor, expected: Tensor) -> float:
         raise AssertionError(f"expected the shape {tuple(expected.shape)}, got {tuple(found.shape)}")
     same = (found == expected) | (found.isnan() & expected.isnan())
     return float((~same).sum())
+
+
+def greatest(errors: Iterable[float]) -> float:
+    """The largest; NaN where any is NaN, which Python's own `max` may lose."""
+    return float(torch.tensor(list(errors), dtype=torch.float64).max())

@@ -10,6 +10,7 @@ from mvrecon.benchmarks.rows import Row
 from mvrecon.benchmarks.trial import reason
 from mvrecon.stresses.case import Case, DoesNotApply
 from mvrecon.stresses.subject import Subject
+from mvrecon.stresses.watchdog import LIMIT, watched
 
 PASS, FAIL, LEFT_OUT = "pass", "FAIL", "n/a"
 #: The columns of a table of verdicts, and their meaning.
@@ -28,18 +29,21 @@ COLUMNS = {
 }
 
 
-def judge(case: Case, subject: Subject) -> Row:
-    """Do a case to a subject. Nothing that a part raises goes further; it fails with that as its note."""
+def judge(case: Case, subject: Subject, limit_s: float = LIMIT) -> Row:
+    """Do a case to a subject. Nothing that a part raises goes further; it fails with that as its note.
+
+    So does one that takes longer than `limit_s`, but for one that hangs beyond Python, which ends all; see `watched`.
+    """
     start, measured, note = time.perf_counter(), math.nan, ""
     allowed = case.allowed(subject.dtype)
     try:
-        with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
+        with watched(limit_s), warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
             warnings.simplefilter("ignore")
             measured = float(case.measure(subject))
         verdict = PASS if measured <= allowed else FAIL  # a NaN is no pass
     except DoesNotApply as why:
         verdict, note = LEFT_OUT, str(why)
-    except Exception as error:  # a plugin's part may raise anything; it must not end the plan
+    except (Exception, SystemExit) as error:  # a plugin's part may raise anything; it must not end the plan
         verdict, note = FAIL, reason(error)
     return {
         **identity(case, subject),

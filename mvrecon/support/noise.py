@@ -47,7 +47,8 @@ def noise_threshold(
     """So many standard deviations of the photon noise of X-ray line integrals, exp(p / 2) / sqrt(photons) each.
 
     A `visual_hull` of noisy views takes it as its threshold, with several witnesses. What gives no ray more may then be
-    lost: at 1e5 photons and 4 sigma that is p = 0.013, or 0.6 mm of water.
+    lost: at 1e5 photons and 4 sigma that is p = 0.013, or 0.6 mm of water. Behind so much matter that the noise grows
+    faster than p the threshold stays as it is, at 2: a ray that hardly a photon passes is no sign of emptiness.
 
     Args:
         views: p = -ln(I / I0).
@@ -59,7 +60,8 @@ def noise_threshold(
     """
     if not (photons > 0 and sigmas > 0):
         raise ValueError(f"Noise needs positive photons and sigmas, got {photons} and {sigmas}")
-    return sigmas * (views / 2).exp() / math.sqrt(photons)
+    steepest = 2 * math.log(2 * math.sqrt(photons) / sigmas)
+    return sigmas * (views.clamp(max=steepest) / 2).exp() / math.sqrt(photons)
 
 
 def bounded_hull(

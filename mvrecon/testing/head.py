@@ -1,19 +1,21 @@
 """The contract of a head."""
 
+from typing import Any
+
 import torch
 
 from mvrecon.models.lift import Frusta
 from mvrecon.parts import HEADS
 
 
-def check_head(name: str, frusta: Frusta, seed: int = 0) -> None:
+def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None:
     """Raise AssertionError unless the named head keeps its promises in these frusta.
 
-    A density of the right shape; finite even where rays miss; nothing outside the region; nothing on rays that measured
-    nothing; and, where `keeps_views` says so, the measured views for any logits and prior.
+    A density of the right shape; finite even where rays miss; nothing outside the region; and, where `keeps_views` says
+    so, the measured views for any logits and prior: nothing on rays that measured nothing.
     """
     torch.manual_seed(seed)
-    head = HEADS.build(name)
+    head = HEADS.build(name, **options)
     depth, v, u = frusta.shape
     m = len(frusta.step)
     views = torch.rand(2, 1, m, v, u) * (frusta.chord.reshape(1, 1, m, v, u) > 0)

@@ -18,11 +18,11 @@ TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
 def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, gradients: bool = True, **options) -> None:
     """Raise AssertionError unless the named projector keeps its promises on this grid and rig.
 
-    Views and volumes of the right shape; A.T the transpose of A in float32 and float64; linear, nothing from nothing;
-    volumes of a batch seen each alone, twice the same to the last bit; moving the object is un-moving the cameras;
-    with a support M it is A diag(M), and diag(M) A^T its transpose; gradients in volume and pose that differences
-    confirm (on a small grid and rig in a generic pose; `gradients=False` leaves them out), that in the volume being
-    the adjoint, and second ones in volume and views.
+    Views and volumes of the right shape and dtype, and finite; A.T the transpose of A in float32 and float64; linear,
+    nothing from nothing; volumes of a batch seen each alone, twice the same to the last bit; moving the object is
+    un-moving the cameras; with a support M it is A diag(M), and diag(M) A^T its transpose; gradients in volume and pose
+    that differences confirm (on a small grid and rig in a generic pose; `gradients=False` leaves them out), that in the
+    volume being the adjoint, and second ones in volume and views.
     """
     torch.manual_seed(seed)
     A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)
@@ -31,9 +31,15 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
         views = A(x)
         expected = (2, 1, len(cameras), *cameras.shape)
         assert views.shape == expected, f"views are {tuple(views.shape)}, expected {expected}"
+        assert views.dtype == dtype, f"views of {dtype} volumes are {views.dtype}"
+        assert views.isfinite().all(), f"{int((~views.isfinite()).sum())} views of a finite volume are not finite"
         y = torch.randn_like(views)
         volume = A.T(y)
         assert volume.shape == x.shape, f"the adjoint gives {tuple(volume.shape)}, expected {tuple(x.shape)}"
+        assert volume.dtype == dtype, f"the adjoint gives {volume.dtype} for {dtype}"
+        assert volume.isfinite().all(), (
+            f"the adjoint gives {int((~volume.isfinite()).sum())} values that are not finite"
+        )
         gap = (_dot(views, y) - _dot(x, volume)).abs() / (views.double().norm() * y.double().norm())
         assert gap < tolerance, f"<A x, y> and <x, A.T y> differ by {gap:.2g} in {dtype}"
         other = torch.randn_like(x)

@@ -131,7 +131,8 @@ def _captioned(columns: Mapping[str, Sequence[Image]], rows: Sequence[str]) -> I
     """Columns of images with their names above and the rows' names on the left, all at one scale."""
     each = iter(enlarged([image for images in columns.values() for image in images]))
     large = {name: [next(each) for _ in images] for name, images in columns.items()}
-    names = [np.zeros((next(iter(large.values()))[r].shape[0] - LABEL, CAPTION, 3), np.uint8) for r in range(len(rows))]
+    heights = [max(0, image.shape[0] - LABEL) for image in next(iter(large.values()))]  # a flat image has less
+    names = [np.zeros((height, CAPTION, 3), np.uint8) for height in heights]
     left = [labelled(blank, row) for blank, row in zip(names, rows, strict=True)]
     left[0] = labelled(left[0], "")
     named = [[labelled(first, name), *rest] for name, (first, *rest) in large.items()]

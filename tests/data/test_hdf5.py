@@ -9,6 +9,7 @@ import pytest
 
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.durable import written_whole
+from mvrecon.testing.damage import LINKS, instead, linked
 from tests.data.conftest import SPACING, head, stored
 
 
@@ -93,26 +94,18 @@ def rewritten(path, change):
     return path
 
 
-def replace(name, **made):
-    def change(file):
-        del file[name]
-        file.create_dataset(name, **made)
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda f: f.pop("ct"), r"no dataset 'ct', only \['id', 'spacing'\]"),
-        (replace("ct", data=np.zeros((7, 4, 4))), r"'ct': \(7, 4, 4\).*ct \[n d h w\]"),
-        (replace("ct", shape=(7, 4, 4, 4), dtype="c8"), "ct complex64.*expected numbers"),
-        (replace("spacing", data=np.ones((6, 3))), r"'spacing': \(6, 3\)"),
+        (instead("ct", data=np.zeros((7, 4, 4))), r"'ct': \(7, 4, 4\).*ct \[n d h w\]"),
+        (instead("ct", shape=(7, 4, 4, 4), dtype="c8"), "ct complex64.*expected numbers"),
+        (instead("spacing", data=np.ones((6, 3))), r"'spacing': \(6, 3\)"),
         (
-            replace("spacing", data=np.diag([1.0, 1, 1, 0, 0, 0, 0])[:, :3]),
+            instead("spacing", data=np.diag([1.0, 1, 1, 0, 0, 0, 0])[:, :3]),
             r"volume 0 has the spacing \[1.0, 0.0, 0.0\]",
         ),
-        (replace("spacing", data=np.full((7, 3), np.nan)), "expected positive mm"),
+        (instead("spacing", data=np.full((7, 3), np.nan)), "expected positive mm"),
         (lambda f: f.attrs.update(axes="x, y, z"), "'axes': 'x, y, z'.*expected"),
         (lambda f: f.attrs.pop("units"), "'units': None"),
     ],
@@ -129,23 +122,7 @@ def test_a_file_that_is_not_hdf5_is_refused(tmp_path):
         VolumeFile(path).read(0)
 
 
-def linked(kind):
-    def change(file):
-        shape = file["ct"].shape
-        del file["ct"]
-        if kind == "virtual":
-            layout = h5py.VirtualLayout(shape, "i2")
-            layout[:] = h5py.VirtualSource("other.h5", "ct", shape=shape)
-            file.create_virtual_dataset("ct", layout)
-        elif kind == "raw":
-            file.create_dataset("ct", shape, "i2", external=[("other.raw", 0, h5py.h5f.UNLIMITED)])
-        else:
-            file["ct"] = h5py.ExternalLink("other.h5", "ct") if kind == "external" else h5py.SoftLink("/spacing")
-
-    return change
-
-
-@pytest.mark.parametrize("kind", ["external", "soft", "virtual", "raw"])
+@pytest.mark.parametrize("kind", LINKS)
 def test_a_file_cannot_lead_to_other_files(volume_file, kind):
     write_volumes(volume_file.with_name("other.h5"), stored(7))
     with pytest.raises(ValueError, match="'ct' is a link, a group or stored elsewhere"):

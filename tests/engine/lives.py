@@ -18,6 +18,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mvrecon.testing.trouble import counted, different, raising, signalled
+
 METHOD, STEPS = "geometry_free", 14
 #: A run of a second: five steps an epoch, a checkpoint every three, averaged weights, a falling rate.
 OPTIONS = (
@@ -67,45 +69,6 @@ def state(folder: Path) -> dict[str, Any]:
     found = read(finished(folder, METHOD))
     del found["callbacks"]["Clock"]
     return found
-
-
-def different(a: Any, b: Any, where: str = "") -> list[str]:
-    """The places where two checkpoints do not hold the same bits."""
-    import torch
-
-    if isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
-        return [place for key in a for place in different(a[key], b[key], f"{where}/{key}")]
-    if isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
-        return [place for i, pair in enumerate(zip(a, b, strict=True)) for place in different(*pair, f"{where}/{i}")]
-    same = torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else a == b
-    return [] if same else [where]
-
-
-def counted(owner: Any, name: str, n: int, what: Any) -> None:
-    """Let something happen at the n-th call of a function, before the function does anything."""
-    function, calls = getattr(owner, name), []
-
-    def called(*args, **kwargs):
-        calls.append(1)
-        if len(calls) == n:
-            what()
-        return function(*args, **kwargs)
-
-    setattr(owner, name, called)
-
-
-def signalled(number: int) -> Any:
-    """What sends this process a signal; SIGKILL is how the kernel ends it: nothing is caught, nothing flushed."""
-    return lambda: os.kill(os.getpid(), number)
-
-
-def raising(error: BaseException) -> Any:
-    """What raises an error."""
-
-    def what():
-        raise error
-
-    return what
 
 
 def befall(what: str, n: int) -> None:

@@ -76,8 +76,8 @@ SMALL = (
 )
 MODELS = {
     "cross_view": (),
-    "cross_view in its hull": ("+model.support=hull",),
-    "cross_view, unmasked in its box": ("+model.support=box", "+model.masked=false"),
+    "cross_view in its hull": ("model.support=hull",),
+    "cross_view, unmasked in its box": ("model.support=box", "model.masked=false"),
     "backprojection_unet": (),
     "geometry_free": (),
     "mean_fusion": (),
@@ -104,6 +104,21 @@ def test_what_a_gpu_refuses_would_be_seen(taken_for_a_gpu):
         torch.ones(2).cumsum(0), torch.ones(2, dtype=torch.bool).cumsum(0)
         F.interpolate(x, scale_factor=2, mode="trilinear").sum().backward()  # torch has another way for it
     assert seen.names & REFUSED == {"avg_pool3d_backward", "grid_sampler_3d_backward", "cumsum"}
+
+
+@pytest.mark.parametrize("detector", [(4, 4), (400, 400)])
+def test_the_adjoint_of_a_gpu_adds_up_in_a_fixed_order_or_not_at_all(detector, strict):
+    from mvrecon.kernels.rays.cuda import gathers
+
+    shape = (8, 8, 8)
+    assert gathers(shape, detector, 3, "joseph")
+    with pytest.raises(RuntimeError, match="method 'siddon' adds up in no fixed order"):
+        gathers(shape, detector, 3, "siddon")
+    with pytest.raises(RuntimeError, match="explicit rays adds up in no fixed order"):
+        gathers(shape, detector, 17, "joseph")
+    torch.use_deterministic_algorithms(False)
+    assert gathers(shape, detector, 3, "joseph") == (detector == (4, 4))
+    assert not gathers(shape, detector, 3, "siddon")
 
 
 def test_deterministic_training_has_the_bits_of_any_other_on_the_cpu(tmp_path, strict):

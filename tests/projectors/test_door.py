@@ -5,6 +5,7 @@ import torch
 
 from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.base import check_views
+from mvrecon.projectors.subset import ViewSubset
 from tests.projectors.rigs import CONE, GRID, PARALLEL
 
 
@@ -25,6 +26,18 @@ def test_views_of_the_wrong_shape_are_refused(A, shape):
         A.T(torch.zeros(shape))
     with pytest.raises(ValueError, match=r"views .*\(4, 5, 6\), got"):
         check_views(torch.zeros(shape), CONE)
+
+
+@pytest.mark.parametrize("dtype", [torch.int16, torch.bool, torch.complex64])
+def test_what_would_be_rounded_or_cut_is_refused(A, dtype):
+    for act, shape in ((A, GRID.shape), (A.T, (4, 5, 6)), (ViewSubset(A, [0, 1, 2, 3]).T, (4, 5, 6))):
+        with pytest.raises(ValueError, match=rf"Expected .*, got {dtype}"):
+            act(torch.ones(1, 1, *shape, dtype=dtype))
+
+
+def test_an_array_is_no_tensor(A):
+    with pytest.raises(TypeError, match="a volume .* as a tensor, got ndarray"):
+        A(torch.zeros(1, 1, *GRID.shape).numpy())
 
 
 def test_views_that_are_not_numbers_are_refused():

@@ -79,3 +79,10 @@ def test_gradients_flow_through_it():
     )
     y = torch.rand(1, 1, 2, 2, 3, dtype=torch.float64, requires_grad=True)
     torch.autograd.gradcheck(lambda y: sirt(A, y, 2, nonnegative=False), (y,))
+
+
+def test_the_logarithm_of_no_intensity_is_refused(A):
+    views = A(torch.rand(1, 1, *GRID.shape))
+    views[0, 0, 1, 2, :2] = torch.tensor([0.0, -1.0]).log()
+    with pytest.raises(ValueError, match="must be finite, got 2 of"):
+        sirt(A, views, 1)

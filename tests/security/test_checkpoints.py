@@ -1,12 +1,10 @@
 """A checkpoint is a list of numbers: whatever is in it, nothing runs."""
 
 import io
-import pickle
 import struct
 import subprocess
 import sys
 import zipfile
-from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -15,8 +13,8 @@ import torch
 from mvrecon.engine.archive import check_archive
 from mvrecon.engine.checkpoints import finished, load, unfinished
 from mvrecon.limits import Refused
-from tests.security.samples import checkpoint, pickle_of, saved, with_pickle
-from tests.security.test_configs import Payload
+from mvrecon.stresses.samples import checkpoint
+from mvrecon.testing.hostile import SETTINGS, Payload, pickle_of, pickles, saved, with_pickle
 
 
 @pytest.fixture
@@ -56,21 +54,6 @@ def test_a_valid_checkpoint_loads(kept: dict, tmp_path: Path):
     assert all(torch.equal(weights[name], value) for name, value in kept["state_dict"].items())
 
 
-def pickles(sentinel: Path) -> dict[str, bytes]:
-    """Pickles of every protocol that would make the sentinel, or take what torch's own list allows."""
-    payload, text = Payload(f"touch {sentinel}"), f"touch {sentinel}".encode()
-    found = {f"protocol {k}": pickle.dumps(payload, protocol=k) for k in range(6)}
-    return found | {
-        "instance": b"(S'" + text + b"'\nios\nsystem\n.",
-        "obj": b"(cos\nsystem\nS'" + text + b"'\no.",
-        "a dictionary's factory": pickle.dumps(defaultdict(print), protocol=2),
-        "numpy": b"cnumpy._core.multiarray\n_reconstruct\n.",
-        "a great many bytes": b"c__builtin__\nbytearray\n(L" + b"9" * 12 + b"L\ntR.",
-        "torch's own loader": b"ctorch.storage\n_load_from_bytes\n(C\x00tR.",
-        "an extension": b"\x82\x01.",
-    }
-
-
 @pytest.mark.parametrize("name", sorted(pickles(Path("sentinel"))))
 def test_a_pickle_builds_tensors_and_plain_values_only(name: str, kept: dict, sentinel: Path, tmp_path: Path):
     evil = pickles(sentinel)[name]
@@ -95,15 +78,6 @@ def test_the_sample_would_work_if_it_were_unpickled(sentinel: Path, tmp_path: Pa
     code = f"import torch; torch.load({str(path)!r}, weights_only=False)"
     subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[2], capture_output=True)
     assert sentinel.exists()
-
-
-SETTINGS = {
-    "an instantiator": {"_instantiator": "os.system", "_class_path": "os.system"},
-    "another key": {"checkpoint_path": "x"},
-    "a target": {"model": {"name": "backprojection_unet", "_target_": "os.system"}},
-    "an object": {"loss": {"volume": torch.zeros(2)}},
-    "a class": {"loss": {"volume": torch.float32}},
-}
 
 
 @pytest.mark.parametrize("name", SETTINGS)

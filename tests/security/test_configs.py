@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,48 +10,13 @@ import torch
 
 from mvrecon.config import compose, import_plugins, instantiate
 from mvrecon.limits import Refused, yaml_of
-
-
-class Payload:
-    """Unpickling it makes a file."""
-
-    def __init__(self, command: str):
-        self.command = command
-
-    def __reduce__(self):
-        import os
-
-        return os.system, (self.command,)
+from mvrecon.testing.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
 
 
 @pytest.fixture
 def sentinel(tmp_path: Path) -> Path:
     """A file that only a hostile sample makes."""
     return tmp_path / "sentinel"
-
-
-def targets(sentinel: Path) -> dict[str, dict]:
-    """Nodes that would make the sentinel if they were built."""
-    touch = f"touch {sentinel}"
-    pickled = sentinel.with_name("payload.ckpt")
-    timer = {"_target_": "lightning.pytorch.callbacks.Timer"}
-    call = "lightning.pytorch.cli.instantiate_class"
-    load = "lightning.pytorch.LightningModule.load_from_checkpoint"
-    return {
-        "direct": {"_target_": "os.system", "command": touch},
-        "builtin": {"_target_": "builtins.eval", "source": f"open({str(sentinel)!r}, 'w')"},
-        "through a module's import": {"_target_": "lightning.pytorch.trainer.trainer.os.system", "command": touch},
-        "through another package": {"_target_": "logging.os.system", "command": touch},
-        "a function that calls": {"_target_": call, "args": touch, "init": {"class_path": "os.system"}},
-        "a function that writes": {"_target_": "mvrecon.engine.record.write", "path": str(sentinel), "text": "x"},
-        "a method that unpickles": {"_target_": load, "checkpoint_path": str(pickled), "weights_only": False},
-        "a class of another kind": {"_target_": "lightning.pytorch.Trainer", "default_root_dir": str(sentinel)},
-        "nested": {**timer, "duration": {"_target_": "os.system", "command": touch}},
-        "nested in a list": {**timer, "duration": [{"_target_": "os.system", "command": touch}]},
-        "partial": {**timer, "_partial_": True},
-        "positional": {**timer, "_args_": [touch]},
-        "not a name": {"_target_": ["os.system"], "command": touch},
-    }
 
 
 @pytest.mark.parametrize("name", sorted(targets(Path("sentinel"))))
@@ -79,39 +45,17 @@ callbacks:
 def folder(tmp_path: Path):
     """An experiment in a folder that was fetched from somewhere; returns the overrides that choose it."""
 
-    def write(text: str, **files: str) -> list[str]:
-        for name, content in {"experiment/evil.yaml": f"# @package _global_\n{text}\n", **files}.items():
-            (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
-            (tmp_path / name).write_text(content)
-        return [f"hydra.searchpath=[file://{tmp_path}]", "experiment=evil"]
-
-    return write
+    return partial(experiment, tmp_path)
 
 
-def nasty(sentinel: Path) -> dict[str, str]:
-    """Experiments that tell Hydra itself what to do; each made the sentinel, or opened a way to, before the guard."""
-    touch, call = f'"touch {sentinel}"', "lightning.pytorch.cli.instantiate_class"
-    evil = f"{{_target_: {call}, args: {touch}, init: {{class_path: os.system}}}}"
-    handler = f"{{class: {call}, args: {touch}, init: {{class_path: os.system}}}}"
-    return {
-        "a callback": f"hydra: {{callbacks: {{evil: {evil}}}}}",
-        "a log handler": f"hydra: {{job_logging: {{handlers: {{file: {handler}}}}}}}",
-        "a log file": f"hydra: {{job_logging: {{handlers: {{file: {{filename: {sentinel}}}}}}}}}",
-        "a library's folder": "hydra: {job: {env_set: {HDF5_PLUGIN_PATH: .}}}",
-        "a launcher": "hydra: {launcher: {_target_: os.system}}",
-        "a folder": f"hydra: {{run: {{dir: {sentinel}}}}}",
-        "another choice": "defaults: [override /hydra/job_logging: none]",
-    }
-
-
-@pytest.mark.parametrize("name", sorted(nasty(Path("sentinel"))))
+@pytest.mark.parametrize("name", sorted(experiments(Path("sentinel"))))
 def test_a_fetched_experiment_tells_hydra_nothing(name: str, sentinel: Path, folder):
     with pytest.raises(PermissionError, match=r"A config sets \['hydra\..*only a command line may"):
-        compose(*folder(nasty(sentinel)[name]))
+        compose(*folder(experiments(sentinel)[name]))
 
 
 def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, root: Path, tmp_path: Path):
-    folder(nasty(sentinel)["a callback"])
+    folder(experiments(sentinel)["a callback"])
     command = [sys.executable, "-m", "mvrecon.simulate", f"--config-dir={tmp_path}", "+experiment=evil", "cases=[0]"]
     command += [f"hydra.run.dir={tmp_path}/out"]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120, check=False)
@@ -137,15 +81,10 @@ def test_environment_variables_are_not_read(folder, monkeypatch: pytest.MonkeyPa
     assert compose("name=${oc.env:SECRET}")["name"] == "s3cret"  # the user's own word
 
 
-@pytest.mark.parametrize("name", ["../../out", "/etc/out", "a/../../b", "..", "a\\..\\b", "a\nb"])
+@pytest.mark.parametrize("name", WAYS_OUT)
 def test_a_name_does_not_lead_out_of_the_outputs(name: str, folder):
     with pytest.raises(Refused, match="has the name"):
         compose(*folder(f"name: {name!r}"))
-
-
-BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 10)
-)
 
 
 def test_a_yaml_file_that_unfolds_is_refused_at_once(folder, tmp_path: Path):

@@ -170,6 +170,13 @@ def test_a_body_in_air_is_found_in_noisy_x_rays_and_none_of_it_is_lost():
         noise_threshold(noisy, 0.0)
 
 
+def test_a_ray_that_no_photon_passes_is_not_taken_for_an_empty_one():
+    """Beyond p = 14 at 1e5 photons, 4 exp(p / 2) / sqrt(photons) is above p itself."""
+    p = torch.tensor([0.01, 0.02, 5.0, 13.0, 15.0, 40.0, 200.0])
+    assert (p > noise_threshold(p, 1e5)).tolist() == [False, True, True, True, True, True, True]
+    assert noise_threshold(p, 1e5).max() == pytest.approx(2)
+
+
 def test_behind_more_matter_a_brick_needs_more_to_be_seen():
     """The threshold is 4 exp(p / 2) / sqrt(photons): what is empty at few photons is not at many."""
     grid = Grid.centred((8, 8, 8), 1.0)

@@ -1,7 +1,8 @@
 """The compiled operators of CUDA devices: the same three as `cpu.py`, on torch's current stream.
 
 Forward and derivative by the geometry are the same to the last bit in every run. So is the adjoint where it gathers,
-voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of additions, and so the last digits, vary.
+voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of additions, and so the last digits, vary;
+under `torch.use_deterministic_algorithms` it never does.
 """
 
 import math
@@ -66,8 +67,20 @@ def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method:
     """Whether the adjoint goes by voxels: for Joseph's method, where few pixels lie on the picture of a voxel.
 
     The detector is taken to show the whole volume: to know better would mean to wait for the device.
+
+    Raises:
+        RuntimeError: torch is to use deterministic algorithms alone, and there is none.
     """
-    return method == "joseph" and columns == 3 and math.prod(detector) <= GATHER * math.prod(shape) ** (2 / 3)
+    possible = method == "joseph" and columns == 3
+    if not torch.are_deterministic_algorithms_enabled():
+        return possible and math.prod(detector) <= GATHER * math.prod(shape) ** (2 / 3)
+    if not possible:
+        what = f"method {method!r}" if columns == 3 else "explicit rays"
+        raise RuntimeError(
+            f"The adjoint of {what} adds up in no fixed order on a GPU, and torch.use_deterministic_algorithms was "
+            "called; it needs a camera's rays by method 'joseph', or backend 'reference'"
+        )
+    return True
 
 
 def gather(

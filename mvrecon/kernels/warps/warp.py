@@ -36,5 +36,5 @@ def warp(
         )
     if volumes.dtype not in (torch.float32, torch.float64):
         return warp(volumes.float(), maps, shape, backend).to(volumes.dtype)
-    kernels = warp_ops if kernels_for(volumes, backend)[0] == "cpu" else warp_reference
+    kernels = warp_ops if kernels_for(volumes, backend, None, maps)[0] == "cpu" else warp_reference
     return kernels.warp(volumes, maps, list(shape))

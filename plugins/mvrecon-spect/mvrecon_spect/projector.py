@@ -18,6 +18,8 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.backends import wide
+from mvrecon.projectors.base import check, check_floating
 from mvrecon.projectors.drr import Drr
 
 
@@ -50,6 +52,9 @@ class Spect(Drr):
 
     def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """Activity from counts, by the matched adjoint."""
+        check(views, "views [b c m v u]", (len(self.rays), *self.rays.shape), self.fixed_lines.device)
+        check_floating(views, "views")
+        views = wide(views)  # a half would round the sensitivity, or lose it
         return super().adjoint(views * sensitivity(self.cameras, self.diameter_mm).to(views))
 
 

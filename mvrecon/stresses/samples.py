@@ -1,0 +1,84 @@
+"""A valid file of every kind that is read, and how it is read."""
+
+import gzip
+from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from mvrecon.cameras.files import from_file, save
+from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
+from mvrecon.data.nifti import read_nifti
+from mvrecon.engine.checkpoints import load
+from mvrecon.engine.module import ReconstructionModule
+from mvrecon.limits import yaml_of
+from mvrecon.parts import CAMERAS
+from mvrecon.testing.hostile import pickle_of, saved, with_pickle
+
+Wrap = Callable[[bytes], bytes]
+HU = np.arange(6 * 7 * 8, dtype=np.int16).reshape(6, 7, 8)
+RIG = {"name": "circular", "views": 3, "sid": 300.0, "sdd": 450.0, "detector": {"pixels": [10, 12], "pixel_mm": 9.0}}
+#: A method of few weights, as a run keeps its settings.
+METHOD = {
+    "geometry": {
+        "grid": {"shape": [6, 6, 6], "spacing": 4.0},
+        "camera": {**RIG, "views": 2, "detector": {"pixels": [6, 6], "pixel_mm": 9.0}},
+        "projector": {"name": "drr"},
+    },
+    "model": {"name": "backprojection_unet", "width": 2},
+    "loss": {"volume": 1.0},
+    "optimizer": {"name": "adamw", "lr": 1e-3, "schedule": "constant", "warmup": 0.0},
+    "data_range": 0.04,
+}
+
+
+def checkpoint() -> dict[str, Any]:
+    """What a run keeps of a small method."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        module = ReconstructionModule(**METHOD)
+    kept = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams), "global_step": 3}
+    return {**kept, "callbacks": {"Clock": {"seconds": 1.5}}, "pytorch-lightning_version": "2.6.6"}
+
+
+def read_volumes(path: Path) -> list[Stored]:
+    """Every volume of a file."""
+    file = VolumeFile(path)
+    return [file.read(index) for index in range(len(file)) if file.orientation != "none"]
+
+
+def samples(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, str]]:
+    """By reader: how it reads, what is damaged, what is put around the damaged bytes, and the file's ending.
+
+    NIfTI is among them where nibabel is installed.
+    """
+    write_volumes(folder / "a.h5", [Stored(f"p{k}", HU + k, (3.0, 2.0, 2.0)) for k in range(3)], orientation="LPI")
+    save(CAMERAS.from_config(RIG), folder / "a.json")
+    hdf5, rig = ((folder / f"a.{suffix}").read_bytes() for suffix in ("h5", "json"))
+    archive, whole = saved(checkpoint()), bytes
+    settings = yaml.safe_dump({"name": "train", "plugins": [], **METHOD["geometry"]}).encode()
+    return {
+        "HDF5 volumes": (read_volumes, hdf5, whole, ".h5"),
+        **(_nifti(folder) if find_spec("nibabel") else {}),
+        "cameras": (from_file, rig, whole, ".json"),
+        "settings": (yaml_of, settings, whole, ".yaml"),
+        "checkpoint": (load, archive, whole, ".ckpt"),
+        "checkpoint's pickle": (load, pickle_of(archive), partial(with_pickle, archive), ".ckpt"),
+    }
+
+
+def _nifti(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, str]]:
+    import nibabel
+
+    nibabel.save(nibabel.Nifti1Image(HU, np.diag([2.0, 2.0, 3.0, 1.0])), folder / "a.nii")
+    nifti = (folder / "a.nii").read_bytes()
+    return {
+        "NIfTI": (read_nifti, nifti, bytes, ".nii"),
+        "NIfTI, then packed": (read_nifti, nifti, partial(gzip.compress, compresslevel=1), ".nii.gz"),
+        "NIfTI, packed": (read_nifti, gzip.compress(nifti), bytes, ".nii.gz"),
+    }

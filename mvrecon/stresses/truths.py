@@ -1,0 +1,95 @@
+"""What rays ought to see, known without a projector: rows of voxels, chords of a box, a Gaussian blob."""
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.scenes.solids import Phantom, Solids
+
+#: Integer directions, of which all orders and signs are taken.
+DIRECTIONS = ((1, 1, 1), (1, 1, 0), (2, 1, 0), (2, 1, 1), (3, 2, 1), (3, 1, 0))
+#: Starts and ends of rays in world mm, and what each ought to see.
+Seen = tuple[Float[Tensor, "r 3"], Float[Tensor, "r 3"], Float[Tensor, " r"]]
+
+
+def rows(grid: Grid, volume: Float[Tensor, "d h w"]) -> Seen:
+    """Rays through the centres of voxels along x, y and z, from outside to outside: sums times the spacing."""
+    found = []
+    for axis in range(3):
+        counts = [grid.shape[2 - i] for i in range(3) if i != axis]
+        index = torch.cartesian_prod(*[torch.arange(count, dtype=torch.float64) for count in counts])
+        sums = volume.double().cpu().sum(dim=2 - axis).mT.flatten() * grid.spacing[axis]
+        found.append((*ends(grid, axis, index), sums))
+    start, end, sums = (torch.cat(each) for each in zip(*found, strict=True))
+    return start, end, sums
+
+
+def ends(grid: Grid, axis: int, index: Float[Tensor, "r 2"]) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r 3"]]:
+    """Where rays along an axis start and end, outside of the grid, at voxel indices of the other two axes."""
+    start = torch.zeros(len(index), 3, dtype=torch.float64)
+    start[:, [i for i in range(3) if i != axis]] = index
+    end = start.clone()
+    start[:, axis], end[:, axis] = -20.0, grid.shape[2 - axis] + 25.0
+    return grid.to_world(start), grid.to_world(end)
+
+
+def through(grid: Grid, count: int = 12, seed: int = 0) -> Seen:
+    """Slanting rays from face to opposite face, along x, y and z, and their lengths in the box.
+
+    They stay half a voxel away from the other faces, and in the middle where there is but one voxel, so that an
+    interpolating projector sees the same of ones.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    sizes = torch.tensor(grid.shape[::-1], dtype=torch.float64)
+    found = []
+    for axis in range(3):
+        enter, leave = ((sizes - 1) * torch.rand(count, 3, generator=rng, dtype=torch.float64) for _ in range(2))
+        way = leave - enter
+        enter[:, axis], way[:, axis] = -0.5, 0
+        steep = way.abs().amax(dim=-1, keepdim=True) / (0.9 * sizes[axis])
+        way /= steep.clamp(min=1)  # a ray's main axis is its fastest, in voxels
+        way[:, axis] = sizes[axis]
+        found.append((grid.to_world(enter - 2 * way), grid.to_world(enter + 3.5 * way)))
+    start, end = (torch.cat(each) for each in zip(*found, strict=True))
+    return start, end, (end - start).norm(dim=-1) / 5.5
+
+
+def ways() -> Float[Tensor, "r 3"]:
+    """Every order and sign of the integer directions: lines in them, through lattice points, meet edges and corners."""
+    signed = itertools.product(DIRECTIONS, itertools.permutations(range(3)), itertools.product((-1, 1), repeat=3))
+    found = {tuple(way[i] * sign for i, sign in zip(order, signs, strict=True)) for way, order, signs in signed}
+    return torch.tensor(sorted(found), dtype=torch.float64)
+
+
+def box_lengths(rig: Cameras, grid: Grid, grown: float = 0.0) -> Float[Tensor, "m v u"]:
+    """Mm of each ray that lie in an axis-aligned grid's box, grown by so many voxels on every side."""
+    sizes = zip(grid.shape[::-1], grid.spacing, strict=True)
+    half = torch.tensor([[(n / 2 + grown) * mm for n, mm in sizes]], dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64)[None]
+    box = Phantom((Solids("box", grid.centre[None], eye, half, torch.ones(1)),))
+    return box.integrals(*rig.rays(), extent=rig.limits)
+
+
+@dataclass(frozen=True, eq=False)
+class Blob:
+    """exp(-|X - centre|^2 / 2 sigma^2): as smooth as can be; sigma and centre in mm."""
+
+    centre: Float[Tensor, "3"]
+    sigma: float
+
+    def values(self, grid: Grid) -> Float[Tensor, "d h w"]:
+        """At the centres of voxels."""
+        off = voxel_centres(grid) - self.centre
+        return torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))
+
+    def integrals(self, start: Float[Tensor, "*r 3"], end: Float[Tensor, "*r 3"]) -> Float[Tensor, "*r"]:
+        """Along the whole lines through these points, in mm."""
+        along = end - start
+        along = along / along.norm(dim=-1, keepdim=True)
+        off = torch.linalg.cross(start - self.centre, along)
+        return self.sigma * (2 * torch.pi) ** 0.5 * torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))
