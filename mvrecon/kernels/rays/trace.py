@@ -101,6 +101,12 @@ def shortened(across, begin, end, from_, to):
 
 
 @scalar
+def overlapped(first, last, begin, end):
+    """Slabs without those behind the ray's ends: a ray may end on a face, or so near that a rounded sum is beyond."""
+    return first + int(first + 0.5 <= begin), last - int(last - 1.5 >= end)
+
+
+@scalar
 def trace(line, axis, near, pixel, space, method):
     """Where the ray of a pixel runs; `first >= last` says that it misses. All in float64.
 
@@ -135,10 +141,8 @@ def trace(line, axis, near, pixel, space, method):
     if begin < end and enter <= leave:
         first = max(space.box[axis], int(ceil(enter + centre - margin)))
         last = min(space.box[3 + axis], int(floor(leave + centre + margin)) + 1)
-        # sums round: a ray that ends on a face, or all but so, has no part of the slab behind it
-        if method != TRILINEAR and first < last:
-            first += int(first - centre + 0.5 <= begin)
-            last -= int(last - 1 - centre - 0.5 >= end)
+        if method != TRILINEAR:
+            first, last = overlapped(first, last, begin + centre, end + centre)
     b0, c0 = value_b + (space.sizes[far] - 1) / 2.0 + 1, value_c + (space.sizes[near] - 1) / 2.0 + 1
     return Ray(
         *(axis, far, near, b0, slope_b, c0, slope_c, slab_length(line, axis, u, v)),

@@ -13,7 +13,7 @@ from mvrecon.parts import PROJECTORS
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon.stresses.case import PRECISE, Case, DoesNotApply
-from mvrecon.stresses.subject import GRID, ProjectorSubject, gap
+from mvrecon.stresses.subject import GRID, ProjectorSubject, gap, greatest
 from mvrecon.stresses.truths import Blob, ends, ways
 
 #: Sums of rounded terms; 1e-6 is of the plan.
@@ -45,7 +45,7 @@ def adjoint(subject: ProjectorSubject) -> float:
         x = subject.random(1, 2, *grid.shape, seed=seed)
         y = subject.random(1, 2, len(rig), *rig.shape, seed=seed + 100)
         one, two = (A(x).double() * y).sum(), (x.double() * A.T(y)).sum()
-        worst = max(worst, float((one - two).abs() / torch.maximum(one.abs(), two.abs()).clamp(min=1e-30)))
+        worst = greatest([worst, float((one - two).abs() / torch.maximum(one.abs(), two.abs()).clamp(min=1e-30))])
     return worst
 
 
@@ -56,7 +56,7 @@ def linear(subject: ProjectorSubject) -> float:
     seen, other = A(x), A(y)
     worst = gap(A(x + y), seen.double() + other.double())
     for factor in (3.0, -1e-3, 1e6):
-        worst = max(worst, gap(A(factor * x), factor * seen.double()))
+        worst = greatest([worst, gap(A(factor * x), factor * seen.double())])
     return worst + float((A(0 * x) != 0).sum()) + float((A.T(0 * seen) != 0).sum())
 
 
@@ -69,7 +69,7 @@ def moved(subject: ProjectorSubject) -> float:
         affine = GRID.affine.clone()
         affine[:3] = R @ affine[:3]
         affine[:3, 3] += t
-        worst = max(worst, gap(subject.projector(Grid(GRID.shape, affine), rig.moved(R, t))(volume), views))
+        worst = greatest([worst, gap(subject.projector(Grid(GRID.shape, affine), rig.moved(R, t))(volume), views)])
     return worst
 
 
@@ -114,7 +114,8 @@ def differences(subject: ProjectorSubject) -> float:
             way = torch.randn(slope.shape, generator=rng, dtype=torch.float64).to(slope)
             ends = [[*inputs[:index], inputs[index] + step * way, *inputs[index + 1 :]] for step in (1e-5, -1e-5)]
             more, less = ((views(*each) * weights).sum() for each in ends)
-            worst = max(worst, float(((more - less) / 2e-5 - (slope * way).sum()).abs() / (slope.norm() * way.norm())))
+            error = ((more - less) / 2e-5 - (slope * way).sum()).abs() / (slope.norm() * way.norm())
+            worst = greatest([worst, float(error)])
     return worst
 
 
@@ -141,7 +142,7 @@ def twice(subject: ProjectorSubject) -> float:
     by_y, by_x = torch.autograd.grad((A(x) * y).sum(), (y, x), create_graph=True)
     w, z = subject.random(*y.shape, seed=1), subject.random(*x.shape, seed=2)
     mixed = torch.autograd.grad((by_y * w).sum(), x)[0], torch.autograd.grad((by_x * z).sum(), y)[0]
-    return max(gap(mixed[0], A.T(w)), gap(mixed[1], A(z)))
+    return greatest([gap(mixed[0], A.T(w)), gap(mixed[1], A(z))])
 
 
 def twice_by_pose(subject: ProjectorSubject) -> float:
@@ -170,9 +171,9 @@ def mapped(subject: ProjectorSubject) -> float:
     worst = 0.0
     for act, given in ((A, x), (A.T, y)):
         loop = torch.stack([torch.stack([act(one) for one in each]) for each in given])
-        worst = max(worst, gap(torch.func.vmap(act)(given[:, 0]), loop[:, 0]))
-        worst = max(worst, gap(torch.func.vmap(act, in_dims=1)(given[0].transpose(0, 1)), loop[0]))
-        worst = max(worst, gap(torch.func.vmap(torch.func.vmap(act))(given), loop))
+        worst = greatest([worst, gap(torch.func.vmap(act)(given[:, 0]), loop[:, 0])])
+        worst = greatest([worst, gap(torch.func.vmap(act, in_dims=1)(given[0].transpose(0, 1)), loop[0])])
+        worst = greatest([worst, gap(torch.func.vmap(torch.func.vmap(act))(given), loop)])
     return worst
 
 
@@ -193,7 +194,7 @@ def pushed(subject: ProjectorSubject) -> float:
     A, worst = subject.projector(SMALL, subject.rig(SMALL, FEW, views=2)), 0.0
     for act, shape in ((A, (1, 1, *SMALL.shape)), (A.T, (1, 1, 2, 3, 2))):
         given, tangent = subject.random(*shape), subject.random(*shape, seed=1)
-        worst = max(worst, gap(torch.func.jvp(act, (given,), (tangent,))[1], act(tangent)))
+        worst = greatest([worst, gap(torch.func.jvp(act, (given,), (tangent,))[1], act(tangent))])
     return worst
 
 
@@ -210,7 +211,7 @@ def compiled(subject: ProjectorSubject) -> float:
     for given in (x, torch.cat([x, 2 * x])):  # the second makes the sizes of the graph symbols
         seen, expected = whole(given), step(given)
         slopes = [torch.autograd.grad(each.square().sum(), given)[0] for each in (seen, expected)]
-        worst = max(worst, gap(seen, expected), gap(*slopes))
+        worst = greatest([worst, gap(seen, expected), gap(*slopes)])
     return worst
 
 

@@ -17,7 +17,7 @@ from mvrecon.reconstruct.poisson import PoissonLikelihood
 from mvrecon.scenes.derenzo import derenzo
 from mvrecon.stresses.case import Case, DoesNotApply
 from mvrecon.stresses.refusals import none_of, refusal
-from mvrecon.stresses.subject import GRID, ProjectorSubject, Subject, gap
+from mvrecon.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
 from mvrecon.support.hull import visual_hull
 from mvrecon.support.noise import noise_threshold
 
@@ -63,7 +63,7 @@ def thick_matter(subject: ProjectorSubject) -> float:
         (change,) = torch.autograd.grad(views.sum(), x)
         if not (views.isfinite().all() and change.isfinite().all()):
             raise AssertionError(f"at p = {p} some views or gradients are not finite")
-        worst = max(worst, gap(views, float(level) * ones))
+        worst = greatest([worst, gap(views, float(level) * ones)])
     return worst
 
 
@@ -119,7 +119,7 @@ def odd_counts(subject: ProjectorSubject) -> float:
             x = mlem(A, counts, 1)
             kept = float((PoissonLikelihood(A, counts).sensitivity(x.dtype).double() * x.double()).sum())
             total = float(counts.double().sum())
-            worst = max(worst, abs(kept - total) / (total or 1.0))
+            worst = greatest([worst, abs(kept - total) / (total or 1.0)])
             x = mlem(A, counts, 2, start=x)
             if not (x >= 0).all() or not x.isfinite().all():
                 raise AssertionError(f"a voxel is negative or not finite at counts up to {float(counts.max()):.3g}")
@@ -153,7 +153,7 @@ def rising(subject: ProjectorSubject) -> float:
     for _ in range(100):
         x = mlem(A, counts, 1, 0.1, start=x, skip_zero_bins=False)
         value = float(likelihood(x))
-        worst, last = max(worst, (value - last) / abs(last)), value
+        worst, last = greatest([worst, (value - last) / abs(last)]), value
     return worst
 
 

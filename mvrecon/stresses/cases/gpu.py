@@ -6,7 +6,7 @@ from torch.nn.functional import conv3d
 from mvrecon.geometry.grid import Grid
 from mvrecon.stresses.case import Case, DoesNotApply
 from mvrecon.stresses.cases.sizes import FEW, LONG, band
-from mvrecon.stresses.subject import GRID, ProjectorSubject, Subject, gap
+from mvrecon.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
 
 #: What cuDNN may round to in bfloat16; of its faults, results are off by as much as themselves.
 ROUGH = 2e-2
@@ -61,7 +61,7 @@ def huge_views(subject: ProjectorSubject) -> float:
     views, few = A(x), B(x)
     error = gap(views[..., -FEW:, -FEW:], few)
     views.zero_()[..., -FEW:, -FEW:] = few
-    return max(error, gap(A.T(views), B.T(few))) if few.any() else torch.nan
+    return greatest([error, gap(A.T(views), B.T(few))]) if few.any() else torch.nan
 
 
 CASES = (

@@ -12,7 +12,7 @@ from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.grid import Grid
 from mvrecon.stresses.case import Case
-from mvrecon.stresses.subject import ProjectorSubject, Subject, gap
+from mvrecon.stresses.subject import ProjectorSubject, Subject, gap, greatest
 from mvrecon.stresses.truths import DIRECTIONS, box_lengths, ends, rows, ways
 
 #: Exact in float64 but for the rotation of a ray into voxels; float32 rounds each of about ten sums.
@@ -31,7 +31,7 @@ def axis_aligned(subject: ProjectorSubject) -> float:
         start, end, sums = rows(grid, volume)
         for a, b in ((start, end), (end, start)):
             seen = subject.values(grid, a, b, volume)
-            worst = max(worst, float((seen - sums).abs().max() / sums.max()))
+            worst = greatest([worst, float((seen - sums).abs().max() / sums.max())])
     return worst
 
 
@@ -50,7 +50,7 @@ def on_faces(subject: ProjectorSubject) -> float:
         start, end = ends(grid, axis, halves)
         for a, b in ((start, end), (end, start)):
             seen = subject.values(grid, a, b, volume)
-            worst = max(worst, float(torch.maximum(seen - most, least - seen).max()))
+            worst = greatest([worst, float(torch.maximum(seen - most, least - seen).max())])
     return worst
 
 
@@ -69,7 +69,7 @@ def abutting(subject: ProjectorSubject) -> float:
         low[axis] = high[axis] = at
         parts = Box((0, 0, 0), three(high)), Box(three(low), (4, 4, 4))
         total = sum(subject.values(grid.cropped(box), start, end, volume[box.slices]) for box in parts)
-        worst = max(worst, float((total - whole).abs().max() / whole.max()))
+        worst = greatest([worst, float((total - whole).abs().max() / whole.max())])
     return worst
 
 
@@ -90,13 +90,13 @@ def turned_corners(subject: ProjectorSubject) -> float:
     for order in itertools.permutations(range(3)):
         turned = volume.permute(2, 1, 0).permute(order).permute(2, 1, 0)
         again = subject.values(grid, start[:, order], end[:, order], turned)
-        worst = max(worst, float((again - seen).abs().max() / seen.max()))
+        worst = greatest([worst, float((again - seen).abs().max() / seen.max())])
     free = (way != 0).all(dim=1)  # the others lie in faces, which belong to the voxel above
     for axis in range(3):
         sign = torch.ones(3, dtype=torch.float64)
         sign[axis] = -1
         again = subject.values(grid, (start * sign)[free], (end * sign)[free], volume.flip(2 - axis))
-        worst = max(worst, float((again - seen[free]).abs().max() / seen.max()))
+        worst = greatest([worst, float((again - seen[free]).abs().max() / seen.max())])
     return worst
 
 
@@ -128,7 +128,7 @@ def nearly_aligned(subject: ProjectorSubject) -> float:
     for axis in range(3):
         tilts, way = _tilted(axis)
         seen = subject.values(grid, -30 * way, 30 * way, volume)
-        worst = max(worst, float(((seen / seen[0] - 1).abs() - 20 * tilts).max()))
+        worst = greatest([worst, float(((seen / seen[0] - 1).abs() - 20 * tilts).max())])
     return worst
 
 
@@ -145,7 +145,7 @@ def nearly_on_faces(subject: ProjectorSubject) -> float:
         known = subject.values(grid, start[:1] + offset, end[:1] + offset, volume)
         seen = subject.values(grid, start, end, volume)
         excess = torch.maximum(seen - known.max(), known.min() - seen) / known.max() - 20 * tilts
-        worst = max(worst, float(excess.max()))
+        worst = greatest([worst, float(excess.max())])
     return worst
 
 
@@ -209,7 +209,7 @@ def tiled(subject: ProjectorSubject) -> float:
             source = rig.source + shift if rig.parallel else rig.source
             cut = replace(rig, source=source, origin=rig.origin + shift, shape=shape)
             parts[..., row : row + shape[0], column : column + shape[1]] = subject.projector(grid, cut)(volume)
-        worst = max(worst, gap(parts, whole))
+        worst = greatest([worst, gap(parts, whole)])
     return worst
 
 

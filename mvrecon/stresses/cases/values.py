@@ -5,11 +5,13 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
+from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.base import Projector
 from mvrecon.projectors.skipping import SKIPS
 from mvrecon.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon.stresses.subject import GRID, ProjectorSubject, bits, gap
+from mvrecon.stresses.truths import box_lengths
 
 EVERY = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 #: More than one brick along each axis, under a detector that does not see all of them.
@@ -95,16 +97,24 @@ def beyond_support(subject: ProjectorSubject) -> float:
 
 
 def touched(subject: ProjectorSubject) -> float:
-    """Rays through corners and edges of voxels, and along their faces: a NaN is met only where a ray has a length."""
+    """Rays through corners and edges of voxels, and along their faces: a NaN is met where a ray has a length in it.
+
+    Where the ray touches what it could read and no more, at a weight of exactly zero, it may be met or not: 0 * NaN.
+    """
     subject.need_exact()
     grid = Grid.centred((4, 4, 4), 1.0)
     way = torch.tensor([[1.0, 1, 0], [1, -1, 0], [0, 1, 1], [2, 1, 0], [1, 1, 1]], dtype=torch.float64)
     middle = torch.tensor([[0, 0, 0.3], [0, 0, 0.3], [0.3, 0, 0], [0, 0, 0.3], [0, 0, 0]], dtype=torch.float64)
-    A = subject.projector(grid, subject.rays(middle - 20 * way, middle + 20 * way))
+    rig = subject.rays(middle - 20 * way, middle + 20 * way)
+    A = subject.projector(grid, rig)
     voxels = torch.eye(64, dtype=subject.dtype, device=subject.device).reshape(64, 1, 4, 4, 4)
     alone = subject.random(1, 1, 4, 4, 4).expand(64, -1, -1, -1, -1)
-    seen = A(torch.where(voxels > 0, torch.nan, alone))
-    return float((seen.isfinite() == (A(voxels) != 0)).sum())
+    spoilt = ~A(torch.where(voxels > 0, torch.nan, alone)).isfinite().flatten(1).cpu()
+    weighed = (A(voxels) != 0).flatten(1).cpu()
+    reach = 1e-9 + (0.0 if subject.of_cells else 0.5)
+    each = [Box((z, y, x), (z + 1, y + 1, x + 1)) for z in range(4) for y in range(4) for x in range(4)]
+    near = torch.stack([box_lengths(rig, grid.cropped(box), reach).flatten() > 0 for box in each])
+    return float(((weighed & ~spoilt) | (spoilt & ~near)).sum())
 
 
 CASES = (
@@ -121,6 +131,6 @@ CASES = (
     ),
     Case(47, "a pixel that is no number", "exactly the voxels on its ray are none", "projector", bad_pixel),
     Case(47, "no numbers outside of a support", "not met", "projector", beyond_support, dtypes=EVERY),
-    Case(47, "no number at a corner", "only rays with a length in it are none", "projector", touched),
+    Case(47, "no number at a corner", "rays with a length in it are none, others not", "projector", touched),
     Case(49, "negative values", "mirrored to the bit, and linear", "projector", negative, PRECISE, EVERY),
 )
