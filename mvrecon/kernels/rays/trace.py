@@ -101,8 +101,10 @@ def shortened(across, begin, end, from_, to):
 
 
 @scalar
-def overlapped(first, last, begin, end):
+def overlapped(method, first, last, begin, end):
     """Slabs without those behind the ray's ends: a ray may end on a face, or so near that a rounded sum is beyond."""
+    if method == TRILINEAR:  # its samples belong to no slab alone
+        return first, last
     return first + int(first + 0.5 <= begin), last - int(last - 1.5 >= end)
 
 
@@ -141,8 +143,7 @@ def trace(line, axis, near, pixel, space, method):
     if begin < end and enter <= leave:
         first = max(space.box[axis], int(ceil(enter + centre - margin)))
         last = min(space.box[3 + axis], int(floor(leave + centre + margin)) + 1)
-        if method != TRILINEAR:
-            first, last = overlapped(first, last, begin + centre, end + centre)
+        first, last = overlapped(method, first, last, begin + centre, end + centre)
     b0, c0 = value_b + (space.sizes[far] - 1) / 2.0 + 1, value_c + (space.sizes[near] - 1) / 2.0 + 1
     return Ray(
         *(axis, far, near, b0, slope_b, c0, slope_c, slab_length(line, axis, u, v)),
