@@ -99,13 +99,12 @@ allowed; n/a is what a part is not made for, with the reason. Where half precisi
 def page(found: dict[str, Any], seed: int) -> str:
     """The page."""
     text = PROSE + markdown(("what", "figure", "command"), figures(**found), 3)
-    parts = [
-        (part, *map(str, (counts.get(v, 0) for v in VERDICTS))) for part, counts in found["stress"]["parts"].items()
-    ]
-    text += "\n## The stress plan, part by part\n\n" + markdown(("part", *VERDICTS), parts)
-    text += "".join(
-        f"\nFailed: {line}.\n" for line in (*found["stress"]["failed"], *found["kills"]["runs that differ"])
-    )
+    tried = {part: counts for part, counts in found["stress"]["parts"].items() if set(counts) != {"n/a"}}
+    parts = [(part, *(str(counts.get(verdict, 0)) for verdict in VERDICTS)) for part, counts in tried.items()]
+    text += "\n## The stress plan, part by part\n\nWithout the parts of plugins whose packages are not installed.\n\n"
+    text += markdown(("part", *VERDICTS), parts)
+    failed = *found["stress"]["failed"], *found["kills"]["runs that differ"]
+    text += "".join(f"\nFailed: {line}.\n" for line in failed)
     text += "\n## Damaged files, reader by reader\n\nRead all the same: damaged where nothing is.\n\n"
     text += markdown(("reader", "inputs", "read", "failures", "slowest s", "most MB"), list(readers(found["fuzz"])))
     made = ", ".join(f"{name} {versions()[name]}" for name in ("python", "torch", "numba"))
