@@ -62,7 +62,7 @@ def properties(given: argparse.Namespace) -> Any:
     """Random geometries that the properties were tried on."""
     options = ("-q", "--hypothesis-show-statistics", f"--hypothesis-seed={given.seed}", "-p", "no:cacheprovider")
     said = done(sys.executable, "-m", "pytest", "tests/properties", *options, HYPOTHESIS_PROFILE="thorough")
-    counted = [tuple(map(int, found)) for found in re.findall(r"(\d+) passing examples, (\d+) failing", said)]
+    counted = [tuple(map(int, found)) for found in re.findall(r"(\d+) passing, (\d+) failing", said)]
     return {"properties": len(counted), "examples": sum(a for a, _ in counted), "failing": sum(b for _, b in counted)}
 
 
