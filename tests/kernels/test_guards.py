@@ -58,6 +58,12 @@ MEMORY = {
 }
 
 
+def least(call):
+    """What a call returns, and the least of the MB that it needed twice: what else the process does only adds."""
+    (found, once), (_, again) = (with_memory(call, "cpu") for _ in range(2))
+    return found, min(once, again)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark cannot be reset")
 @pytest.mark.parametrize("n", [192, 256])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
@@ -69,12 +75,12 @@ def test_little_memory_is_taken_beyond_input_and_output(kind, dtype, n):
         little = torch.rand(1, 16, 16, 16).to(dtype)
         ops.lines_vjp(little, warm(little[None])[0], warm.lines, warm.window, warm.kernel)  # compiles
         x = torch.rand(1, 1, n, n, n).to(dtype)
-        views, forward = with_memory(lambda A=A, x=x: A(x), "cpu")
+        views, forward = least(lambda A=A, x=x: A(x))
         assert forward < views.nbytes / 2**20 + 64
-        volume, back = with_memory(lambda A=A, views=views: A.T(views), "cpu")
+        volume, back = least(lambda A=A, views=views: A.T(views))
         assert back < volume.nbytes / 2**20 + 64
         arguments = (x[:, 0], views[:, 0], A.lines, A.window, A.kernel)
-        _, vjp = with_memory(lambda arguments=arguments: ops.lines_vjp(*arguments), "cpu")
+        _, vjp = least(lambda arguments=arguments: ops.lines_vjp(*arguments))
         assert vjp < 64
 
 
