@@ -35,20 +35,21 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.stresses.stress import counts
+    from mvrecon.stresses.verdict import FAIL
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     rows = stress(to_plain(config), folder)
     tell = Console(markup=False, highlight=False).print
     found = counts(rows)
     for row in rows:
-        if row["verdict"] == "FAIL":
+        if row["verdict"] == FAIL:
             tell(
                 f"FAIL {row['number']:.0f} {row['case']}, {row['part']} {row['dtype']}: {row.get('measured')} > "
                 f"{row['tolerance']:g} {row.get('note', '')}",
                 soft_wrap=True,
             )
     tell(f"{', '.join(f'{count} {verdict}' for verdict, count in found.items())}; all is in {folder}", soft_wrap=True)
-    if found["FAIL"]:
+    if found[FAIL]:
         raise SystemExit(1)
 
 

@@ -19,10 +19,11 @@ from typing import Any
 from mvrecon.benchmarks.report import markdown
 from mvrecon.durable import written_whole
 from mvrecon.engine.record import versions
+from mvrecon.stresses.verdict import FAIL, LEFT_OUT, PASS
 
 ROOT = Path(__file__).resolve().parents[1]
 FOUND = ROOT / "outputs" / "trust"
-VERDICTS = ("pass", "FAIL", "n/a")
+VERDICTS = (PASS, FAIL, LEFT_OUT)
 
 
 def done(*command: str, **environment: str) -> str:
@@ -39,7 +40,7 @@ def stress(_: argparse.Namespace) -> Any:
     parts: dict[str, Counter] = {}
     for row in rows:
         parts.setdefault(f"{row['part']}, {row['dtype']}", Counter())[row["verdict"]] += 1
-    failed = [f"{row['number']:.0f} {row['case']}, {row['part']}" for row in rows if row["verdict"] == "FAIL"]
+    failed = [f"{row['number']:.0f} {row['case']}, {row['part']}" for row in rows if row["verdict"] == FAIL]
     cases, numbers = {(row["number"], row["case"]) for row in rows}, {row["number"] for row in rows}
     return {"parts": parts, "rows": len(rows), "cases": len(cases), "numbers": len(numbers), "failed": failed}
 
@@ -99,7 +100,7 @@ allowed; n/a is what a part is not made for, with the reason. Where half precisi
 def page(found: dict[str, Any], seed: int) -> str:
     """The page."""
     text = PROSE + markdown(("what", "figure", "command"), figures(**found), 3)
-    tried = {part: counts for part, counts in found["stress"]["parts"].items() if set(counts) != {"n/a"}}
+    tried = {part: counts for part, counts in found["stress"]["parts"].items() if set(counts) != {LEFT_OUT}}
     parts = [(part, *(str(counts.get(verdict, 0)) for verdict in VERDICTS)) for part, counts in tried.items()]
     text += "\n## The stress plan, part by part\n\nWithout the parts of plugins whose packages are not installed.\n\n"
     text += markdown(("part", *VERDICTS), parts)

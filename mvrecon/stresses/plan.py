@@ -4,9 +4,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
-import torch
-
+from mvrecon.benchmarks.cases import DTYPES
 from mvrecon.parts import REGISTRIES
+from mvrecon.projectors.base import METHODS
 from mvrecon.registry import hint
 from mvrecon.stresses.case import KINDS, Case
 from mvrecon.stresses.subject import Subject, subject_of
@@ -30,9 +30,6 @@ FILES = (
     "repeats",
     "gpu",
 )
-DTYPES = {"float64": torch.float64, "float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
-#: Projectors come with each of their methods, where a plan asks for all parts.
-METHODS = ("joseph", "siddon", "trilinear")
 
 
 def cases() -> list[Case]:
@@ -67,7 +64,10 @@ def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> 
 
 
 def every_part() -> list[tuple[str, str, dict[str, Any]]]:
-    """Kind, name and options of all that is registered, plugins included, and of mvrecon itself."""
+    """Kind, name and options of all that is registered, plugins included, and of mvrecon itself.
+
+    Our own projectors come with each of their methods.
+    """
     found: list[tuple[str, str, dict[str, Any]]] = []
     for kind in KINDS[:-1]:
         for name in REGISTRIES[kind].names():

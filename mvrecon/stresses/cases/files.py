@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.util import find_spec
 from multiprocessing import get_all_start_methods
 from pathlib import Path
@@ -30,7 +30,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.limits import Refused
 from mvrecon.projectors.drr import Drr
 from mvrecon.stresses.apart import python
-from mvrecon.stresses.case import Case, DoesNotApply
+from mvrecon.stresses.case import DoesNotApply, once
 from mvrecon.stresses.refusals import none_of, refusal
 from mvrecon.stresses.samples import RIG, checkpoint
 from mvrecon.stresses.subject import Subject
@@ -276,18 +276,13 @@ def honest_benchmarks(subject: Subject) -> float:
     return none_of(wrong)
 
 
-def case(number: int, name: str, holds: str, measure: Callable[[Subject], float]) -> Case:
-    """A row of this file, done once: no dtype matters."""
-    return Case(number, name, holds, "mvrecon", measure, 0.0, (torch.float32,))
-
-
 CASES = (
-    case(62, "volume files that are damaged", "refused by name, no bit read otherwise", damaged_volumes),
-    case(63, "volume files that are something else", "refused by name", strange_volumes),
-    case(63, "NIfTI that declares what is not there", "refused by name", strange_nifti),
-    case(64, "forked and spawned workers", "the same batches to the last bit", loaders),
-    case(66, "damaged files of every kind", "read, or refused by name in time", fuzzed),
-    case(70, "checkpoints that are damaged", "the one before is read, or refused by name", damaged_checkpoints),
-    case(73, "a board of bad numbers and pictures", "shown; logged again, once", boards),
-    case(80, "the benchmark of a wrong operator", "its error beside its time", honest_benchmarks),
+    once(62, "volume files that are damaged", "refused by name, no bit read otherwise", damaged_volumes),
+    once(63, "volume files that are something else", "refused by name", strange_volumes),
+    once(63, "NIfTI that declares what is not there", "refused by name", strange_nifti),
+    once(64, "forked and spawned workers", "the same batches to the last bit", loaders),
+    once(66, "damaged files of every kind", "read, or refused by name in time", fuzzed),
+    once(70, "checkpoints that are damaged", "the one before is read, or refused by name", damaged_checkpoints),
+    once(73, "a board of bad numbers and pictures", "shown; logged again, once", boards),
+    once(80, "the benchmark of a wrong operator", "its error beside its time", honest_benchmarks),
 )

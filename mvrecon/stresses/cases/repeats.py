@@ -2,7 +2,6 @@
 
 import multiprocessing
 import random
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from mvrecon.benchmarks.measure import threads, with_memory
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import MODELS, PROJECTORS, SCENES
 from mvrecon.projectors.base import Projector
+from mvrecon.stresses.apart import LIMIT, python
 from mvrecon.stresses.case import Case, DoesNotApply
 from mvrecon.stresses.subject import GRID, ProjectorSubject, Subject, bits, rig_about
 
@@ -26,7 +26,7 @@ PIXELS = {"pixels": [70, 70], "pixel_mm": 0.19, "offset_mm": [0.04, -0.03]}
 #: Loops over which memory must stay as it is, after as many as fill what is kept.
 LOOPS, FIRST = 500, 50
 #: Seconds after which another process is taken to hang; a fresh one may have to compile.
-PATIENCE = {"fork": 30.0, "spawn": 100.0}
+PATIENCE = {"fork": 30.0, "spawn": LIMIT}
 SINGLE, DOUBLE = (torch.float32,), (torch.float64,)
 
 
@@ -185,9 +185,8 @@ def imported(subject: Subject) -> float:
         "    if known[kind].origin(name).startswith('mvrecon.'): known[kind].get(name)\n"
         "print(time.process_time() - begin, torch.cuda.is_initialized())"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE["spawn"], check=True
-    )
+    done = python("-c", code)
+    done.check_returncode()
     seconds, woken = done.stdout.split()
     return float("inf") if woken != "False" else float(seconds)
 

@@ -1,18 +1,17 @@
 """Runs: two at once in a folder, a file that is read while it is written, kills, full disks, and what hangs."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import torch
 
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.durable import claimed
 from mvrecon.stresses.apart import apart, python
-from mvrecon.stresses.case import Case, DoesNotApply
+from mvrecon.stresses.case import DoesNotApply, once
 from mvrecon.stresses.refusals import none_of
 from mvrecon.stresses.subject import Subject
 from mvrecon.stresses.survival import survival
@@ -90,7 +89,7 @@ def reader_while_writing(subject: Subject) -> float:
 
 HANGING = """
 import signal, sys, time
-from mvrecon.stresses.case import Case
+from mvrecon.stresses.case import once
 from mvrecon.stresses.subject import Subject
 from mvrecon.stresses.verdict import judge
 from mvrecon.stresses.watchdog import watched
@@ -99,7 +98,7 @@ def hang(subject):
     while True:
         pass
 
-row = judge(Case(77, "x", "y", "mvrecon", hang), Subject("mvrecon"), 0.2)
+row = judge(once(77, "x", "y", hang), Subject("mvrecon"), 0.2)
 sys.stdout.write(f"{row['verdict']} {row['note']}\\n")
 sys.stdout.flush()
 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})  # as compiled code, which no signal reaches
@@ -121,16 +120,11 @@ def hanging(subject: Subject) -> float:
     return none_of(wrong)
 
 
-def case(number: int, name: str, holds: str, measure: Callable[[Subject], float]) -> Case:
-    """A row of this file, done once: no dtype matters."""
-    return Case(number, name, holds, "mvrecon", measure, 0.0, (torch.float32,))
-
-
 CASES = (
-    case(65, "two processes in one run folder", "the second is refused, the first named", two_writers),
-    case(65, "a file that is read while it is written", "one edition, whole", reader_while_writing),
-    case(67, "kills while a checkpoint is written", "a whole one is read", kills_in_saving),
-    case(68, "a kill, and on from there", "the bits of a run that was not killed", kill_and_resume),
-    case(69, "a full disk", "told, and the last checkpoint stays", full_disk),
-    case(77, "cases that hang", "told, or a loud exit", hanging),
+    once(65, "two processes in one run folder", "the second is refused, the first named", two_writers),
+    once(65, "a file that is read while it is written", "one edition, whole", reader_while_writing),
+    once(67, "kills while a checkpoint is written", "a whole one is read", kills_in_saving),
+    once(68, "a kill, and on from there", "the bits of a run that was not killed", kill_and_resume),
+    once(69, "a full disk", "told, and the last checkpoint stays", full_disk),
+    once(77, "cases that hang", "told, or a loud exit", hanging),
 )

@@ -17,15 +17,13 @@ from mvrecon.parts import MODELS, PROJECTORS, REGISTRIES, SCENES
 from mvrecon.projectors.drr import Drr
 from mvrecon.registry import Registry
 from mvrecon.stresses.apart import apart, python
-from mvrecon.stresses.case import Case
+from mvrecon.stresses.case import once
 from mvrecon.stresses.compositions import Wrong, compositions
 from mvrecon.stresses.refusals import none_of, refusal
 from mvrecon.stresses.samples import RIG, checkpoint
 from mvrecon.stresses.subject import GRID, Subject, rig_about
 from mvrecon.testing import check_projector, hostile
 from mvrecon.testing.plugins import plugin
-
-OTHER = (torch.float32,)
 
 
 @cache
@@ -280,18 +278,13 @@ def foreign_places(subject: Subject) -> float:
     return 0.0
 
 
-def case(number: int, name: str, holds: str, measure: Any) -> Case:
-    """A row of this file, done once: no dtype matters."""
-    return Case(number, name, holds, "mvrecon", measure, 0.0, OTHER)
-
-
 CASES = (
-    case(57, "grids, rigs and volumes that do not fit", "refused, with both sides told", mismatches),
-    case(58, "misspelt names, options and keys", "refused, with the nearest one", typing_mistakes),
-    case(59, "names that are taken", "refused, with both parts named", names_taken_twice),
-    case(60, "plugins that do not import", "told on use, each time alike; others work", broken_plugins),
-    case(61, "projectors that break their contract", "told by check_projector", bad_projectors),
-    case(71, "checkpoints made to harm", "refused, and nothing runs", evil_checkpoints),
-    case(72, "configs made to harm", "refused, and nothing runs", evil_configs),
-    case(79, "foreign places", "an app works", foreign_places),
+    once(57, "grids, rigs and volumes that do not fit", "refused, with both sides told", mismatches),
+    once(58, "misspelt names, options and keys", "refused, with the nearest one", typing_mistakes),
+    once(59, "names that are taken", "refused, with both parts named", names_taken_twice),
+    once(60, "plugins that do not import", "told on use, each time alike; others work", broken_plugins),
+    once(61, "projectors that break their contract", "told by check_projector", bad_projectors),
+    once(71, "checkpoints made to harm", "refused, and nothing runs", evil_checkpoints),
+    once(72, "configs made to harm", "refused, and nothing runs", evil_configs),
+    once(79, "foreign places", "an app works", foreign_places),
 )
