@@ -69,7 +69,7 @@ class BackprojectionUNet(nn.Module):
         region = self.regions(views)
         y, x0, scale = normalised(region, views, self.iterations)
         seen = torch.cat([x0, region.back(y), region.residual(x0, y)], dim=1)
-        volume = x0 + region.within(self.net(seen, region.net_mask, region.bricks))
+        volume = x0 + region.within(self.net(seen, region.net_mask))
         sigma = None if self.skip.sigma is None else self.skip.sigma / scale
         volume = self.consistency(region, volume, y, sigma) * scale
         return Reconstruction(volume=region.pasted(volume), support=region.support)

@@ -5,11 +5,10 @@ from typing import cast
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.bricks import brick_convolution
-from mvrecon.models.masks import Mask, group_norm
+from mvrecon.models.voxels import Voxels, convolved, group_norm
 
 #: PyTorch leaves 3x3x3 convolutions of one CPU volume with at most so many (channels x depth x rows) to a kernel that
 #: was measured to be 5 to 12 times slower than the one (oneDNN's) that it takes for two.
@@ -19,7 +18,7 @@ ALONE = 20480
 class ConvBlock(nn.Module):
     """Two 3x3x3 convolutions, each followed by group normalisation and SiLU, with a residual path around the second.
 
-    With a mask: defined on its voxels alone, zero elsewhere; by `bricks`, from `active_bricks`, in less time.
+    On some voxels: features are their rows [k c], and all others are taken for zero.
     """
 
     def __init__(self, inputs: int, outputs: int, groups: int = 4):
@@ -32,19 +31,17 @@ class ConvBlock(nn.Module):
             nn.Conv3d(outputs, outputs, 3, padding=1, bias=False), nn.GroupNorm(groups, outputs), nn.SiLU()
         )
 
-    def forward(
-        self, x: Float[Tensor, "n i d h w"], mask: Mask | None = None, bricks: Int[Tensor, "k 4"] | None = None
-    ) -> Float[Tensor, "n o d h w"]:
-        x = _step(self.first, x, mask, bricks)
-        return x + _step(self.second, x, mask, bricks)
+    def forward(self, x: Float[Tensor, "n i *d"], on: Voxels | None = None) -> Float[Tensor, "n o *d"]:
+        x = _step(self.first, x, on)
+        return x + _step(self.second, x, on)
 
 
-def _step(steps: nn.Sequential, x: Tensor, mask: Mask | None, bricks: Tensor | None) -> Tensor:
+def _step(steps: nn.Sequential, x: Tensor, on: Voxels | None) -> Tensor:
     conv, norm = cast(nn.Conv3d, steps[0]), cast(nn.GroupNorm, steps[1])
-    x = convolution(x, conv.weight) if bricks is None else brick_convolution(x, conv.weight, bricks)
-    if mask is None:
-        return F.silu(norm(x))
-    return F.silu(group_norm(x, mask, norm.num_groups, (norm.weight, norm.bias), norm.eps))
+    if on is None:
+        return F.silu(norm(convolution(x, conv.weight)))
+    x = convolved(x, conv.weight, on)
+    return F.silu(group_norm(x, on.counts, norm.num_groups, (norm.weight, norm.bias), norm.eps))
 
 
 def convolution(x: Float[Tensor, "n i d h w"], weight: Float[Tensor, "o i 3 3 3"]) -> Float[Tensor, "n o d h w"]:

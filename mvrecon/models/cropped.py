@@ -5,9 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.culling import seen_depth_range
 from mvrecon.geometry.box import Box
-from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.lift import Frusta
 from mvrecon.models.window import Window
@@ -28,8 +26,8 @@ class CroppedFrusta(Frusta):
     def __init__(self, whole: Frusta, grid: Grid, cameras: Cameras, box: Box, window: Window, views: Int[Tensor, " k"]):
         nn.Module.__init__(self)
         self.window, self.depth = window, whole.shape[0]
-        edges = depth_edges(seen_depth_range(cameras, grid), self.depth, whole.spacing)
-        self._place(grid.cropped(box), window.cameras(cameras), window.edges(edges), whole.spacing)
+        edges = window.edges(whole.edges[views]).to(cameras.source)
+        self._place(grid.cropped(box), window.cameras(cameras), edges, whole.spacing)
         visible, occupied, step = (part[views] for part in (whole.visible, whole.occupied, whole.step))
         self._hold(visible[..., *box.slices], window.bins(occupied), window.bins(step))
 

@@ -6,7 +6,7 @@ It is made once for the grid, and once for every crop of it that a scene needs.
 import inspect
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
@@ -15,7 +15,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.cropped import CroppedFrusta
 from mvrecon.models.lift import Frusta
-from mvrecon.models.window import window_of
+from mvrecon.models.window import brick_corners, window_of
 from mvrecon.projectors.base import Projector
 from mvrecon.reconstruct.iterative import sirt_weights
 
@@ -79,10 +79,16 @@ def whole_geometry(projector: Projector, binning: int | None = None) -> Geometry
     return Geometry(projector, sirt_weights(projector), frusta)
 
 
-def cropped_geometry(whole: Geometry, box: Box) -> Geometry:
+def cropped_geometry(whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | None = None) -> Geometry:
     """The same for the voxels in a box, and the cameras that see any of it.
 
     What is equal to them is taken over, the rest made for them alone.
+
+    Args:
+        whole: of the grid.
+        box: the voxels.
+        bricks: of the box, those that may hold anything, from `held_bricks`: the frusta have no bins for others. None:
+            all.
     """
     views = _seeing(whole.projector.cameras, whole.projector.grid.cropped(box)).to(whole.row.device)
     projector = cropped_projector(whole.projector, box, views)
@@ -92,7 +98,7 @@ def cropped_geometry(whole: Geometry, box: Box) -> Geometry:
     fine, coarse = whole.fine, whole.coarse
     grid, cameras, binning = whole.projector.grid, projector.cameras, fine.shape[1] // coarse.shape[1]
     binned = cameras.binned(binning)
-    window = window_of(projector.grid, grid, binned, coarse.shape[0], MULTIPLE)
+    window = window_of(brick_corners(projector.grid, bricks), binned, coarse.edges[views], MULTIPLE)
     finer = window.scaled(2, binning)
     if fine.shape[0] % 2:  # coarse bins are no pairs of fine ones: both keep all of them
         window, finer = window.deep(coarse.shape[0]), finer.deep(fine.shape[0])
@@ -132,7 +138,7 @@ def cropped_projector(A: Projector, box: Box, views: Int[Tensor, " k"]) -> Proje
     return type(A)(grid=A.grid.cropped(box), cameras=cameras, **options).to(A.lines.device)
 
 
-def crop_of(whole: Geometry, box: Box) -> Geometry:
+def crop_of(whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | None = None) -> Geometry:
     """`cropped_geometry` that training may use although evaluation asked for it first."""
     with torch.inference_mode(False), torch.no_grad():
-        return cropped_geometry(whole, box)
+        return cropped_geometry(whole, box, bricks)

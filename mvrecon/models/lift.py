@@ -35,6 +35,7 @@ class Frusta(Bins, nn.Module):
 
     frusta_from_world: Tensor  # [m 1 5 2 3] where each voxel lies in each frustum
     world_from_frusta: Tensor  # [1 m 5 2 3] where each bin lies in the world grid
+    edges: Tensor  # [m e] planes between the depth bins in mm, float64
     visible: Tensor  # [m 1 d h w] voxels that a frustum holds
     occupied: Tensor  # [m 1 D v u] bins inside the grid's box, ahead of the source
     step: Tensor  # [m 1 D v u] mm of ray in a bin
@@ -55,6 +56,7 @@ class Frusta(Bins, nn.Module):
         self.grid_shape, self.shape = grid.shape, (edges.shape[1] - 1, *cameras.shape)
         self.spacing: Spacing = spacing
         world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges, spacing)
+        self.register_buffer("edges", edges, persistent=False)
         self.register_buffer("frusta_from_world", lattice_maps(frusta, world), persistent=False)
         self.register_buffer("world_from_frusta", lattice_maps(world, frusta), persistent=False)
 
@@ -64,9 +66,10 @@ class Frusta(Bins, nn.Module):
         self.register_buffer("step", step, persistent=False)
 
     def _apply(self, fn, recurse: bool = True):
-        exact = self.frusta_from_world, self.world_from_frusta
-        super()._apply(fn, recurse)  # moves the maps; their digits stay
-        self.frusta_from_world, self.world_from_frusta = (maps.to(self.step.device) for maps in exact)
+        exact = {name: getattr(self, name) for name in ("edges", "frusta_from_world", "world_from_frusta")}
+        super()._apply(fn, recurse)  # moves them; their digits stay
+        for name, given in exact.items():
+            setattr(self, name, given.to(self.step.device))
         return self
 
     def part_of(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:

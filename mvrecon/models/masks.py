@@ -45,39 +45,6 @@ def halved(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
     return _Halved.apply(x)
 
 
-def group_norm(
-    x: Float[Tensor, "n c d h w"], mask: Mask, groups: int, affine: tuple[Tensor, Tensor], eps: float = 1e-5
-) -> Float[Tensor, "n c d h w"]:
-    """Group normalisation (Wu & He, ECCV 2018) by the statistics of the mask's voxels; zero outside.
-
-    In two passes, mean first, so that an offset costs the variance no digits.
-
-    Args:
-        x: features; their values outside the mask do not matter.
-        mask: which voxels count, of each sample.
-        groups: of channels.
-        affine: scale and shift of every channel.
-        eps: added to the variance.
-    """
-    n, c = x.shape[:2]
-    count = mask.flatten(1).sum(dim=1).clamp_min(1).reshape(n, 1, 1) * (c // groups)
-    sums = (x * mask).sum(dim=(2, 3, 4)).reshape(n, groups, -1)
-    mean = (sums.sum(dim=2, keepdim=True) / count).expand_as(sums).reshape(n, c, 1, 1, 1)
-    about = (x - mean) * mask
-    squares = about.square().sum(dim=(2, 3, 4)).reshape(n, groups, -1)
-    variance = (squares.sum(dim=2, keepdim=True) / count).expand_as(squares).reshape(n, c)
-    scale, shift = affine
-    slope = (scale * (variance + eps).rsqrt())[..., None, None, None]
-    return torch.addcmul(shift[:, None, None, None] * mask, about, slope)
-
-
-def pooled(x: Float[Tensor, "n c d h w"], mask: Mask) -> tuple[Float[Tensor, "n c e i x"], Float[Tensor, "n 1 e i x"]]:
-    """Means of 2x2x2 voxels over those in the mask, and the max-pooled mask."""
-    share = halved(mask)
-    some = (share > 0).to(x.dtype)
-    return halved(x) / (share + (1 - some)), some
-
-
 def upsampled(
     x: Float[Tensor, "n c e i x"], mask: Float[Tensor, "n 1 e i x"], onto: Mask, size: Sequence[int]
 ) -> Float[Tensor, "n c d h w"]:

@@ -20,7 +20,7 @@ from mvrecon.models.output import Reconstruction
 from mvrecon.models.region import Region
 from mvrecon.models.regions import Regions
 from mvrecon.models.skip import Skip
-from mvrecon.models.unet3d import UNet3d, on_its_box
+from mvrecon.models.unet3d import UNet3d
 from mvrecon.models.weighting import Weighting, fuse
 from mvrecon.projectors.base import Projector
 
@@ -78,7 +78,7 @@ class CrossView(nn.Module):
         logits = torch.zeros_like(opinions)
         if self.weighting is not None:
             seen = self._compare(region, opinions, x0, y - cross_views)
-            logits = self.weighting(seen, region.net_mask, region.bricks)
+            logits = self.weighting(seen, region.net_mask)
         volume, weights = fuse(opinions, logits, region.seen())
         if self.refine is not None:
             volume = volume + self._correction(region, volume, (opinions, features, weights), x0, y)
@@ -111,10 +111,10 @@ class CrossView(nn.Module):
         wrong, heard = region.residual(fused, y), (weights * features).sum(dim=1)
         evidence = torch.cat([fused, wrong, mean[:, 0], _root(variance)[:, 0], x0, heard], dim=1)
         if self.skip.refine_where == "all":
-            return region.within(self.refine(evidence, region.net_mask, region.bricks))
+            return region.within(self.refine(evidence, region.net_mask))
         where = disagreement(variance[:, 0].sqrt(), self.skip.tolerance)
         where = where if region.net_mask is None else where & region.net_mask
-        return region.within(on_its_box(self.refine, evidence, where, self.skip.bricks))
+        return region.within(self.refine(evidence, where))
 
 
 def _of_all(

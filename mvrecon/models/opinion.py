@@ -105,10 +105,10 @@ class Opinions(nn.Module):
         mask = bins.occupied if region.seen_by_nets else None
         if len(self.nets) == 1:
             mask = None if mask is None else mask.flatten(0, 1)
-            return self.nets[0](inputs.flatten(0, 1), mask, region.bricks).unflatten(0, (b, m))
+            return self.nets[0](inputs.flatten(0, 1), mask).unflatten(0, (b, m))
         each = [None if mask is None else mask[:, k] for k in range(m)]
         nets = [self.nets[k] for k in region.geometry.views.tolist()]
-        answers = [net(inputs[:, k], each[k], region.bricks) for k, net in enumerate(nets)]
+        answers = [net(inputs[:, k], each[k]) for k, net in enumerate(nets)]
         return torch.stack(answers, dim=1)
 
 

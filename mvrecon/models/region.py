@@ -11,7 +11,7 @@ from torch.nn.functional import adaptive_max_pool3d
 
 from mvrecon.geometry.box import Box, placed
 from mvrecon.models.bins import Bins, SomeBins
-from mvrecon.models.geometry import Geometry
+from mvrecon.models.geometry import MULTIPLE, Geometry
 from mvrecon.projectors.base import Projector
 from mvrecon.reconstruct.iterative import correction
 
@@ -28,7 +28,6 @@ class Region:
         box: the crop; none for the whole grid.
         mask: where the density may differ from zero; none for everywhere.
         seen_by_nets: whether the mask belongs to the networks' definition.
-        bricks: how masked convolutions are done; see `active_bricks`.
     """
 
     geometry: Geometry
@@ -38,7 +37,6 @@ class Region:
     box: Box | None = None
     mask: Bool[Tensor, "b 1 d h w"] | None = None
     seen_by_nets: bool = False
-    bricks: str = "never"
 
     @property
     def A(self) -> Projector:
@@ -47,8 +45,11 @@ class Region:
 
     @property
     def net_mask(self) -> Bool[Tensor, "b 1 d h w"] | None:
-        """The mask of the world's networks."""
-        return self.mask if self.seen_by_nets else None
+        """The mask of the world's networks; none where one of ones would change nothing, and take longer."""
+        if not self.seen_by_nets or self.mask is None:
+            return None
+        plain = self.mask.all() and not any(size % MULTIPLE for size in self.mask.shape[2:])
+        return None if plain else self.mask
 
     def measured(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c k v u"]:
         """The views of the cameras that see the crop."""

@@ -11,6 +11,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.models.geometry import MULTIPLE, Geometry, crop_of, whole_geometry
 from mvrecon.models.region import Region
 from mvrecon.models.skip import Skip
+from mvrecon.models.window import held_bricks
 from mvrecon.projectors.base import Projector, check_views
 from mvrecon.reconstruct.iterative import inverse_sums
 from mvrecon.support.support import WORTH, support_from_views
@@ -49,16 +50,18 @@ class Regions(nn.Module):
         assert found.mask is not None  # a hull has a mask
         mask = torch.cat([worked_on(one, skip.support) for one in found.mask.split(1)])
         box = Box.around(mask)
-        box = (box if box.size else found.box).grown(skip.halo, A.grid.shape).aligned(MULTIPLE, A.grid.shape)
-        geometry, mask = self.crop(box), mask[..., *box.slices]
+        box = (box if box.size else found.box).grown(skip.margin, A.grid.shape).aligned(MULTIPLE, A.grid.shape)
+        mask = mask[..., *box.slices]
+        geometry = self.crop(box, held_bricks(mask) if skip.masked else None)
         weights = masked_weights(geometry, mask, views.dtype)
-        return Region(geometry, A.grid.shape, len(A.cameras), weights, box, mask, skip.masked, skip.bricks)
+        return Region(geometry, A.grid.shape, len(A.cameras), weights, box, mask, skip.masked)
 
-    def crop(self, box: Box) -> Geometry:
-        """The geometry of a crop, made at most once while it is kept."""
-        key = box, self.whole.row.device, self.whole.row.dtype
+    def crop(self, box: Box, bricks: Bool[Tensor, "z y x"] | None = None) -> Geometry:
+        """The geometry of a crop, or of some bricks of it, made at most once while it is kept."""
+        told = None if bricks is None else bricks.cpu().numpy().tobytes()
+        key = box, told, self.whole.row.device, self.whole.row.dtype
         if key not in self.crops:
-            self.crops[key] = crop_of(self.whole, box)
+            self.crops[key] = crop_of(self.whole, box, bricks)
         self.crops.move_to_end(key)
         while len(self.crops) > KEPT:
             self.crops.popitem(last=False)

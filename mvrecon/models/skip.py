@@ -7,7 +7,8 @@ from typing import Any, Literal
 from mvrecon.registry import hint
 from mvrecon.support.support import KINDS
 
-Bricks = Literal["auto", "always", "never"]
+#: Voxels that networks which do not know of the mask see around it.
+HALO = 4
 
 
 @dataclass(frozen=True)
@@ -19,9 +20,9 @@ class Skip:
             the hull of a sample if its box is small and else everything, or "none" to ask for nothing. Work is done on
             a crop around it, and outside it the density is 0 by definition.
         noise: of the views, as `support_from_views` wants it; none for exact views.
-        halo: voxels around the support's box that the crop holds, at least 1. With `masked` they change nothing.
+        halo: voxels around the support's box that the crop holds, at least 1. With `masked` they change nothing: by
+            default there are none then, and else 4.
         masked: the support belongs to the networks too: features are zero and normalisation does not look outside it.
-        bricks: masked convolutions at active bricks alone: "never", "always", or "auto" where that was measured to pay.
         sigma: standard deviation of the views' noise, in their unit; the consistency steps stop where it explains what
             is left. None: every step.
         refine_where: "all" of the support, or bricks of "disagreement" between the opinions.
@@ -33,24 +34,28 @@ class Skip:
 
     support: str = "none"
     noise: Mapping[str, Any] | None = None
-    halo: int = 4
+    halo: int | None = None
     masked: bool = True
-    bricks: Bricks = "never"
     sigma: float | None = None
     refine_where: Literal["all", "disagreement"] = "all"
     tolerance: float = 0.1
 
     def __post_init__(self) -> None:
-        known = {"support": KINDS, "bricks": ("auto", "always", "never"), "refine_where": ("all", "disagreement")}
+        known = {"support": KINDS, "refine_where": ("all", "disagreement")}
         for name, choices in known.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
-        if self.halo < 1:
+        if self.halo is not None and self.halo < 1:
             raise ValueError(f"A crop needs a halo of at least one voxel, got {self.halo}")
         for name in ("sigma", "tolerance"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
+
+    @property
+    def margin(self) -> int:
+        """Voxels around the support's box that the crop holds."""
+        return self.halo if self.halo is not None else 0 if self.masked else HALO
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> "Skip":

@@ -1,13 +1,16 @@
 """A small 3-D U-Net (Cicek et al., MICCAI 2016) with group normalisation and additive skips."""
 
+from collections.abc import Sequence
+from typing import cast
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.geometry.box import Box, placed
+from mvrecon.models import voxels
 from mvrecon.models.blocks import ConvBlock
-from mvrecon.models.bricks import active_bricks
-from mvrecon.models.masks import halved, pooled, upsampled
+from mvrecon.models.masks import halved
+from mvrecon.models.voxels import Voxels, pyramid
 
 
 class UNet3d(nn.Module):
@@ -37,12 +40,13 @@ class UNet3d(nn.Module):
             nn.init.zeros_(self.last.weight)
 
     def forward(
-        self, x: Float[Tensor, "n i d h w"], mask: Bool[Tensor, "n 1 d h w"] | None = None, bricks: str = "never"
+        self, x: Float[Tensor, "n i d h w"], mask: Bool[Tensor, "n 1 d h w"] | None = None
     ) -> Float[Tensor, "n o d h w"]:
-        """The answer; with a mask, zero outside it, and by `bricks` ("auto", "always", "never") where that pays."""
-        x = x.contiguous(memory_format=torch.channels_last_3d)
+        """The answer; with a mask, zero outside it."""
         if mask is not None:
-            return self._masked(x, mask.to(x.dtype), bricks)
+            levels = pyramid(mask, len(self.down))
+            return levels[0].put(self.on(levels, levels[0].pick(x)))
+        x = x.contiguous(memory_format=torch.channels_last_3d)
         skips: list[Tensor] = []
         for level, block in enumerate(self.down):
             if level:
@@ -55,30 +59,21 @@ class UNet3d(nn.Module):
             x = self.up[level](x + skip)
         return self.last(x)
 
-    def _masked(self, x: Tensor, mask: Tensor, bricks: str) -> Tensor:
-        masks, active, skips = [mask], [active_bricks(mask, bricks)], []
-        x = x * mask
+    def on(self, levels: Sequence[Voxels], x: Float[Tensor, "k i"]) -> Float[Tensor, "k o"]:
+        """The answer at a mask's voxels from their features; `levels` are the mask's `pyramid`."""
+        skips: list[Tensor] = []
         for level, block in enumerate(self.down):
             if level:
                 skips.append(x)
-                x, mask = pooled(x, mask)
-                masks.append(mask)
-                active.append(active_bricks(mask, bricks))
-            x = block(x, mask, active[level])
+                x = voxels.halved(x, levels[level - 1], levels[level])
+            x = block(x, levels[level])
         for level in reversed(range(len(self.up))):
-            whole = [2 * n for n in x.shape[2:]]
-            x = upsampled(self.reduce[level](x), masks[level + 1], masks[level], whole)
-            x = self.up[level](x + skips[level], masks[level], active[level])
-        return self.last(x)
+            x = voxels.doubled(_pointwise(self.reduce[level], x), levels[level + 1], levels[level])
+            x = self.up[level](x + skips[level], levels[level])
+        return _pointwise(self.last, x)
 
 
-def on_its_box(
-    net: UNet3d, x: Float[Tensor, "n i d h w"], mask: Bool[Tensor, "n 1 d h w"], bricks: str = "never"
-) -> Float[Tensor, "n o d h w"]:
-    """A masked network's answer, worked out on the least box around the mask that keeps coarse voxels in place."""
-    shape = x.shape[2:]
-    box = Box.around(mask).aligned(2 ** len(net.up), shape)
-    if not box.size:
-        return x.new_zeros(len(x), net.last.out_channels, *shape)
-    part = net(x[..., *box.slices], mask[..., *box.slices], bricks)
-    return placed(part, box, shape)
+def _pointwise(conv: nn.Module, x: Float[Tensor, "k i"]) -> Float[Tensor, "k o"]:
+    """A 1x1x1 convolution of rows."""
+    one = cast(nn.Conv3d, conv)
+    return nn.functional.linear(x, one.weight.flatten(1), one.bias)

@@ -4,8 +4,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.models.masks import halved, pooled, upsampled
+from mvrecon.models import voxels
+from mvrecon.models.masks import halved
 from mvrecon.models.unet3d import UNet3d
+from mvrecon.models.voxels import pyramid
 
 
 def fuse(
@@ -36,21 +38,21 @@ class Weighting(nn.Module):
         self.net = UNet3d(inputs, 1, width, levels=2, zero=True)
 
     def forward(
-        self,
-        features: Float[Tensor, "b m c d h w"],
-        mask: Bool[Tensor, "b 1 d h w"] | None = None,
-        bricks: str = "never",
+        self, features: Float[Tensor, "b m c d h w"], mask: Bool[Tensor, "b 1 d h w"] | None = None
     ) -> Float[Tensor, "b m 1 d h w"]:
         """Logits; with a mask, from its voxels alone and zero outside it."""
-        b, m = features.shape[:2]
         if mask is not None:
-            return self._masked(features.flatten(0, 1), mask.repeat_interleave(m, dim=0), bricks).unflatten(0, (b, m))
-        coarse = halved(features.flatten(0, 1))
-        logits = nn.functional.interpolate(self.net(coarse), size=features.shape[-3:], mode="trilinear")
-        return logits.unflatten(0, (b, m))
+            return self._on(features, mask)
+        logits = self.net(halved(features.flatten(0, 1)))
+        whole = nn.functional.interpolate(logits, size=features.shape[-3:], mode="trilinear")
+        return whole.unflatten(0, features.shape[:2])
 
-    def _masked(self, features: Tensor, mask: Tensor, bricks: str) -> Tensor:
-        fine = mask.to(features.dtype)
-        coarse, held = pooled(features * fine, fine)
-        logits = self.net(coarse, held > 0, bricks)
-        return upsampled(logits, held, fine, [2 * n for n in held.shape[2:]])
+    def _on(self, features: Tensor, mask: Tensor) -> Float[Tensor, "b m 1 d h w"]:
+        m = features.shape[1]
+        fine, coarse = pyramid(mask, 2)
+        rows = voxels.halved(fine.pick(features.flatten(1, 2)), fine, coarse)  # of all cameras, side by side
+        each = [part.unflatten(1, (m, -1)).transpose(0, 1).flatten(0, 1) for part in rows.split(coarse.counts)]
+        levels = pyramid(coarse.mask.repeat_interleave(m, dim=0), len(self.net.down))
+        logits = self.net.on(levels, torch.cat(each)).split([m * count for count in coarse.counts])
+        side_by_side = torch.cat([part.view(m, -1).T for part in logits])
+        return fine.put(voxels.doubled(side_by_side, coarse, fine))[:, :, None]

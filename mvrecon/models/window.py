@@ -1,18 +1,23 @@
-"""The part of each camera's frustum that a crop of the grid needs: some depths, rows and columns, as many for all.
+"""The part of each camera's frustum that a part of the grid needs: some depths, rows and columns, as many for all.
 
 Its bins are bins of the whole frustum, so what is worked out in a window is what would be worked out without it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
+from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.culling import seen_depth_range
-from mvrecon.geometry.frustum import depth_edges, depth_index
+from mvrecon.geometry.box import Box, three
+from mvrecon.geometry.frustum import depth_index
 from mvrecon.geometry.grid import Grid
+
+#: Bricks along the longest side of a mask, at most: enough to follow a body, few enough to be projected at once.
+BRICKS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,39 +57,33 @@ class Window:
 
     def views(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:
         """The part of every view that falls on the cut detectors."""
-        m, _, rows, columns = (index[:, 0] for index in self._index(views.device))
-        return views[:, :, m, rows, columns]
+        return torch.stack([view[..., v, u] for view, (_, v, u) in zip(views.unbind(2), self._parts(), strict=True)], 2)
 
     def bins(self, values: Shaped[Tensor, "m 1 D v u"]) -> Shaped[Tensor, "m 1 E r s"]:
         """Values of all bins at those that are kept."""
-        m, depths, rows, columns = self._index(values.device)
-        return values[m, 0, depths, rows, columns][:, None]
+        return torch.stack([each[:, *part] for each, part in zip(values, self._parts(), strict=True)])
 
-    def _index(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Camera, depth, row and column of the bins, each with four axes."""
-        first = self.first.to(device)[:, :, None, None, None]
-        each = [torch.arange(n, device=device) for n in (len(first), *self.shape)]
-        m, d, v, u = (axis.reshape([-1 if k == i else 1 for k in range(4)]) for i, axis in enumerate(each))
-        return m, d + first[:, 0], v + first[:, 1], u + first[:, 2]
+    def _parts(self) -> list[tuple[slice, slice, slice]]:
+        """What cuts each camera's bins out of all; slices, since an index for each bin takes ten times as long."""
+        first = self.first.tolist()
+        return [Box(three(low), three(a + n for a, n in zip(low, self.shape, strict=True))).slices for low in first]
 
 
-def window_of(crop: Grid, whole: Grid, cameras: Cameras, depth: int, multiple: int) -> Window:
-    """The least window of frusta over a grid that holds every bin which the voxels of a crop read, or are read by.
+def window_of(corners: Float[Tensor, "n 3"], cameras: Cameras, edges: Float[Tensor, "m e"], multiple: int) -> Window:
+    """The least window of frusta that holds every bin which the voxels of some boxes read, or are read by.
 
     Bounds are multiples of a number, so that the coarser levels of a network keep their places; an axis whose size is
-    none is kept whole, and so are the pixels of a camera whose source lies between the planes that bound the crop.
+    none is kept whole, and so are the pixels of a camera whose source lies between the planes that bound the boxes.
 
     Args:
-        crop: the part of the grid.
-        whole: the grid.
+        corners: of the boxes, in world mm.
         cameras: the rig.
-        depth: bins of the whole frusta along depth.
+        edges: the planes in mm between the whole frusta's depth bins.
         multiple: that number.
     """
-    seen = cameras.project(crop.corners().to(cameras.source)).cpu()  # [m 8 3]
-    edges = depth_edges(seen_depth_range(cameras, whole), depth).cpu()
-    place = torch.stack([depth_index(seen[..., 2], edges), seen[..., 1], seen[..., 0]], dim=-1)
-    sizes = torch.tensor([depth, *cameras.shape])
+    seen = cameras.project(corners.to(cameras.source)).cpu()  # [m n 3]
+    place = torch.stack([depth_index(seen[..., 2], edges.cpu()), seen[..., 1], seen[..., 0]], dim=-1)
+    sizes = torch.tensor([edges.shape[1] - 1, *cameras.shape])
     across = (seen[..., 2].amin(dim=1) * seen[..., 2].amax(dim=1) <= 0) & (not cameras.parallel)
     least, most = place.amin(dim=1), place.amax(dim=1)
     least[across, 1:], most[across, 1:] = 0.0, torch.inf
@@ -96,3 +95,24 @@ def window_of(crop: Grid, whole: Grid, cameras: Cameras, depth: int, multiple: i
     first = low.long().minimum(sizes - count)
     d, v, u = count.tolist()
     return Window(first, (d, v, u))
+
+
+def held_bricks(mask: Bool[Tensor, "b 1 d h w"]) -> Bool[Tensor, "z y x"]:
+    """The bricks, at most 16 along each axis, in which any of the masks holds a voxel."""
+    edge = _edge(mask.shape[2:])
+    return max_pool3d(mask.any(dim=0).float(), edge, ceil_mode=True)[0] > 0
+
+
+def brick_corners(grid: Grid, bricks: Bool[Tensor, "z y x"] | None = None) -> Float[Tensor, "n 3"]:
+    """World positions in mm of the corners of those bricks of a grid; of its box, where there is none."""
+    if bricks is None or not bricks.any():
+        return grid.corners()
+    around = pad(bricks.float(), (1, 1, 1, 1, 1, 1))[None]
+    index = (max_pool3d(around, 2, stride=1)[0] > 0).nonzero().cpu() * _edge(grid.shape)
+    index = index.minimum(torch.tensor(grid.shape))
+    return grid.to_world(index.flip(1).double() - 0.5)
+
+
+def _edge(shape: Sequence[int]) -> int:
+    """Of a brick, in voxels."""
+    return -(-max(shape) // BRICKS)

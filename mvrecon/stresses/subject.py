@@ -19,6 +19,12 @@ from mvrecon.stresses.case import DoesNotApply
 #: No two sizes or spacings alike, off the origin.
 GRID = Grid.centred((5, 6, 7), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
 BEAMS: tuple[tuple[bool, Extent], ...] = ((False, "segment"), (True, "segment"), (False, "behind"))
+#: What a projector is taken to claim, and what a plugin's class says by setting an attribute of this name to False.
+CLAIMS = {
+    "matched": "its adjoint is not the transpose of its forward",
+    "local": "a number that is none is seen beyond the rays that meet it",
+    "bits": "its rays are rounded, so that sums which are exact in floating point are not to the last bit",
+}
 DETECTOR = {"pixels": [6, 5], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 
 
@@ -59,8 +65,22 @@ class ProjectorSubject(Subject):
     """A projector under stress, and geometry of the beam that it takes."""
 
     def projector(self, grid: Grid, cameras: Cameras, **options: Any) -> Any:
-        """The operator, on the device."""
-        return self.build(grid=grid, cameras=cameras, **options).to(self.device)
+        """The operator, on the device.
+
+        Raises:
+            DoesNotApply: a plugin's refuses this geometry, and says why.
+        """
+        try:
+            return self.build(grid=grid, cameras=cameras, **options).to(self.device)
+        except ValueError as error:
+            if self.ours:
+                raise
+            raise DoesNotApply(f"it refuses: {error}") from error
+
+    @property
+    def ours(self) -> bool:
+        """Whether it is mvrecon's own, which must take what a plugin's part may refuse."""
+        return REGISTRIES[self.kind].origin(self.name).startswith("mvrecon.")
 
     @cached_property
     def beam(self) -> tuple[bool, Extent]:
@@ -72,14 +92,23 @@ class ProjectorSubject(Subject):
         refusals = []
         for beam in BEAMS:
             try:
-                self.projector(GRID, rig_about(GRID, *beam))
+                A = self.build(grid=GRID, cameras=rig_about(GRID, *beam)).to(self.device)
             except ImportError as error:
                 raise DoesNotApply(str(error)) from error
             except ValueError as error:
                 refusals.append(str(error))
             else:
+                self._need_dtype(A)
                 return beam
         raise DoesNotApply(f"it takes no rig of this plan: {'; '.join(refusals)}")
+
+    def _need_dtype(self, A: Callable[[Tensor], Tensor]) -> None:
+        try:
+            A(self.random(1, 1, *GRID.shape))
+        except ValueError as error:
+            if self.ours:
+                raise
+            raise DoesNotApply(f"it refuses this dtype: {error}") from error
 
     @cached_property
     def error_of_ones(self) -> float:
@@ -98,6 +127,11 @@ class ProjectorSubject(Subject):
         enter, leave = 7 / 18, (2 + 2.3) / 8.2  # by the face x = -2, and by y = 2
         length = (leave - enter) * float((end - start).norm())
         return abs(float(self.values(grid, start, end)) / length - 1) < 1e-4
+
+    def need(self, claim: str) -> None:
+        """Raise DoesNotApply where a plugin's class says that it does not claim this; see `CLAIMS`."""
+        if not self.ours and not getattr(REGISTRIES[self.kind].get(self.name), claim, True):
+            raise DoesNotApply(f"it says that {CLAIMS[claim]}")
 
     def need_lines(self) -> None:
         """Raise DoesNotApply unless its views are line integrals in mm, with no other factor."""

@@ -15,7 +15,7 @@ from mvrecon.models.geometry import cropped_geometry, cropped_projector, whole_g
 from mvrecon.models.model import CrossView
 from mvrecon.parts import CAMERAS, PROJECTORS
 from tests.models.rig import small_rig
-from tests.models.test_support import _close
+from tests.models.test_support import _close, _with_mask
 
 
 @torch.no_grad()
@@ -131,3 +131,27 @@ def test_cameras_that_see_nothing_of_the_crop_are_left_out_and_change_nothing(sh
         assert _close(getattr(out, name), getattr(expected, name), 1e-5), name
     assert all(torch.allclose(a, b, rtol=1e-3, atol=1e-6) for a, b in zip(gradients, others, strict=True))
     assert any(g.any() for g in gradients)
+
+
+@torch.no_grad()
+def test_frusta_end_at_the_mask_and_nothing_changes(monkeypatch):
+    """A wall across the diagonal of its box."""
+    torch.manual_seed(0)
+    grid, detector = Grid.centred((32, 32, 32), 1.0), {"pixels": [48, 48], "pixel_mm": 1.0}
+    cameras = CAMERAS.build("dome", views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector)
+    A = PROJECTORS.build("drr", grid=grid, cameras=cameras)
+    model = CrossView(A, {"name": "softmax_depth"}, {"width": 4}, refine=4, start=3, consistency=1, support="hull")
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    y, x = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="ij")
+    mask = torch.zeros(1, 1, *grid.shape, dtype=torch.bool)
+    mask[..., 12:20, 4:28, 4:28] = ((y - x).abs() < 3)[4:28, 4:28]
+    _with_mask(monkeypatch, mask)
+    views = A(torch.rand(mask.shape) * mask)
+    found, narrow = model(views), model.regions(views)
+    model.regions.crops.clear()
+    monkeypatch.setattr(regions, "held_bricks", lambda mask: None)
+    expected, wide = model(views), model.regions(views)
+    assert narrow.geometry.fine.step.numel() < wide.geometry.fine.step.numel()
+    for field in ("volume", "opinions", "weights", "cross_views"):
+        assert _close(getattr(found, field), getattr(expected, field), 1e-5), field

@@ -1,12 +1,14 @@
-"""A masked network does not depend on the empty space around its mask, nor on how its convolutions are done."""
+"""A masked network does not depend on the empty space around its mask, and is what its definition says."""
+
+from functools import partial
 
 import pytest
 import torch
 import torch.nn.functional as F
 
 from mvrecon.models.blocks import ALONE, ConvBlock, convolution
-from mvrecon.models.bricks import EDGE, active_bricks, brick_convolution
-from mvrecon.models.unet3d import UNet3d, on_its_box
+from mvrecon.models.unet3d import UNet3d
+from tests.models.dense import net_on
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 
@@ -63,48 +65,27 @@ def test_a_mask_of_ones_is_no_mask():
     assert _close(net(x, torch.ones(2, 1, 12, 8, 16, dtype=torch.bool)), net(x), 1e-5)
 
 
-def test_the_least_box_is_as_good_as_everything():
-    net, mask = _net(), F.pad(_blob((7, 6, 5)), [5, 9, 6, 4, 3, 8])
-    x = torch.randn(2, 3, *mask.shape[2:])
-    assert _close(on_its_box(net, x, mask), net(x, mask), 1e-5)
-    assert not on_its_box(net, x, torch.zeros_like(mask)).any()
-
-
-def test_bricks_are_the_dense_masked_network_with_its_gradients():
-    net, mask = _net(), F.pad(_blob((9, 8, 7)), [0, 17, 4, 4, 10, 5])
-    x = torch.randn(2, 3, *mask.shape[2:])
-    found = []
-    for how in ("never", "always"):
+def test_rows_are_the_dense_masked_network_with_its_gradients():
+    net, mask = _net(torch.float64), F.pad(_blob((9, 8, 7)), [0, 17, 4, 4, 10, 5])
+    mask[1, :, :12] = False
+    x, found = torch.randn(2, 3, *mask.shape[2:], dtype=torch.float64), []
+    for done in (net, partial(net_on, net)):
         net.zero_grad()
         given = x.clone().requires_grad_()
-        out = net(given, mask, how)
+        out = done(given, mask)
         out.square().mean().backward()
         found.append([out, given.grad, *(p.grad for p in net.parameters())])
-    for bricks, dense in zip(found[1], found[0], strict=True):
-        assert dense.any() and (bricks - dense).abs().max() <= 1e-5 * dense.abs().max()
+    for rows, dense in zip(*found, strict=True):
+        assert dense.any() and (rows - dense).abs().max() <= 1e-12 * dense.abs().max()
 
 
-def test_a_convolution_by_bricks_is_exact_in_them_and_zero_elsewhere():
-    torch.manual_seed(0)
-    x, weight = torch.randn(2, 3, 11, 17, 8), torch.randn(5, 3, 3, 3, 3)
-    mask = torch.zeros(2, 1, 11, 17, 8)
-    mask[0, 0, 9, 16, 3] = mask[1, 0, 0, 0, 0] = 1
-    bricks = active_bricks(mask, "always")
-    assert bricks is not None and bricks.tolist() == [[0, 1, 2, 0], [1, 0, 0, 0]]
-    expected = torch.zeros(2, 5, 11, 17, 8)
-    dense = F.conv3d(x, weight, padding=1)
-    expected[0, :, EDGE:, 2 * EDGE :] = dense[0, :, EDGE:, 2 * EDGE :]
-    expected[1, :, :EDGE, :EDGE] = dense[1, :, :EDGE, :EDGE]
-    assert torch.allclose(brick_convolution(x, weight, bricks), expected, atol=1e-5)
-
-
-def test_bricks_are_chosen_where_few_are_active_and_nothing_is_learnt():
-    mask = torch.zeros(1, 1, 32, 32, 32)
-    mask[..., :8, :8, :8] = 1
-    with torch.no_grad():
-        assert active_bricks(mask, "auto") is not None and active_bricks(mask, "never") is None
-        assert active_bricks(torch.ones_like(mask), "auto") is None
-    assert active_bricks(mask, "auto") is None
+def test_a_sample_with_no_voxel_is_zero_and_leaves_the_other_alone():
+    net, mask = _net(), _blob()
+    x, both = torch.randn(2, 3, *mask.shape[2:]), mask.clone()
+    both[1] = False
+    out = net(x, both)
+    assert _close(out[:1], net(x[:1], mask[:1]), 1e-5) and not out[1].any()
+    assert not net(x, torch.zeros_like(mask)).any()
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 9, 5, 6), (1, 3, 2, 4, 4), (1, 3, 1, 4, 4), (2, 3, 6, 6, 6)])

@@ -127,7 +127,7 @@ def test_an_empty_scene_in_a_batch_leaves_the_other_alone(projector, scenes):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_weights_are_the_same_with_and_without(name, projector):
-    off, on = _build(name, projector), _build(name, projector, support="hull", bricks="always")
+    off, on = _build(name, projector), _build(name, projector, support="hull")
     on.load_state_dict(off.state_dict())
     assert not any("crops" in key or "whole" in key for key in off.state_dict())
 
@@ -159,15 +159,6 @@ def test_every_parameter_learns_on_a_support_met_first_in_evaluation(projector, 
     ReconstructionLoss(1.0, edges=0.1)(out, {"volume": volume, "views": views})["total"].backward()
     assert not [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
     assert len(model.regions.crops) == 1
-
-
-@torch.no_grad()
-def test_bricks_change_nothing(projector, scenes, monkeypatch):
-    _, views, mask = scenes
-    _with_mask(monkeypatch, mask)
-    options = {"support": "hull", "halo": 24}
-    found = [_build("cross_view", projector, bricks=how, **options)(views).volume for how in ("never", "always")]
-    assert _close(found[1], found[0], 1e-5)
 
 
 def test_disagreement_is_bricks_and_those_around_them():
@@ -232,7 +223,7 @@ def test_losses_count_what_is_in_the_support(projector, scenes, monkeypatch):
     ("options", "said"),
     [
         ({"support": "hulk"}, "support must be one of"),
-        ({"bricks": "some"}, "bricks must be one of"),
+        ({"refine_where": "some"}, "refine_where must be one of"),
         ({"halo": 0}, "halo of at least one"),
         ({"sigma": 0.0}, "sigma must be positive"),
     ],

@@ -12,7 +12,7 @@ from collections import namedtuple
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rays.lanes import LANES, mix, more, put, take
+from mvrecon.kernels.rays.lanes import LANES, between, mix, more, put, take
 from mvrecon.kernels.rays.loops import Rig, pixel, silent, steps_of
 from mvrecon.kernels.rays.stores import Store
 from mvrecon.kernels.rays.stores import store as store_of
@@ -48,7 +48,7 @@ def _read_lanes(room, group, rays):
     four, start, one = np.uint64(LANES), np.uint64(group * room.width * LANES), room.shares.dtype.type(1)
     for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
         below, here = np.uint64(places[v]) * four + start, np.uint64(v) * four
-        value = mix(take(row, below), take(row, below + four), shares[v])
+        value = mix(take(row, below), take(row, below + four), shares[v], one - shares[v])
         put(sums, here, more(take(sums, here), one, value))
 
 
@@ -61,11 +61,11 @@ def _read(room, lanes, group, rays):
     first = group * room.width
     start, count = rays[0], np.uint32(rays[1] - rays[0])  # loops from zero on: compilers make vectors of these
     places, pairs, row, parts = room.places[start:], room.pairs[start:], room.row_pairs, room.parts[2 * start :]
-    shares, sums = room.shares[start:], room.values[group][start:]
+    shares, sums, one = room.shares[start:], room.values[group][start:], room.shares.dtype.type(1)
     for v in range(count):
         pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
     for v in range(count):
-        sums[v] += parts[2 * v] + shares[v] * (parts[2 * v + 1] - parts[2 * v])
+        sums[v] += between(parts[2 * v], parts[2 * v + 1], shares[v], one - shares[v])
 
 
 #: Room for one column: flat indices of its pieces, four numbers each, from where to where they are held; per ray its

@@ -10,7 +10,7 @@ vectorises.
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.lanes import LANES, mix, more, plus, put, take, times
+from mvrecon.kernels.rays.lanes import LANES, between, mix, more, plus, put, take, times
 from mvrecon.kernels.rays.order import fold
 
 
@@ -48,11 +48,12 @@ def sum(store, n, steps, visited, room):
     count, lead = visited
     fetch(store.pairs, n * store.size, steps.far, count, room)
     y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
-    terms = room.terms[lead:]
+    terms, one = room.terms[lead:], y.dtype.type(1)
     for i in range(np.uint32(count)):
-        lower = low[2 * i] + z[i] * (low[2 * i + 1] - low[2 * i])
-        upper = high[2 * i] + z[i] * (high[2 * i + 1] - high[2 * i])
-        terms[i] = share[i] * (lower + y[i] * (upper - lower))
+        rest = one - z[i]
+        lower = between(low[2 * i], low[2 * i + 1], z[i], rest)
+        upper = between(high[2 * i], high[2 * i + 1], z[i], rest)
+        terms[i] = share[i] * between(lower, upper, y[i], one - y[i])
     return fold(room.terms, lead, count)
 
 
@@ -60,12 +61,12 @@ def sum(store, n, steps, visited, room):
 def spread(store, n, steps, count, room, value):
     """Add a value to volume n along a ray with the weights of `sum`: its transpose."""
     y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
+    one = y.dtype.type(1)
     for i in range(np.uint32(count)):
-        both = value * share[i]
-        upper = both * y[i]
-        lower = both - upper
-        low_z, high_z = lower * z[i], upper * z[i]
-        low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1] = lower - low_z, low_z, upper - high_z, high_z
+        both, rest = value * share[i], one - z[i]
+        lower, upper = both * (one - y[i]), both * y[i]
+        low[2 * i], low[2 * i + 1] = lower * rest, lower * z[i]
+        high[2 * i], high[2 * i + 1] = upper * rest, upper * z[i]
     pairs, index, lowers, uppers = store.pairs, room.index, room.low, room.high
     offset, above = np.uint64(n * store.size), np.uint64(n * store.size) + np.uint64(steps.far)
     for i in range(np.uint32(count)):
@@ -79,13 +80,13 @@ def sum_lanes(store, group, steps, count, room):
     """The sums of four volumes along a ray, in voxels of the main axis, into room.totals."""
     index, y, z, share, values = room.index, room.one, room.two, room.three, store.values
     first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
-    far, none = np.uint64(steps.far) * four, y.dtype.type(0)
+    far, none, one = np.uint64(steps.far) * four, y.dtype.type(0), y.dtype.type(1)
     totals = (none, none, none, none)
     for i in range(np.uint32(count)):
-        k = np.uint64(index[i]) * four + first
-        lower = mix(take(values, k), take(values, k + four), z[i])
-        upper = mix(take(values, k + far), take(values, k + far + four), z[i])
-        totals = plus(totals, times(share[i], mix(lower, upper, y[i])))
+        k, rest = np.uint64(index[i]) * four + first, one - z[i]
+        lower = mix(take(values, k), take(values, k + four), z[i], rest)
+        upper = mix(take(values, k + far), take(values, k + far + four), z[i], rest)
+        totals = plus(totals, times(share[i], mix(lower, upper, y[i], one - y[i])))
     put(room.totals, np.uint64(0), totals)
 
 
@@ -94,16 +95,14 @@ def spread_lanes(store, group, steps, count, room):
     """Add room.totals to four volumes along a ray: the transpose of `sum_lanes`."""
     index, y, z, share, values = room.index, room.one, room.two, room.three, store.values
     first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
-    far, given = np.uint64(steps.far) * four, take(room.totals, np.uint64(0))
+    far, given, one = np.uint64(steps.far) * four, take(room.totals, np.uint64(0)), y.dtype.type(1)
     for i in range(np.uint32(count)):
-        k = np.uint64(index[i]) * four + first
-        high = share[i] * y[i]
-        low = share[i] - high
-        low_z, high_z = low * z[i], high * z[i]
-        put(values, k, more(take(values, k), low - low_z, given))
-        put(values, k + four, more(take(values, k + four), low_z, given))
-        put(values, k + far, more(take(values, k + far), high - high_z, given))
-        put(values, k + far + four, more(take(values, k + far + four), high_z, given))
+        k, rest = np.uint64(index[i]) * four + first, one - z[i]
+        low, high = share[i] * (one - y[i]), share[i] * y[i]
+        put(values, k, more(take(values, k), low * rest, given))
+        put(values, k + four, more(take(values, k + four), low * z[i], given))
+        put(values, k + far, more(take(values, k + far), high * rest, given))
+        put(values, k + far + four, more(take(values, k + far + four), high * z[i], given))
 
 
 @scalar

@@ -22,14 +22,25 @@ def put(values, k, four):
     values[k], values[k + np.uint64(1)], values[k + np.uint64(2)], values[k + np.uint64(3)] = four
 
 
+@ordered
+def between(low, high, share, rest):
+    """The part `rest` = 1 - share of `low` and the part `share` of `high`, as the transpose gives them back.
+
+    low + share * (high - low) is one product less, but rounds to the digits of the greater of the two: next to a `low`
+    with hardly any weight a `high` of zero would get none of the digits that the transpose has. In another order a
+    compiler makes the one of the other.
+    """
+    return rest * low + share * high
+
+
 @scalar
-def mix(low, high, share):
-    """From `low` the part `share` of the way to `high`."""
+def mix(low, high, share, rest):
+    """`between` of each."""
     return (
-        low[0] + share * (high[0] - low[0]),
-        low[1] + share * (high[1] - low[1]),
-        low[2] + share * (high[2] - low[2]),
-        low[3] + share * (high[3] - low[3]),
+        between(low[0], high[0], share, rest),
+        between(low[1], high[1], share, rest),
+        between(low[2], high[2], share, rest),
+        between(low[3], high[3], share, rest),
     )
 
 

@@ -10,6 +10,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.base import METHODS
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon.stresses.case import PRECISE, Case, DoesNotApply
@@ -31,6 +32,7 @@ ORACLES = ("rtk", "diffdrr", "nanodrr")
 
 def adjoint(subject: ProjectorSubject) -> float:
     """<A x, y> and <x, A^T y> in twenty random geometries, relative to the greater; all positive: nothing cancels."""
+    subject.need("matched")
     rng, worst = torch.Generator().manual_seed(0), 0.0
     for seed in range(20):
         shape = torch.randint(2, 9, (3,), generator=rng).tolist()
@@ -86,15 +88,22 @@ def sharp(subject: ProjectorSubject) -> float:
 
 
 def oracles(subject: ProjectorSubject) -> float:
-    """The least distance from what another library's projector sees of a blob that fades before the faces."""
+    """The least distance from what another library's projector sees of a blob that fades before the faces.
+
+    To a plugin's projector mvrecon's own are others too.
+    """
     subject.need_lines()
     grid = Grid.centred((49, 49, 49), 1.0, (3.0, -2.0, 4.0))
     rig = subject.rig(grid, {"pixels": [9, 11], "pixel_mm": [0.9, 0.8], "offset_mm": [0.04, -0.03]})
     volume = Blob(grid.centre + 0.4, 5.5).values(grid).to(subject.device, subject.dtype)[None, None]
     views, gaps = subject.projector(grid, rig)(volume), []
-    for name in set(ORACLES) & set(PROJECTORS.names()) - {subject.name}:
+    others = [{"name": name} for name in set(ORACLES) & set(PROJECTORS.names()) - {subject.name}]
+    if not subject.ours:
+        others += [{"name": "radon" if rig.parallel else "drr", "method": method} for method in METHODS]
+    for other in others:
         try:
-            gaps.append(gap(views, PROJECTORS.build(name, grid=grid, cameras=rig)(volume.cpu())))
+            B = PROJECTORS.from_config(other, grid=grid, cameras=rig)
+            gaps.append(gap(views, B(volume.cpu())))
         except (ImportError, ValueError):  # not installed, or made for other rigs
             continue
     if not gaps:

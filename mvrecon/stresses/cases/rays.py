@@ -38,6 +38,7 @@ def axis_aligned(subject: ProjectorSubject) -> float:
 def on_faces(subject: ProjectorSubject) -> float:
     """Rays on every face and edge of voxels: by how much they miss the upper voxel, or leave the neighbours' range."""
     subject.need_exact()
+    subject.need("bits")
     grid, volume = _integers(subject)
     worst = 0.0
     for axis in range(3):

@@ -55,6 +55,7 @@ def negative(subject: ProjectorSubject) -> float:
 
 def bad_voxels(subject: ProjectorSubject) -> float:
     """One NaN or infinity, among values and alone: where most rays meet it, where few do, and unseen."""
+    subject.need("local")
     A = subject.projector(BRICKS, rig := subject.rig(BRICKS, NARROW))
     x, wrong = subject.random(1, 1, *BRICKS.shape), 0.0
     met = A.T(torch.ones(1, 1, len(rig), *rig.shape, dtype=x.dtype, device=x.device)).flatten()
@@ -72,6 +73,7 @@ def bad_voxels(subject: ProjectorSubject) -> float:
 
 def bad_pixel(subject: ProjectorSubject) -> float:
     """One NaN or infinity in views, for the adjoint."""
+    subject.need("local")
     A = subject.projector(BRICKS, rig := subject.rig(BRICKS))
     y = subject.random(1, 1, len(rig), *rig.shape)
     one, wrong = torch.zeros_like(y), 0.0
