@@ -135,11 +135,10 @@ def test_cameras_that_see_nothing_of_the_crop_are_left_out_and_change_nothing(sh
 
 @torch.no_grad()
 def test_frusta_end_at_the_mask_and_nothing_changes(monkeypatch):
-    """A wall across the diagonal of its box."""
+    """A wall across the diagonal of its box, seen along itself."""
     torch.manual_seed(0)
     grid, detector = Grid.centred((32, 32, 32), 1.0), {"pixels": [48, 48], "pixel_mm": 1.0}
-    cameras = CAMERAS.build("dome", views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector)
-    A = PROJECTORS.build("drr", grid=grid, cameras=cameras)
+    A = PROJECTORS.build("drr", grid=grid, cameras=circular(2, 90.0, 120.0, detector, angles=[40.0, 50.0]))
     model = CrossView(A, {"name": "softmax_depth"}, {"width": 4}, refine=4, start=3, consistency=1, support="hull")
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
