@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from mvrecon.cameras.rigs import circular
-from mvrecon.parts import CAMERAS, MODELS
+from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
+from mvrecon.projectors.drr import Drr
 from mvrecon.stresses import plan
 from mvrecon.stresses.case import DoesNotApply
 from mvrecon.stresses.subject import subject_of
@@ -64,3 +65,35 @@ def test_a_model_that_needs_other_options_is_left_out(monkeypatch):
     monkeypatch.setitem(MODELS._parts, "mine", lambda projector, atlas: torch.nn.Identity())
     with pytest.raises(DoesNotApply, match="it needs atlas"):
         subject_of("model", "mine", {}, "cpu", torch.float32).model()
+
+
+class Fussy(Drr):
+    """A projector that refuses cameras of one pixel, and whose adjoint is twice one."""
+
+    matched = False
+
+    def __init__(self, grid, cameras):
+        if cameras.shape == (1, 1):
+            raise ValueError("takes more than one pixel")
+        super().__init__(grid, cameras)
+
+    def adjoint(self, views):
+        return 2 * super().adjoint(views)
+
+
+def judged(name, case):
+    subject = subject_of("projector", name, {}, "cpu", torch.float32)
+    return next(judge(each, subject) for each, _ in plan.jobs([subject]) if each.name == case)
+
+
+@pytest.mark.parametrize(
+    ("case", "says"),
+    [("rays through corners, axes turned", "refuses: takes more"), ("the adjoint in twenty geometries", "transpose")],
+)
+def test_a_plugin_is_left_out_of_what_it_refuses_or_says_it_is_not_and_mvrecon_is_not(monkeypatch, case, says):
+    monkeypatch.setitem(PROJECTORS._parts, "fussy", Fussy)
+    row = judged("fussy", case)
+    assert row["verdict"] == LEFT_OUT and says in row["note"]
+    assert judged("fussy", "sums, multiples and nothing")["verdict"] == "pass"
+    monkeypatch.setattr(Fussy, "__module__", "mvrecon.fussy")
+    assert judged("fussy", case)["verdict"] == FAIL

@@ -38,6 +38,8 @@ class Astra(Paired):
         ImportError: ASTRA is not installed.
     """
 
+    precisions = (torch.float32,)
+
     def __init__(self, grid: Grid, cameras: Cameras, method: str = "line"):
         super().__init__(grid, cameras)
         self.method = choice("method", method, METHODS)
@@ -58,7 +60,7 @@ class Astra(Paired):
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
         """The algorithm FP in every slice that a row sees."""
-        x, rows, columns = volume.float(), *self.rig.shape
+        x, rows, columns = volume, *self.rig.shape
         views = x.new_zeros(rows, len(self.rig), columns)
         for row, index in self.pairs:
             self._run("FP", x[index], views[row])
@@ -66,7 +68,7 @@ class Astra(Paired):
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
         """The algorithm BP in every slice that a row sees."""
-        y = views.float().transpose(0, 1).contiguous()
+        y = views.transpose(0, 1).contiguous()
         x = y.new_zeros(self.grid.shape)
         for row, index in self.pairs:
             image = torch.zeros_like(x[index])

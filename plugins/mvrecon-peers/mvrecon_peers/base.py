@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from io import StringIO
@@ -10,13 +11,16 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.forward_ad import make_dual, unpack_dual
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.base import check
-from mvrecon_peers.frame import framed, wants_gradient
+from mvrecon.kernels.backends import wide
+from mvrecon.projectors.base import check, check_floating
+from mvrecon_peers.frame import framed, near, wants_gradient
+from mvrecon_peers.operator import known_by, linear
 
-Map = Callable[[Tensor], Tensor]
+CPU = torch.device("cpu")
 
 
 def load(module: str, package: str, attribute: str = "") -> Any:
@@ -55,52 +59,81 @@ def choice(what: str, given: str, known: tuple[str, ...]) -> str:
 class Peer(nn.Module):
     """Another library's projector: [b c d h w] -> [b c m v u], in (unit of the volume) * mm.
 
-    `box` and `rig` are the grid and the cameras in the volume's own frame, where the library is given them.
+    `box` and `rig` are the grid and the cameras in the volume's own frame, where the library is given them. A subclass
+    gives `project` and `backproject`, which take one contiguous tensor in float32 or float64, without a graph.
     """
+
+    #: What the library computes in; halves become float32, anything else is refused.
+    precisions: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
+    #: Whether `adjoint` is the transpose of `forward`.
+    matched = True
+    #: Whether sums that are exact in floating point are so to the last bit.
+    bits = False
 
     def __init__(self, grid: Grid, cameras: Cameras):
         super().__init__()
         self.grid, self.cameras = grid, cameras
         self.box, self.rig = framed(grid, cameras)
+        self.key = known_by(self)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self.key = known_by(self)
 
     @property
     def T(self) -> Callable[[Float[Tensor, "b c m v u"]], Float[Tensor, "b c d h w"]]:
-        """The adjoint; the class says whether it matches."""
+        """The adjoint; `matched` says whether it is one."""
         return self.adjoint
 
     def forward(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Views of volumes, one after the other.
 
         Raises:
-            ValueError: a wrong rank or size, or a device that the library does not work on.
+            TypeError: no tensor.
+            ValueError: a wrong rank or size, or a dtype or a device that the library does not work in.
         """
-        check(volume, "a volume [b c d h w]", self.grid.shape, volume.device)
-        return self._each(self._views, volume)
+        check(volume, "a volume [b c d h w]", self.grid.shape, getattr(volume, "device", CPU))
+        return self._act(volume, "a volume", back=False)
 
     def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """Volumes from views, one after the other.
 
         Raises:
+            TypeError: as `forward`.
             ValueError: as `forward`.
         """
-        check(views, "views [b c m v u]", (len(self.cameras), *self.cameras.shape), views.device)
-        return self._each(self._volume, views)
+        check(views, "views [b c m v u]", self.sizes(back=False), getattr(views, "device", CPU))
+        return self._act(views, "views", back=True)
 
-    def _each(self, act: Map, tensor: Tensor) -> Tensor:
-        wide = tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
-        return torch.stack([act(one) for one in wide.flatten(0, 1)]).unflatten(0, tensor.shape[:2])
+    def sizes(self, back: bool) -> tuple[int, ...]:
+        """The last sizes of volumes (back) or of views."""
+        return tuple(self.grid.shape) if back else (len(self.cameras), *self.cameras.shape)
 
-    def _views(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
+    def _act(self, given: Tensor, what: str, back: bool) -> Tensor:
+        check_floating(given, what)
+        given = wide(given)
+        if given.dtype not in self.precisions:
+            names = " or ".join(str(dtype) for dtype in self.precisions)
+            raise ValueError(f"{type(self).__name__} computes in {names}, got {what} of {given.dtype}; convert it")
+        primal, tangent = unpack_dual(given)
+        if tangent is not None:
+            return make_dual(self._act(primal, what, back), self._act(tangent, what, back))
+        return self._linear(given.flatten(0, 1), back).unflatten(0, given.shape[:2])
+
+    def _linear(self, given: Tensor, back: bool) -> Tensor:
+        return linear(given, self.key, back)
+
+    def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
+        """The library's forward projection of one volume."""
         raise NotImplementedError
 
-    def _volume(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
+    def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
+        """The library's back projection of one volume's views."""
         raise NotImplementedError
 
 
 class Paired(Peer):
-    """A library with a forward and a back projection, outside autograd: each is the other's gradient.
-
-    A subclass gives `project` and `backproject`, which take contiguous tensors in main memory.
+    """A library with a forward and a back projection, outside autograd, in main memory: each is the other's gradient.
 
     Raises:
         ValueError: cameras that require a gradient, which the library does not have.
@@ -112,41 +145,10 @@ class Paired(Peer):
             raise ValueError(f"{who} has no gradient in the cameras, got cameras that require one; detach them")
         super().__init__(grid, cameras)
 
-    def _views(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
-        return _Linear.apply(volume, self._main(self.project), self._main(self.backproject))  # type: ignore[return-value]
-
-    def _volume(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
-        return _Linear.apply(views, self._main(self.backproject), self._main(self.project))  # type: ignore[return-value]
-
-    def _main(self, act: Map) -> Map:
-        def run(tensor: Tensor) -> Tensor:
-            if tensor.device.type != "cpu":
-                raise ValueError(f"{type(self).__name__} works in main memory, got a tensor on {tensor.device}")
-            return act(tensor.contiguous()).to(tensor.dtype)
-
-        return run
-
-    def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
-        """The library's forward projection of one volume."""
-        raise NotImplementedError
-
-    def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
-        """The library's back projection of one volume's views."""
-        raise NotImplementedError
-
-
-class _Linear(torch.autograd.Function):
-    """y = A x, whose gradient is A^T, whose gradient is A."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, forth: Map, back: Map) -> Tensor:
-        ctx.pair = forth, back
-        return forth(x.detach())
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Any, None, None]:  # type: ignore[override]
-        forth, back = ctx.pair
-        return _Linear.apply(grad, back, forth), None, None
+    def _act(self, given: Tensor, what: str, back: bool) -> Tensor:
+        if given.device.type != "cpu":
+            raise ValueError(f"{type(self).__name__} works in main memory, got a tensor on {given.device}")
+        return super()._act(given, what, back)
 
 
 class Traced(Peer):
@@ -159,15 +161,23 @@ class Traced(Peer):
         super().__init__(grid, cameras)
         self._held: tuple[Tensor, Tensor] | None = None
 
+    def _linear(self, given: Tensor, back: bool) -> Tensor:
+        """An operator of torch's, but for gradients in the pose, of which only the library's own graph knows."""
+        if not wants_gradient(self.cameras):
+            return super()._linear(given, back)
+        act = self._transposed if back else self.project
+        return torch.stack([act(one) for one in given])
+
     def _rays(self, like: Tensor) -> tuple[Float[Tensor, "m r 3"], Float[Tensor, "m r 3"]]:
         """First and last points of all rays in mm in the volume's frame, as `like`; made once if they stay."""
-        if self._held is None or self._held[0].dtype != like.dtype or self._held[0].device != like.device:
+        held = self._held  # another thread may replace it
+        if held is None or held[0].dtype != like.dtype or held[0].device != like.device:
             _, rig = framed(self.grid, self.cameras)
-            first, last = (ends.flatten(1, 2).to(like) for ends in rig.rays())
+            first, last = (ends.flatten(1, 2).to(like) for ends in near(self.box, *rig.rays()))
             if first.requires_grad or last.requires_grad:
                 return first, last
-            self._held = first, last
-        return self._held
+            self._held = held = first, last
+        return held
 
     def at_once(self, device: torch.device) -> int:
         """How many views are rendered together: on a CPU, grid_sample gives each thread a view."""
@@ -177,10 +187,16 @@ class Traced(Peer):
         for first, last in zip(*(p.split(self.at_once(volume.device)) for p in self._rays(volume)), strict=True):
             yield self.render(volume, first, last).unflatten(1, self.cameras.shape)
 
-    def _views(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
+    def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
+        """The library's views."""
         return torch.cat(list(self._parts(volume)))
 
-    def _volume(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
+    def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
+        """Their derivative by the volume; in a thread of its own, since autograd sleeps inside of an operator."""
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(self._transposed, views).result()
+
+    def _transposed(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
         graph = torch.is_grad_enabled() and (views.requires_grad or wants_gradient(self.cameras))
         with torch.enable_grad():
             x = views.new_zeros(self.grid.shape).requires_grad_()

@@ -8,6 +8,8 @@ oblique grid is no longer oblique and a far world origin is gone; then rays with
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
@@ -57,6 +59,34 @@ def segments(box: Grid, cameras: Cameras) -> Cameras:
     reach = ((high if side > 0 else -low).clamp(min=1e-6) * pitch).max()
     k = (side * reach / pitch)[:, None]
     return replace(cameras, origin=cameras.source + k * axis, u=k * cameras.u, v=k * cameras.v, extent="segment")
+
+
+def chords(
+    box: Grid, first: Float[Tensor, "*n 3"], last: Float[Tensor, "*n 3"], grown: float = 0.0
+) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
+    """Where whole lines enter and leave the box, grown by so many voxels: 0 at `first`, 1 at `last`.
+
+    Of a line that misses, the first is not less than the second.
+    """
+    half = first.new_tensor(box.spacing) * (first.new_tensor(box.shape[::-1]) / 2 + grown)
+    way = last - first
+    low, high = (((side * half - first) / way).nan_to_num(nan=side * torch.inf) for side in (-1, 1))
+    return torch.minimum(low, high).amax(dim=-1), torch.maximum(low, high).amin(dim=-1)
+
+
+def near(
+    box: Grid, first: Float[Tensor, "*n 3"], last: Float[Tensor, "*n 3"]
+) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n 3"]]:
+    """The same rays, cut off where they are more than a voxel away from the box: far ends would cost them their digits.
+
+    One that does not come as near is replaced by another that misses the box. Differentiable in both ends.
+    """
+    enter, leave = (part[..., None] for part in chords(box, first.detach(), last.detach(), 1.5))
+    start = torch.where(enter > 0, first + enter.clamp(0, 1) * (last - first), first)
+    end = torch.where(leave < 1, first + leave.clamp(0, 1) * (last - first), last)
+    met = (enter < leave) & (enter < 1) & (leave > 0)
+    size = first.new_tensor(box.spacing) * (first.new_tensor(box.shape[::-1]) + 3)
+    return torch.where(met, start, size), torch.where(met, end, size * size.new_tensor([1.0, 1.15, 1.3]))
 
 
 def wants_gradient(cameras: Cameras) -> bool:

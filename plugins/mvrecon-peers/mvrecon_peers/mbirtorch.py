@@ -92,14 +92,19 @@ class Mbirtorch(Paired):
     Args:
         grid: where the voxels lie.
         cameras: the rig.
-        compile_mode: mbirtorch's own: "auto" compiles at the first call, where there is a compiler; or "off".
+        compile_mode: mbirtorch's own: "auto" compiles at the first call, and again for another number of threads, where
+            there is a compiler, which takes minutes; or "off".
 
     Raises:
         ValueError: an unknown mode, a geometry that mbirtorch does not take, or cameras that require a gradient.
         ImportError: mbirtorch is not installed.
     """
 
-    def __init__(self, grid: Grid, cameras: Cameras, compile_mode: str = "auto"):
+    precisions = (torch.float32,)
+    #: mbirtorch gives weights of zero to all that is near a ray.
+    local = False
+
+    def __init__(self, grid: Grid, cameras: Cameras, compile_mode: str = "off"):
         super().__init__(grid, cameras)
         self.scan = scan_of(self.rig)
         self.pairs = plane_of_rows(self.box, self.rig, "mbirtorch's parallel beam") if self.rig.parallel else None
@@ -126,7 +131,7 @@ class Mbirtorch(Paired):
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
         """mbirtorch's sparse_forward_project of all voxels, which it takes as [(y x) z]."""
-        given = volume.permute(1, 2, 0).flatten(0, 1).float().contiguous()
+        given = volume.permute(1, 2, 0).flatten(0, 1).contiguous()
         with quiet():
             made = self._turned(self.model.sparse_forward_project(given, self.model.full_indices_device()))
         if self.pairs is None:
@@ -138,7 +143,7 @@ class Mbirtorch(Paired):
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
         """mbirtorch's sparse_back_project."""
-        given = views.float()
+        given = views
         if self.pairs is not None:
             given = given.new_zeros(len(self.rig), self.grid.shape[0], self.rig.shape[1])
             for row, index in self.pairs:

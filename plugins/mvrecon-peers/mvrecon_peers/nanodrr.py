@@ -1,5 +1,7 @@
 """nanodrr: a trilinear ray marcher in torch, with a Triton kernel on CUDA (https://github.com/eigenvivek/nanodrr)."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -17,7 +19,7 @@ class Nanodrr(Traced):
     Args:
         grid: where the voxels lie.
         cameras: the rig.
-        samples: on a ray; as many as the grid has voxels along its longest axis by default.
+        samples: on a ray; as many as voxels fit along the grid's diagonal by default.
         backend: nanodrr's own: "auto", "torch", "triton".
 
     Raises:
@@ -27,7 +29,7 @@ class Nanodrr(Traced):
 
     def __init__(self, grid: Grid, cameras: Cameras, samples: int | None = None, backend: str = "auto"):
         super().__init__(grid, cameras)
-        self.samples, self.backend = samples or max(2, *grid.shape), backend
+        self.samples, self.backend = samples or max(2, math.ceil(math.hypot(*grid.shape))), backend
         if self.samples < 2:
             raise ValueError(f"nanodrr takes at least 2 samples on a ray, got {samples}")
         self.subject = load("nanodrr.data", "nanodrr", "Subject")
@@ -38,7 +40,9 @@ class Nanodrr(Traced):
     ) -> Float[Tensor, "k r"]:
         """nanodrr's views; its detector is one row of all rays, since only their ends matter."""
         x, size = volume[None, None], first.shape[1]
-        affine, scale = self.box.affine.to(volume), self.subject._make_voxel_to_grid((1, 1, *volume.shape)).to(volume)
+        affine, counts = self.box.affine.to(volume), volume.new_tensor(volume.shape[::-1])
+        scale = torch.diag(torch.cat([2 / counts, counts.new_ones(1)]))  # nanodrr's own has seven digits
+        scale[:3, 3] = 1 / counts - 1
         subject = self.subject(x, torch.zeros_like(x), affine, affine.inverse(), scale, affine[:3, 3], 0)
         subject.convert_to_mu = False
         still = torch.eye(4).to(volume).expand(len(first), 4, 4)

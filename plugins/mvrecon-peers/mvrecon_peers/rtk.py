@@ -1,20 +1,33 @@
 """RTK, the Reconstruction Toolkit of ITK: its Joseph filters on the CPU (https://www.openrtk.org)."""
 
+import math
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Paired, load
 from mvrecon_peers.frame import require_between
 
+#: Empty voxels about the volume: RTK's own ends at the outer voxels' centres, and a ray's first step in it is rough.
+RIM = 2
+#: Of the volume's size: where a detector is as near to its source as this, RTK's matrices have lost their digits.
+SHORT = 1e-6
+#: How many times as long as wide a voxel may be: RTK turns rays in mm, which rounds them in the finest voxels.
+OBLONG = 1e3
+#: Radians that no ray notices; left in, they make ITK's inverse of a matrix fail.
+TINY = 1e-20
 
-def view_arguments(box: Grid, rig: Cameras) -> list[tuple]:
-    """What RTK's `AddProjection` takes for each view.
 
-    A cone beam: source, detector's centre, and the directions of rows and columns. A parallel beam: half the length of
-    the rays, 0 for no source, and the detector's angles in degrees and offsets in mm; see `parallel_arguments`.
+def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
+    """What RTK's `AddProjectionInRadians` takes for each view.
+
+    Depths of the source, and of the detector below it (0: parallel rays); gantry angle, the detector's offsets,
+    out-of-plane and in-plane angle, the source's offsets. RTK's own door for vectors has only five digits where a
+    detector faces the y axis.
 
     Raises:
         ValueError: detectors that are not rectangular, pixels that differ between views, or parallel beams that are
@@ -28,29 +41,43 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple]:
         pitch = step.norm(dim=-1)
         if not torch.allclose(pitch, pitch[0], rtol=1e-6, atol=0):
             raise ValueError(f"RTK takes one pixel size for all views, got {what} of {pitch.unique().tolist()} mm")
+    axes = torch.stack([u, v, torch.linalg.cross(u, v)], dim=1)
     centre = rig.origin + rig.u * (columns - 1) / 2 + rig.v * (rows - 1) / 2
+    across, down, depth = (axes * centre[:, None]).sum(dim=-1).unbind(dim=-1)
+    x, y, z = (axes * rig.source[:, None]).sum(dim=-1).unbind(dim=-1)
+    below = z - depth
     if rig.parallel:
-        return parallel_arguments(box, rig, centre, torch.stack([u, v, torch.linalg.cross(u, v)], dim=1))
-    return list(zip(*(vectors.tolist() for vectors in (rig.source, centre, u, v)), strict=True))
+        require_square(box, rig, axes[:, 2])
+        x = y = below = torch.zeros_like(depth)
+        z = torch.full_like(depth, box.corners().norm(dim=-1).max().item() + 3 * sum(box.spacing))
+    elif (short := below.abs().min().item()) < SHORT * (size := box.corners().norm(dim=-1).max().item()):
+        raise ValueError(
+            f"RTK takes detectors no nearer to the source than {SHORT:g} of the volume's size, got {short / size:.2g}"
+        )
+    gantry, out, inner = zip(*map(angles, axes.tolist()), strict=True)
+    z, below, across, down, x, y = (each.tolist() for each in (z, below, across, down, x, y))
+    return list(zip(z, below, gantry, across, down, out, inner, x, y, strict=True))
 
 
-def parallel_arguments(
-    box: Grid, rig: Cameras, centre: Float[Tensor, "m 3"], axes: Float[Tensor, "m 3 3"]
-) -> list[tuple]:
-    """sid, 0, gantry angle, offsets, out-of-plane and in-plane angle, of axes = Rz(-in) Rx(-out) Ry(-gantry)."""
+def require_square(box: Grid, rig: Cameras, normal: Float[Tensor, "m 3"]) -> None:
+    """Raise ValueError unless parallel rays meet their detector at right angles, with the box between their ends."""
     require_between(box, rig, "RTK's parallel geometry")
     look = torch.nn.functional.normalize(rig.origin - rig.source, dim=-1)
-    if (slant := torch.linalg.cross(look, axes[:, 2]).norm(dim=-1).max().item()) > 1e-6:
+    if (slant := torch.linalg.cross(look, normal).norm(dim=-1).max().item()) > 1e-6:
         raise ValueError(f"RTK takes parallel beams square to their detector, got one slanted by {slant:.3g}")
-    reach = box.corners().norm(dim=-1).max().item() + sum(box.spacing)
-    out = torch.asin(axes[:, 2, 1].clamp(-1, 1))
-    locked = out.cos() < 1e-9  # a beam along y: only the sum of the other two angles counts
-    gantry = torch.where(locked, torch.atan2(axes[:, 0, 2], axes[:, 0, 0]), torch.atan2(-axes[:, 2, 0], axes[:, 2, 2]))
-    inner = torch.where(locked, 0.0, torch.atan2(-axes[:, 0, 1], axes[:, 1, 1]))
-    gantry, out, inner = (-torch.rad2deg(angle) for angle in (gantry, out, inner))
-    across, down = (axes[:, :2] @ centre[..., None])[..., 0].unbind(dim=-1)
-    rest = (angles.tolist() for angles in (gantry, across, down, out, inner))
-    return [(reach, 0.0, *view) for view in zip(*rest, strict=True)]
+
+
+def angles(axes: list[list[float]]) -> tuple[float, float, float]:
+    """Gantry, out-of-plane and in-plane angle of axes u, v, n = Rz(-inner) Rx(-out) Ry(-gantry), exact in every pose.
+
+    One camera at a time: what torch computes of many, it rounds by where they stand among them.
+    """
+    (ux, uy, uz), _, (nx, ny, nz) = axes
+    gantry, out = math.atan2(nx, nz), math.atan2(-ny, math.hypot(nx, nz))
+    rx, rz = math.cos(gantry), -math.sin(gantry)  # where columns run if the in-plane angle is 0; n x that is for rows
+    inner = math.atan2(ux * ny * rz + uy * (nz * rx - nx * rz) - uz * ny * rx, ux * rx + uz * rz)
+    gantry, out, inner = (0.0 if abs(angle) < TINY else angle for angle in (gantry, out, inner))
+    return gantry, out, inner
 
 
 class Rtk(Paired):
@@ -69,29 +96,43 @@ class Rtk(Paired):
 
     def __init__(self, grid: Grid, cameras: Cameras):
         super().__init__(grid, cameras)
-        views = view_arguments(self.box, self.rig)
+        if (ratio := max(self.box.spacing) / min(self.box.spacing)) > OBLONG:
+            raise ValueError(f"RTK takes voxels at most {OBLONG:g} times as long as wide, got {ratio:.3g} times")
+        # ITK has tolerances in mm, so the unit is one, of a power of two, in which a voxel is about 1
+        self.unit = 2.0 ** round(math.log2(min(self.box.spacing)))
+        box = Grid.centred(grid.shape, [mm / self.unit for mm in self.box.spacing])
+        rig = replace(self.rig, **{name: getattr(self.rig, name) / self.unit for name in VECTORS})
+        views = view_arguments(box, rig)
         self.itk, self.rtk = load("itk", "itk-rtk"), load("itk", "itk-rtk", "RTK")
         self.geometry = self.rtk.ThreeDCircularProjectionGeometry.New()
         for view in views:
-            if self.geometry.AddProjection(*view) is False:
+            if self.geometry.AddProjectionInRadians(*view) is False:
                 raise ValueError(f"RTK does not take the view {view}")
-        pitch = [self.rig.u[0].norm().item(), self.rig.v[0].norm().item(), 1.0]
-        rows, columns = self.rig.shape
+        pitch = [rig.u[0].norm().item(), rig.v[0].norm().item(), 1.0]
+        rows, columns = rig.shape
         self.detector = pitch, [-pitch[0] * (columns - 1) / 2, -pitch[1] * (rows - 1) / 2, 0.0]
-        self.voxels = list(self.box.spacing), self.box.affine[:3, 3].tolist()
+        rim = Grid.centred([n + 2 * RIM for n in grid.shape], box.spacing)
+        self.voxels = list(rim.spacing), rim.affine[:3, 3].tolist()
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
         """JosephForwardProjectionImageFilter."""
         empty = self._image(volume.new_zeros(len(self.rig), *self.rig.shape), self.detector)
-        return self._run(self.rtk.JosephForwardProjectionImageFilter, empty, self._image(volume, self.voxels))
+        given = self._image(torch.nn.functional.pad(volume, (RIM,) * 6), self.voxels)
+        return self._run(self.rtk.JosephForwardProjectionImageFilter, empty, given)
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
         """JosephBackProjectionImageFilter."""
-        empty = self._image(views.new_zeros(self.grid.shape), self.voxels)
-        return self._run(self.rtk.JosephBackProjectionImageFilter, empty, self._image(views, self.detector))
+        empty = self._image(views.new_zeros([n + 2 * RIM for n in self.grid.shape]), self.voxels)
+        found = self._run(self.rtk.JosephBackProjectionImageFilter, empty, self._image(views, self.detector))
+        return found[RIM:-RIM, RIM:-RIM, RIM:-RIM]
 
     def _image(self, values: Tensor, frame: tuple[list[float], list[float]]):
         image = self.itk.image_view_from_array(values.numpy())
+        if values[0].numel() == 1:  # such memory ITK takes for Fortran's, and its first axis for the last
+            image = type(image).New()
+            image.SetRegions(values.shape[::-1])
+            image.Allocate()
+            self.itk.array_view_from_image(image)[:] = values.numpy()
         image.SetSpacing(frame[0])
         image.SetOrigin(frame[1])
         return image
@@ -103,4 +144,4 @@ class Rtk(Paired):
         operator.SetInput(0, target)
         operator.SetInput(1, given)
         operator.Update()
-        return torch.from_numpy(self.itk.array_from_image(operator.GetOutput()))
+        return torch.from_numpy(self.itk.array_from_image(operator.GetOutput())) * self.unit

@@ -56,6 +56,8 @@ class Skimage(Paired):
         ImportError: scikit-image is not installed.
     """
 
+    matched = False
+
     def __init__(self, grid: Grid, cameras: Cameras):
         super().__init__(grid, cameras)
         self.angles, self.columns = turns(self.box, self.rig)

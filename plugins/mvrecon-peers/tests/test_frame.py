@@ -19,7 +19,7 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon_peers.astra import Astra
 from mvrecon_peers.diffdrr import Diffdrr
-from mvrecon_peers.frame import framed, plane_of_rows
+from mvrecon_peers.frame import chords, framed, near, plane_of_rows
 from mvrecon_peers.mbirtorch import Mbirtorch, rig_of, scan_of
 from mvrecon_peers.nanodrr import Nanodrr
 from mvrecon_peers.rtk import Rtk, view_arguments
@@ -28,6 +28,7 @@ from mvrecon_peers.skimage import Skimage, turns
 GRID = Grid.centred((10, 12, 14), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
 DETECTOR = {"pixels": [5, 7], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 CONE = circular(4, 40.0, 70.0, DETECTOR, start_degrees=13.0).moved(torch.eye(3), GRID.centre)
+NORMAL = torch.linalg.cross(CONE.u, CONE.v)
 BEAM = parallel(4, DETECTOR, 60.0, start_degrees=11.0).moved(torch.eye(3), GRID.centre)
 PINHOLES = dome(4, 30.0, 20.0, 120.0, DETECTOR, target=GRID.centre.tolist())
 RIGS = {
@@ -76,20 +77,48 @@ def test_framing_keeps_the_graph_of_the_cameras():
     assert torch.autograd.grad(torch.stack(rig.rays()).square().sum(), source)[0].any()
 
 
-def test_rtk_gets_unit_vectors_and_angles_that_make_the_detector():
-    box, rig = framed(GRID, CONE)
-    source, centre, u, v = view_arguments(box, rig)[2]
-    across = rig.unproject(torch.tensor([3.0, 2.0, 70.0], dtype=torch.float64).expand(4, 3))[2]
-    given = torch.tensor([centre, u, v, source], dtype=torch.float64)
-    assert torch.allclose(given[0], across)
-    assert torch.allclose(given[1:], torch.stack([rig.u[2] / 2.3, rig.v[2] / 2.1, rig.source[2]]))
-    for start in (0.0, 25.0, 90.0):
-        box, rig = framed(GRID, parallel(4, DETECTOR, 60.0, start_degrees=start, arc_degrees=360.0))
-        for m, (_, none, gantry, _, _, out, inner) in enumerate(view_arguments(box, rig)):
-            axes = turned(-inner, 2) @ turned(-out, 0) @ turned(-gantry, 1)
-            assert none == 0
-            assert torch.allclose(axes[0] * 2.3, rig.u[m], atol=1e-9)
-            assert torch.allclose(axes[1] * 2.1, rig.v[m], atol=1e-9)
+@pytest.mark.parametrize("kind", ["cone", "tilted", "along y", "beam"])
+def test_rtk_gets_depths_offsets_and_angles_that_make_the_rays(kind: str):
+    turn = {"tilted": random_rotation(torch.Generator().manual_seed(0)), "along y": turned(90.0, 0) @ turned(-13.0, 2)}
+    R, rig = turn.get(kind, turned(0.0, 0)), CONE.moved(torch.eye(3), -GRID.centre)
+    if kind == "beam":
+        rig = parallel(4, DETECTOR, 60.0, start_degrees=25.0, arc_degrees=360.0)
+    box, rig = framed(GRID, rig.moved(R, GRID.centre))
+    start, end = rig.rays()
+    for m, (sid, sdd, gantry, right, down, out, inner, x, y) in enumerate(view_arguments(box, rig)):
+        degrees = (torch.tensor(angle).rad2deg().item() for angle in (-inner, -out, -gantry))
+        axes = torch.eye(3, dtype=torch.float64)
+        for angle, axis in zip(degrees, (2, 0, 1), strict=True):
+            axes = axes @ turned(angle, axis)
+        assert torch.allclose(axes[0] * 2.3, rig.u[m], atol=1e-12)
+        assert torch.allclose(axes[1] * 2.1, rig.v[m], atol=1e-12)
+        middle = torch.tensor([right, down, sid - sdd], dtype=torch.float64) @ axes
+        if kind == "beam":
+            assert sdd == 0
+            along = torch.linalg.cross(end[m, 2, 3] - start[m, 2, 3], axes[2])
+            assert along.abs().max() < 1e-9
+            assert torch.allclose((middle - end[m, 2, 3]) @ axes[:2].T, torch.zeros(2, dtype=torch.float64), atol=1e-12)
+        else:
+            assert torch.allclose(middle, end[m, 2, 3], atol=1e-12)
+            assert torch.allclose(torch.tensor([x, y, sid], dtype=torch.float64) @ axes, rig.source[m], atol=1e-12)
+
+
+def test_rays_are_cut_off_near_the_box_and_stay_on_their_lines():
+    box, rng = Grid.centred((4, 5, 6), (1.0, 1.2, 0.9)), torch.Generator().manual_seed(0)
+    first, way = torch.rand(2, 200, 3, generator=rng, dtype=torch.float64) * 12 - 6
+    first[:20], way[:60:7, 0] = 0.0, 0.0
+    last = first + 1e5 * way
+    enter, leave = chords(box, first, last)
+    start, end = near(box, first, last)
+    again = chords(box, start, end)
+    hit = (enter < leave) & (leave > 0)
+    assert hit.any() and not hit.all()
+    assert start.abs().max() < 30 and end.abs().max() < 30
+    for fraction, found in zip((enter.clamp(min=0), leave), (again[0].clamp(min=0), again[1]), strict=True):
+        there, expected = start + found[:, None] * (end - start), first + fraction[:, None] * (last - first)
+        assert torch.allclose(there[hit], expected[hit], atol=1e-9)
+    misses = (again[0] >= again[1]) | (again[1] <= 1e-9)
+    assert torch.equal(misses, ~hit)
 
 
 def turned(degrees: float, axis: int) -> torch.Tensor:
@@ -133,7 +162,9 @@ REFUSED = {
     "central line": (Nanodrr, GRID, replace(CONE, extent="line"), {}, "got central cameras of extent 'line'"),
     "one sample": (Nanodrr, GRID, CONE, {"samples": 1}, "at least 2 samples on a ray, got 1"),
     "unknown method": (Diffdrr, GRID, CONE, {"method": "joseph"}, "Known: siddon, trilinear"),
-    "source inside": (Diffdrr, GRID, replace(CONE, source=GRID.centre + CONE.source * 0), {}, "between sources"),
+    "source inside": (Diffdrr, GRID, replace(CONE, source=GRID.centre + CONE.source * 0), {}, "140 of 140 rays"),
+    "next to the source": (Rtk, GRID, replace(CONE, source=CONE.origin - 1e-6 * NORMAL), {}, "no nearer to the source"),
+    "needles": (Rtk, Grid.centred((5, 7, 7), (1.0, 1e-4, 1.0)), CONE, {}, "at most 1000 times as long as wide"),
     "skew pixels": (Rtk, GRID, replace(CONE, v=CONE.v + 0.1 * CONE.u), {}, "right angles"),
     "two pixel sizes": (Rtk, GRID, replace(CONE, u=CONE.u * torch.arange(1, 5)[:, None]), {}, "one pixel size"),
     "slanted beam": (Rtk, GRID, replace(BEAM, origin=BEAM.origin + 9 * BEAM.u), {}, "square to their detector"),

@@ -1,0 +1,54 @@
+"""Any peer as an operator of torch's: opaque to `torch.compile` and to autocast, mapped by vmap, its own derivative."""
+
+from collections.abc import Callable
+from itertools import count
+from typing import Any
+from weakref import WeakValueDictionary
+
+import torch
+from torch import Tensor
+
+_PEERS: WeakValueDictionary[int, Any] = WeakValueDictionary()
+_KEYS = count()
+
+
+def known_by(peer: Any) -> int:
+    """A number by which `linear` finds a peer for as long as it lives; an operator takes no objects."""
+    key = next(_KEYS)
+    _PEERS[key] = peer
+    return key
+
+
+@torch.library.custom_op("mvrecon_peers::linear", mutates_args=())
+def linear(given: Tensor, key: int, back: bool) -> Tensor:
+    """Views [n m v u] of volumes [n d h w] by a peer, or back."""
+    peer = _PEERS[key]
+    act: Callable[[Tensor], Tensor] = peer.backproject if back else peer.project
+    found = given.new_empty(given.shape[0], *peer.sizes(back))
+    with torch.autocast(given.device.type, enabled=False):
+        for one, out in zip(given, found, strict=True):
+            out.copy_(act(one.contiguous()))
+    return found
+
+
+@linear.register_fake
+def _(given, key, back):
+    return given.new_empty(given.shape[0], *_PEERS[key].sizes(back))
+
+
+def _keep(ctx, inputs, output):
+    _, ctx.key, ctx.back = inputs
+    ctx.peer = _PEERS[ctx.key]  # it must live until its derivative is asked for
+
+
+def _transpose(ctx, grad):
+    return linear(grad, ctx.key, not ctx.back), None, None
+
+
+def _mapped(info, in_dims, given, key, back):
+    moved = given.movedim(in_dims[0], 0)
+    return linear(moved.flatten(0, 1), key, back).unflatten(0, moved.shape[:2]), 0
+
+
+linear.register_autograd(_transpose, setup_context=_keep)
+linear.register_vmap(_mapped)
