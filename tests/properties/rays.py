@@ -29,6 +29,13 @@ class Course(NamedTuple):
         return (self.leave - self.enter) * self.way
 
 
+def _indexed(case: Case) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
+    """Where the rays start and how far they go, in voxels (x, y, z) from the first one's centre."""
+    start, end = case.rays.rays()
+    back = torch.linalg.inv(case.grid.affine[:3, :3]).T
+    return (start - case.grid.affine[:3, 3]) @ back, (end - start) @ back
+
+
 def course(case: Case, grown: float = 0.0, inner: bool = False) -> Course:
     """Slab by slab (Kay & Kajiya, Ray tracing complex scenes, 1986), in voxel indices.
 
@@ -37,12 +44,9 @@ def course(case: Case, grown: float = 0.0, inner: bool = False) -> Course:
         grown: voxels by which the box is larger on every side.
         inner: the box of the voxels' centres in place of the voxels' own.
     """
-    grid, (start, end) = case.grid, case.rays.rays()
-    back = torch.linalg.inv(grid.affine[:3, :3]).T
-    one = (start - grid.affine[:3, 3]) @ back
-    way = (end - start) @ back
+    (one, way), (start, end) = _indexed(case), case.rays.rays()
     margin = grown + (0.0 if inner else 0.5)
-    high = torch.tensor(grid.shape[::-1], dtype=torch.float64) - 1 + margin
+    high = torch.tensor(case.grid.shape[::-1], dtype=torch.float64) - 1 + margin
     moves = way != 0
     safe = torch.where(moves, way, 1.0)
     near, far = (-margin - one) / safe, (high - one) / safe
@@ -54,6 +58,29 @@ def course(case: Case, grown: float = 0.0, inner: bool = False) -> Course:
     enter, leave = (torch.where(hits, t, 0.0) for t in (enter, leave))
     first, last = (one + t[..., None] * way for t in (enter, leave))
     return Course(enter, leave, first, last, (end - start).norm(dim=-1))
+
+
+def faded(case: Case) -> Float[Tensor, "m v u"]:
+    """What Joseph's method sees of ones, in mm, and so of any volume at most per unit of its greatest value.
+
+    A ray's length in each slab of its main axis, times the ones in the slab's middle. Across that axis they fade from
+    one at the outermost centres to zero a voxel further out, half a voxel beyond the box. No chord bounds it but that
+    of a box grown by a voxel across: before and behind the middle the ray may be half a voxel further out still, as
+    its slope is at most one. All of it is said in voxels, so a sheared grid is like any other.
+    """
+    (one, way), (least, most) = _indexed(case), case.rays.limits
+    sizes = torch.tensor(case.grid.shape[::-1], dtype=torch.float64)
+    main = way.abs().argmax(dim=-1, keepdim=True)
+    begin, pace, count = one.gather(-1, main), way.gather(-1, main), sizes[main]
+    total = torch.zeros_like(way[..., 0])
+    for k in range(max(case.grid.shape)):
+        ends = torch.stack([(k + half - begin) / pace for half in (-0.5, 0.5)]).clamp(least, most)
+        share = (ends[1] - ends[0]).abs() * (k < count)
+        place = one + (k - begin) / pace * way
+        ones = torch.minimum(place + 1, sizes - place).clamp(0, 1).scatter(-1, main, 1.0)
+        total += share[..., 0] * ones.prod(dim=-1)
+    start, end = case.rays.rays()
+    return total * (end - start).norm(dim=-1)
 
 
 def sharpness(case: Case, dtype: torch.dtype = torch.float64) -> tuple[Float[Tensor, "m v u"], Bool[Tensor, "m v u"]]:

@@ -5,6 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 from tests.projectors.cases import Case
@@ -27,6 +28,30 @@ def test_the_adjoint_is_the_transpose(case, method, dtype, data, rays, seed):
     y = noise(A(x).shape, seed, dtype)
     apart = (A(x).double() * y.double()).sum() - (x.double() * A.T(y).double()).sum()
     assert apart.abs() <= ADJOINT[dtype] * (A(x.abs()).double() * y.double().abs()).sum()
+
+
+def beside_nothing(away: float, shape: tuple[int, int]) -> tuple[Case, torch.Tensor]:
+    """Rays that run level a little before slice 6, which is empty; slice 5 is not, and weighs that little."""
+    z = 0.5 - away
+    source, origin, u, v = [0.1, -20.0, z], [0.1, 20.0, z], [-0.1, 0.0, 0.0], [0.0, 0.0, 1e-3 * away]
+    cameras = Cameras(*(torch.tensor([each], dtype=torch.float64) for each in (source, origin, u, v)), shape=shape)
+    x = torch.zeros(1, 1, 12, 5, 5, dtype=torch.float64)
+    x[:, :, 5] = torch.rand(5, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1
+    return Case(Grid.centred((12, 5, 5), 1.0), cameras), x
+
+
+@pytest.mark.parametrize("channels", [1, 4])
+@pytest.mark.parametrize("shape", [(9, 3), (1, 3)])  # read column by column, and ray by ray
+@pytest.mark.parametrize("method", ["joseph", "trilinear"])
+def test_weights_near_zero_are_the_same_in_the_transpose(method, shape, channels):
+    """Shrunk: to rounding errors of the weights themselves, not of the empty voxel that has nearly all the weight."""
+    for dtype, away in ((torch.float32, 1e-5), (torch.float64, 1e-12)):
+        case, x = beside_nothing(away, shape)
+        x, A = x.to(dtype).expand(1, channels, -1, -1, -1).contiguous(), case.build(method=method)
+        views, y = A(x), noise((1, channels, 1, *shape), 0, dtype)
+        assert (views > 0).all() and (views < 10 * away).all()
+        apart = (views.double() * y.double()).sum() - (x.double() * A.T(y).double()).sum()
+        assert apart.abs() <= 20 * epsilon(dtype) * (views.double() * y.double().abs()).sum()
 
 
 @given(**ANY, a=real(-10, 10), b=real(-10, 10))
