@@ -68,7 +68,7 @@ def test_rays_given_one_by_one_see_what_the_flat_detector_sees(kind, option):
 def test_a_curved_detector_sees_the_chords_of_a_box(backend):
     sizes = zip(GRID.shape[::-1], GRID.spacing, strict=True)
     half = torch.tensor([[n * mm / 2 for n, mm in sizes]], dtype=torch.float64)
-    eye = torch.eye(3, dtype=torch.float64)[None]
+    eye = torch.eye(3, dtype=torch.float64)[None, None]
     box = Phantom((Solids("box", GRID.centre[None], eye, half, torch.ones(1)),))
     rays = curved(columns=14, rows=9, views=5)
     chords = box.integrals(rays.source, rays.target)
@@ -133,3 +133,16 @@ def test_a_back_end_refuses_tensors_of_another_memory():
 def test_parallel_beams_are_no_rays_one_by_one():
     with pytest.raises(ValueError, match="parallel rig"):
         PROJECTORS.build("radon", grid=GRID, cameras=curved())
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_a_ray_all_but_along_a_face_crosses_it_where_it_does(backend):
+    """In float32, too: a place in it is rounded to 4e-6 voxels, 60 times as much along a ray of slope 1/60."""
+    grid, height = Grid.centred((4, 96, 96), 1.0), torch.linspace(-0.5, 0.5, 41, dtype=torch.float64)[None, None]
+    start = torch.stack([torch.full_like(height, -70), 31 + height - 70 / 60, torch.zeros_like(height) + 0.3], dim=-1)
+    end = start + start.new_tensor([140, 140 / 60, 0])
+    volume = torch.zeros(1, 1, *grid.shape)
+    volume[..., 79:, :] = 1  # y > 31
+    A = PROJECTORS.build("drr", grid=grid, cameras=ExplicitRays(start, end), method="siddon", backend=backend)
+    expected = (48 + 60 * height[0]) * (1 + 1 / 60**2) ** 0.5
+    assert (A(volume)[0, 0].double() - expected).abs().max() <= 1e-6 * expected.max()

@@ -14,7 +14,6 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.kernels.rays import choice, plan, reference
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy
 from mvrecon.kernels.rays.scan import bricks_of
-from mvrecon.projectors import base
 from tests.projectors.cases import Case, curved
 
 #: No size is a multiple of a brick's edge, and no two spacings are alike.
@@ -280,17 +279,6 @@ def test_compiled_and_mapped_calls_skip_too():
     x = volumes("blob")
     compiled = torch.compile(A, backend="eager", fullgraph=True)
     assert torch.equal(compiled(x), A(x))
-
-
-def test_what_another_thread_found_about_its_volume_is_not_read(monkeypatch):
-    A = CASES["cone"].build(skip="box")
-    x = volumes("blob")
-    expected = A(x)
-    A(x.flip(2, 3, 4))
-    elsewhere = A._last
-    monkeypatch.setattr(base.Projector, "_last", property(lambda _: elsewhere, lambda *_: None), raising=False)
-    assert A.skipped.box != Box.around(x[0, 0] != 0)
-    assert torch.equal(A(x), expected)
 
 
 def test_the_reference_needs_no_skipping():

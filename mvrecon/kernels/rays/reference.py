@@ -138,7 +138,8 @@ def _weights(
 ):
     """Every flat index and weight, in mm, of all rays: the rows of the system matrix, slab by slab."""
     name, _, samples = method.partition(":")
-    rays = rays_of(lines, window, detector, shape, like, 0.5 if name == "trilinear" else 0.0)
+    exact = lines if name == "siddon" else like  # a crossing moves by many times what a place is rounded by
+    rays = rays_of(lines, window, detector, shape, exact, 0.5 if name == "trilinear" else 0.0)
     if name == "trilinear":
         for index, weight in _trilinear(rays, int(samples)):
             yield index, weight * rays.length
@@ -146,10 +147,10 @@ def _weights(
     cells = {"joseph": _joseph, "siddon": _siddon}[name]
     for slab in range(max(shape)):
         k = torch.minimum(torch.tensor(slab, device=lines.device), rays.sizes[0] - 1)
-        s = k.to(like.dtype) - (rays.sizes[0] - 1) / 2
+        s = k.to(exact.dtype) - (rays.sizes[0] - 1) / 2
         counts = (rays.sizes[0] > slab) * rays.length
-        for index, weight in cells(rays, k, s.to(like.dtype)):
-            yield index, weight * counts
+        for index, weight in cells(rays, k, s.to(exact.dtype)):
+            yield index, (weight * counts).to(like.dtype)
 
 
 def project(

@@ -21,26 +21,29 @@ def reach(low, high, before, per_slope, length):
 
 @scalar
 def cells(ray, count, steps, room):
-    """Per slab that `order.visit` has chosen: flat indices of the cells that the ray crosses in order, lengths."""
+    """Per slab that `order.visit` has chosen: flat indices of the cells that the ray crosses in order, lengths.
+
+    Crossings are found in float64 and rounded last: a ray that is all but along a plane moves its crossing by many
+    times what a place is rounded by.
+    """
     index0, index1, index2, part0, part1, part2 = room.index, room.index_b, room.index_c, room.one, room.two, room.three
     real, whole = part0.dtype.type, index0.dtype.type
-    half = real(0.5)
-    b, slope_b, c, slope_c = real(ray.b) + half, real(ray.slope_b), real(ray.c) + half, real(ray.slope_c)
+    b, slope_b, c, slope_c = ray.b + 0.5, ray.slope_b, ray.c + 0.5, ray.slope_c
     # a ray without slope stays in its cell, and this is never used
-    per_b, per_c = real(1 / ray.slope_b if ray.slope_b else 0), real(1 / ray.slope_c if ray.slope_c else 0)
-    begin, end, first = real(ray.begin), real(ray.end), real(ray.centre + 1)
+    per_b, per_c = 1 / ray.slope_b if ray.slope_b else 0.0, 1 / ray.slope_c if ray.slope_c else 0.0
+    begin, end, first = ray.begin, ray.end, ray.centre + 1
     along, far, origin = whole(steps.along), whole(steps.far), whole(steps.origin)
     for i in range(np.uint32(count)):
-        s = room.four[i]
-        s0, s1 = max(begin, s - half), min(end, s + half)
+        s = np.float64(room.four[i])
+        s0, s1 = max(begin, s - 0.5), min(end, s + 0.5)
         length = s1 - s0
         y0, z0 = b + s0 * slope_b, c + s0 * slope_c
         b0, b1 = np.int32(y0), np.int32(b + s1 * slope_b)
         c0, c1 = np.int32(z0), np.int32(c + s1 * slope_c)
-        to_b = reach(real(b0), real(b1), y0, per_b, length)
-        to_c = reach(real(c0), real(c1), z0, per_c, length)
+        to_b = reach(np.float64(b0), np.float64(b1), y0, per_b, length)
+        to_c = reach(np.float64(c0), np.float64(c1), z0, per_c, length)
         one, two = min(to_b, to_c), max(to_b, to_c)
-        part0[i], part1[i], part2[i] = one, two - one, length - two
+        part0[i], part1[i], part2[i] = real(one), real(two - one), real(length - two)
         base = whole(whole(whole(np.int32(s + first)) * along) - origin)
         along_b0, along_b1 = whole(whole(b0) * far), whole(whole(b1) * far)
         index0[i] = whole(base + whole(along_b0 + whole(c0)))
