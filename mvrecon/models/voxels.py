@@ -12,7 +12,7 @@ from itertools import product
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 #: Voxels (z, y, x) of the bricks that convolutions are done in, all as one batch, each with a halo of one voxel.
@@ -63,7 +63,7 @@ def voxels_of(mask: Bool[Tensor, "n 1 d h w"]) -> Voxels:
     n, _, d, h, w = mask.shape
     behind = [-size % edge for size, edge in zip((d, h, w), BRICK, strict=True)]
     padded = F.pad(mask[:, 0], (0, behind[2], 0, behind[1], 0, behind[0]))
-    bricks = padded.unfold(1, BRICK[0], BRICK[0]).unfold(2, BRICK[1], BRICK[1]).unfold(3, BRICK[2], BRICK[2])
+    bricks = _bricks(padded, 0)
     active = bricks.any(dim=-1).any(dim=-1).any(dim=-1).nonzero()  # [q 4]
     held = bricks[tuple(active.unbind(dim=1))].flatten(1)  # [q 128]
     brick, inner = held.nonzero().unbind(dim=1)
@@ -71,17 +71,21 @@ def voxels_of(mask: Bool[Tensor, "n 1 d h w"]) -> Voxels:
     sample, (z, y, x) = active[brick, 0], index.unbind(dim=1)
     row = torch.full((n, *[size + 2 for size in padded.shape[1:]]), len(z), device=mask.device)
     row[sample, z + 1, y + 1, x + 1] = torch.arange(len(z), device=mask.device)
-    windows = row
-    for axis, edge in enumerate(BRICK, start=1):
-        windows = windows.unfold(axis, edge + 2, edge)
     return Voxels(
         shape=(n, d, h, w),
-        counts=torch.bincount(sample, minlength=n).tolist(),
+        counts=mask.flatten(1).sum(dim=1).tolist(),
         place=((sample * d + z) * h + y) * w + x,
         row=row,
-        around=windows[tuple(active.unbind(dim=1))],
+        around=_bricks(row, 2)[tuple(active.unbind(dim=1))],
         own=brick * held.shape[1] + inner,
     )
+
+
+def _bricks(volumes: Shaped[Tensor, "n d h w"], more: int) -> Shaped[Tensor, "n z y x a e i"]:
+    """Windows as large as bricks, or by so many voxels larger, at every brick."""
+    for axis, edge in enumerate(BRICK, start=1):
+        volumes = volumes.unfold(axis, edge + more, edge)
+    return volumes
 
 
 def pyramid(mask: Bool[Tensor, "n 1 d h w"], levels: int) -> list[Voxels]:

@@ -68,7 +68,7 @@ def test_rays_given_one_by_one_see_what_the_flat_detector_sees(kind, option):
 def test_a_curved_detector_sees_the_chords_of_a_box(backend):
     sizes = zip(GRID.shape[::-1], GRID.spacing, strict=True)
     half = torch.tensor([[n * mm / 2 for n, mm in sizes]], dtype=torch.float64)
-    eye = torch.eye(3, dtype=torch.float64)[None, None]
+    eye = torch.eye(3, dtype=torch.float64)[None]
     box = Phantom((Solids("box", GRID.centre[None], eye, half, torch.ones(1)),))
     rays = curved(columns=14, rows=9, views=5)
     chords = box.integrals(rays.source, rays.target)

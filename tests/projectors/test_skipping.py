@@ -14,6 +14,7 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.kernels.rays import choice, plan, reference
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy
 from mvrecon.kernels.rays.scan import bricks_of
+from mvrecon.projectors import base
 from tests.projectors.cases import Case, curved
 
 #: No size is a multiple of a brick's edge, and no two spacings are alike.
