@@ -1,8 +1,6 @@
-"""A U-Net's steps between convolutions, defined on a part of the volume: nothing outside counts, nothing leaves it.
+"""Steps between the scales of whole volumes: halving, and interpolation on a part of them.
 
-Normalisation, pooling and upsampling average over the mask alone. So their results do not depend on how much empty
-space lies around the mask, as long as coarse voxels keep their places, and a mask of ones gives the plain steps.
-Masks are numbers 0 and 1 in the features' type; features are zero outside them.
+Masks are numbers 0 and 1 in the features' type. Networks that work on a mask's voxels alone: `voxels`.
 """
 
 from collections.abc import Sequence
@@ -12,8 +10,6 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
-
-Mask = Float[Tensor, "n 1 d h w"]
 
 
 class _Halved(torch.autograd.Function):
@@ -46,7 +42,10 @@ def halved(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
 
 
 def upsampled(
-    x: Float[Tensor, "n c e i x"], mask: Float[Tensor, "n 1 e i x"], onto: Mask, size: Sequence[int]
+    x: Float[Tensor, "n c e i x"],
+    mask: Float[Tensor, "n 1 e i x"],
+    onto: Float[Tensor, "n 1 d h w"],
+    size: Sequence[int],
 ) -> Float[Tensor, "n c d h w"]:
     """Trilinear interpolation between the voxels of a coarse mask, on those of a fine one.
 
