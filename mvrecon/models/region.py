@@ -4,6 +4,7 @@ Convention: inside a model every volume is the crop's; only what a model returns
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
@@ -43,7 +44,7 @@ class Region:
         """The operator between the crop and the views."""
         return self.geometry.projector
 
-    @property
+    @cached_property
     def net_mask(self) -> Bool[Tensor, "b 1 d h w"] | None:
         """The mask of the world's networks; none where one of ones would change nothing, and take longer."""
         if not self.seen_by_nets or self.mask is None:

@@ -1,6 +1,8 @@
 import pytest
 import torch
 
+from mvrecon.kernels.rays import choice
+
 
 @pytest.fixture
 def threads():
@@ -8,3 +10,10 @@ def threads():
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def nothing_is_too_little(monkeypatch):
+    """Small volumes are looked at, too."""
+    monkeypatch.setattr(choice, "SOME", 0)
+    monkeypatch.setattr(choice, "MUCH", 0)

@@ -1,16 +1,15 @@
 """One projector in several threads: what a thread found out about its volume is its own."""
 
+import pytest
 import torch
 
 from mvrecon.geometry.box import Box
-from mvrecon.kernels.rays import choice
 from mvrecon.projectors import base
 from tests.projectors.test_skipping import CASES, volumes
 
 
+@pytest.mark.usefixtures("nothing_is_too_little")
 def test_what_another_thread_found_about_its_volume_is_not_read(monkeypatch):
-    monkeypatch.setattr(choice, "SOME", 0)  # small volumes are looked at, too
-    monkeypatch.setattr(choice, "MUCH", 0)
     A = CASES["cone"].build(skip="box")
     x = volumes("blob")
     expected = A(x)

@@ -11,11 +11,13 @@ from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.kernels.rays import choice, plan, reference
+from mvrecon.kernels.rays import plan, reference
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy
 from mvrecon.kernels.rays.scan import bricks_of
 from mvrecon.projectors import base
 from tests.projectors.cases import Case, curved
+
+pytestmark = pytest.mark.usefixtures("nothing_is_too_little")
 
 #: No size is a multiple of a brick's edge, and no two spacings are alike.
 GRID = Grid.centred((19, 26, 33), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
@@ -41,13 +43,6 @@ CASES = {
 }
 METHODS = ["joseph", "siddon", "trilinear", "trilinear:7"]
 WAYS = ["box", "brick", "auto", "verify"]
-
-
-@pytest.fixture(autouse=True)
-def nothing_is_too_little(monkeypatch):
-    """Small volumes are looked at, too."""
-    monkeypatch.setattr(choice, "SOME", 0)
-    monkeypatch.setattr(choice, "MUCH", 0)
 
 
 def volumes(kind: str, dtype: torch.dtype = torch.float32, count: int = 1) -> torch.Tensor:
