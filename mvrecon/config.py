@@ -90,6 +90,19 @@ def plugin_conf_dirs() -> list[Path]:
     return [Path(folder) for package in packages if package for folder in package.submodule_search_locations or ()]
 
 
+def app_file(config_name: str) -> Path:
+    """The YAML file of an app's settings: mvrecon's own, or that of an installed plugin.
+
+    Raises:
+        FileNotFoundError: no app has such a file.
+    """
+    folders = [conf_dir(), *plugin_conf_dirs()]
+    for file in (folder / f"{config_name}.yaml" for folder in folders):
+        if file.is_file():
+            return file
+    raise FileNotFoundError(f"No app has the settings {config_name}.yaml in any of {shown(map(str, folders))}")
+
+
 def prepare_hydra() -> None:
     """Make the schemas and the plugins' config groups known to Hydra, in this process only."""
     ConfigStore.instance().store(name="schema", node=Settings)
@@ -122,7 +135,7 @@ def help_text(config_name: str) -> str:
         for file in folder.glob("*/*.yaml"):
             choices.setdefault(file.parent.name, set()).add(file.stem)
     groups = "\n".join(f"  {group:<12}{', '.join(sorted(names))}" for group, names in sorted(choices.items()))
-    settings = (conf_dir() / f"{config_name}.yaml").read_text(encoding="utf-8")
+    settings = app_file(config_name).read_text(encoding="utf-8")
     return (
         f"Usage: mvrecon-{config_name} [group=choice ...] [key=value ...]\n\nGroups and their choices:\n{groups}\n\n"
         f"{settings}\n"

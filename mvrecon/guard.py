@@ -44,7 +44,7 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
         config = composed(overrides)
         foreign = [s.path for s in config.hydra.runtime.config_sources if s.schema == "file" and s.path not in trusted]
         if foreign:
-            if not (main / f"{config_name}.yaml").is_file():
+            if not any((folder / f"{config_name}.yaml").is_file() for folder in (main, *others)):
                 raise PermissionError(f"--config-name={config_name} is no app of mvrecon's; choose an experiment=...")
             check_foreign(config, foreign, overrides, composed)
         return _named(config)

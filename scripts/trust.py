@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from mvrecon.benchmarks.report import markdown
 from mvrecon.durable import written_whole
 from mvrecon.engine.record import versions
-from mvrecon.stresses.verdict import FAIL, LEFT_OUT, PASS
+from mvrecon_bench.benchmarks.report import markdown
+from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, PASS
 
 ROOT = Path(__file__).resolve().parents[1]
 FOUND = ROOT / "outputs" / "trust"
@@ -35,7 +35,7 @@ def done(*command: str, **environment: str) -> str:
 def stress(_: argparse.Namespace) -> Any:
     """The verdicts of the stress plan: rows by part and verdict, the cases, and what failed."""
     with tempfile.TemporaryDirectory() as folder:
-        done(sys.executable, "-m", "mvrecon.stress", f"out={folder}/stress")
+        done(sys.executable, "-m", "mvrecon_bench.stress", f"out={folder}/stress")
         rows = json.loads((Path(folder) / "stress" / "verdicts.json").read_text())
     parts: dict[str, Counter] = {}
     for row in rows:
@@ -49,7 +49,7 @@ def fuzz(given: argparse.Namespace) -> Any:
     """What became of damaged files, reader by reader."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.json"
-        done(sys.executable, "-m", "mvrecon.stresses.fuzzing", str(given.seed), str(given.fuzz), str(out))
+        done(sys.executable, "-m", "mvrecon_bench.stresses.fuzzing", str(given.seed), str(given.fuzz), str(out))
         return json.loads(out.read_text())
 
 
@@ -130,7 +130,7 @@ def figures(stress: Any, properties: Any, fuzz: Any, kills: Any, soak: Any) -> l
         ("properties", str(properties["properties"]), "`pytest tests/properties`"),
         ("random geometries that they were tried on", str(properties["examples"]), ""),
         ("of these, failures", str(properties["failing"]), ""),
-        ("damaged files given to readers", str(inputs), "`python -m mvrecon.stresses.fuzzing`"),
+        ("damaged files given to readers", str(inputs), "`python -m mvrecon_bench.stresses.fuzzing`"),
         ("of these, failures", str(hurt), ""),
         ("the slowest; the most memory", f"{slowest:.2f} s; {largest / 2**20:.0f} MB", ""),
         ("trainings killed at random, and resumed", str(kills["kills"]), "`python -m tests.engine.lives`"),

@@ -53,8 +53,6 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
         "mvrecon-train": "mvrecon.train:main",
         "mvrecon-eval": "mvrecon.eval:main",
         "mvrecon-simulate": "mvrecon.simulate:main",
-        "mvrecon-bench": "mvrecon.bench:main",
-        "mvrecon-stress": "mvrecon.stress:main",
         "mvrecon-list": "mvrecon.listing:main",
     }
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.benchmarks.measure import once, threads, with_memory
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import cpu, ops, plan, stores, upright
 from mvrecon.kernels.rays.loops import backproject_slabs, project_rows, room_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.parts import PROJECTORS
+from mvrecon_bench.benchmarks.measure import once, threads, with_memory
 from tests.projectors.cases import CASES, OPTIONS, Case, noise
 
 PIXELS = {"pixels": [48, 48], "pixel_mm": 1.5}

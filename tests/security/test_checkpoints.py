@@ -13,8 +13,8 @@ import torch
 from mvrecon.engine.archive import check_archive
 from mvrecon.engine.checkpoints import finished, load, unfinished
 from mvrecon.limits import Refused
-from mvrecon.stresses.samples import checkpoint
 from mvrecon.testing.hostile import SETTINGS, Payload, pickle_of, pickles, saved, with_pickle
+from mvrecon_bench.stresses.samples import checkpoint
 
 
 @pytest.fixture

@@ -1,0 +1,45 @@
+"""`mvrecon-bench`: run time against error of the projectors, and their cost against the work."""
+
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from mvrecon.config import import_plugins, launch, to_plain
+
+
+def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
+    """Run the benchmark that `settings` describes, go on where it was left, and return all its rows.
+
+    The folder then holds `results.csv`, `table.md`, `targets.md`, a plot, `config.yaml`, `versions.txt`, and all of it
+    on TensorBoard.
+    """
+    import_plugins(settings["plugins"])
+    from mvrecon.engine import record
+    from mvrecon_bench.benchmarks import runner
+    from mvrecon_bench.benchmarks.kinds import BENCHES
+
+    kind = BENCHES.from_config(settings["bench"])
+    record.start(folder, settings)
+    return runner.run(kind, folder)
+
+
+def task(config: DictConfig) -> None:
+    """One run of the app."""
+    from rich.console import Console
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    rows = bench(to_plain(config), folder)
+    skipped = sum(row["status"] != "ok" for row in rows)
+    tell = Console(markup=False, highlight=False).print
+    tell(f"{len(rows)} rows, {skipped} of them skipped; table, plot and targets are in {folder}", soft_wrap=True)
+
+
+def main() -> None:
+    """Entry point of `mvrecon-bench`."""
+    launch(task, "bench")
+
+
+if __name__ == "__main__":
+    main()

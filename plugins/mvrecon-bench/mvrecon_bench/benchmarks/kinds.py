@@ -1,0 +1,11 @@
+"""The benchmarks by name: `bench=<name>` takes its options from `conf/bench/<name>.yaml`."""
+
+from mvrecon.registry import Registry
+
+BENCHES = Registry(
+    "bench",
+    operators="mvrecon_bench.benchmarks.operators:Operators",
+    scaling="mvrecon_bench.benchmarks.scaling:Scaling",
+    precision="mvrecon_bench.benchmarks.precision:Precision",
+    skip="mvrecon_bench.benchmarks.skip:Skip",
+)

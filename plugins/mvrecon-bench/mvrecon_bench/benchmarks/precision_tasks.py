@@ -1,0 +1,110 @@
+"""What `bench=precision` does in each precision: operators, a U-Net, the cross-view model."""
+
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mvrecon.engine.checkpoints import load
+from mvrecon.metrics import volume_metrics
+from mvrecon.models.unet3d import UNet3d
+from mvrecon.parts import MODELS, PROJECTORS, SCENES
+from mvrecon.projectors.base import METHODS
+from mvrecon.scenes.voxelise import voxelise
+from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig
+
+#: Name -> what volumes and views are stored in, and what autocast computes networks in (none: as they are stored, at
+#: least float32).
+PRECISIONS: dict[str, tuple[torch.dtype, torch.dtype | None]] = {
+    "float64": (torch.float64, None),
+    "float32": (torch.float32, None),
+    "bfloat16 stored": (torch.bfloat16, None),
+    "float16 stored": (torch.float16, None),
+    "bfloat16 autocast": (torch.float32, torch.bfloat16),
+    "float16 autocast": (torch.float32, torch.float16),
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """Something to compute.
+
+    Args:
+        call: precision -> a call that does it.
+        score: PSNR in dB of what a call gave, where the model is trained.
+    """
+
+    call: Callable[[str], Callable[[], Tensor]]
+    score: Callable[[Tensor], float] | None = None
+
+
+def operator_tasks(case: Case) -> dict[str, Callable[[], Task]]:
+    """Forward and adjoint of each method on a case; the views of the adjoint are the forward's."""
+    return {
+        f"{method} {direction}": partial(_operator, case, method, direction)
+        for method in METHODS
+        for direction in ("forward", "adjoint")
+    }
+
+
+def _operator(case: Case, method: str, direction: str) -> Task:
+    x = voxelise(case.phantom(), case.grid()).double()[None, None].to(case.device)
+    A = PROJECTORS.build("drr", grid=case.grid(), cameras=case.cameras(), method=method).to(case.device)
+    given = x if direction == "forward" else A(x)
+
+    def call(precision: str) -> Callable[[], Tensor]:
+        operand = given.to(PRECISIONS[precision][0])
+        return (lambda: A(operand)) if direction == "forward" else (lambda: A.T(operand))
+
+    return Task(call)
+
+
+def net_task(options: Mapping[str, Any], device: str) -> Task:
+    """A U-Net with random weights on noise."""
+    torch.manual_seed(0)
+    n, inputs = options["n"], options["inputs"]
+    net = UNet3d(inputs, 1, options["width"]).to(device).eval()
+    x = torch.rand(1, inputs, n, n, n, dtype=torch.float64, device=device)
+    return Task(lambda precision: _run(net, x, precision))
+
+
+def model_task(settings: Mapping[str, Any], device: str) -> Task:
+    """The cross-view model on one scene: trained, or with random weights in all of its layers."""
+    if trained := settings.get("checkpoint") is not None:
+        module = load(Path(settings["checkpoint"])).module
+        A, net, scale = module.projector, module.model, module.hparams["data_range"]
+    else:
+        grid = cube({}, settings["n"])
+        A = PROJECTORS.build("drr", grid=grid, cameras=rig(settings["rig"], edge(grid), settings["n"]))
+        torch.manual_seed(0)
+        net, scale = MODELS.from_config(settings["model"], projector=A), 1.0
+        for parameter in net.parameters():  # the last layers start from zero, and would hide the rest
+            nn.init.normal_(parameter, std=0.1)
+    sample = SCENES.build("ellipsoids").sample(0, 1, A.grid, A.cameras)
+    views = sample.views[None].double().to(device)
+
+    def score(volume: Tensor) -> float:
+        return volume_metrics(volume[0].float().cpu(), sample.volume, sample.inside, scale)["psnr"]
+
+    return Task(lambda precision: _run(net.to(device).eval(), views, precision), score if trained else None)
+
+
+def _run(net: nn.Module, x: Tensor, precision: str) -> Callable[[], Tensor]:
+    """A network in a precision; halves are stored, and computed in float32 but for autocast."""
+    stored, auto = PRECISIONS[precision]
+    kept = stored if stored == torch.float64 else torch.float32
+    own, operand = deepcopy(net).to(kept), x.to(stored).to(kept)
+    device = x.device.type
+
+    def call() -> Tensor:
+        with torch.autocast(device, dtype=auto, enabled=auto is not None):
+            answer = own(operand)
+        return getattr(answer, "volume", answer)
+
+    return call

@@ -1,0 +1,170 @@
+"""`bench=skip`: what skipping gains, against the full cube and against the cropped volume, and what it changes."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.box import Box
+from mvrecon_bench.benchmarks import skip_report, targets
+from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.columns import SKIP, SKIP_KEYS
+from mvrecon_bench.benchmarks.measure import load_average, threads
+from mvrecon_bench.benchmarks.rows import Row
+from mvrecon_bench.benchmarks.skip_measure import compared
+from mvrecon_bench.benchmarks.skip_model import CHANGING, STATIC, Learned
+from mvrecon_bench.benchmarks.skip_scenes import Filled, cube, edge, filled, rig
+from mvrecon_bench.benchmarks.skip_tasks import DENSE, TASKS, Bed, Trial, reconstruction
+from mvrecon_bench.benchmarks.trial import reason
+
+#: The tasks that are not an operator's.
+MODEL = (CHANGING, STATIC)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One mode of one task on one scene under one rig."""
+
+    scene: str
+    rig: str
+    method: str
+    task: str
+    mode: str
+    n: int | None
+    device: str
+    threads: int
+
+    @property
+    def row(self) -> Row:
+        """The columns that tell this row from all others."""
+        return asdict(self)
+
+
+class Skip:
+    """Every task on every scene, all modes of one timed in turns.
+
+    Args:
+        scenes: name -> `{volume, rigs, ...}`, see `skip_scenes.filled`; `rigs` are names of `rigs`.
+        rigs: name -> cameras, see `skip_scenes.rig`.
+        tasks: name of `skip_tasks.TASKS` -> methods of the projector.
+        modes: of the projector's `skip`, besides off and cropped.
+        base: n, device (or auto), threads (0: all).
+        cross_view: model, n, rig, modes (kinds of support), `checkpoints` (scene -> file), `cases` over which a trained
+            model's PSNR is averaged; null leaves it out.
+        repeats: least number of calls of which a time is the median.
+
+    Raises:
+        ValueError: an unknown task, rig or scene.
+    """
+
+    columns: Mapping[str, str] = SKIP
+    keys: Sequence[str] = SKIP_KEYS
+    charts: Sequence[str] = ("ms", "over_full", "over_crop")
+
+    def __init__(
+        self,
+        scenes: Mapping[str, Mapping[str, Any]],
+        rigs: Mapping[str, Mapping[str, Any]],
+        tasks: Mapping[str, Sequence[str]],
+        modes: Sequence[str],
+        base: Mapping[str, Any],
+        cross_view: Mapping[str, Any] | None = None,
+        repeats: int = 5,
+    ):
+        asked = {name for scene in scenes.values() for name in scene["rigs"]}
+        trained = {name for name, path in (cross_view or {}).get("checkpoints", {}).items() if path is not None}
+        for what, names, known in (("task", tasks, TASKS), ("rig", asked, rigs), ("scene", trained, scenes)):
+            if unknown := set(names) - set(known):
+                raise ValueError(f"Unknown {what} {', '.join(sorted(unknown))}. Known: {', '.join(known)}")
+        self.scenes, self.rigs, self.tasks, self.modes = scenes, rigs, tasks, [*DENSE, *modes]
+        settled = Case(device=base["device"], threads=base["threads"])
+        self.n, self.device, self.threads = base["n"], settled.device, settled.threads
+        self.learned, self.repeats = cross_view, repeats
+        self._last: tuple[str, Filled] | None = None
+
+    def groups(self) -> list[list[Job]]:
+        """What is measured together: the modes of a task."""
+        found = []
+        for name, scene in self.scenes.items():
+            where = {"device": self.device, "threads": self.threads}
+            for rig_name in scene["rigs"]:
+                for task, methods in self.tasks.items():
+                    keys = [{"rig": rig_name, "method": method, "task": task} for method in methods]
+                    found += [[Job(name, **key, mode=mode, n=self.n, **where) for mode in self.modes] for key in keys]
+            if self.learned:
+                trained = self.learned["checkpoints"].get(name) is not None
+                n = None if trained else self.learned["n"]
+                for task in MODEL:
+                    key = {"rig": "trained" if trained else "model", "method": "joseph", "task": task}
+                    found.append([Job(name, **key, mode=mode, n=n, **where) for mode in self._modes(task)])
+        return found
+
+    def _modes(self, task: str) -> list[str]:
+        return [*DENSE, *self.learned["modes"]] if task in MODEL and self.learned else self.modes
+
+    def label(self, row: Row) -> str:
+        """A row's case and mode, short."""
+        return skip_report.label(row)
+
+    def measure(self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]) -> Iterator[Row]:
+        """The rows of some modes of a task; all of its modes are timed, since they only compare side by side."""
+        job = jobs[0]
+        say(f"{job.scene}, {job.rig}, {job.method}: {job.task}")
+        common: Row = {"load": load_average()}
+        with threads(job.threads), torch.no_grad():
+            try:
+                setup, known = self._model(job) if job.task in MODEL else self._operator(job)
+                found = compared(setup, self._modes(job.task), self.repeats, job.device)
+                common |= known
+            except Exception as error:  # what a scene, a rig or a file raises is its rows' status
+                found = {each.mode: {"status": f"skipped: {reason(error)}"} for each in jobs}
+        for each in jobs:
+            yield {**each.row, **common, **found[each.mode]}
+
+    def _operator(self, job: Job) -> tuple[Callable[[str], Trial], Row]:
+        """How a mode of an operator's task is set up, and what is known of the case."""
+        scene, task = self.scenes[job.scene], TASKS[job.task]
+        if self._last is None or self._last[0] != job.scene:
+            self._last = job.scene, filled(scene, cube(scene, self.n))
+        what = self._last[1]
+        bed = Bed(what, rig(self.rigs[job.rig], edge(what.grid), self.n), job.method, job.device)
+        known = facts(what.source, what.volume != 0, bed.cameras)
+        if task is reconstruction:
+            known["support"] = bed.within_hull.mask.double().mean().item()
+        return partial(task, bed), known
+
+    def _model(self, job: Job) -> tuple[Callable[[str], Trial], Row]:
+        """The same of the model's."""
+        assert self.learned is not None
+        checkpoint = self.learned["checkpoints"].get(job.scene)
+        learned = Learned.of(self.scenes[job.scene], self.learned, checkpoint, job.device)
+        known = facts(learned.first.source, learned.first.volume[0] != 0, learned.A.cameras)
+        return partial(learned.trial, job.task), known | {"support": learned.support("hull").fraction}
+
+    def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
+        """Write `speedups.png` where matplotlib is installed; the texts of the tables by name."""
+        panels = skip_report.panels(rows)
+        if panels and find_spec("matplotlib"):
+            from mvrecon_bench.benchmarks import plots  # of the optional extra `bench`
+
+            plots.speedups(panels, folder / "speedups.png")
+        base = {"device": self.device, "threads": self.threads}
+        return {"table": skip_report.table(rows, self.columns), "targets": targets.table(targets.SKIP, rows, base)}
+
+
+def facts(source: str, there: Bool[Tensor, "d h w"], cameras: Cameras) -> Row:
+    """What a row tells of a volume, by its voxels that are not zero, and of a rig."""
+    return {
+        "source": source,
+        "grid": "x".join(map(str, there.shape)),
+        "views": "x".join(map(str, (len(cameras), *cameras.shape))),
+        "occupancy": there.double().mean().item(),
+        "box": Box.around(there).size / there.numel(),
+    }

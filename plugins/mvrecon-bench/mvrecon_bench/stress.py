@@ -1,0 +1,62 @@
+"""`mvrecon-stress`: the stress plan on any operator, camera, head or model, a plugin's included."""
+
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from mvrecon.config import import_plugins, launch, to_plain
+
+
+def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
+    """Do the plan that `settings` describes, go on where it was left, and return all its verdicts.
+
+    The folder then holds `results.csv`, `verdicts.json`, `table.md`, `config.yaml`, `versions.txt`, and all of it on
+    TensorBoard.
+    """
+    import_plugins(settings["plugins"])
+    from mvrecon.engine import record
+    from mvrecon_bench.benchmarks import runner
+    from mvrecon_bench.stresses.stress import Stress
+
+    chosen = (settings["parts"], settings["cases"] or (), settings["device"], settings["dtypes"])
+    plan = Stress(*chosen, settings["limit_s"])
+    record.start(folder, settings)
+    return runner.run(plan, folder)
+
+
+def task(config: DictConfig) -> None:
+    """One run of the app.
+
+    Raises:
+        SystemExit: a case failed.
+    """
+    from rich.console import Console
+
+    from mvrecon_bench.stresses.stress import counts
+    from mvrecon_bench.stresses.verdict import FAIL
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    rows = stress(to_plain(config), folder)
+    tell = Console(markup=False, highlight=False).print
+    found = counts(rows)
+    for row in rows:
+        if row["verdict"] == FAIL:
+            tell(
+                f"FAIL {row['number']:.0f} {row['case']}, {row['part']} {row['dtype']}: {row.get('measured')} > "
+                f"{row['tolerance']:g} {row.get('note', '')}",
+                soft_wrap=True,
+            )
+    tell(f"{', '.join(f'{count} {verdict}' for verdict, count in found.items())}; all is in {folder}", soft_wrap=True)
+    if found[FAIL]:
+        raise SystemExit(1)
+
+
+def main() -> None:
+    """Entry point of `mvrecon-stress`."""
+    launch(task, "stress")
+
+
+if __name__ == "__main__":
+    main()

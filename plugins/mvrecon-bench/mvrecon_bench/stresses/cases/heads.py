@@ -1,0 +1,119 @@
+"""Heads: logits, priors and views at the ends of their ranges."""
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from mvrecon.models.lift import Frusta
+from mvrecon.models.weighting import fuse
+from mvrecon.testing import check_head
+from mvrecon_bench.stresses.case import Case
+from mvrecon_bench.stresses.learned import GRID, HeadSubject, small_rig
+from mvrecon_bench.stresses.refusals import none_of
+from mvrecon_bench.stresses.subject import Subject, gap, greatest
+
+#: Of a sum over the bins of a ray.
+SUMS = {torch.float64: 1e-12, torch.float32: 1e-5}
+
+
+def contract(subject: HeadSubject) -> float:
+    """`mvrecon.testing.check_head`."""
+    check_head(subject.name, Frusta(GRID, small_rig(), depth=10), **subject.options)
+    return 0.0
+
+
+def extremes(subject: HeadSubject) -> Iterator[tuple[str, tuple[Tensor, Tensor, Tensor]]]:
+    """Logits, prior and views that are large, small, alike, or nothing."""
+    logits, prior, views = subject.given
+    one = torch.full_like(logits, -1e4)
+    one[:, :, :, 4] = 1e4
+    for name, bad in (("1e4", torch.full_like(logits, 1e4)), ("-1e4", torch.full_like(logits, -1e4))):
+        yield f"logits of {name}", (bad, prior, views)
+    yield "logits of 1e6 and -1e6", (1e6 * logits.sign(), prior, views)
+    yield "logits of 1e4 in one bin", (one, prior, views)
+    yield "logits of nought", (logits * 0, prior, views)
+    yield "a prior of nought", (logits, prior * 0, views)
+    yield "a prior below nought", (logits, -prior, views)
+    yield "a prior of 1e-30", (logits, 1e-30 * prior, views)
+    yield "a prior of 1e12", (logits, 1e12 * prior, views)
+    yield "a prior in one bin", (logits, prior * (one > 0), views)
+    yield "views of nothing", (logits, prior, views * 0)
+    yield "views of nothing, no prior", (logits, prior * 0, views * 0)
+    yield "views of 1e-30", (logits, 1e-30 * prior, 1e-30 * views)
+    yield "views of 1e12", (logits, prior, 1e12 * views)
+    yield "views below nought", (logits, prior, -views)
+
+
+def at_the_ends(subject: HeadSubject) -> float:
+    """A density that is finite and within the region, and finite gradients."""
+    found = {}
+    for name, given in extremes(subject):
+        leaves = [each.clone().requires_grad_() for each in given]
+        density = subject.head(*leaves, subject.frusta)
+        slopes = torch.autograd.grad(density.sum(), leaves, allow_unused=True)
+        wrong = {
+            "densities not finite": ~density.isfinite(),
+            "densities outside": (density * ~subject.frusta.occupied) != 0,
+            "gradients not finite": torch.cat([~each.isfinite().flatten() for each in slopes if each is not None]),
+        }
+        found |= {f"{name}, {what}": str(int(hit.sum())) for what, hit in wrong.items() if hit.any()}
+    return none_of(found)
+
+
+def views_kept(subject: HeadSubject) -> float:
+    """What a head that keeps views integrates to, for the same; of any head, nothing from nothing."""
+    errors = [0.0]
+    for _, (logits, prior, views) in extremes(subject):
+        density = subject.head(logits, prior, views, subject.frusta)
+        if subject.head.keeps_views:
+            errors.append(gap(subject.frusta.integrate(density), views))
+        elif not views.any() and not prior.any():
+            errors.append(float(density.abs().max()))
+    return greatest(errors)
+
+
+def bad_logits(subject: HeadSubject) -> float:
+    """One logit that is NaN: that bin is, and no ray but its own."""
+    logits, prior, views = subject.given
+    *_, d, v, u = (int(i) for i in subject.frusta.occupied[0, 0].nonzero()[0])
+    wrong = 0
+    for bad in (math.nan, math.inf):
+        spoilt = logits.clone()
+        spoilt[0, 0, 0, d, v, u] = bad
+        density = subject.head(spoilt, prior, views, subject.frusta)
+        wrong += int(density[0, 0, 0, d, v, u].isfinite())
+        density[0, 0, 0, :, v, u] = 0
+        wrong += int((~density.isfinite()).sum())
+    return wrong
+
+
+def no_ray_hits(subject: HeadSubject) -> float:
+    """Frusta of which no bin may hold anything."""
+    frusta = Frusta(GRID, small_rig(), depth=10).to(subject.device, subject.dtype)
+    frusta.occupied.zero_()
+    density = subject.head(*subject.given, frusta)
+    return float((density != 0).sum())  # true of NaN, too
+
+
+def fused_weights(subject: Subject) -> float:
+    """The weights of three cameras' opinions from logits of any size: one in sum where any sees."""
+    visible = subject.random(3, 1, 4, 5, 6) < 0.5
+    wrong = []
+    for size in (0.0, 1e4, -1e4, 1e30, -1e30):
+        logits = torch.full((2, 3, 1, 4, 5, 6), size, dtype=subject.dtype)
+        volume, weights = fuse(subject.random(2, 3, 1, 4, 5, 6), logits, visible)
+        expected = visible.to(subject.dtype) / visible.sum(dim=0).clamp_min(1)
+        wrong += [float((weights - expected).abs().max()), float(volume.isnan().sum())]
+    return greatest(wrong)
+
+
+CASES = (
+    Case(19, "rays that miss", "a density of zero", "head", no_ray_hits),
+    Case(47, "a logit that is NaN", "is not hidden, and spoils its own ray alone", "head", bad_logits),
+    Case(53, "logits, priors, views at the ends of their range", "all is finite, none outside", "head", at_the_ends),
+    Case(53, "views, with all these", "are kept where promised; nothing from nothing", "head", views_kept, SUMS),
+    Case(53, "fusion by logits of any size", "weights are one in sum", "mvrecon", fused_weights, SUMS),
+    Case(61, "the contract of a head", "is kept", "head", contract),
+)

@@ -1,0 +1,204 @@
+"""Again: twice, on more threads, in other threads and processes, many times over; and what a call leaves behind."""
+
+import multiprocessing
+import random
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import MODELS, PROJECTORS, SCENES
+from mvrecon.projectors.base import Projector
+from mvrecon_bench.benchmarks.measure import threads, with_memory
+from mvrecon_bench.stresses.apart import LIMIT, python
+from mvrecon_bench.stresses.case import Case, DoesNotApply
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits, rig_about
+
+#: Work for several threads.
+WORK = Grid.centred((28, 29, 30), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+PIXELS = {"pixels": [70, 70], "pixel_mm": 0.19, "offset_mm": [0.04, -0.03]}
+#: Loops over which memory must stay as it is, after as many as fill what is kept.
+LOOPS, FIRST = 500, 50
+#: Seconds after which another process is taken to hang; a fresh one may have to compile.
+PATIENCE = {"fork": 30.0, "spawn": LIMIT}
+SINGLE, DOUBLE = (torch.float32,), (torch.float64,)
+
+
+def both(subject: ProjectorSubject) -> list[Tensor]:
+    """Views and adjoint of some noise, in main memory."""
+    A = subject.projector(WORK, rig := subject.rig(WORK, PIXELS, views=2))
+    x, y = subject.random(1, 1, *WORK.shape), subject.random(1, 1, len(rig), *rig.shape, seed=1)
+    return [A(x).cpu(), A.T(y).cpu()]
+
+
+def differ(found: list[Tensor], expected: list[Tensor]) -> float:
+    """How many values of all are not the same."""
+    return sum(bits(*pair) for pair in zip(found, expected, strict=True))
+
+
+def again(subject: ProjectorSubject) -> float:
+    """The same twice, and with an operator made anew."""
+    A = subject.projector(GRID, rig := subject.rig())
+    x, y = subject.random(3, 2, *GRID.shape), subject.random(3, 2, len(rig), *rig.shape)
+    other = subject.projector(GRID, rig)
+    return differ([A(x), A.T(y), other(x), other.T(y)], 2 * [A(x), A.T(y)])
+
+
+def more_threads(subject: ProjectorSubject) -> float:
+    """On 1, 2 and 8 threads."""
+    found = []
+    for count in (1, 2, 8):
+        with threads(count):
+            found.append(both(subject))
+    return differ(found[1], found[0]) + differ(found[2], found[0])
+
+
+def at_once(subject: ProjectorSubject) -> float:
+    """One operator called by eight threads of Python at once, each with a volume of its own, most of it empty."""
+    A = subject.projector(WORK, rig := subject.rig(WORK, {"pixels": [12, 11], "pixel_mm": 1.1}))
+    layers = torch.arange(WORK.shape[0], device=subject.device)[:, None, None] // 4
+    volumes = [subject.random(1, 1, *WORK.shape, seed=i) * (layers == i) for i in range(8)]
+    views = subject.random(8, 1, 1, len(rig), *rig.shape)
+    if isinstance(A, Projector):
+        A.skip = "box"
+    expected = [A(x) for x in volumes] + [A.T(y) for y in views]
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            found = [[*pool.map(A, volumes), *pool.map(A.T, views)] for _ in range(3)]
+    finally:
+        sys.setswitchinterval(before)
+    return sum(differ(each, expected) for each in found)
+
+
+def forked(subject: ProjectorSubject) -> float:
+    """In a process forked from this one, whose threads have worked before: as torch's own workers, on one thread."""
+    if subject.device != "cpu" or "fork" not in multiprocessing.get_all_start_methods():
+        raise DoesNotApply("a GPU's context does not survive a fork, and some systems have none")
+    with threads(2):
+        expected = both(subject)
+        return differ(_elsewhere("fork", [subject])[0], expected)
+
+
+def spawned(subject: Subject) -> float:
+    """In a fresh process."""
+    kinds = [(name, dtype) for name in ("drr", "radon") for dtype in SINGLE + DOUBLE]
+    ours = [ProjectorSubject("projector", name, {}, "cpu", dtype) for name, dtype in kinds]
+    pairs = zip(_elsewhere("spawn", ours), map(both, ours), strict=True)
+    return sum(differ(found, expected) for found, expected in pairs)
+
+
+def _elsewhere(method: str, given: list[ProjectorSubject]) -> list[list[Tensor]]:
+    with multiprocessing.get_context(method).Pool(1, torch.set_num_threads, (1,)) as pool:
+        found = pool.map_async(_numbers, given).get(PATIENCE[method])
+    return [[torch.from_numpy(each) for each in arrays] for arrays in found]
+
+
+def _numbers(subject: ProjectorSubject) -> list[np.ndarray]:
+    return [each.numpy() for each in both(subject)]
+
+
+@contextmanager
+def undrawn() -> Iterator[list[str]]:
+    """Names, when it ends, the global generators from which something was drawn inside."""
+    states: dict[str, Callable[[], object]] = {
+        "random": random.getstate,
+        "numpy": lambda: [str(part) if isinstance(part, int | float | str) else part.tobytes() for part in _numpy()],
+        "torch": lambda: torch.get_rng_state().tolist(),
+        "cuda": lambda: [state.tolist() for state in torch.cuda.get_rng_state_all()] if _has_gpu() else None,
+    }
+    before, drawn = {name: state() for name, state in states.items()}, []
+    yield drawn
+    drawn += [name for name, state in states.items() if state() != before[name]]
+
+
+def _numpy() -> tuple:
+    return np.random.get_state(legacy=True)  # type: ignore[return-value]
+
+
+def _has_gpu() -> bool:
+    return torch.cuda.is_available() and torch.cuda.is_initialized()
+
+
+def draws_nothing(subject: ProjectorSubject) -> float:
+    """Making an operator, with and without a support, using it, and its derivative."""
+    x = subject.random(1, 1, *WORK.shape) * (subject.random(*WORK.shape, seed=1) > 0.9)
+    with undrawn() as drawn:
+        A = subject.projector(WORK, subject.rig(WORK, {"pixels": [9, 8], "pixel_mm": 1.5}))
+        for B in [A, A.with_support(x[0, 0].cpu() > 0)] if isinstance(A, Projector) else [A]:
+            views = B(x.requires_grad_())
+            torch.autograd.grad(views.square().sum() + B.T(views).sum(), x)
+    return float(len(drawn))
+
+
+def evaluation_draws_nothing(subject: Subject) -> float:
+    """Scenes by index, evaluation of a model, pictures, and what is written to the board."""
+    from mvrecon.engine.evaluation import evaluate
+    from mvrecon.engine.loggers import Board
+    from mvrecon.viz import montage
+
+    grid = Grid.centred((7, 8, 9), 1.0)
+    rig = rig_about(grid)
+    A = PROJECTORS.build("drr", grid=grid, cameras=rig)
+    model = MODELS.build("backprojection", projector=A)
+    with undrawn() as drawn, TemporaryDirectory() as folder:
+        scene = SCENES.build("ellipsoids").sample(3, 5, grid, rig)
+        batch = {"views": scene.views[None], "volume": scene.volume[None], "inside": scene.inside[None], "name": ["0"]}
+        scores = evaluate({"model": model}, [batch], A, 1.0)
+        board = Board(folder)
+        board.log_metrics({"psnr": scores["model"][0]["psnr"]}, 0)
+        picture = montage.views(scene.views[0], A(scene.volume[None])[0, 0])
+        board.experiment.add_image("views", picture, 0, dataformats="HWC")
+        board.finalize("success")
+    return float(len(drawn))
+
+
+def loops(subject: ProjectorSubject) -> float:
+    """Forward and backward again and again: by how many volumes memory grows in a loop."""
+    grid = Grid.centred((32, 33, 34), 1.0)
+    A = subject.projector(grid, subject.rig(grid, {"pixels": [4, 4], "pixel_mm": 6.0}, views=2))
+    x = subject.random(1, 1, *grid.shape).requires_grad_()
+
+    def run(count: int) -> None:
+        for _ in range(count):
+            torch.autograd.grad(A(x).square().sum(), x)
+
+    run(FIRST)
+    short, long = (with_memory(lambda count=count: run(count), subject.device)[1] for count in (FIRST, LOOPS))
+    return (long - short) * 2**20 / (LOOPS - FIRST) / (x.numel() * x.element_size())
+
+
+def imported(subject: Subject) -> float:
+    """A fresh process imports every part of ours: its seconds of work beyond torch's; without end if it woke a GPU."""
+    code = (
+        "import time, torch; begin = time.process_time()\n"
+        "from mvrecon.parts import REGISTRIES as known\n"
+        "parts = [(kind, name) for kind in known for name in known[kind].names()]\n"
+        "for kind, name in parts:\n"
+        "    if known[kind].origin(name).startswith('mvrecon.'): known[kind].get(name)\n"
+        "print(time.process_time() - begin, torch.cuda.is_initialized())"
+    )
+    done = python("-c", code)
+    done.check_returncode()
+    seconds, woken = done.stdout.split()
+    return float("inf") if woken != "False" else float(seconds)
+
+
+CASES = (
+    Case(74, "again", "the same bits", "projector", again),
+    Case(74, "on 1, 2 and 8 threads", "the same bits", "projector", more_threads),
+    Case(74, "from eight threads of Python", "the same bits", "projector", at_once),
+    Case(74, "in a forked process", "the same bits", "projector", forked, dtypes=SINGLE),
+    Case(74, "in a spawned process", "the same bits", "mvrecon", spawned, dtypes=SINGLE),
+    Case(75, "random numbers of others", "none is drawn", "projector", draws_nothing),
+    Case(75, "random numbers of others", "none is drawn", "mvrecon", evaluation_draws_nothing, dtypes=SINGLE),
+    Case(76, "memory over 500 loops", "grows by less than a tenth of a volume each", "projector", loops, 0.1, SINGLE),
+    Case(78, "a fresh process imports all parts", "within 2 s beyond torch, no GPU", "mvrecon", imported, 2.0, SINGLE),
+)

@@ -1,0 +1,110 @@
+"""Heads and models under stress: small frusta, a small rig, and weights that are all in use."""
+
+import inspect
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.rigs import circular
+from mvrecon.geometry.grid import Grid
+from mvrecon.models.lift import Frusta
+from mvrecon.parts import MODELS, PROJECTORS
+from mvrecon.projectors.base import Projector
+from mvrecon_bench.stresses.case import DoesNotApply
+from mvrecon_bench.stresses.subject import Subject, gap
+
+#: No two sizes alike; the detectors see beside it.
+GRID = Grid.centred((8, 9, 10), 2.0)
+#: What a model is given that needs it, or has a dearer default, and was not given it.
+NEEDED = {"head": {"name": "softmax_depth"}}
+CHEAPER = {"iterations": 8, "start": 4}
+
+
+def small_rig(views: int = 3) -> Cameras:
+    """Cone beams that miss the grid at the detectors' edges; the detectors' sizes are multiples of 3."""
+    return circular(views, 60.0, 120.0, {"pixels": [12, 15], "pixel_mm": [5.0, 4.5]}, start_degrees=13.0)
+
+
+class HeadSubject(Subject):
+    """A head under stress."""
+
+    @cached_property
+    def frusta(self) -> Frusta:
+        """Small ones, some of whose rays miss the grid."""
+        return Frusta(GRID, small_rig(), depth=10).to(self.device, self.dtype)
+
+    @cached_property
+    def head(self) -> nn.Module:
+        """The head."""
+        return self.build().to(self.device, self.dtype)
+
+    @cached_property
+    def given(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits and prior [2 m 1 D v u], and views [2 1 m v u] of nothing where a ray misses."""
+        m, (depth, v, u) = len(self.frusta.step), self.frusta.shape
+        shape = (2, m, 1, depth, v, u)
+        seen = self.frusta.chord.reshape(m, v, u) > 0
+        return 6 * self.random(*shape) - 3, self.random(*shape, seed=1), self.random(2, 1, m, v, u, seed=2) * seen
+
+
+class ModelSubject(Subject):
+    """A model under stress."""
+
+    def projector(self, cameras: Cameras | None = None) -> Projector:
+        """The operator of the small rig, or of another one."""
+        return PROJECTORS.build("drr", grid=GRID, cameras=cameras or small_rig()).to(self.device)
+
+    def model(self, cameras: Cameras | None = None, **options: Any) -> nn.Module:
+        """A new model with its first weights, the same each time, in evaluation.
+
+        Raises:
+            DoesNotApply: it needs an option that it was not given.
+        """
+        given = {**self.options, **options}
+        for name, parameter in inspect.signature(MODELS.get(self.name)).parameters.items():
+            if name in ("projector", *given) or parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+                continue
+            if name in CHEAPER and isinstance(parameter.default, int):
+                given[name] = CHEAPER[name]
+            elif parameter.default is parameter.empty:
+                if name not in NEEDED:
+                    raise DoesNotApply(f"it needs {name}; stress it as {{kind: model, name: {self.name}, {name}: ..}}")
+                given[name] = NEEDED[name]
+        torch.manual_seed(0)
+        return self.build(**{**given, "projector": self.projector(cameras)}).to(self.device, self.dtype).eval()
+
+    def stirred(self, cameras: Cameras | None = None, **options: Any) -> nn.Module:
+        """A new model with random weights, so that layers which start at zero take part."""
+        model, rng = self.model(cameras, **options), torch.Generator().manual_seed(1)
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter += 0.1 * torch.randn(parameter.shape, generator=rng).to(parameter)
+        return model
+
+    @cached_property
+    def used(self) -> nn.Module:
+        """One such model, for cases that leave it as it is."""
+        return self.stirred()
+
+    @cached_property
+    def truth(self) -> Float[Tensor, "3 1 d h w"]:
+        """Three blobs, as many as there are cameras."""
+        volume = torch.zeros(3, 1, *GRID.shape, dtype=self.dtype, device=self.device)
+        volume[:, :, 2:6, 2:7, 3:8] = 0.5 + self.random(3, 1, 4, 5, 5)
+        return volume
+
+    @cached_property
+    def views(self) -> Float[Tensor, "3 1 m v u"]:
+        """Their views."""
+        return self.projector()(self.truth)
+
+    @cached_property
+    def scales(self) -> bool:
+        """Whether it claims that a multiple of the views gives that multiple of the volume: it does so for 8."""
+        with torch.no_grad():
+            volume, other = (self.used(scale * self.views[:1]).volume for scale in (1, 8))
+        return gap(other / 8, volume) < 1e-3

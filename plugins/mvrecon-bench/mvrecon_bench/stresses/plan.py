@@ -1,0 +1,105 @@
+"""Which cases are done to which subjects."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib import import_module
+from typing import Any
+
+from mvrecon.parts import REGISTRIES
+from mvrecon.projectors.base import METHODS
+from mvrecon.registry import hint
+from mvrecon_bench.benchmarks.cases import DTYPES
+from mvrecon_bench.stresses.case import KINDS, Case
+from mvrecon_bench.stresses.subject import Subject, subject_of
+
+#: The files of cases, in the plan's order.
+FILES = (
+    "rays",
+    "scales",
+    "algebra",
+    "cameras",
+    "poses",
+    "heads",
+    "models",
+    "counts",
+    "settings",
+    "files",
+    "runs",
+    "tensors",
+    "values",
+    "sizes",
+    "repeats",
+    "gpu",
+)
+
+
+def cases() -> list[Case]:
+    """Every case, by number.
+
+    Raises:
+        ValueError: two cases of one number are done to one kind of part.
+    """
+    found = [case for file in FILES for case in import_module(f"mvrecon_bench.stresses.cases.{file}").CASES]
+    keys = [(case.number, case.kind, case.name) for case in found]
+    if len(set(keys)) < len(keys):
+        raise ValueError(f"Two cases are the same: {sorted(key for key in set(keys) if keys.count(key) > 1)}")
+    return sorted(found, key=lambda case: case.number)
+
+
+def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> list[Subject]:
+    """What a plan is done to.
+
+    Args:
+        parts: "all", or names and mappings `{kind: ..., name: ..., **options}`; a name alone is looked up in all kinds.
+        device: on which it is done.
+        dtypes: names of `DTYPES`.
+
+    Raises:
+        LookupError: an unknown part, kind or dtype.
+    """
+    for dtype in dtypes:
+        if dtype not in DTYPES:
+            raise LookupError(f"No dtype is named {dtype!r}{hint(dtype, DTYPES)}")
+    named = every_part() if parts == "all" else [_part(each) for each in _listed(parts)]
+    return [subject_of(kind, name, options, device, DTYPES[dtype]) for kind, name, options in named for dtype in dtypes]
+
+
+def every_part() -> list[tuple[str, str, dict[str, Any]]]:
+    """Kind, name and options of all that is registered, plugins included, and of mvrecon itself.
+
+    Our own projectors come with each of their methods.
+    """
+    found: list[tuple[str, str, dict[str, Any]]] = []
+    for kind in KINDS[:-1]:
+        for name in REGISTRIES[kind].names():
+            ours = kind == "projector" and REGISTRIES[kind].origin(name).startswith("mvrecon.")
+            found += [(kind, name, {"method": method}) for method in METHODS] if ours else [(kind, name, {})]
+    return [*found, ("mvrecon", "", {})]
+
+
+def jobs(given: Iterable[Subject], chosen: Sequence[int] = ()) -> Iterator[tuple[Case, Subject]]:
+    """Each case with each subject that it is meant for; only these numbers, where some are chosen."""
+    every = [case for case in cases() if not chosen or case.number in chosen]
+    for subject in given:
+        for case in every:
+            if case.kind == subject.kind and subject.dtype in case.dtypes:
+                yield case, subject
+
+
+def _listed(parts: str | Sequence[Any]) -> Sequence[Any]:
+    return [parts] if isinstance(parts, str) else parts
+
+
+def _part(given: str | Mapping[str, Any]) -> tuple[str, str, dict[str, Any]]:
+    """Kind, name and options of one part."""
+    if isinstance(given, str):
+        given = {"name": given}
+    options = {key: value for key, value in given.items() if key not in ("kind", "name")}
+    name = given.get("name", "")
+    if given.get("kind", name) == "mvrecon":
+        return "mvrecon", "", {}
+    kinds = [given["kind"]] if "kind" in given else [kind for kind in KINDS[:-1] if name in REGISTRIES[kind].names()]
+    if not kinds or kinds[0] not in KINDS:
+        known = [each for kind in KINDS[:-1] for each in REGISTRIES[kind].names()]
+        raise LookupError(f"No part to stress is {dict(given)}{hint(name, known)}")
+    REGISTRIES[kinds[0]].origin(name)
+    return kinds[0], name, options

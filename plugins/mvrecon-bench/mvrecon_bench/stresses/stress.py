@@ -1,0 +1,105 @@
+"""The stress plan as something that the runner of benchmarks can run: rows that outlive a crash, report and board."""
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mvrecon.engine import record
+from mvrecon_bench.benchmarks.report import legend, markdown
+from mvrecon_bench.benchmarks.rows import Row
+from mvrecon_bench.stresses import plan
+from mvrecon_bench.stresses.case import Case
+from mvrecon_bench.stresses.subject import Subject
+from mvrecon_bench.stresses.verdict import COLUMNS, FAIL, LEFT_OUT, PASS, identity, judge
+from mvrecon_bench.stresses.watchdog import LIMIT
+
+SHOWN = ("number", "case", "holds", "measured", "tolerance", "verdict", "note")
+KEYS = ("number", "part", "case", "device", "dtype")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A case that is done to a subject."""
+
+    case: Case
+    subject: Subject
+
+    @property
+    def row(self) -> Row:
+        """The columns that tell it from all others."""
+        return identity(self.case, self.subject)
+
+
+class Stress:
+    """The plan for some parts.
+
+    Args:
+        parts: "all", or a list of names and of mappings `{kind: ..., name: ..., **options}`.
+        cases: numbers of the plan; none: all.
+        device: on which it is done.
+        dtypes: of volumes and views.
+        limit_s: seconds that a case may take.
+
+    Raises:
+        LookupError: an unknown part, or an unknown dtype.
+    """
+
+    columns: Mapping[str, str] = COLUMNS
+    keys: Sequence[str] = KEYS
+    charts: Sequence[str] = ("measured",)
+
+    def __init__(
+        self,
+        parts: str | Sequence[str | Mapping] = "all",
+        cases: Sequence[int] = (),
+        device: str = "cpu",
+        dtypes: Sequence[str] = ("float64", "float32"),
+        limit_s: float = LIMIT,
+    ):
+        self.subjects, self.cases, self.limit_s = plan.subjects(parts, device, dtypes), cases, limit_s
+
+    def groups(self) -> list[list[Job]]:
+        """The cases of each subject."""
+        return [[Job(*pair) for pair in plan.jobs([subject], self.cases)] for subject in self.subjects]
+
+    def label(self, row: Row) -> str:
+        """A row's part and case, short."""
+        return f"{row['number']:.0f} {row['part']} {row['dtype']}"
+
+    def measure(self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]) -> Iterator[Row]:
+        """A verdict for each job."""
+        for job in jobs:
+            say(f"{job.subject.label}: {job.case.name}")
+            yield judge(job.case, job.subject, self.limit_s)
+
+    def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
+        """The table, and all rows as JSON."""
+        record.write(folder / "verdicts.json", json.dumps(list(rows), indent=1) + "\n")
+        return {"table": table(rows)}
+
+
+def counts(rows: Sequence[Row]) -> dict[str, int]:
+    """How many rows have each verdict."""
+    found = Counter(str(row["verdict"]) for row in rows)
+    return {verdict: found[verdict] for verdict in (PASS, FAIL, LEFT_OUT)}
+
+
+def table(rows: Sequence[Row]) -> str:
+    """All rows as Markdown: what failed first, then part by part."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["part"], row["dtype"], row["device"]), []).append(row)
+    summary = [(*key, *map(str, counts(members).values())) for key, members in groups.items()]
+    text = "# Stress plan\n\n" + markdown(("part", "dtype", "device", *counts(rows)), summary, 3)
+    failed = [[row["part"], row["dtype"], *_cells(row)] for row in rows if row["verdict"] == FAIL]
+    if failed:
+        text += f"\n## Failed\n\n{markdown(('part', 'dtype', *SHOWN), failed, len(SHOWN) + 2)}"
+    for key, members in groups.items():
+        text += f"\n## {', '.join(key)}\n\n{markdown(SHOWN, map(_cells, members), len(SHOWN))}"
+    return text + legend(COLUMNS)
+
+
+def _cells(row: Row) -> list[str]:
+    return [format(found, ".3g") if isinstance(found := row.get(name, ""), float) else found for name in SHOWN]

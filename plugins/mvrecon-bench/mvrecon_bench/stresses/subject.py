@@ -1,0 +1,248 @@
+"""What is put under stress: a part by name, with its options, on a device and in a dtype."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from importlib import import_module
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import VECTORS, Cameras, Extent
+from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import REGISTRIES
+from mvrecon_bench.stresses.case import DoesNotApply
+
+#: No two sizes or spacings alike, off the origin.
+GRID = Grid.centred((5, 6, 7), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+BEAMS: tuple[tuple[bool, Extent], ...] = ((False, "segment"), (True, "segment"), (False, "behind"))
+#: What a projector is taken to claim, and what a plugin's class says by setting an attribute of this name to False.
+CLAIMS = {
+    "matched": "its adjoint is not the transpose of its forward",
+    "local": "a number that is none is seen beyond the rays that meet it",
+    "bits": "its rays are rounded, so that sums which are exact in floating point are not to the last bit",
+}
+DETECTOR = {"pixels": [6, 5], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A part under stress.
+
+    Args:
+        kind: of part; "mvrecon" has no part.
+        name: in that registry.
+        options: of the part.
+        device: on which it works.
+        dtype: of volumes and views.
+    """
+
+    kind: str
+    name: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float32
+
+    @property
+    def label(self) -> str:
+        """Short, and different for different options."""
+        return " ".join([self.name or self.kind, *(f"{key}={value}" for key, value in self.options.items())])
+
+    def build(self, **given: Any) -> Any:
+        """The part, with its options and what a case adds."""
+        return REGISTRIES[self.kind].build(self.name, **{**self.options, **given})
+
+    def random(self, *shape: int, seed: int = 0) -> Tensor:
+        """Uniform in [0, 1), exactly representable in the dtype, on the device."""
+        rng = torch.Generator().manual_seed(seed)
+        return torch.rand(*shape, generator=rng, dtype=torch.float64).to(self.dtype).to(self.device)
+
+
+class ProjectorSubject(Subject):
+    """A projector under stress, and geometry of the beam that it takes."""
+
+    def projector(self, grid: Grid, cameras: Cameras, **options: Any) -> Any:
+        """The operator, on the device.
+
+        Raises:
+            DoesNotApply: a plugin's refuses this geometry, and says why.
+        """
+        try:
+            return self.build(grid=grid, cameras=cameras, **options).to(self.device)
+        except ValueError as error:
+            if self.ours:
+                raise
+            raise DoesNotApply(f"it refuses: {error}") from error
+
+    @property
+    def ours(self) -> bool:
+        """Whether it is mvrecon's own, which must take what a plugin's part may refuse."""
+        return REGISTRIES[self.kind].origin(self.name).startswith("mvrecon.")
+
+    @cached_property
+    def beam(self) -> tuple[bool, Extent]:
+        """Whether its rays are parallel, and the part of a ray that counts.
+
+        Raises:
+            DoesNotApply: it takes none of the beams that are known, or is not installed.
+        """
+        refusals = []
+        for beam in BEAMS:
+            try:
+                A = self.build(grid=GRID, cameras=rig_about(GRID, *beam)).to(self.device)
+            except ImportError as error:
+                raise DoesNotApply(str(error)) from error
+            except ValueError as error:
+                refusals.append(str(error))
+            else:
+                self._need_dtype(A)
+                return beam
+        raise DoesNotApply(f"it takes no rig of this plan: {'; '.join(refusals)}")
+
+    def _need_dtype(self, A: Callable[[Tensor], Tensor]) -> None:
+        try:
+            A(self.random(1, 1, *GRID.shape))
+        except ValueError as error:
+            if self.ours:
+                raise
+            raise DoesNotApply(f"it refuses this dtype: {error}") from error
+
+    @cached_property
+    def error_of_ones(self) -> float:
+        """By how much it misses the length of a ray in a box of ones, relative."""
+        grid = Grid.centred((16, 16, 16), 1.0)
+        start = torch.tensor([[-30.0, 0.3, 0.4]], dtype=torch.float64)
+        length = self.projector(grid, self.rays(start, -start))(torch.ones(1, 1, 16, 16, 16, device=self.device))
+        expected = 16 * float((2 * start).norm()) / 60
+        return abs(float(length) - expected) / expected
+
+    @cached_property
+    def of_cells(self) -> bool:
+        """Whether a voxel counts where a ray is in it and nowhere else, so that any ray's length in a box is exact."""
+        grid = Grid.centred((4, 4, 4), 1.0)
+        start, end = torch.tensor([[[-9.0, -2.3, 0.7]], [[9.0, 5.9, -0.9]]], dtype=torch.float64)
+        enter, leave = 7 / 18, (2 + 2.3) / 8.2  # by the face x = -2, and by y = 2
+        length = (leave - enter) * float((end - start).norm())
+        return abs(float(self.values(grid, start, end)) / length - 1) < 1e-4
+
+    def need(self, claim: str) -> None:
+        """Raise DoesNotApply where a plugin's class says that it does not claim this; see `CLAIMS`."""
+        if not self.ours and not getattr(REGISTRIES[self.kind].get(self.name), claim, True):
+            raise DoesNotApply(f"it says that {CLAIMS[claim]}")
+
+    def need_lines(self) -> None:
+        """Raise DoesNotApply unless its views are line integrals in mm, with no other factor."""
+        if not self.error_of_ones < 0.02:
+            raise DoesNotApply("its views are no plain line integrals")
+
+    def need_exact(self) -> None:
+        """Raise DoesNotApply unless its line integrals are exact for ones; those of samples along a ray are not."""
+        self.need_lines()
+        if not self.error_of_ones < 1e-4:
+            raise DoesNotApply("it takes samples along a ray; case 31 tells of their order")
+
+    def need_segment(self) -> None:
+        """Raise DoesNotApply unless its rays end at source and pixel."""
+        if self.beam[1] != "segment":
+            raise DoesNotApply(f"its rays are of extent {self.beam[1]!r}")
+
+    def rig(self, grid: Grid = GRID, detector: Mapping[str, Any] | None = None, views: int = 3) -> Cameras:
+        """A rig in a generic pose that sees the grid, in units of its size."""
+        return rig_about(grid, *self.beam, detector=detector, views=views)
+
+    def rays(self, start: Float[Tensor, "m 3"], end: Float[Tensor, "m 3"]) -> Cameras:
+        """One camera of one pixel for each ray from `start` to `end` (mm); a pinhole's ray goes on beyond `end`."""
+        is_parallel, extent = self.beam
+        look = (end - start) / (end - start).abs().amax(dim=-1, keepdim=True)  # of any length, however small
+        axis = torch.nn.functional.one_hot(look.abs().argmin(dim=-1), 3).to(look)
+        u = torch.nn.functional.normalize(torch.linalg.cross(axis, look), dim=-1)
+        v = torch.nn.functional.normalize(torch.linalg.cross(look, u), dim=-1)
+        target = start - (end - start) if extent == "behind" else end
+        return Cameras(start, target, u, v, (1, 1), is_parallel, extent)
+
+    def posed(self, grid: Grid, cameras: Cameras) -> tuple[Callable[..., Tensor], list[Tensor]]:
+        """Views as a function of volumes and the cameras' vectors, and these, of which gradients are wanted.
+
+        Raises:
+            DoesNotApply: it takes no cameras that require a gradient.
+        """
+        vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
+
+        def views(volume: Tensor, *vectors: Tensor) -> Tensor:
+            return self.projector(grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True))))(volume)
+
+        try:
+            self.projector(grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True))))
+        except ValueError as error:
+            raise DoesNotApply(str(error)) from error
+        return views, vectors
+
+    def values(self, grid: Grid, start: Tensor, end: Tensor, volume: Tensor | None = None) -> Float[Tensor, " m"]:
+        """What each ray sees of a volume [d h w], in float64; of ones, unless given."""
+        x = torch.ones(grid.shape, dtype=self.dtype) if volume is None else volume
+        views = self.projector(grid, self.rays(start, end))(x.to(self.device)[None, None])
+        return views.flatten().double().cpu()
+
+
+def rig_about(
+    grid: Grid,
+    is_parallel: bool = False,
+    extent: Extent = "segment",
+    detector: Mapping[str, Any] | None = None,
+    views: int = 3,
+) -> Cameras:
+    """A rig in a generic pose about a grid's centre, sized for `GRID` and scaled to the given one."""
+    scale = _radius(grid) / _radius(GRID)
+    given = dict(detector or DETECTOR)
+    for length in ("pixel_mm", "offset_mm"):
+        value = given.get(length, 0.0)
+        given[length] = [each * scale for each in value] if isinstance(value, list) else value * scale
+    if is_parallel:
+        rig = parallel(views, given, 60.0 * scale, start_degrees=11.0)
+    elif extent == "behind":
+        return dome(views, 30.0 * scale, 20.0 * scale, 120.0, given, target=grid.centre.tolist())
+    else:
+        rig = circular(views, 40.0 * scale, 70.0 * scale, given, start_degrees=13.0)
+    return rig.moved(torch.eye(3), grid.centre)
+
+
+def _radius(grid: Grid) -> float:
+    return float((grid.corners() - grid.centre).norm(dim=-1).max())
+
+
+#: The subjects that are more than a part, as strings, since their files import this one.
+SUBJECTS = {
+    "projector": "mvrecon_bench.stresses.subject:ProjectorSubject",
+    "camera": "mvrecon_bench.stresses.rig:CameraSubject",
+    "head": "mvrecon_bench.stresses.learned:HeadSubject",
+    "model": "mvrecon_bench.stresses.learned:ModelSubject",
+}
+
+
+def subject_of(kind: str, *arguments: Any) -> Subject:
+    """A subject of that kind; arguments as `Subject`."""
+    module, _, name = SUBJECTS.get(kind, "mvrecon_bench.stresses.subject:Subject").partition(":")
+    return getattr(import_module(module), name)(kind, *arguments)
+
+
+def gap(found: Tensor, expected: Tensor) -> float:
+    """Relative L2 error in float64; of expected zeros, the norm itself; infinite, not NaN, where a number is none."""
+    a, b = found.detach().double().cpu(), expected.detach().double().cpu()
+    norm = float(b.norm())
+    return float((a - b).norm().nan_to_num(torch.inf)) / (norm if 0 < norm < torch.inf else 1.0)
+
+
+def bits(found: Tensor, expected: Tensor) -> float:
+    """How many values differ; two NaN are the same."""
+    if found.shape != expected.shape:
+        raise AssertionError(f"expected the shape {tuple(expected.shape)}, got {tuple(found.shape)}")
+    same = (found == expected) | (found.isnan() & expected.isnan())
+    return float((~same).sum())
+
+
+def greatest(errors: Iterable[float]) -> float:
+    """The largest; NaN where any is NaN, which Python's own `max` may lose."""
+    return float(torch.tensor(list(errors), dtype=torch.float64).max())

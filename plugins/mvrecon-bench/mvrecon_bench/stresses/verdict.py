@@ -1,0 +1,67 @@
+"""One case done to one subject: what was measured, and what that means."""
+
+import math
+import time
+import warnings
+
+import torch
+
+from mvrecon_bench.benchmarks.rows import Row
+from mvrecon_bench.benchmarks.trial import reason
+from mvrecon_bench.stresses.case import Case, DoesNotApply
+from mvrecon_bench.stresses.subject import Subject
+from mvrecon_bench.stresses.watchdog import LIMIT, watched
+
+PASS, FAIL, LEFT_OUT = "pass", "FAIL", "n/a"
+#: The columns of a table of verdicts, and their meaning.
+COLUMNS = {
+    "number": "of the case in the plan",
+    "part": "what was put under stress, with its options",
+    "case": "what was done to it",
+    "holds": "what must hold; the measured number says how far it did not",
+    "measured": "worst error or count of violations",
+    "tolerance": "what is allowed; 0: to the last bit, or not once",
+    "verdict": f"{PASS}, {FAIL}, or {LEFT_OUT} where the part is not made for what the case asks",
+    "note": "why it failed or was left out",
+    "device": "where it was done",
+    "dtype": "of volumes and views",
+    "seconds": "that it took",
+}
+
+
+def judge(case: Case, subject: Subject, limit_s: float = LIMIT) -> Row:
+    """Do a case to a subject. Nothing that a part raises goes further; it fails with that as its note.
+
+    So does one that takes longer than `limit_s`, but for one that hangs beyond Python, which ends all; see `watched`.
+    """
+    start, measured, note = time.perf_counter(), math.nan, ""
+    allowed = case.allowed(subject.dtype)
+    try:
+        with watched(limit_s), warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
+            warnings.simplefilter("ignore")
+            measured = float(case.measure(subject))
+        verdict = PASS if measured <= allowed else FAIL  # a NaN is no pass
+    except DoesNotApply as why:
+        verdict, note = LEFT_OUT, str(why)
+    except (Exception, SystemExit) as error:  # a plugin's part may raise anything; it must not end the plan
+        verdict, note = FAIL, reason(error)
+    return {
+        **identity(case, subject),
+        "holds": case.holds,
+        "measured": measured,
+        "tolerance": allowed,
+        "verdict": verdict,
+        "note": note,
+        "seconds": round(time.perf_counter() - start, 3),
+    }
+
+
+def identity(case: Case, subject: Subject) -> Row:
+    """The columns that tell one row from all others."""
+    return {
+        "number": case.number,
+        "part": subject.label,
+        "case": case.name,
+        "device": subject.device,
+        "dtype": str(subject.dtype).removeprefix("torch."),
+    }

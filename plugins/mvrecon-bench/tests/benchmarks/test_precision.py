@@ -1,0 +1,56 @@
+"""`mvrecon-bench bench=precision` on sizes that take seconds: each precision errs by what its digits say."""
+
+import math
+
+import pytest
+
+from mvrecon_bench.benchmarks.precision import TRUTH, USUAL
+from mvrecon_bench.benchmarks.rows import value
+
+MODEL = (
+    "{n: 16, rig: {name: circular, views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, pixels: 12}, checkpoint: null,"
+    " model: {name: cross_view, head: {name: softmax_depth}, opinion: {width: 4}, refine: 4, start: 2, consistency: 1}}"
+)
+TINY = (
+    "bench=precision",
+    "bench.base={n: 16, views: 2, device: cpu, threads: 1}",
+    "bench.tasks=[joseph forward, siddon adjoint, unet, model]",
+    "bench.unet={n: 8, inputs: 2, width: 4}",
+    "~bench.model",
+    f"+bench.model={MODEL}",
+    "bench.repeats=1",
+)
+#: Half a unit in the last place, twice: of the operand, and of what rounding in float32 adds.
+STORED = {"bfloat16 stored": 2**-8, "float16 stored": 2**-11}
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory, call):
+    texts = call(tmp_path_factory.mktemp("bench") / "precision", *TINY)
+    return [{name: value(text) for name, text in row.items()} for row in texts]
+
+
+def of(rows, precision):
+    return [row for row in rows if row["precision"] == precision]
+
+
+def test_autocast_is_for_networks_alone_and_all_else_for_every_task(rows):
+    assert {row["status"] for row in rows} == {"ok"}
+    assert len(of(rows, USUAL)) == len(of(rows, TRUTH)) == 4
+    assert {row["task"] for row in of(rows, "bfloat16 autocast")} == {"unet", "model"}
+
+
+def test_each_precision_errs_by_its_digits(rows):
+    assert all(row["error"] == 0 for row in of(rows, TRUTH))
+    assert all(0 < row["error"] < 1e-5 for row in of(rows, USUAL))
+    for precision, most in STORED.items():
+        operators = [row for row in of(rows, precision) if row["task"] not in ("unet", "model")]
+        assert all(most / 50 < row["error"] < most for row in operators), precision
+    assert all(row["error"] > 1e-5 for row in of(rows, "bfloat16 autocast"))
+    assert all(row["not_finite"] == 0 for row in rows)
+
+
+def test_times_are_told_against_float32(rows):
+    assert all(row["ratio"] == 1 for row in of(rows, USUAL))
+    usual = {row["task"]: row["ms"] for row in of(rows, USUAL)}
+    assert all(math.isclose(row["ratio"], row["ms"] / usual[row["task"]], rel_tol=1e-4) for row in rows)

@@ -1,0 +1,99 @@
+"""Parts that a plan meets for the first time: what they are built with, and what is said where that does not do."""
+
+import pytest
+import torch
+
+from mvrecon.cameras.rigs import circular
+from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
+from mvrecon.projectors.drr import Drr
+from mvrecon_bench.stresses import plan
+from mvrecon_bench.stresses.case import DoesNotApply
+from mvrecon_bench.stresses.subject import subject_of
+from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, judge
+
+DETECTOR = {"pixels": 4, "pixel_mm": 2.0}
+
+
+def helix(pitch_mm: float, views: int):
+    """A camera with an option of a name of its own."""
+    return circular(views, 40.0 + pitch_mm, 70.0, DETECTOR)
+
+
+def many(views: int, detector):
+    """A camera that refuses a small number of views."""
+    if views < 5:
+        raise ValueError(f"views must be at least 5, got {views}")
+    return circular(views, 40.0, 70.0, detector)
+
+
+def unsteady(views: int):
+    """A camera that breaks its contract."""
+    return circular(views, 40.0 + float(torch.rand(())), 70.0, DETECTOR)
+
+
+@pytest.fixture
+def plugin(monkeypatch):
+    for part in (helix, many, unsteady):
+        monkeypatch.setitem(CAMERAS._parts, part.__name__, part)
+
+
+def verdicts(name, **options):
+    subject = subject_of("camera", name, options, "cpu", torch.float64)
+    return {case.name: judge(case, subject) for case, _ in plan.jobs([subject])}
+
+
+@pytest.mark.parametrize(("name", "says"), [("helix", "it needs pitch_mm"), ("many", "at least 5")])
+def test_a_camera_that_needs_other_options_is_left_out_and_told_why(plugin, name, says):
+    rows = verdicts(name)
+    assert rows and all(row["verdict"] == LEFT_OUT and says in row["note"] for row in rows.values())
+
+
+@pytest.mark.parametrize(("name", "options"), [("helix", {"pitch_mm": 2.0}), ("many", {"views": 6})])
+def test_a_camera_with_options_of_its_own_is_measured(plugin, name, options):
+    assert all(row["verdict"] != LEFT_OUT for row in verdicts(name, **options).values())
+
+
+def test_a_camera_that_breaks_its_contract_fails(plugin):
+    assert "differs from call to call" in verdicts("unsteady")["the contract of a camera"]["note"]
+
+
+def test_wrong_options_of_a_user_are_a_failure_and_no_excuse(plugin):
+    assert verdicts("many", views=3, detector=DETECTOR)["cameras far away"]["verdict"] == FAIL
+
+
+def test_a_model_that_needs_other_options_is_left_out(monkeypatch):
+    monkeypatch.setitem(MODELS._parts, "mine", lambda projector, atlas: torch.nn.Identity())
+    with pytest.raises(DoesNotApply, match="it needs atlas"):
+        subject_of("model", "mine", {}, "cpu", torch.float32).model()
+
+
+class Fussy(Drr):
+    """A projector that refuses cameras of one pixel, and whose adjoint is twice one."""
+
+    matched = False
+
+    def __init__(self, grid, cameras):
+        if cameras.shape == (1, 1):
+            raise ValueError("takes more than one pixel")
+        super().__init__(grid, cameras)
+
+    def adjoint(self, views):
+        return 2 * super().adjoint(views)
+
+
+def judged(name, case):
+    subject = subject_of("projector", name, {}, "cpu", torch.float32)
+    return next(judge(each, subject) for each, _ in plan.jobs([subject]) if each.name == case)
+
+
+@pytest.mark.parametrize(
+    ("case", "says"),
+    [("rays through corners, axes turned", "refuses: takes more"), ("the adjoint in twenty geometries", "transpose")],
+)
+def test_a_plugin_is_left_out_of_what_it_refuses_or_says_it_is_not_and_mvrecon_is_not(monkeypatch, case, says):
+    monkeypatch.setitem(PROJECTORS._parts, "fussy", Fussy)
+    row = judged("fussy", case)
+    assert row["verdict"] == LEFT_OUT and says in row["note"]
+    assert judged("fussy", "sums, multiples and nothing")["verdict"] == "pass"
+    monkeypatch.setattr(Fussy, "__module__", "mvrecon.fussy")
+    assert judged("fussy", case)["verdict"] == FAIL

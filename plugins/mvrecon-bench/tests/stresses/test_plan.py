@@ -1,0 +1,27 @@
+"""The stress plan holds for every built-in part and every shipped plugin; and it fails where it should."""
+
+import pytest
+import torch
+
+from mvrecon.parts import REGISTRIES
+from mvrecon_bench.stresses import plan
+from mvrecon_bench.stresses.subject import subject_of
+from mvrecon_bench.stresses.verdict import FAIL, judge
+
+#: Other libraries' projectors keep their own promises, not ours.
+OURS = ("mvrecon.", "mvrecon_spect.")
+
+
+def rows():
+    for kind, name, options in plan.every_part():
+        if kind == "mvrecon" or REGISTRIES[kind].origin(name).startswith(OURS):
+            for dtype in (torch.float64, torch.float32):
+                subject = subject_of(kind, name, options, "cpu", dtype)
+                for case, _ in plan.jobs([subject]):
+                    yield pytest.param(case, subject, id=f"{case.number}-{case.name}-{subject.label}-{dtype}")
+
+
+@pytest.mark.parametrize(("case", "subject"), list(rows()))
+def test_the_plan_holds(case, subject):
+    row = judge(case, subject)
+    assert row["verdict"] != FAIL, f"{case.holds}: {row['measured']} > {row['tolerance']} {row['note']}"
