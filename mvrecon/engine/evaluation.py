@@ -15,7 +15,7 @@ from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
 from mvrecon.engine.module import Settings
 from mvrecon.metrics import UNITS, view_metrics, volume_metrics
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 
 Scores = dict[str, list[dict[str, float]]]
 See = Callable[[dict[str, Any], dict[str, Tensor]], None]

@@ -13,7 +13,7 @@ from mvrecon.losses import ReconstructionLoss
 from mvrecon.metrics import view_metrics, volume_metrics
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 
 Settings = dict[str, Any]
 

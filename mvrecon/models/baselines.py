@@ -13,7 +13,8 @@ from mvrecon.models.output import Reconstruction
 from mvrecon.models.regions import Regions
 from mvrecon.models.skip import Skip
 from mvrecon.models.unet3d import UNet3d
-from mvrecon.projectors.base import Projector, check_views
+from mvrecon.projectors.checks import check_views
+from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import sirt
 
 

@@ -3,8 +3,6 @@
 It is made once for the grid, and once for every crop of it that a scene needs.
 """
 
-import inspect
-
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor, nn
@@ -16,7 +14,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.models.cropped import CroppedFrusta
 from mvrecon.models.lift import Frusta
 from mvrecon.models.window import brick_corners, window_of
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import sirt_weights
 
 #: Coarse bins, along each axis, that the coarsest level of the depth U-Net joins into one.
@@ -91,7 +89,7 @@ def cropped_geometry(whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | 
             all.
     """
     views = _seeing(whole.projector.cameras, whole.projector.grid.cropped(box)).to(whole.row.device)
-    projector = cropped_projector(whole.projector, box, views)
+    projector = whole.projector.cropped(box, views.tolist())
     weights = whole.row[:, :, views], whole.column[..., *box.slices]
     if whole.frusta is None:
         return Geometry(projector, weights, views=views)
@@ -113,29 +111,6 @@ def _seeing(cameras: Cameras, grid: Grid) -> Int[Tensor, " k"]:
     """Which cameras see any of a grid; all of them, where none does."""
     seen = views_that_see(cameras, grid)
     return (seen if seen.any() else ~seen).nonzero()[:, 0]
-
-
-def cropped_projector(A: Projector, box: Box, views: Int[Tensor, " k"]) -> Projector:
-    """The projector with the same options for the voxels in a box and some cameras; a support is cropped with it.
-
-    Raises:
-        TypeError: a projector that does not keep its options as attributes of the same names.
-    """
-    names: set[str] = set()
-    for kind in type(A).__mro__:
-        if "__init__" in vars(kind):
-            parameters = inspect.signature(kind).parameters.values()
-            names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
-            if not any(p.kind is p.VAR_KEYWORD for p in parameters):
-                break
-    names -= {"grid", "cameras"}
-    if lost := sorted(name for name in names if not hasattr(A, name)):
-        raise TypeError(f"{type(A).__name__} cannot be made for a crop: it does not keep its {', '.join(lost)}")
-    options = {name: getattr(A, name) for name in names}
-    if isinstance(options.get("support"), Tensor):
-        options["support"] = options["support"][box.slices]
-    cameras = A.cameras[views.to(A.cameras.source.device)]
-    return type(A)(grid=A.grid.cropped(box), cameras=cameras, **options).to(A.lines.device)
 
 
 def crop_of(whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | None = None) -> Geometry:

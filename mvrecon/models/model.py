@@ -22,7 +22,7 @@ from mvrecon.models.regions import Regions
 from mvrecon.models.skip import Skip
 from mvrecon.models.unet3d import UNet3d
 from mvrecon.models.weighting import Weighting, fuse
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 
 #: Edge in voxels of the bricks that the refinement looks at or not; crops keep them in place.
 BRICK = MULTIPLE

@@ -13,7 +13,7 @@ from mvrecon.models.masks import upsampled
 from mvrecon.models.region import Region
 from mvrecon.models.unet3d import UNet3d
 from mvrecon.parts import HEADS
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 
 Prior = Literal["learned", "uniform"]
 

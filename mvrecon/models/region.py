@@ -13,7 +13,7 @@ from torch.nn.functional import adaptive_max_pool3d
 from mvrecon.geometry.box import Box, placed
 from mvrecon.models.bins import Bins, SomeBins
 from mvrecon.models.geometry import MULTIPLE, Geometry
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import correction
 
 

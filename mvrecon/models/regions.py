@@ -12,7 +12,8 @@ from mvrecon.models.geometry import MULTIPLE, Geometry, crop_of, whole_geometry
 from mvrecon.models.region import Region
 from mvrecon.models.skip import Skip
 from mvrecon.models.window import held_bricks
-from mvrecon.projectors.base import Projector, check_views
+from mvrecon.projectors.checks import check_views
+from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import inverse_sums
 from mvrecon.support.support import WORTH, support_from_views
 

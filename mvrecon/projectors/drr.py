@@ -6,11 +6,11 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.ray_transform import RayTransform
 
 
-class Drr(Projector):
-    """Digitally reconstructed radiographs: integrals along the rays through each camera's point; see `Projector`.
+class Drr(RayTransform):
+    """Digitally reconstructed radiographs: integrals along the rays through each camera's point; see `RayTransform`.
 
     Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth volumes, "siddon" one.
 
@@ -24,7 +24,7 @@ class Drr(Projector):
         support: the voxels that may be anything but zero.
 
     Raises:
-        ValueError: a parallel rig, or as `Projector`.
+        ValueError: a parallel rig, or as `RayTransform`.
     """
 
     def __init__(

@@ -5,11 +5,11 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.ray_transform import RayTransform
 
 
-class Radon(Projector):
-    """Integrals along parallel rays; see `Projector`.
+class Radon(RayTransform):
+    """Integrals along parallel rays; see `RayTransform`.
 
     A grid of one slice under detectors of one row is the 2-D Radon transform. Detector rows along z see a stack of
     slices: the volume is then read as whole rows along z, several times faster than by rays that are tilted.
@@ -25,7 +25,7 @@ class Radon(Projector):
         support: the voxels that may be anything but zero.
 
     Raises:
-        ValueError: a rig of central cameras, or as `Projector`.
+        ValueError: a rig of central cameras, or as `RayTransform`.
     """
 
     def __init__(

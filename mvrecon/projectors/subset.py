@@ -1,132 +1,124 @@
-"""Some of a projector's rays, at a cost that falls with their number: bins with counts, ordered subsets of cameras."""
+"""Some rays of a ray transform, at a cost that falls with their number: ordered subsets, bins that hold counts."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.kernels.backends import wide
-from mvrecon.projectors.base import Projector, check_floating
+from mvrecon.projectors.checks import check_floating
+from mvrecon.projectors.operator import LinearOperator
+from mvrecon.projectors.selection import RaySelection, ViewSelection
+
+if TYPE_CHECKING:
+    from mvrecon.projectors.ray_transform import RayTransform
 
 
-class Subset(ABC):
-    """Some rows of a projector: the chosen entries of A x, and the matched adjoint of what chooses them.
+class SomeRays(LinearOperator):
+    """Some rows of a ray transform: the chosen entries of A x, and the matched adjoint.
 
-    Differentiable as the projector is, in the cameras' tensors too, and on the device where the projector is. The
-    values are the whole operator's up to rounding, since sums may be taken in another order: to about 1e-6 of their
-    norm in float32, 1e-12 in float64. A projector that does more than to integrate along its lines is computed whole:
-    right, but nothing is saved; `alone` tells.
+    Differentiable as the transform is, in the cameras' tensors too, and on its device. The values are the whole
+    operator's up to rounding, since sums may be taken in another order: to about 1e-6 of their norm in float32, 1e-12
+    in float64. Fixed rays are kept: 96 bytes for each view's or pixel's, 288 where a pixel has several.
+
+    Args:
+        A: the ray transform.
+        selection: the views or pixels, an operator on all views.
     """
 
-    #: Of the values for one volume, behind batch and channel.
-    shape: tuple[int, ...]
     #: Pixels (rows, columns) of each of the views that `lines` describes.
     detector: tuple[int, int]
 
-    def __init__(self, A: Projector):
-        self.A, self.grid = A, A.grid
-        self.alone = type(A).forward is Projector.forward and type(A).adjoint is Projector.adjoint
-        self._fixed = None if A.poses else self._choose(A.lines)
+    def __init__(self, A: "RayTransform", selection: LinearOperator):
+        self.A, self.selection = A, selection
+        self.domain_shape, self.range_shape = A.domain_shape, selection.range_shape
+        self._prepare()
+        self._fixed = None if A.pose_gradient else self._choose(A.lines)
 
-    @abstractmethod
-    def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]: ...
+    def _prepare(self) -> None:
+        """What does not depend on where the rays lie."""
+        raise NotImplementedError
 
-    @abstractmethod
-    def pick(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c *shape"]:
-        """The entries of views that belong to the subset."""
+    def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]:
+        """The rays' lines."""
+        raise NotImplementedError
 
-    @abstractmethod
-    def place(self, values: Float[Tensor, "b c *shape"]) -> Float[Tensor, "b c m v u"]:
-        """Views with these entries, zero elsewhere: the transpose of `pick`."""
+    @property
+    def device(self) -> torch.device:
+        return self.A.device
+
+    @property
+    def pose_gradient(self) -> bool:
+        return self.A.pose_gradient
 
     @property
     def lines(self) -> Float[Tensor, "n 4 3 k"]:
         """The rays in voxel space; made anew, with their graph, where the cameras want a gradient."""
-        return self._choose(self.A.lines) if self._fixed is None else self._fixed.to(self.A.fixed_lines.device)
+        return self._choose(self.A.lines) if self._fixed is None else self._fixed.to(self.device)
 
-    def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *shape"]:
+    def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
         """The chosen entries of A x.
 
         Raises:
             ValueError: a wrong rank, size or device.
         """
-        if not self.alone:
-            return self.pick(self.A(volume))
         r = self.A.rays_per_pixel
-        rays = self.A.project_along(volume, self.lines, [n * r for n in self.detector])
+        rays = self.A.project_along(x, self.lines, [n * r for n in self.detector])
         # as a batch, which may be empty
         rays = avg_pool2d(rays.flatten(0, 1)[:, None], r) if r > 1 else rays
-        return self._sorted(rays.reshape(*volume.shape[:2], *self.shape))
+        return self._sorted(rays.reshape(*x.shape[:2], *self.range_shape))
 
-    @property
-    def T(self) -> Callable[[Float[Tensor, "b c *shape"]], Float[Tensor, "b c d h w"]]:
-        """The matched adjoint: volumes from the chosen entries alone."""
-        return self.adjoint
-
-    def adjoint(self, values: Float[Tensor, "b c *shape"]) -> Float[Tensor, "b c d h w"]:
+    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c d h w"]:
         """Volumes from the chosen entries, as if all others were zero.
 
         Raises:
             ValueError: a wrong rank, size or dtype.
         """
-        if values.ndim != 2 + len(self.shape) or tuple(values.shape[2:]) != self.shape:
-            raise ValueError(f"Expected values [b c ..] with last sizes {self.shape}, got {tuple(values.shape)}")
-        check_floating(values, "values")
-        if not self.alone:
-            return self.A.T(self.place(values))
-        lines, r = self.lines, self.A.rays_per_pixel
-        y = self._walked(wide(values)).reshape(values.shape[0] * values.shape[1], len(lines), *self.detector)
+        if y.ndim != 2 + len(self.range_shape) or tuple(y.shape[2:]) != self.range_shape:
+            expected = f"values [b c ..] with last sizes {self.range_shape}"
+            raise ValueError(f"Expected {expected}, got {tuple(y.shape)}")
+        check_floating(y, "values")
+        lines, r, n = self.lines, self.A.rays_per_pixel, y.shape[0] * y.shape[1]
+        rays = self._walked(wide(y)).reshape(n, len(lines), *self.detector)
         if r > 1:
-            y = (y / r**2).repeat_interleave(r, dim=2).repeat_interleave(r, dim=3)
-        return self.A.backproject_along(y, lines).unflatten(0, values.shape[:2])
+            rays = (rays / r**2).repeat_interleave(r, dim=2).repeat_interleave(r, dim=3)
+        return self.A.backproject_along(rays, lines).unflatten(0, y.shape[:2])
 
-    def _walked(self, values: Float[Tensor, "b c *shape"]) -> Float[Tensor, "b c *shape"]:
+    def _walked(self, values: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
         """Values in the order of `lines`."""
         return values
 
-    def _sorted(self, values: Float[Tensor, "b c *shape"]) -> Float[Tensor, "b c *shape"]:
+    def _sorted(self, values: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
         """The inverse of `_walked`."""
         return values
 
 
-class RaySubset(Subset):
-    """Chosen pixels of a projector: volumes [b c d h w] to [b c r], in the order of `chosen.nonzero()`.
+class SomePixels(SomeRays):
+    """Chosen pixels of a ray transform: volumes [b c d h w] to values [b c r]."""
 
-    Fixed rays are kept: 96 bytes each, 288 where a pixel has several.
+    selection: RaySelection
 
-    Args:
-        A: the projector.
-        chosen: which pixels of which views.
-
-    Raises:
-        ValueError: no mask of the size of the projector's views.
-    """
-
-    def __init__(self, A: Projector, chosen: Bool[Tensor, "m v u"]):
-        sizes = (len(A.rays), *A.rays.shape)
-        if chosen.dtype != torch.bool or tuple(chosen.shape) != sizes:
-            raise ValueError(f"Expected a mask [m v u] of sizes {sizes}, got {chosen.dtype} {tuple(chosen.shape)}")
-        here = chosen.to(A.fixed_lines.device)
+    def _prepare(self) -> None:
+        _, rows, columns = self.selection.domain_shape
+        chosen = self.selection.chosen.to(self.device)
         # column by column: rays in turn mostly differ in z, and meet again the voxels that the cache holds
-        view, u, v = here.mT.nonzero().unbind(dim=1)
-        self.pixels = torch.stack([view, v, u])
-        flat = (view * sizes[1] + v) * sizes[2] + u
-        self.index, self.order = flat.sort()
-        self.sizes, self.shape, self.detector = sizes, (len(flat),), (1, 1)
-        super().__init__(A)
+        view, u, v = chosen.mT.nonzero().unbind(dim=1)
+        self.pixels, self.detector = torch.stack([view, v, u]), (1, 1)
+        self.order = ((view * rows + v) * columns + u).argsort()
 
     def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "r 4 3 k"]:
         """Each chosen pixel as a view of its own, of one ray or of as many as a pixel has."""
+        _, rows, columns = self.selection.domain_shape
         view, v, u = self.pixels.to(lines.device)
         if lines.shape[3] == 1:
-            return lines[(view * self.sizes[1] + v) * self.sizes[2] + u]
-        r, (_, rows, columns) = self.A.rays_per_pixel, self.sizes
+            return lines[(view * rows + v) * columns + u]
+        r = self.A.rays_per_pixel
         across, down, middle = lines[view].unbind(dim=3) if r > 1 else (lines[..., k][view] for k in range(3))
-        u, v = (r * (n - (size - 1) / 2).to(lines)[:, None, None] for n, size in ((u, columns), (v, rows)))
+        u = r * (u - (columns - 1) / 2).to(lines)[:, None, None]
+        v = r * (v - (rows - 1) / 2).to(lines)[:, None, None]
         here = across * u + down * v + middle
         return torch.stack([across, down, here], dim=3) if r > 1 else here[..., None]
 
@@ -136,56 +128,16 @@ class RaySubset(Subset):
     def _sorted(self, values: Float[Tensor, "b c r"]) -> Float[Tensor, "b c r"]:
         return values.index_select(2, self.order.to(values.device))
 
-    def pick(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c r"]:
-        """The entries of views at the chosen pixels."""
-        return views.flatten(2).index_select(2, self.index.to(views.device))
 
-    def place(self, values: Float[Tensor, "b c r"]) -> Float[Tensor, "b c m v u"]:
-        """Views with these values at the chosen pixels, zero elsewhere."""
-        m, v, u = self.sizes
-        empty = values.new_zeros(*values.shape[:2], m * v * u)
-        return empty.index_copy(2, self.index.to(values.device), values).unflatten(2, self.sizes)
+class SomeViews(SomeRays):
+    """Chosen cameras of a ray transform: volumes [b c d h w] to views [b c k v u], in the selection's order."""
 
+    selection: ViewSelection
 
-class ViewSubset(Subset):
-    """Chosen cameras of a projector: volumes [b c d h w] to views [b c k v u], in the given order.
-
-    Args:
-        A: the projector.
-        views: indices of its views, each once.
-
-    Raises:
-        ValueError: an index that no view has, or one given twice.
-    """
-
-    def __init__(self, A: Projector, views: Sequence[int]):
-        self.views = [int(view) for view in views]
-        count = len(A.rays)
-        if len(set(self.views)) < len(self.views) or not all(0 <= view < count for view in self.views):
-            raise ValueError(f"Expected different views from 0 to {count - 1}, got {self.views}")
-        self.count, self.shape = count, (len(self.views), *A.rays.shape)
-        self.detector = (1, 1) if isinstance(A.rays, ExplicitRays) else A.rays.shape
-        super().__init__(A)
+    def _prepare(self) -> None:
+        rays = self.A.rays
+        self.detector = (1, 1) if isinstance(rays, ExplicitRays) else rays.shape
 
     def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]:
-        return lines.unflatten(0, (self.count, -1))[self.views].flatten(0, 1)
-
-    def pick(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c k v u"]:
-        """The chosen views."""
-        return views[:, :, self.views]
-
-    def place(self, values: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c m v u"]:
-        """All views: the chosen ones, and zeros."""
-        every = values.new_zeros(*values.shape[:2], self.count, *values.shape[3:])
-        return every.index_copy(2, torch.tensor(self.views, device=values.device), values)
-
-
-def ordered_subsets(A: Projector, count: int) -> list[ViewSubset]:
-    """The projector's cameras dealt out to `count` subsets in turn, so that each sees the object from all around.
-
-    Raises:
-        ValueError: fewer than one subset, or more than there are cameras.
-    """
-    if not 1 <= count <= len(A.rays):
-        raise ValueError(f"Cameras are dealt out to 1 to {len(A.rays)} subsets, one camera each at least, got {count}")
-    return [ViewSubset(A, range(first, len(A.rays), count)) for first in range(count)]
+        count = self.selection.domain_shape[0]
+        return lines.unflatten(0, (count, -1))[self.selection.views].flatten(0, 1)

@@ -13,7 +13,7 @@ from mvrecon.geometry.lattice import centred_affine
 from mvrecon.kernels.backends import kernels_for, wide
 from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.kernels.voxels import reference as voxel_reference
-from mvrecon.projectors.base import check
+from mvrecon.projectors.checks import check
 
 Weight = Literal["none", "distance"]
 
@@ -29,8 +29,8 @@ def backproject(
 
     Bilinear in the view; beyond the outermost pixel centres values fade to zero over one pixel. A voxel counts where
     its ray does: on the right side of the source, and for a segment before the detector. Order of accuracy: second in
-    the pixel size. It is no projector's adjoint; `Projector.T` is. Differentiable in the views by its exact transpose;
-    in the cameras with "reference", which "auto" takes for cameras that want a gradient. Half and bfloat16 views are
+    the pixel size. It is no projector's adjoint; `LinearOperator.T` is. Differentiable in the views by its exact
+    transpose; in the cameras with "reference", which "auto" takes for cameras that want a gradient. Half and bfloat16 views are
     summed, and given back, in float32.
 
     Args:

@@ -1,4 +1,4 @@
-"""Iterative reconstruction that needs a projector and nothing else."""
+"""Iterative reconstruction that needs a linear operator and nothing else."""
 
 import math
 
@@ -6,41 +6,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.cameras.symmetry import Mirror, mirror_pairs
 from mvrecon.cameras.views import check_finite
-from mvrecon.projectors.base import Projector
-from mvrecon.projectors.subset import ViewSubset
+from mvrecon.projectors.operator import LinearOperator
+from mvrecon.projectors.selection import ViewSelection
 
 
-def sirt_weights(A: Projector, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-    """Inverse row sums R [1 1 m v u] and column sums C [1 1 d h w] of A, zero where a ray or voxel is empty.
+def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
+    """Inverse row sums R [1 1 *range] and column sums C [1 1 *domain] of A, zero where a ray or voxel is empty.
 
     A rig that is its own mirror image is projected by half; the numbers are the same up to rounding.
     """
-    ones = torch.ones(1, 1, *A.grid.shape, dtype=dtype, device=A.lines.device)
+    ones = torch.ones(1, 1, *A.domain_shape, dtype=dtype, device=A.device)
     with torch.no_grad():
-        mirror = _mirror(A)
+        mirror = A.mirror()
         if mirror is None:
             rows = A(ones)
             return inverse_sums(rows), inverse_sums(A.T(torch.ones_like(rows)))
         share = mirror.share.to(ones)[:, None, None]
-        half = ViewSubset(A, share.flatten().nonzero()[:, 0].tolist())
-        rows = share * half.place(half(ones))
-        columns = half.T(half.pick(share.expand_as(rows)))
+        selection = ViewSelection(A.range_shape, share.flatten().nonzero()[:, 0].tolist())
+        half = A.subset(selection)
+        rows = share * selection.T(half(ones))
+        columns = half.T(selection(share.expand_as(rows)))
         return inverse_sums(rows + mirror.views(rows)), inverse_sums(columns + mirror.volume(columns))
-
-
-def _mirror(A: Projector) -> Mirror | None:
-    """The symmetry of an operator that saves something; it has to hold for all that the operator does."""
-    plain = type(A).forward is Projector.forward and type(A).adjoint is Projector.adjoint
-    # a ray in the face between two voxels is given to one of them by "siddon": not to that one's mirror image
-    if not plain or A.method == "siddon" or isinstance(A.rays, ExplicitRays):
-        return None
-    mirror = mirror_pairs(A.rays, A.grid)
-    if mirror is None or mirror.share.all():
-        return None
-    return mirror if A.support is None or torch.equal(mirror.volume(A.support), A.support) else None
 
 
 def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -51,7 +38,7 @@ def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def correction(
-    A: Projector, residual: Float[Tensor, "b c m v u"], weights: tuple[Tensor, Tensor]
+    A: LinearOperator, residual: Float[Tensor, "b c m v u"], weights: tuple[Tensor, Tensor]
 ) -> Float[Tensor, "b c d h w"]:
     """What residual views ask of each voxel, C A^T R r, in the unit of the volume; `weights` are (R, C)."""
     row, column = weights
@@ -59,7 +46,7 @@ def correction(
 
 
 def sirt(
-    A: Projector,
+    A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     iterations: int,
     start: Float[Tensor, "b c d h w"] | None = None,
@@ -74,7 +61,7 @@ def sirt(
     Imaging Sci. 2, 2009, eq. 4.2 and 4.3).
 
     Args:
-        A: the projector.
+        A: the operator.
         views: measured integrals.
         iterations: how many.
         start: the first volume; zero by default.
@@ -87,7 +74,7 @@ def sirt(
     """
     check_finite(views)
     weights = weights or sirt_weights(A, views.dtype if views.dtype == torch.float64 else torch.float32)
-    x = weights[0].new_zeros(*views.shape[:2], *A.grid.shape) if start is None else start
+    x = weights[0].new_zeros(*views.shape[:2], *A.domain_shape) if start is None else start
     ahead, t = x, 1.0
     for _ in range(iterations):
         last, x = x, ahead + correction(A, views - A(ahead), weights)

@@ -4,13 +4,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.projectors.base import Projector
-from mvrecon.projectors.subset import ordered_subsets
+from mvrecon.projectors.operator import LinearOperator
+from mvrecon.projectors.selection import ordered_subsets
 from mvrecon.reconstruct.poisson import PoissonLikelihood
 
 
 def mlem(
-    A: Projector,
+    A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
     iterations: int,
     background: float | Float[Tensor, "b c m v u"] = 0.0,
@@ -28,7 +28,7 @@ def mlem(
     Imaging 13, 1994).
 
     Args:
-        A: the projector.
+        A: the operator, in counts per unit of the volume.
         counts: measured.
         iterations: over all counts.
         background: expected counts of other origin, one number or views that broadcast to the counts.
@@ -40,7 +40,7 @@ def mlem(
         ValueError: as `PoissonLikelihood`; counts that the start does not allow, a start that is negative somewhere or
             not finite, a number of subsets that is below one or above that of the cameras.
     """
-    dealt = [subset.views for subset in ordered_subsets(A, subsets)]
+    dealt = ordered_subsets(A.range_shape[0], subsets)
     parts = [PoissonLikelihood(A, counts, background, views, skip_zero_bins) for views in dealt]
     with torch.no_grad():
         return _expectation_maximised(parts, iterations, start)

@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.backends import wide
-from mvrecon.projectors.base import Projector, check
-from mvrecon.projectors.subset import RaySubset, Subset, ViewSubset
+from mvrecon.projectors.checks import check
+from mvrecon.projectors.operator import LinearOperator
+from mvrecon.projectors.selection import RaySelection, ViewSelection
 
 #: The share of bins with counts up to which a list of rays costs less than whole views, for all rigs and methods: a ray
 #: of a list takes up to three times as long, and the adjoint leaves out rays of zero in whole views as well.
@@ -24,10 +25,10 @@ class PoissonLikelihood:
     whole views are cheaper than lists of rays, and are taken; `why` tells what was chosen, and for what reason.
 
     Expected counts must be positive wherever counts are. A volume with negative voxels is let through as long as they
-    are. Make it anew when counts, projector or its device change; cameras that want a gradient may move.
+    are. Make it anew when counts, operator or its device change; cameras that want a gradient may move.
 
     Args:
-        A: the projector, in counts per unit of the volume.
+        A: the operator, in counts per unit of the volume.
         counts: measured, [b c m v u]; rays are left out where no case of the batch has counts.
         background: expected counts r of other origin, one number or views that broadcast to the counts.
         views: indices of the only views that count; all by default.
@@ -39,48 +40,51 @@ class PoissonLikelihood:
 
     def __init__(
         self,
-        A: Projector,
+        A: LinearOperator,
         counts: Float[Tensor, "b c m v u"],
         background: float | Float[Tensor, "b c m v u"] = 0.0,
         views: Sequence[int] | None = None,
         skip_zero_bins: bool = True,
     ):
-        check(counts, "counts [b c m v u]", (len(A.rays), *A.rays.shape), A.fixed_lines.device)
-        self.A, self.every = A, ViewSubset(A, range(len(A.rays)) if views is None else views)
-        measured, added = wide(self.every.pick(counts)), self.every.pick(_spread(background, counts))
+        check(counts, "counts [b c m v u]", A.range_shape, A.device)
+        self.A, self.views = A, ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views)
+        measured, added = wide(self.views(counts)), self.views(_spread(background, counts))
         for what, values in (("counts", measured), ("background", added)):
             bad = int((~(values >= 0) | ~values.isfinite()).sum())
             if bad:
                 raise ValueError(f"Expected {what} that are finite and not negative, got {bad} bins that are not")
-        self.bins, self.why = self._choose(measured, skip_zero_bins)
-        self.counts, self.background = (self.bins.pick(self.every.place(each)) for each in (measured, added))
+        self.selection, self.why = self._choose(measured, skip_zero_bins)
+        self.bins = A.subset(self.selection)
+        self.counts, self.background = (self.selection(self.views.T(values)) for values in (measured, added))
         self._added = added.flatten(1).sum(dim=1, dtype=torch.float64)
         self._sensitivity: dict[torch.dtype, Tensor] = {}
 
-    def _choose(self, measured: Float[Tensor, "b c k v u"], skip: bool) -> tuple[Subset, str]:
+    def _choose(self, measured: Float[Tensor, "b c k v u"], skip: bool) -> tuple[LinearOperator, str]:
         if not skip:
-            return self.every, "all bins: asked for"
-        if not self.every.alone:
-            return self.every, f"all bins: {type(self.A).__name__} does not compute rays one by one"
-        chosen = self.every.place((measured != 0).any(dim=0, keepdim=True).any(dim=1, keepdim=True))[0, 0]
+            return self.views, "all bins: asked for"
+        if "subset" not in self.A.capabilities:
+            return self.views, f"all bins: {type(self.A).__name__} does not compute rays one by one"
+        chosen = self.views.T((measured != 0).any(dim=0, keepdim=True).any(dim=1, keepdim=True))[0, 0]
         share = int(chosen.sum()) / max(1, measured[:1, :1].numel())
-        told = f"{share:.1%} of the bins hold counts, a list of rays pays up to {LIST:.0%}"
+        reason = f"{share:.1%} of the bins hold counts, a list of rays pays up to {LIST:.0%}"
         if share > LIST:
-            return self.every, f"all bins: {told}"
-        return RaySubset(self.A, chosen), f"bins with counts: {told}"
+            return self.views, f"all bins: {reason}"
+        return RaySelection(self.A.range_shape, chosen), f"bins with counts: {reason}"
 
     def sensitivity(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
         """s = A^T 1: the counts that one unit in each voxel brings; made anew where the cameras want a gradient."""
-        if self.A.poses or dtype not in self._sensitivity:
-            held, ones = (
-                torch.ones(1, 1, *s.shape, dtype=dtype, device=self.counts.device) for s in (self.bins, self.every)
-            )
-            if self.bins is self.every:
-                self._sensitivity[dtype] = self.every.T(ones)
-            else:  # a list of rays rounds otherwise than whole views, and MLEM divides what a list explains by this
-                rest = ones - self.every.pick(self.bins.place(held))
-                self._sensitivity[dtype] = self.bins.T(held) + self.every.T(rest)
+        if self.A.pose_gradient or dtype not in self._sensitivity:
+            self._sensitivity[dtype] = self._summed(dtype)
         return self._sensitivity[dtype]
+
+    def _summed(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
+        shapes = self.selection.range_shape, self.views.range_shape
+        own, ones = (torch.ones(1, 1, *s, dtype=dtype, device=self.counts.device) for s in shapes)
+        if self.selection is self.views:
+            return self.bins.T(own)
+        # a list of rays rounds otherwise than whole views, and MLEM divides what a list explains by this
+        rest = ones - self.views(self.selection.T(own))
+        return self.bins.T(own) + self.A.subset(self.views).T(rest)
 
     def expected(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
         """ybar, the counts to be expected in the bins that are computed.

@@ -9,7 +9,7 @@ from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 
 #: Relative to |A x| |y|.
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}

@@ -11,7 +11,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import geometry, regions
-from mvrecon.models.geometry import cropped_geometry, cropped_projector, whole_geometry
+from mvrecon.models.geometry import cropped_geometry, whole_geometry
 from mvrecon.models.model import CrossView
 from mvrecon.parts import CAMERAS, PROJECTORS
 from tests.models.rig import small_rig
@@ -36,7 +36,7 @@ def test_a_crop_is_the_operator_on_it(projector):
     x = torch.rand(1, 1, *box.shape)
     whole = torch.zeros(1, 1, 24, 24, 24)
     whole[..., *box.slices] = x
-    crop = cropped_projector(projector, box, torch.arange(4))
+    crop = projector.cropped(box)
     assert _close(crop(x), projector(whole), 1e-5)
     views = torch.rand(1, 1, 4, 36, 36)
     assert _close(crop.T(views), projector.T(views)[..., *box.slices], 1e-5)

@@ -11,7 +11,7 @@ from mvrecon.cameras.rigs import arc, circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.ray_transform import RayTransform
 from tests.projectors.rigs import AXIAL, GRID, INSIDE
 
 METHODS = ("joseph", "siddon", "trilinear")
@@ -27,7 +27,7 @@ class Case:
     rays: Cameras | ExplicitRays
     upright: bool = False
 
-    def build(self, **options) -> Projector:
+    def build(self, **options) -> RayTransform:
         """The operator, of the CPU unless said otherwise."""
         name = "radon" if self.rays.parallel else "drr"
         return PROJECTORS.build(name, **({"grid": self.grid, "cameras": self.rays, "backend": "cpu"} | options))

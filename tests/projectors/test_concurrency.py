@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.box import Box
-from mvrecon.projectors import base
+from mvrecon.projectors.ray_transform import RayTransform
 from tests.projectors.test_skipping import CASES, volumes
 
 
@@ -15,6 +15,6 @@ def test_what_another_thread_found_about_its_volume_is_not_read(monkeypatch):
     expected = A(x)
     A(x.flip(2, 3, 4))
     elsewhere = A._last
-    monkeypatch.setattr(base.Projector, "_last", property(lambda _: elsewhere, lambda *_: None), raising=False)
+    monkeypatch.setattr(RayTransform, "_last", property(lambda _: elsewhere, lambda *_: None), raising=False)
     assert A.skipped.box != Box.around(x[0, 0] != 0)
     assert torch.equal(A(x), expected)

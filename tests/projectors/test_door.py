@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.base import check_views
-from mvrecon.projectors.subset import ViewSubset
+from mvrecon.projectors.checks import check_views
+from mvrecon.projectors.selection import view_subset
 from tests.projectors.rigs import CONE, GRID, PARALLEL
 
 
@@ -30,7 +30,7 @@ def test_views_of_the_wrong_shape_are_refused(A, shape):
 
 @pytest.mark.parametrize("dtype", [torch.int16, torch.bool, torch.complex64])
 def test_what_would_be_rounded_or_cut_is_refused(A, dtype):
-    for act, shape in ((A, GRID.shape), (A.T, (4, 5, 6)), (ViewSubset(A, [0, 1, 2, 3]).T, (4, 5, 6))):
+    for act, shape in ((A, GRID.shape), (A.T, (4, 5, 6)), (view_subset(A, [0, 1, 2, 3]).T, (4, 5, 6))):
         with pytest.raises(ValueError, match=rf"Expected .*, got {dtype}"):
             act(torch.ones(1, 1, *shape, dtype=dtype))
 

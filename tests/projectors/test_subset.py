@@ -10,7 +10,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import cpu
 from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.subset import RaySubset, ViewSubset, ordered_subsets
+from mvrecon.projectors.selection import RaySelection, ViewSelection, ordered_subsets, ray_subset, view_subset
 from tests.projectors.cases import CASES, DIFFERENTIABLE, OPTIONS, Case, gap, noise
 
 #: Of each way through the loops: upright columns inside and beside the volume, pinholes, beams, rays one by one.
@@ -41,11 +41,11 @@ def test_they_are_entries_of_the_whole(kind, rays, option, dtype):
     # upright columns are read in another order; in float32 a crossing under a small slope is known to fewer digits
     views, tolerance = A(x), 1e-12 if dtype == torch.float64 else 5e-6 if case.upright else 1e-6
     order = [len(case.rays) - 1, 0]
-    for B, entries in ((RaySubset(A, chosen), views[:, :, chosen]), (ViewSubset(A, order), views[:, :, order])):
+    for B, entries in ((ray_subset(A, chosen), views[:, :, chosen]), (view_subset(A, order), views[:, :, order])):
         assert B(x).dtype == dtype and gap(B(x), entries) < tolerance
-        assert torch.equal(B.pick(views), entries)
-        values = B.pick(y)
-        alone = A.T(torch.where(B.place(torch.ones_like(values)) != 0, y, 0))
+        assert torch.equal(B.selection(views), entries)
+        values = B.selection(y)
+        alone = A.T(torch.where(B.selection.T(torch.ones_like(values)) != 0, y, 0))
         assert gap(B.T(values), alone) < tolerance
 
 
@@ -56,11 +56,14 @@ def test_the_adjoint_is_matched(kind, rays, option):
     A = case.build(rays_per_pixel=rays, **OPTIONS[option])
     for dtype, tolerance in ((torch.float32, 1e-5), (torch.float64, 1e-12)):
         x, y = noise(case, dtype)
-        for B in (RaySubset(A, some(case)), ViewSubset(A, [1, 0])):
-            values, given = B(x).double(), B.pick(y)
+        for B in (ray_subset(A, some(case)), view_subset(A, [1, 0])):
+            values, given = B(x).double(), B.selection(y)
             apart = (values * given).sum() - (x.double() * B.T(given)).sum()
             assert apart.abs() < tolerance * values.norm() * given.double().norm() and values.norm() > 1
-            assert torch.equal(B.pick(B.place(given)), given) and B.place(given).count_nonzero() == given.numel()
+            assert (
+                torch.equal(B.selection(B.selection.T(given)), given)
+                and B.selection.T(given).count_nonzero() == given.numel()
+            )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -68,10 +71,11 @@ def test_parts_that_make_the_whole_add_up_to_it(kind):
     case = CASES[kind]
     A, chosen = case.build(), some(case)
     _, y = noise(case)
-    halves = [RaySubset(A, chosen), RaySubset(A, ~chosen)]
-    for parts in (halves, ordered_subsets(A, 2), ordered_subsets(A, len(case.rays))):
-        assert gap(torch.stack([B.T(B.pick(y)) for B in parts]).sum(dim=0), A.T(y)) < 1e-12
-    assert [B.views for B in ordered_subsets(A, 2)] == [list(range(k, len(case.rays), 2)) for k in (0, 1)]
+    halves = [ray_subset(A, chosen), ray_subset(A, ~chosen)]
+    dealt = [[view_subset(A, views) for views in ordered_subsets(len(case.rays), n)] for n in (2, len(case.rays))]
+    for parts in (halves, *dealt):
+        assert gap(torch.stack([B.T(B.selection(y)) for B in parts]).sum(dim=0), A.T(y)) < 1e-12
+    assert [list(views) for views in ordered_subsets(5, 2)] == [[0, 2, 4], [1, 3]]
 
 
 @pytest.mark.parametrize(
@@ -83,9 +87,9 @@ def test_differences_confirm_the_derivatives(kind, method, rays):
     x, vectors = noise(case)[0][:1].requires_grad_(), leaves(case)
 
     def subset(*vectors):
-        return RaySubset(case.moved(*vectors).build(method=method, rays_per_pixel=rays), some(case))
+        return ray_subset(case.moved(*vectors).build(method=method, rays_per_pixel=rays), some(case))
 
-    values = subset(*vectors).pick(noise(case)[1][:1]).requires_grad_()
+    values = subset(*vectors).selection(noise(case)[1][:1]).requires_grad_()
     assert torch.autograd.gradcheck(lambda x, *v: subset(*v)(x), (x, *vectors), atol=1e-5)
     assert torch.autograd.gradcheck(lambda y, *v: subset(*v).T(y), (values, *vectors), atol=1e-5)
 
@@ -97,11 +101,11 @@ def test_derivatives_are_those_of_the_whole(kind, rays, option):
     x, y = noise(case)
     vectors = leaves(case)
     A = case.moved(*vectors).build(rays_per_pixel=rays, **OPTIONS[option])
-    for B in (RaySubset(A, some(case)), ViewSubset(A, [2, 0] if len(case.rays) > 2 else [1])):
-        values, volume = B.pick(y).requires_grad_(), x.clone().requires_grad_()
+    for B in (ray_subset(A, some(case)), view_subset(A, [2, 0] if len(case.rays) > 2 else [1])):
+        values, volume = B.selection(y).requires_grad_(), x.clone().requires_grad_()
         leaf = [volume, values, *vectors]
         found = torch.autograd.grad((B(volume) * values).sum() + (B.T(values) * volume.square()).sum(), leaf)
-        whole = B.place(values)
+        whole = B.selection.T(values)
         expected = torch.autograd.grad((A(volume) * whole).sum() + (A.T(whole) * volume.square()).sum(), leaf)
         for one, other in zip(found, expected, strict=True):
             assert gap(one, other) < 1e-11
@@ -111,8 +115,8 @@ def test_the_reference_agrees():
     for kind in ("cone", "dome", "explicit"):
         case = CASES[kind]
         x, y = noise(case)
-        one, other = (RaySubset(case.build(backend=backend), some(case)) for backend in ("cpu", "reference"))
-        assert gap(one(x), other(x)) < 1e-12 and gap(one.T(one.pick(y)), other.T(other.pick(y))) < 1e-12
+        one, other = (ray_subset(case.build(backend=backend), some(case)) for backend in ("cpu", "reference"))
+        assert gap(one(x), other(x)) < 1e-12 and gap(one.T(one.selection(y)), other.T(other.selection(y))) < 1e-12
 
 
 @pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
@@ -122,11 +126,11 @@ def test_support_and_skipping_are_the_projectors(kind):
     support = torch.zeros(case.grid.shape, dtype=torch.bool)
     support[1:4, 2:5, 3:6] = True
     A = case.build(support=support)
-    for B in (RaySubset(A, some(case)), ViewSubset(A, [1])):
-        assert gap(B(x), B.pick(A(x))) < 1e-12 and gap(B(x), B(x * support)) < 1e-12 and B(x).any()
-        volume = B.T(B.pick(y))
+    for B in (ray_subset(A, some(case)), view_subset(A, [1])):
+        assert gap(B(x), B.selection(A(x))) < 1e-12 and gap(B(x), B(x * support)) < 1e-12 and B(x).any()
+        volume = B.T(B.selection(y))
         assert volume.any() and not volume[..., ~support].any()
-    full, *less = (RaySubset(case.build(skip=skip), some(case)) for skip in ("off", "box", "brick", "verify"))
+    full, *less = (ray_subset(case.build(skip=skip), some(case)) for skip in ("off", "box", "brick", "verify"))
     for B in less:
         assert torch.equal(B(x * support), full(x * support))
 
@@ -136,7 +140,7 @@ def test_none_of_the_rays():
         for backend in ("cpu", "reference"):
             A = CASES[kind].build(backend=backend)
             x, _ = noise(CASES[kind])
-            for B in (RaySubset(A, some(CASES[kind], -1.0)), ViewSubset(A, [])):
+            for B in (ray_subset(A, some(CASES[kind], -1.0)), view_subset(A, [])):
                 assert B(x).numel() == 0 and B(x).shape[:2] == x.shape[:2]
                 assert not B.T(B(x)).any() and B.T(B(x)).shape == x.shape
 
@@ -151,9 +155,11 @@ def test_a_projector_with_a_way_of_its_own_is_computed_whole():
 
     case = CASES["dome"]
     A, (x, y) = Halved(case.grid, case.rays), noise(case)
-    for B in (RaySubset(A, some(case)), ViewSubset(A, [2, 1])):
-        assert not B.alone and torch.equal(B(x), B.pick(A(x)))
-        assert ((B(x) * B.pick(y)).sum() - (x * B.T(B.pick(y))).sum()).abs() < 1e-12 * x.norm() * y.norm()
+    shape = A.range_shape
+    for S in (RaySelection(shape, some(case)), ViewSelection(shape, [2, 1])):
+        B = A.subset(S)
+        assert not A.capabilities and torch.equal(B(x), S(A(x)))
+        assert ((B(x) * S(y)).sum() - (x * B.T(S(y))).sum()).abs() < 1e-12 * x.norm() * y.norm()
 
 
 def test_no_other_ray_is_computed(monkeypatch):
@@ -174,9 +180,9 @@ def test_no_other_ray_is_computed(monkeypatch):
     x, y = noise(case)
     for rays in (1, 2):
         A, chosen = case.build(rays_per_pixel=rays), some(case)
-        for B, count in ((RaySubset(A, chosen), int(chosen.sum())), (ViewSubset(A, [3]), chosen[3].numel())):
+        for B, count in ((ray_subset(A, chosen), int(chosen.sum())), (view_subset(A, [3]), chosen[3].numel())):
             computed.clear()
-            B(x), B.T(B.pick(y))
+            B(x), B.T(B.selection(y))
             assert computed == [count * rays**2] * 2
 
 
@@ -185,7 +191,7 @@ def test_a_twentieth_of_the_rays_costs_far_less_than_all():
     size, detector = 48, {"pixels": [48, 48], "pixel_mm": 1.6}
     rig = dome(64, 80.0, 80.0, 150.0, detector)
     A = PROJECTORS.build("drr", grid=Grid.centred((size,) * 3, 1.0), cameras=rig)
-    B = RaySubset(A, torch.rand(64, size, size, generator=torch.Generator().manual_seed(1)) < 0.05)
+    B = ray_subset(A, torch.rand(64, size, size, generator=torch.Generator().manual_seed(1)) < 0.05)
     x, y = torch.rand(1, 1, size, size, size), torch.rand(1, 1, 64, size, size)
 
     def seconds(operator, values) -> float:
@@ -196,22 +202,22 @@ def test_a_twentieth_of_the_rays_costs_far_less_than_all():
             spent.append(time.process_time() - start)
         return min(spent)
 
-    assert seconds(B, B.pick(y)) < 0.35 * seconds(A, y)
+    assert seconds(B, B.selection(y)) < 0.35 * seconds(A, y)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda A: RaySubset(A, torch.ones(4, 5, 8)), r"mask \[m v u\] of sizes \(4, 8, 5\), got torch.float32"),
-        (lambda A: RaySubset(A, torch.ones(4, 5, 8, dtype=torch.bool)), r"\(4, 8, 5\), got torch.bool \(4, 5, 8\)"),
-        (lambda A: ViewSubset(A, [0, 4]), r"different views from 0 to 3, got \[0, 4\]"),
-        (lambda A: ViewSubset(A, [-1]), r"from 0 to 3, got \[-1\]"),
-        (lambda A: ViewSubset(A, [1, 1]), r"different views .* got \[1, 1\]"),
-        (lambda A: ordered_subsets(A, 0), "1 to 4 subsets, .* got 0"),
-        (lambda A: ordered_subsets(A, 5), "1 to 4 subsets, .* got 5"),
-        (lambda A: ViewSubset(A, [1])(torch.zeros(1, 1, 7, 6, 5)), r"volume .*\(5, 6, 7\), got"),
-        (lambda A: ViewSubset(A, [1]).T(torch.zeros(1, 1, 2, 8, 5)), r"last sizes \(1, 8, 5\), got \(1, 1, 2, 8, 5\)"),
-        (lambda A: RaySubset(A, torch.ones(4, 8, 5) > 0).T(torch.zeros(160)), r"last sizes \(160,\), got \(160,\)"),
+        (lambda A: ray_subset(A, torch.ones(4, 5, 8)), r"mask \[m v u\] of sizes \(4, 8, 5\), got torch.float32"),
+        (lambda A: ray_subset(A, torch.ones(4, 5, 8, dtype=torch.bool)), r"\(4, 8, 5\), got torch.bool \(4, 5, 8\)"),
+        (lambda A: view_subset(A, [0, 4]), r"different views from 0 to 3, got \[0, 4\]"),
+        (lambda A: view_subset(A, [-1]), r"from 0 to 3, got \[-1\]"),
+        (lambda A: view_subset(A, [1, 1]), r"different views .* got \[1, 1\]"),
+        (lambda A: ordered_subsets(4, 0), "1 to 4 subsets, .* got 0"),
+        (lambda A: ordered_subsets(4, 5), "1 to 4 subsets, .* got 5"),
+        (lambda A: view_subset(A, [1])(torch.zeros(1, 1, 7, 6, 5)), r"volume .*\(5, 6, 7\), got"),
+        (lambda A: view_subset(A, [1]).T(torch.zeros(1, 1, 2, 8, 5)), r"last sizes \(1, 8, 5\), got \(1, 1, 2, 8, 5\)"),
+        (lambda A: ray_subset(A, torch.ones(4, 8, 5) > 0).T(torch.zeros(160)), r"last sizes \(160,\), got \(160,\)"),
     ],
 )
 def test_what_does_not_fit_is_refused(make, message):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mvrecon.geometry.box import Box
 from mvrecon.kernels.rays import choice
-from mvrecon.projectors.subset import RaySubset, ViewSubset
+from mvrecon.projectors.selection import ray_subset, view_subset
 from tests.projectors.cases import CASES
 from tests.properties.rays import allowed
 from tests.properties.strategies import DTYPES, METHODS, SEEDS, cases, epsilon, volumes
@@ -73,8 +73,8 @@ def test_leaving_out_what_is_empty_changes_no_bit(case, method, dtype, data, see
 def test_some_views_are_those_of_all_to_the_last_bit(case, method, dtype, data, seed, rays):
     x = data.draw(volumes(case.grid.shape, dtype))
     A, m = case.build(method=method, rays_per_pixel=rays), len(case.rays)
-    B = ViewSubset(A, torch.randperm(m, generator=torch.Generator().manual_seed(seed))[: seed % (m + 1)].tolist())
-    assert torch.equal(B(x), B.pick(A(x)))
+    B = view_subset(A, torch.randperm(m, generator=torch.Generator().manual_seed(seed))[: seed % (m + 1)].tolist())
+    assert torch.equal(B(x), B.selection(A(x)))
 
 
 @given(**ANY, seed=SEEDS, rays=st.sampled_from([1, 1, 2]))
@@ -83,8 +83,8 @@ def test_some_rays_are_those_of_all(case, method, dtype, data, seed, rays):
     x = data.draw(volumes(case.grid.shape, dtype))
     A, (m, v, u) = case.build(method=method, rays_per_pixel=rays), (len(case.rays), *case.rays.shape)
     rows = (torch.arange(v) % 2 == seed % 2)[None, :, None].expand(m, v, u)
-    for B in (RaySubset(A, rows), RaySubset(A, masks(seed, (m, v, u), 0.4))):
-        apart, size = (each.double().norm() for each in (B(x) - B.pick(A(x)), A(x.abs())))
+    for B in (ray_subset(A, rows), ray_subset(A, masks(seed, (m, v, u), 0.4))):
+        apart, size = (each.double().norm() for each in (B(x) - B.selection(A(x)), A(x.abs())))
         assert apart <= {torch.float32: 1e-6, torch.float64: 1e-12}[dtype] * size
 
 
@@ -92,6 +92,6 @@ def test_no_ray_of_several_a_pixel():
     """Shrunk: a mean over the rays of no pixel at all was refused by torch."""
     case = CASES["cone"]
     A = case.build(rays_per_pixel=2)
-    for B in (RaySubset(A, torch.zeros(5, 8, 5, dtype=torch.bool)), ViewSubset(A, [])):
+    for B in (ray_subset(A, torch.zeros(5, 8, 5, dtype=torch.bool)), view_subset(A, [])):
         values = B(torch.ones(1, 2, *case.grid.shape))
         assert values.shape == (1, 2, *B.shape) and not values.numel() and not B.T(values).any()

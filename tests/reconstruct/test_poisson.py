@@ -9,7 +9,7 @@ from mvrecon.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.subset import RaySubset, ViewSubset
+from mvrecon.projectors.subset import SomePixels, SomeViews
 from mvrecon.reconstruct.mlem import mlem
 from mvrecon.reconstruct.poisson import PoissonLikelihood
 
@@ -53,7 +53,7 @@ def test_value_and_gradient_are_those_of_all_bins(kind, background, skip):
     counts = measured(A, 0.05, batch=2)
     added = {"none": 0.0, "number": 0.07, "views": torch.rand_like(counts[:1])}[background]
     L = PoissonLikelihood(A, counts, added, skip_zero_bins=skip)
-    assert isinstance(L.bins, RaySubset if skip else ViewSubset)
+    assert isinstance(L.bins, SomePixels if skip else SomeViews)
     x = (0.01 + torch.rand(2, 1, *GRID.shape, dtype=torch.float64)).requires_grad_()
     expected, value = naive(A, counts, x, added), L(x)
     assert value.shape == (2,) and ((value - expected) / expected).abs().max() < 1e-12
@@ -167,8 +167,8 @@ def test_subsets_of_the_views_share_the_likelihood():
 def test_it_says_which_bins_it_takes_and_why(kind):
     A = operator(kind)
     few, many = PoissonLikelihood(A, measured(A, 0.05)), PoissonLikelihood(A, measured(A, 30.0))
-    assert few.why.startswith("bins with counts: ") and "20%" in few.why and isinstance(few.bins, RaySubset)
-    assert many.why.startswith("all bins: ") and "20%" in many.why and isinstance(many.bins, ViewSubset)
+    assert few.why.startswith("bins with counts: ") and "20%" in few.why and isinstance(few.bins, SomePixels)
+    assert many.why.startswith("all bins: ") and "20%" in many.why and isinstance(many.bins, SomeViews)
     assert "asked for" in PoissonLikelihood(A, measured(A, 0.05), skip_zero_bins=False).why
 
 

@@ -29,12 +29,12 @@ def halves(monkeypatch):
     """The views of every part of a rig that is projected on its own."""
     made = []
 
-    class Spy(iterative.ViewSubset):
-        def __init__(self, A, views):
+    class Spy(iterative.ViewSelection):
+        def __init__(self, shape, views):
             made.append(views)
-            super().__init__(A, views)
+            super().__init__(shape, views)
 
-    monkeypatch.setattr(iterative, "ViewSubset", Spy)
+    monkeypatch.setattr(iterative, "ViewSelection", Spy)
     return made
 
 

@@ -1,7 +1,7 @@
 """What all peers share: the door, the adjoint's two ways, and how their libraries are loaded."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
@@ -16,7 +16,8 @@ from torch.autograd.forward_ad import make_dual, unpack_dual
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.backends import wide
-from mvrecon.projectors.base import check, check_floating
+from mvrecon.projectors.checks import check, check_floating
+from mvrecon.projectors.operator import Projector
 from mvrecon_peers.frame import framed, near, wants_gradient
 from mvrecon_peers.operator import known_by, linear
 
@@ -56,7 +57,7 @@ def choice(what: str, given: str, known: tuple[str, ...]) -> str:
     return given
 
 
-class Peer(nn.Module):
+class Peer(nn.Module, Projector):
     """Another library's projector: [b c d h w] -> [b c m v u], in (unit of the volume) * mm.
 
     `box` and `rig` are the grid and the cameras in the volume's own frame, where the library is given them. A subclass
@@ -73,17 +74,13 @@ class Peer(nn.Module):
     def __init__(self, grid: Grid, cameras: Cameras):
         super().__init__()
         self.grid, self.cameras = grid, cameras
+        self.domain_shape, self.range_shape = tuple(grid.shape), (len(cameras), *cameras.shape)
         self.box, self.rig = framed(grid, cameras)
         self.key = known_by(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self.key = known_by(self)
-
-    @property
-    def T(self) -> Callable[[Float[Tensor, "b c m v u"]], Float[Tensor, "b c d h w"]]:
-        """The adjoint; `matched` says whether it is one."""
-        return self.adjoint
 
     def forward(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Views of volumes, one after the other.
@@ -92,7 +89,7 @@ class Peer(nn.Module):
             TypeError: no tensor.
             ValueError: a wrong rank or size, or a dtype or a device that the library does not work in.
         """
-        check(volume, "a volume [b c d h w]", self.grid.shape, getattr(volume, "device", CPU))
+        check(volume, "a volume [b c d h w]", self.domain_shape, getattr(volume, "device", CPU))
         return self._act(volume, "a volume", back=False)
 
     def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
@@ -102,12 +99,12 @@ class Peer(nn.Module):
             TypeError: as `forward`.
             ValueError: as `forward`.
         """
-        check(views, "views [b c m v u]", self.sizes(back=False), getattr(views, "device", CPU))
+        check(views, "views [b c m v u]", self.range_shape, getattr(views, "device", CPU))
         return self._act(views, "views", back=True)
 
     def sizes(self, back: bool) -> tuple[int, ...]:
         """The last sizes of volumes (back) or of views."""
-        return tuple(self.grid.shape) if back else (len(self.cameras), *self.cameras.shape)
+        return self.domain_shape if back else self.range_shape
 
     def _act(self, given: Tensor, what: str, back: bool) -> Tensor:
         check_floating(given, what)

@@ -10,6 +10,7 @@ over the detector this is a point source's d^2 cos^3(phi) / (16 h^2), h its dist
 Audenhaege et al., Med. Phys. 42 (2015) 4796.
 """
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,12 +19,11 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.backends import wide
-from mvrecon.projectors.base import check, check_floating
 from mvrecon.projectors.drr import Drr
+from mvrecon.projectors.operator import Scaled
 
 
-class Spect(Drr):
+class Spect(Scaled):
     """Counts that ideal pinholes see, no attenuation, no blur: [b c d h w] in counts / mm^3 -> [b c m v u] in counts.
 
     Args:
@@ -42,20 +42,10 @@ class Spect(Drr):
             raise ValueError(f"Pinhole SPECT needs central cameras of extent 'behind', got {kind!r}")
         if not diameter_mm > 0:
             raise ValueError(f"A pinhole's diameter must be positive mm, got {diameter_mm}")
-        super().__init__(grid, cameras, **options)
+        A = Drr(grid, cameras, **options)
+        weight = partial(sensitivity, cameras, float(diameter_mm))
+        super().__init__(A, weight if A.pose_gradient else weight())
         self.diameter_mm = float(diameter_mm)
-
-    def forward(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
-        """Counts in every pixel."""
-        views = super().forward(volume)
-        return views * sensitivity(self.cameras, self.diameter_mm).to(views)
-
-    def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
-        """Activity from counts, by the matched adjoint."""
-        check(views, "views [b c m v u]", (len(self.rays), *self.rays.shape), self.fixed_lines.device)
-        check_floating(views, "views")
-        views = wide(views)  # a half would round the sensitivity, or lose it
-        return super().adjoint(views * sensitivity(self.cameras, self.diameter_mm).to(views))
 
 
 def sensitivity(cameras: Cameras, diameter_mm: float) -> Float[Tensor, "m v u"]:

@@ -16,7 +16,7 @@ from mvrecon.data.body import body, enclosed
 from mvrecon.data.volumes import TISSUE, FileScene
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 from mvrecon.scenes.analytic import AnalyticScene, generator
 from mvrecon.scenes.sample import Scene
 from mvrecon.scenes.voxelise import voxelise

@@ -17,7 +17,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.reconstruct.iterative import sirt
 from mvrecon.support.support import support_from_views
 from mvrecon_bench.benchmarks.skip_scenes import Filled
@@ -101,7 +101,7 @@ class Bed:
         """The same with that support."""
         return replace(self, support=self.hull())
 
-    def operator(self, mode: str, masked: bool = False) -> Projector:
+    def operator(self, mode: str, masked: bool = False) -> RayTransform:
         """The projector in a mode, with the support as part of it or not."""
         grid = self.grid.cropped(self.box) if mode == CROPPED else self.grid
         options = {"method": self.method, "skip": OFF if mode in DENSE else mode}
@@ -167,11 +167,11 @@ def _same(views: Tensor) -> Tensor:
     return views
 
 
-def _told(A: Projector, mode: str) -> Callable[[], tuple[str, str]]:
+def _told(A: RayTransform, mode: str) -> Callable[[], tuple[str, str]]:
     return lambda: (OFF, "") if mode in DENSE else (A.skipped.mode, A.skipped.why)
 
 
-def _rebuilding(A: Projector, bed: Bed, mode: str) -> Callable[[], Any] | None:
+def _rebuilding(A: RayTransform, bed: Bed, mode: str) -> Callable[[], Any] | None:
     return None if mode in DENSE else lambda: A.with_support(bed.mask)
 
 

@@ -13,7 +13,7 @@ from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.lift import Frusta
 from mvrecon.parts import MODELS, PROJECTORS
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject, gap
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.learned import ModelSubject, small_rig
 from mvrecon_bench.stresses.refusals import none_of, refusal
@@ -134,7 +134,7 @@ def autocast(subject: ModelSubject) -> float:
     """The whole model under autocast to bfloat16: all float32, and how far from that without."""
     model, given = subject.stirred(), []
     for module in model.modules():
-        if isinstance(module, Projector):
+        if isinstance(module, RayTransform):
             module.register_forward_hook(lambda _module, _volume, views: given.append(views.dtype))
     with torch.no_grad():
         volume = model(subject.views[:1]).volume

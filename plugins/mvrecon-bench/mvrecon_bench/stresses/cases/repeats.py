@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import MODELS, PROJECTORS, SCENES
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from mvrecon_bench.stresses.apart import LIMIT, python
 from mvrecon_bench.stresses.case import Case, DoesNotApply
@@ -65,7 +65,7 @@ def at_once(subject: ProjectorSubject) -> float:
     layers = torch.arange(WORK.shape[0], device=subject.device)[:, None, None] // 4
     volumes = [subject.random(1, 1, *WORK.shape, seed=i) * (layers == i) for i in range(8)]
     views = subject.random(8, 1, 1, len(rig), *rig.shape)
-    if isinstance(A, Projector):
+    if isinstance(A, RayTransform):
         A.skip = "box"
     expected = [A(x) for x in volumes] + [A.T(y) for y in views]
     before = sys.getswitchinterval()
@@ -132,7 +132,7 @@ def draws_nothing(subject: ProjectorSubject) -> float:
     x = subject.random(1, 1, *WORK.shape) * (subject.random(*WORK.shape, seed=1) > 0.9)
     with undrawn() as drawn:
         A = subject.projector(WORK, subject.rig(WORK, {"pixels": [9, 8], "pixel_mm": 1.5}))
-        for B in [A, A.with_support(x[0, 0].cpu() > 0)] if isinstance(A, Projector) else [A]:
+        for B in [A, A.with_support(x[0, 0].cpu() > 0)] if isinstance(A, RayTransform) else [A]:
             views = B(x.requires_grad_())
             torch.autograd.grad(views.square().sum() + B.T(views).sum(), x)
     return float(len(drawn))

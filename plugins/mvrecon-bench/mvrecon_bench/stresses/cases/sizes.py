@@ -17,8 +17,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import ops
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.base import Projector
-from mvrecon.projectors.subset import RaySubset, ViewSubset, ordered_subsets
+from mvrecon.projectors.selection import RaySelection, ViewSelection, ordered_subsets
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.refusals import refusal
 from mvrecon_bench.stresses.subject import (
@@ -69,7 +68,7 @@ def no_geometry(subject: Subject) -> float:
         lambda: circular(0, 40.0, 70.0, dict(DETECTOR)),
         lambda: parallel(0, dict(DETECTOR), 60.0),
         lambda: dome(0, 30.0, 20.0, 120.0, dict(DETECTOR)),
-        lambda: ordered_subsets(A, 0),
+        lambda: ordered_subsets(4, 0),
         lambda: PROJECTORS.build("drr", grid=GRID, cameras=rig, method="trilinear:0"),
         lambda: PROJECTORS.build("drr", grid=GRID, cameras=rig, rays_per_pixel=0),
         lambda: A(torch.zeros(1, 1, 0, 6, 7)),
@@ -140,17 +139,16 @@ def band(rig: Cameras, column: int, row: int, shape: tuple[int, int]) -> Cameras
 def subsets(subject: ProjectorSubject) -> float:
     """Cameras and pixels in parts: together what the operator and its adjoint make of all."""
     A = subject.projector(GRID, rig := subject.rig(views=7))
-    if not isinstance(A, Projector):
-        raise DoesNotApply("it is no mvrecon.projectors.base.Projector, which subsets are made of")
     x, y = subject.random(1, 2, *GRID.shape), subject.random(1, 2, len(rig), *rig.shape)
-    chosen = torch.rand(len(rig), *rig.shape) < 0.4
+    chosen, shape = torch.rand(len(rig), *rig.shape) < 0.4, A.range_shape
     errors = []
-    for parts in (
-        [ViewSubset(A, [6, 0, 3]), ViewSubset(A, [1, 2, 4, 5])],
-        [RaySubset(A, chosen), RaySubset(A, ~chosen)],
+    for selections in (
+        [ViewSelection(shape, [6, 0, 3]), ViewSelection(shape, [1, 2, 4, 5])],
+        [RaySelection(shape, chosen), RaySelection(shape, ~chosen)],
     ):
-        errors += [gap(torch.stack([part.place(part(x)) for part in parts]).sum(dim=0), A(x))]
-        errors += [gap(torch.stack([part.T(part.pick(y)) for part in parts]).sum(dim=0), A.T(y))]
+        parts = [(S, A.subset(S)) for S in selections]
+        errors += [gap(torch.stack([S.T(B(x)) for S, B in parts]).sum(dim=0), A(x))]
+        errors += [gap(torch.stack([B.T(S(y)) for S, B in parts]).sum(dim=0), A.T(y))]
     return greatest(errors)
 
 

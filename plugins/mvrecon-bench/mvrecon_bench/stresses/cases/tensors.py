@@ -10,7 +10,7 @@ from torch import Tensor
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits, gap, greatest
 
@@ -149,7 +149,7 @@ def no_numbers(subject: ProjectorSubject) -> float:
             except (ValueError, TypeError):
                 continue
             numbers = other.to(found.dtype) if isinstance(other, Tensor) and not other.is_complex() else None
-            ours = isinstance(getattr(act, "__self__", act), Projector)
+            ours = isinstance(getattr(act, "__self__", act), RayTransform)
             wrong += ours or numbers is None or bits(found, act(numbers)) > 0
     return wrong
 

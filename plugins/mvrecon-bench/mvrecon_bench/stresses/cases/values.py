@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.projectors.skipping import SKIPS
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, bits, gap
@@ -21,7 +21,7 @@ NARROW = {"pixels": [5, 4], "pixel_mm": 0.9, "offset_mm": [0.13, -0.21]}
 
 def skips(A: Callable[[Tensor], Tensor]) -> Iterator[None]:
     """Every way that an operator has to leave out what is zero, set on it in turn."""
-    if not isinstance(A, Projector):
+    if not isinstance(A, RayTransform):
         yield
         return
     for A.skip in SKIPS:
@@ -88,7 +88,7 @@ def bad_pixel(subject: ProjectorSubject) -> float:
 def beyond_support(subject: ProjectorSubject) -> float:
     """NaN everywhere outside of a support."""
     A = subject.projector(BRICKS, subject.rig(BRICKS))
-    if not isinstance(A, Projector):
+    if not isinstance(A, RayTransform):
         raise DoesNotApply("it has no supports")
     x, inside = subject.random(1, 1, *BRICKS.shape), torch.zeros(BRICKS.shape, dtype=torch.bool)
     inside[2:7, 3:12, 1:8] = True

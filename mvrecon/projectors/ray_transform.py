@@ -1,7 +1,7 @@
-"""What every projector is: a linear operator between the volumes of one grid and the views of one rig."""
+"""The ray transform: integrals of the volumes of one grid along the rays of one rig, and its matched adjoint."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from types import ModuleType
 
@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.cameras.views import check_finite
+from mvrecon.cameras.symmetry import Mirror, mirror_pairs
 from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
@@ -20,12 +20,16 @@ from mvrecon.kernels.backends import wide
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.projectors.checks import check, check_floating
+from mvrecon.projectors.operator import LinearOperator, Projector
+from mvrecon.projectors.selection import RaySelection, ViewSelection
 from mvrecon.projectors.skipping import SKIPS, Skipped, check_support, told, verify, within
+from mvrecon.projectors.subset import SomePixels, SomeViews
 
 METHODS = ("joseph", "siddon", "trilinear")
 
 
-class Projector(nn.Module):
+class RayTransform(nn.Module, Projector):
     """y = A x: the integrals of volumes along the rays of a rig, in (unit of x) * mm.
 
     Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; twice in volume and views.
@@ -55,6 +59,7 @@ class Projector(nn.Module):
             and cameras on different devices.
     """
 
+    capabilities = frozenset({"subset", "crop", "support"})
     support: Tensor | None
 
     def __init__(
@@ -77,6 +82,7 @@ class Projector(nn.Module):
                 f"Grid and cameras must be on one device, got {grid.affine.device} and {cameras.source.device}"
             )
         self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
+        self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
         self.last_backend: str | None = None
         self.window = list(cameras.limits)
@@ -87,8 +93,60 @@ class Projector(nn.Module):
         self._held = self._hold()
         self._last: Tensor | None = None
 
-    def with_support(self, support: Bool[Tensor, "d h w"] | None) -> "Projector":
+    def __init_subclass__(cls, **options: object) -> None:
+        """A subclass that computes something else has the whole operator's parts alone: right, but nothing is saved."""
+        super().__init_subclass__(**options)
+        if {"forward", "adjoint"} & vars(cls).keys():
+            cls.capabilities = frozenset()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the operator computes."""
+        return self.fixed_lines.device
+
+    @property
+    def pose_gradient(self) -> bool:
+        """Whether the cameras want a gradient: the rays are then made anew in every call."""
+        return self.poses
+
+    def subset(self, selection: LinearOperator) -> LinearOperator:
+        """The rays of some views or pixels alone."""
+        if "subset" in self.capabilities and isinstance(selection, ViewSelection):
+            return SomeViews(self, selection)
+        if "subset" in self.capabilities and isinstance(selection, RaySelection):
+            return SomePixels(self, selection)
+        return super().subset(selection)
+
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> LinearOperator:
+        """The same for the voxels of a box and for some cameras, with the same options.
+
+        Raises:
+            ValueError: as `cameras`.
+        """
+        if "crop" not in self.capabilities:
+            return super().cropped(box, views)
+        support = None if self.support is None else self.support[box.slices].cpu()
+        device = self.cameras.source.device
+        cameras = self.cameras if views is None else self.cameras[torch.tensor(views, device=device)]
+        options = (self.method, self.backend, self.rays_per_pixel, self.skip, support)
+        return RayTransform(self.grid.cropped(box), cameras, *options).to(self.device)
+
+    def mirror(self) -> Mirror | None:
+        """A plane that mirrors grid, rig and support into themselves."""
+        # a ray in the face between two voxels is given to one of them by "siddon": not to that one's mirror image
+        known = bool(self.capabilities) and self.method != "siddon"
+        if not known or isinstance(self.rays, ExplicitRays):
+            return None
+        mirror = mirror_pairs(self.rays, self.grid)
+        if mirror is None or mirror.share.all():
+            return None
+        fits = self.support is None or torch.equal(mirror.volume(self.support), self.support)
+        return mirror if fits else None
+
+    def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
         """The same operator with another support, or with none."""
+        if "support" not in self.capabilities:
+            return super().with_support(check_support(support, self.grid))
         other = copy(self)
         other._buffers = dict(self._buffers)
         moved = check_support(support, self.grid)
@@ -146,12 +204,7 @@ class Projector(nn.Module):
         views = self.project_along(volume, self.lines, self.detector)
         if self.rays_per_pixel > 1:
             views = avg_pool2d(views, self.rays_per_pixel)
-        return views.reshape(*volume.shape[:2], len(self.rays), *self.rays.shape)
-
-    @property
-    def T(self) -> Callable[[Float[Tensor, "b c m v u"]], Float[Tensor, "b c d h w"]]:
-        """The matched adjoint: <A x, y> = <x, A.T(y)>."""
-        return self.adjoint
+        return views.reshape(*volume.shape[:2], *self.range_shape)
 
     def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """Volumes from views: every value spread along its ray with the weights of `forward`; zeros cost nothing.
@@ -159,7 +212,7 @@ class Projector(nn.Module):
         Raises:
             ValueError: a wrong rank, size, device or dtype.
         """
-        check(views, "views [b c m v u]", (len(self.rays), *self.rays.shape), self.fixed_lines.device)
+        check(views, "views [b c m v u]", self.range_shape, self.device)
         check_floating(views, "views")
         y, r = wide(views).flatten(0, 1), self.rays_per_pixel
         if r > 1:
@@ -171,7 +224,7 @@ class Projector(nn.Module):
         self, volume: Float[Tensor, "b c d h w"], lines: Float[Tensor, "r 4 3 k"], detector: Sequence[int]
     ) -> Float[Tensor, "n r v u"]:
         """Integrals along rays in voxel space, see `kernels/rays/lines.py`; a detector has so many (rows, columns)."""
-        check(volume, "a volume [b c d h w]", self.grid.shape, self.fixed_lines.device)
+        check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(volume, "a volume")
         x, kernels = volume.flatten(0, 1), self._kernels(volume, lines)
         rays = lines, self.window, list(detector), self.kernel
@@ -235,29 +288,3 @@ def _kernel(method: str, grid: Grid) -> str:
     if not samples.isdecimal() or int(samples) < 1:
         raise ValueError(f"A ray needs a positive number of samples, as in 'trilinear:300', got {method!r}")
     return method
-
-
-def check(tensor: Tensor, what: str, sizes: tuple[int, ...], device: torch.device) -> None:
-    """Raise ValueError unless a tensor [b c ...] has these last sizes and lies on the device."""
-    if not isinstance(tensor, Tensor):
-        raise TypeError(f"Expected {what} as a tensor, got {type(tensor).__name__}")
-    if tensor.ndim != 5 or tuple(tensor.shape[2:]) != tuple(sizes):
-        raise ValueError(f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}")
-    if tensor.device != device:
-        raise ValueError(f"Expected {what} on {device}, where the projector is, got {tensor.device}")
-
-
-def check_floating(tensor: Tensor, what: str) -> None:
-    """Raise ValueError for integers and masks: they would be rounded to float32 unasked, and have no gradient."""
-    if not tensor.is_floating_point():
-        raise ValueError(f"Expected {what} of floating point, got {tensor.dtype}; convert it, as by .float()")
-
-
-def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
-    """The door for measured views.
-
-    Raises:
-        ValueError: a wrong rank or size, or values that are not finite.
-    """
-    check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
-    check_finite(views)

@@ -1,0 +1,36 @@
+"""The door of operators: shapes, devices and dtypes of volumes and views."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.views import check_finite
+
+
+def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device) -> None:
+    """Raise ValueError unless a tensor [b c ...] has these last sizes and lies on the device."""
+    if not isinstance(tensor, Tensor):
+        raise TypeError(f"Expected {what} as a tensor, got {type(tensor).__name__}")
+    if tensor.ndim != 5 or tuple(tensor.shape[2:]) != tuple(sizes):
+        raise ValueError(f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}")
+    if tensor.device != device:
+        raise ValueError(f"Expected {what} on {device}, where the projector is, got {tensor.device}")
+
+
+def check_floating(tensor: Tensor, what: str) -> None:
+    """Raise ValueError for integers and masks: they would be rounded to float32 unasked, and have no gradient."""
+    if not tensor.is_floating_point():
+        raise ValueError(f"Expected {what} of floating point, got {tensor.dtype}; convert it, as by .float()")
+
+
+def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
+    """The door for measured views.
+
+    Raises:
+        ValueError: a wrong rank or size, or values that are not finite.
+    """
+    check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
+    check_finite(views)

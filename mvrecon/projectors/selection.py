@@ -1,0 +1,85 @@
+"""Chosen cameras or chosen pixels of views, as operators: what picks them, and what puts them back among zeros."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.projectors.operator import LinearOperator
+
+
+class ViewSelection(LinearOperator):
+    """Chosen views, [b c m v u] -> [b c k v u], in the order in which they are named.
+
+    Args:
+        shape: of all views, (m, v, u).
+        views: their indices, none of them twice.
+
+    Raises:
+        ValueError: an index that no view has, or one that comes twice.
+    """
+
+    def __init__(self, shape: Sequence[int], views: Sequence[int]):
+        self.views, count = [int(view) for view in views], shape[0]
+        if len(set(self.views)) < len(self.views) or not all(0 <= v < count for v in self.views):
+            raise ValueError(f"Expected different views from 0 to {count - 1}, got {self.views}")
+        self.domain_shape, self.range_shape = tuple(shape), (len(self.views), *shape[1:])
+
+    def forward(self, x: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c k v u"]:
+        """The chosen views."""
+        return x[:, :, self.views]
+
+    def adjoint(self, y: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c m v u"]:
+        """All views: the chosen ones, and zeros."""
+        index = torch.tensor(self.views, device=y.device)
+        return y.new_zeros(*y.shape[:2], *self.domain_shape).index_copy(2, index, y)
+
+
+class RaySelection(LinearOperator):
+    """Chosen pixels of chosen views, [b c m v u] -> [b c r], in the order of `chosen.nonzero()`.
+
+    Args:
+        shape: of all views, (m, v, u).
+        chosen: the pixels.
+
+    Raises:
+        ValueError: no mask of that shape.
+    """
+
+    def __init__(self, shape: Sequence[int], chosen: Bool[Tensor, "m v u"]):
+        if chosen.dtype != torch.bool or tuple(chosen.shape) != tuple(shape):
+            got = f"{chosen.dtype} {tuple(chosen.shape)}"
+            raise ValueError(f"Expected a mask [m v u] of sizes {tuple(shape)}, got {got}")
+        self.chosen, self.index = chosen, chosen.flatten().nonzero()[:, 0]
+        self.domain_shape, self.range_shape = tuple(shape), (len(self.index),)
+
+    def forward(self, x: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c r"]:
+        """The values of the chosen pixels."""
+        return x.flatten(2).index_select(2, self.index.to(x.device))
+
+    def adjoint(self, y: Float[Tensor, "b c r"]) -> Float[Tensor, "b c m v u"]:
+        """All views: the chosen pixels' values, and zeros."""
+        zeros = y.new_zeros(*y.shape[:2], self.chosen.numel())
+        return zeros.index_copy(2, self.index.to(y.device), y).unflatten(2, self.domain_shape)
+
+
+def view_subset(A: LinearOperator, views: Sequence[int]) -> LinearOperator:
+    """The part of an operator that makes some cameras' views, volumes [b c d h w] to views [b c k v u]."""
+    return A.subset(ViewSelection(A.range_shape, views))
+
+
+def ray_subset(A: LinearOperator, chosen: Bool[Tensor, "m v u"]) -> LinearOperator:
+    """The part of an operator that makes some pixels, volumes [b c d h w] to values [b c r]."""
+    return A.subset(RaySelection(A.range_shape, chosen))
+
+
+def ordered_subsets(count: int, subsets: int) -> list[range]:
+    """The indices of `count` cameras dealt out in turn, so that each ordered subset sees the object from all around.
+
+    Raises:
+        ValueError: fewer than one subset, or more than there are cameras.
+    """
+    if not 1 <= subsets <= count:
+        raise ValueError(f"Cameras are dealt out to 1 to {count} subsets, one camera each at least, got {subsets}")
+    return [range(first, count, subsets) for first in range(subsets)]
