@@ -30,8 +30,8 @@ def backproject(
     Bilinear in the view; beyond the outermost pixel centres values fade to zero over one pixel. A voxel counts where
     its ray does: on the right side of the source, and for a segment before the detector. Order of accuracy: second in
     the pixel size. It is no projector's adjoint; `LinearOperator.T` is. Differentiable in the views by its exact
-    transpose; in the cameras with "reference", which "auto" takes for cameras that want a gradient. Half and bfloat16 views are
-    summed, and given back, in float32.
+    transpose; in the cameras with "reference", which "auto" takes for cameras that want a gradient. Half and bfloat16
+    views are summed, and given back, in float32.
 
     Args:
         views: values on the detectors.

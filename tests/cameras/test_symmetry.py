@@ -10,7 +10,7 @@ from mvrecon.cameras.rigs import arc, circular, dome, parallel
 from mvrecon.cameras.symmetry import mirror_pairs
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.ray_transform import RayTransform
 from tests.cameras.rigs import DETECTOR, random_cameras
 
 GRID = Grid.centred((6, 5, 8), (11.0, 9.0, 7.0))
@@ -40,8 +40,7 @@ def test_the_mirrored_object_is_seen_as_the_partners_see_the_object(name):
     for grid, rig in ((GRID, cameras), (Grid(GRID.shape, affine), cameras.moved(R, t))):
         mirror = mirror_pairs(rig, grid)
         assert mirror is not None and mirror.axis == axis
-        kind = "radon" if rig.parallel else "drr"
-        A = PROJECTORS.build(kind, grid=grid, cameras=rig, backend="reference")
+        A = RayTransform(grid, rig, backend="reference")
         x = torch.rand(1, 1, *grid.shape, dtype=torch.float64)
         torch.testing.assert_close(A(mirror.volume(x)), mirror.views(A(x)), rtol=1e-10, atol=1e-10 * A(x).max().item())
         y = torch.rand_like(A(x))

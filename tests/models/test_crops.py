@@ -14,6 +14,7 @@ from mvrecon.models import geometry, regions
 from mvrecon.models.geometry import cropped_geometry, whole_geometry
 from mvrecon.models.model import CrossView
 from mvrecon.parts import CAMERAS, PROJECTORS
+from mvrecon.projectors.ray_transform import RayTransform
 from tests.models.rig import small_rig
 from tests.models.test_support import _close, _with_mask
 
@@ -53,7 +54,7 @@ def test_the_windows_of_a_crop_hold_all_that_its_inner_voxels_read(rig):
         cameras = CAMERAS.build("dome", views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector)
     if rig == "parallel":
         cameras = CAMERAS.build("parallel", views=3, detector=detector)
-    A = PROJECTORS.build("radon" if rig == "parallel" else "drr", grid=grid, cameras=cameras)
+    A = RayTransform(grid, cameras)
     whole, box = whole_geometry(A, 3), Box((8, 4, 12), (16, 12, 20))
     crop, inner = cropped_geometry(whole, box), (..., *[slice(1, -1)] * 3)
     mask = torch.zeros(1, 1, *grid.shape, dtype=torch.bool)

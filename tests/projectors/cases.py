@@ -10,7 +10,6 @@ from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.cameras.rigs import arc, circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.ray_transform import RayTransform
 from tests.projectors.rigs import AXIAL, GRID, INSIDE
 
@@ -29,8 +28,7 @@ class Case:
 
     def build(self, **options) -> RayTransform:
         """The operator, of the CPU unless said otherwise."""
-        name = "radon" if self.rays.parallel else "drr"
-        return PROJECTORS.build(name, **({"grid": self.grid, "cameras": self.rays, "backend": "cpu"} | options))
+        return RayTransform(self.grid, self.rays, **({"backend": "cpu"} | options))
 
     @property
     def vectors(self) -> dict[str, torch.Tensor]:

@@ -14,6 +14,7 @@ from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
 
@@ -91,7 +92,7 @@ def build(peer: str, case: str, **change):
 
 def ours(case: str, method: str):
     grid, rig = CASES[case]
-    return PROJECTORS.build("radon" if rig.parallel else "drr", grid=grid, cameras=rig, method=method)
+    return RayTransform(grid, rig, method=method)
 
 
 def error(views: Tensor, truth: Tensor) -> float:

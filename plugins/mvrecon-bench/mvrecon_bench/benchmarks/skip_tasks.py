@@ -16,7 +16,6 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.reconstruct.iterative import sirt
 from mvrecon.support.support import support_from_views
@@ -106,8 +105,7 @@ class Bed:
         grid = self.grid.cropped(self.box) if mode == CROPPED else self.grid
         options = {"method": self.method, "skip": OFF if mode in DENSE else mode}
         options |= {"support": self.cut(self.mask, mode)} if masked else {}
-        name = "radon" if self.cameras.parallel else "drr"
-        return PROJECTORS.build(name, grid=grid, cameras=self.cameras, **options).to(self.device)
+        return RayTransform(grid, self.cameras, **options).to(self.device)
 
     def cut(self, volume: Tensor, mode: str) -> Tensor:
         """What a mode works on of a volume."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.scenes.solids import Phantom
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.benchmarks.cases import Case
@@ -53,8 +53,7 @@ def truth_of(case: Case, rays: int) -> Truth:
     watched = torch.linspace(0, len(rig) - 1, min(WATCHED, len(rig))).long()
     cotangent = torch.randn(thin.shape, generator=torch.Generator().manual_seed(0))
     pose = pose_gradient(phantom, rig[watched], cotangent[watched].double(), grid)
-    name = "radon" if rig.parallel else "drr"
-    exact = PROJECTORS.build(name, grid=grid, cameras=rig, method="siddon")(volume.double()[None, None])[0, 0]
+    exact = RayTransform(grid, rig, method="siddon")(volume.double()[None, None])[0, 0]
     floor_thin, floor_pixel = relative_error(exact, thin), relative_error(exact, pixel)
     return Truth(volume, cotangent, thin, pixel, floor_thin, floor_pixel, watched, pose)
 

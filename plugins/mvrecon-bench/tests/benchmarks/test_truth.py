@@ -10,6 +10,7 @@ from mvrecon.cameras.camera import VECTORS
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.benchmarks import accuracy, truth
@@ -75,7 +76,7 @@ def posed(request):
     weights = torch.nn.functional.interpolate(coarse, rig.shape, mode="bicubic")[0]
 
     def views(cameras):
-        A = PROJECTORS.build("radon" if rig.parallel else "drr", grid=grid, cameras=cameras, backend="reference")
+        A = RayTransform(grid, cameras, backend="reference")
         return A(voxelise(phantom, grid).double()[None, None])[0, 0]
 
     leaves = [getattr(rig, name).clone().requires_grad_() for name in VECTORS]
