@@ -1,3 +1,64 @@
-"""mvrecon: volumes from several cameras' views, by networks that know the cameras' geometry."""
+"""mvrecon: volumes from several cameras' views, by operators, classical methods and networks that know the geometry.
+
+The front door. Every name is imported when it is first used, so `import mvrecon` costs nothing::
+
+    import mvrecon as mv
+
+    A = mv.Drr(mv.Grid.centred((64, 64, 64), 4.0), mv.dcspect80(pixels=[32, 32]))
+    volume = mv.sirt(A, A(x), iterations=50)
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mvrecon.cameras.camera import Cameras as Cameras
+    from mvrecon.cameras.dcspect80 import dcspect80 as dcspect80
+    from mvrecon.cameras.explicit import ExplicitRays as ExplicitRays
+    from mvrecon.cameras.files import from_file as from_file
+    from mvrecon.cameras.rigs import arc as arc
+    from mvrecon.cameras.rigs import circular as circular
+    from mvrecon.cameras.rigs import dome as dome
+    from mvrecon.cameras.rigs import parallel as parallel
+    from mvrecon.data.nifti import read_nifti as read_volume
+    from mvrecon.data.nifti import save_nifti as save_volume
+    from mvrecon.engine.checkpoints import load as load
+    from mvrecon.geometry.grid import Grid as Grid
+    from mvrecon.projectors.drr import Drr as Drr
+    from mvrecon.projectors.operator import LinearOperator as LinearOperator
+    from mvrecon.projectors.radon import Radon as Radon
+    from mvrecon.reconstruct.iterative import sirt as sirt
+    from mvrecon.reconstruct.mlem import mlem as mlem
 
 __version__ = "0.1.0"
+
+_DOOR = {
+    "Cameras": "mvrecon.cameras.camera:Cameras",
+    "Drr": "mvrecon.projectors.drr:Drr",
+    "ExplicitRays": "mvrecon.cameras.explicit:ExplicitRays",
+    "Grid": "mvrecon.geometry.grid:Grid",
+    "LinearOperator": "mvrecon.projectors.operator:LinearOperator",
+    "Radon": "mvrecon.projectors.radon:Radon",
+    "arc": "mvrecon.cameras.rigs:arc",
+    "circular": "mvrecon.cameras.rigs:circular",
+    "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
+    "dome": "mvrecon.cameras.rigs:dome",
+    "from_file": "mvrecon.cameras.files:from_file",
+    "load": "mvrecon.engine.checkpoints:load",
+    "mlem": "mvrecon.reconstruct.mlem:mlem",
+    "parallel": "mvrecon.cameras.rigs:parallel",
+    "read_volume": "mvrecon.data.nifti:read_nifti",
+    "save_volume": "mvrecon.data.nifti:save_nifti",
+    "sirt": "mvrecon.reconstruct.iterative:sirt",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _DOOR:
+        raise AttributeError(f"mvrecon has no {name!r}. It has {', '.join(sorted(_DOOR))}")
+    module, _, attribute = _DOOR[name].partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_DOOR])
