@@ -14,19 +14,25 @@ from mvrecon import __version__
 from mvrecon.durable import written_whole
 from mvrecon.limits import yaml_of
 
-PACKAGES = ("torch", "lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
+PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 SETTINGS, VERSIONS, RESULTS = "config.yaml", "versions.txt", "results.json"
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, of mvrecon and of what its numbers depend on."""
-    found = {"mvrecon": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    """Versions of Python, of mvrecon and of what its numbers depend on.
+
+    Torch's is its own, which tells the build (2.13.0+cu130) that the package index leaves out (2.13.0).
+    """
+    import torch
+
+    known = {"mvrecon": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    known["torch"] = str(torch.__version__)
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            known[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            known[name] = "not installed"
+    return known
 
 
 def start(folder: Path, settings: dict[str, Any]) -> None:
