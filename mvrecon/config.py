@@ -21,6 +21,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from mvrecon.durable import new_folder
 from mvrecon.guard import guarded
 from mvrecon.limits import shown
 from mvrecon.registry import importing, installed, locate
@@ -95,6 +96,15 @@ def prepare_hydra() -> None:
     ConfigStore.instance().store(name="schema", node=Settings)
     ConfigStore.instance().store(name="simulation_schema", node=Simulation)
     Plugins.instance().register(PluginConf)
+    OmegaConf.register_new_resolver("new_folder", output_folder, replace=True, use_cache=True)
+
+
+def output_folder(wanted: str, resume: str | None = None) -> str:
+    """Hydra's folder of one run: a new one, made; or where `resume` is given, the one that is there already."""
+    if resume is None:
+        return str(new_folder(wanted))
+    path = Path(resume).expanduser()
+    return str(path if path.is_dir() else path.parent)
 
 
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:

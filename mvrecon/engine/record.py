@@ -15,7 +15,7 @@ from mvrecon.durable import written_whole
 from mvrecon.limits import yaml_of
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
-SETTINGS, VERSIONS, RESULTS = "config.yaml", "versions.txt", "results.json"
+SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
 
 
 def versions() -> dict[str, str]:
@@ -35,9 +35,9 @@ def versions() -> dict[str, str]:
     return known
 
 
-def start(folder: Path, settings: dict[str, Any]) -> None:
+def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
     """Write down a run's settings, plain and resolved, and the versions it runs with."""
-    write(folder / SETTINGS, yaml.safe_dump(settings, sort_keys=False))
+    write(folder / file, yaml.safe_dump(settings, sort_keys=False))
     write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
 
 
