@@ -18,8 +18,9 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
+from hydra.experimental.callback import Callback
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf, open_dict, read_write
 
 from mvrecon.durable import new_folder
 from mvrecon.guard import guarded
@@ -79,6 +80,35 @@ class PluginConf(SearchPathPlugin):
             search_path.append(provider="mvrecon plugin", path=f"file://{folder}")
 
 
+class OwnFolder(Callback):
+    """Makes the folder of a run or a sweep before Hydra writes into it, so that no two have the same.
+
+    A folder that the command line names is taken as it is, and a resumed run has its folder already.
+    """
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """A run's folder."""
+        self._own(config, "hydra.run.dir")
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """A sweep's folder."""
+        self._own(config, "hydra.sweep.dir")
+
+    def _own(self, config: DictConfig, key: str) -> None:
+        overrides = config.hydra.overrides.hydra
+        if any(line.lstrip("+").startswith(f"{key}=") for line in overrides):
+            return
+        if config.get("resume"):
+            there = Path(config.resume).expanduser()
+            folder = there if there.is_dir() else there.parent
+        else:
+            folder = new_folder(OmegaConf.select(config, key))
+        with read_write(config), open_dict(config):
+            OmegaConf.update(config, key, str(folder))
+            quoted = str(folder).replace("'", r"\'")
+            overrides.append(f"{key}='{quoted}'")  # a sweep's jobs are composed anew
+
+
 def conf_dir() -> Path:
     """Where the YAML files are: beside the code in a wheel, one level up in a checkout."""
     here = Path(__file__).resolve().parent
@@ -96,15 +126,6 @@ def prepare_hydra() -> None:
     ConfigStore.instance().store(name="schema", node=Settings)
     ConfigStore.instance().store(name="simulation_schema", node=Simulation)
     Plugins.instance().register(PluginConf)
-    OmegaConf.register_new_resolver("new_folder", output_folder, replace=True, use_cache=True)
-
-
-def output_folder(wanted: str, resume: str | None = None) -> str:
-    """Hydra's folder of one run: a new one, made; or where `resume` is given, the one that is there already."""
-    if resume is None:
-        return str(new_folder(wanted))
-    path = Path(resume).expanduser()
-    return str(path if path.is_dir() else path.parent)
 
 
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -16,8 +17,11 @@ import mvrecon.train
 from mvrecon.cameras import files
 from mvrecon.config import compose
 from mvrecon.data import digests
+from mvrecon.data.hdf5 import Stored, write_volumes
 from mvrecon.durable import new_folder
 from mvrecon.engine import agreement, checkpoints, fit, record, run_folder
+from mvrecon.engine.checkpoints import Trained
+from mvrecon.engine.evaluation import seen_in_training
 from mvrecon.limits import Refused
 from mvrecon.parts import CAMERAS
 from tests.engine.lives import METHOD, OPTIONS
@@ -115,9 +119,10 @@ def test_a_run_tells_from_which_step_it_goes_on(tmp_path, monkeypatch, capsys):
 def test_work_without_its_settings_is_nobody_s(tmp_path):
     """A folder with checkpoints or results whose settings are missing is refused."""
     for name in ("checkpoints", "results.json"):
-        (tmp_path / name / name).mkdir(parents=True)
+        folder = tmp_path / f"run with {name}"
+        (folder / name).mkdir(parents=True)
         with pytest.raises(FileExistsError, match=rf"holds {name} of another run without its config.yaml"):
-            run_folder.check(tmp_path / name, {"seed": 0})
+            run_folder.check(folder, {"seed": 0})
     run_folder.check(tmp_path, {"seed": 0})
 
 
@@ -162,6 +167,14 @@ def test_apps_of_the_same_second_have_folders_of_their_own(tmp_path):
     }
     assert {table["seed"] for table in tables["train"]} == {1, 2}
     assert {len(table["scenes"]) for table in tables["eval"]} == {1, 2}
+
+
+def test_a_resumed_run_makes_no_other_folder(run, tmp_path, monkeypatch):
+    """A resumed run leaves no folder but its own."""
+    folder, _ = run
+    monkeypatch.chdir(tmp_path)
+    assert call(mvrecon.train, f"resume={folder}") == 0
+    assert list(tmp_path.iterdir()) == [] and not list(folder.glob(".hydra"))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
@@ -213,7 +226,7 @@ def test_a_digest_of_a_rig_tells_every_part_of_the_record():
     """Each part of a camera record changes its digest; a millionth of a micrometre, which a processor may, does not."""
     rig = CAMERAS.from_config(RIG)
     others = [replace(rig, **{name: getattr(rig, name) * (1 + 1e-6)}) for name in files.VECTORS]
-    others += [replace(rig, shape=(12, 13)), replace(rig, extent="behind"), replace(rig, parallel=True)]
+    others += [replace(rig, shape=(12, 13)), replace(rig, extent="ahead"), replace(rig, parallel=True)]
     assert len({digests.of_rig(one) for one in (rig, *others)}) == 8
     assert digests.of_rig(replace(rig, source=rig.source + 1e-13)) == digests.of_rig(rig)
 
@@ -232,17 +245,58 @@ def test_a_digest_of_a_file_is_told_by_its_contents(tmp_path):
         digests.compare({str(path): digests.of_file(path)}, before, "run")
 
 
-def test_scenes_of_the_training_are_told_in_results(run, tmp_path):
-    """An evaluation on training cases names each of them in results.json; one on others names none."""
-    from mvrecon.engine.checkpoints import Trained
-    from mvrecon.engine.evaluation import seen_in_training
-
+def test_no_scene_is_called_unseen_where_a_checkpoint_does_not_tell(run):
+    """A checkpoint that does not tell its training cases leaves it open which scenes are unseen; SIRT has seen none."""
     folder, _ = run
     assert json.loads((folder / "results.json").read_text())["seen_in_training"] == []
     trained, sirt = Trained(None, 1.0, 14, ["p1", "p2"]), Trained(None, 0.0, 0)
     assert seen_in_training([trained, sirt], ["p2", "p3"]) == ["p2"]
     assert seen_in_training([sirt], ["p2"]) == []
     assert seen_in_training([sirt, Trained(None, 1.0, 14, None)], ["p2"]) is None
+
+
+@pytest.fixture(scope="module")
+def patients(tmp_path_factory):
+    """A finished run on a file of seven volumes: p0 is its test case, p1, p2 and p3 those of its training."""
+    place = tmp_path_factory.mktemp("patients")
+    rng = np.random.default_rng(0)
+    write_volumes(place / "ct.h5", (volume(f"p{k}", rng) for k in range(7)))
+    options = [*OPTIONS, "scene=hdf5", f"scene.path={place}/ct.h5", "scene.crop=none", "data.batch_size=1"]
+    options += ["data.sizes={train: 3, val: 1, test: 1}", f"hydra.run.dir={place}/run"]
+    assert call(mvrecon.train, *options) == 0
+    return place
+
+
+def volume(name, rng):
+    """A CT volume of noise in soft tissue."""
+    return Stored(name, rng.integers(-50, 50, (8, 8, 8)).astype(np.int16), (16.0, 16.0, 16.0))
+
+
+def test_patients_of_the_training_are_not_called_unseen(patients, tmp_path, capsys):
+    """An evaluation names the patients whose volumes trained the model, and its table does not call them unseen."""
+    sizes = [f"+data.sizes.{part}={size}" for part, size in {"train": 0, "val": 0, "test": 5}.items()]
+    assert call(mvrecon.eval, f"checkpoint={patients}/run", *sizes, f"hydra.run.dir={tmp_path}/eval") == 0
+    table = json.loads((tmp_path / "eval" / "results.json").read_text())
+    assert table["scenes"] == [f"p{k}" for k in range(5)] and table["seen_in_training"] == ["p1", "p2", "p3"]
+    printed = capsys.readouterr().out
+    assert "5 scenes, 3 of them seen in training" in printed and "unseen" not in printed
+
+
+def test_data_that_have_changed_are_refused(patients, tmp_path, capsys):
+    """A data file that has changed since the training is an error of evaluation and of resumption."""
+    path = patients / "ct.h5"
+    expected, whole = digests.of_file(path), path.read_bytes()
+    rng = np.random.default_rng(1)
+    write_volumes(path, (volume(f"p{k}", rng) for k in range(7)))
+    got = digests.of_file(path)
+    for app, options in (
+        (mvrecon.eval, [f"checkpoint={patients}/run", f"hydra.run.dir={tmp_path}/eval"]),
+        (mvrecon.train, [f"resume={patients}/run"]),
+    ):
+        assert call(app, *options) == 1
+        assert f"{path}: got sha256 {got[:16]}, expected {expected[:16]}" in capsys.readouterr().err
+    path.write_bytes(whole)
+    assert call(mvrecon.eval, f"checkpoint={patients}/run", f"hydra.run.dir={tmp_path}/again") == 0
 
 
 @pytest.mark.parametrize(("projector", "warned"), [("drr", False), ("halved", True)])
