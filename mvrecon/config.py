@@ -83,30 +83,35 @@ class PluginConf(SearchPathPlugin):
 class OwnFolder(Callback):
     """Makes the folder of a run or a sweep before Hydra writes into it, so that no two have the same.
 
-    A folder that the command line names is taken as it is, and a resumed run has its folder already.
+    A folder that the command line names is taken as it is, and a resumed run has its folder already. Hydra's log file
+    is made by the first message in it, so that a run that is refused leaves none.
     """
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """A run's folder."""
-        self._own(config, "hydra.run.dir")
+        self._prepare(config, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """A sweep's folder."""
-        self._own(config, "hydra.sweep.dir")
+        self._prepare(config, "hydra.sweep.dir")
 
-    def _own(self, config: DictConfig, key: str) -> None:
-        overrides = config.hydra.overrides.hydra
-        if any(line.lstrip("+").startswith(f"{key}=") for line in overrides):
-            return
-        if config.get("resume"):
-            there = Path(config.resume).expanduser()
-            folder = there if there.is_dir() else there.parent
-        else:
-            folder = new_folder(OmegaConf.select(config, key))
+    def _prepare(self, config: DictConfig, key: str) -> None:
+        overrides, log, changes = config.hydra.overrides.hydra, "hydra.job_logging.handlers.file", {}
+        if OmegaConf.select(config, log):
+            changes[f"{log}.delay"] = "true"
+        if not any(line.lstrip("+").startswith(f"{key}=") for line in overrides):
+            changes[key] = str(self._folder(config, key))
         with read_write(config), open_dict(config):
-            OmegaConf.update(config, key, str(folder))
-            quoted = str(folder).replace("'", r"\'")
-            overrides.append(f"{key}='{quoted}'")  # a sweep's jobs are composed anew
+            for name, value in changes.items():
+                OmegaConf.update(config, name, value)
+                quoted = value.replace("'", r"\'")
+                overrides.append(f"++{name}='{quoted}'")  # a sweep's jobs are composed anew
+
+    def _folder(self, config: DictConfig, key: str) -> Path:
+        if not config.get("resume"):
+            return new_folder(OmegaConf.select(config, key))
+        path = Path(config.resume).expanduser()
+        return path if path.is_dir() else path.parent
 
 
 def conf_dir() -> Path:
