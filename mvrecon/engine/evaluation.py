@@ -107,16 +107,6 @@ def results(
 
     data.setup("test")
     scores = evaluate(models, data.test_dataloader(), A, data.data_range, device, watch)
-    table = {}
-    for label, method in found.items():
-        figures = {name: mean_and_spread([score[name] for score in scores[label]]) for name in UNITS}
-        table[label] = {
-            "parameters": sum(p.numel() for p in method.module.model.parameters() if p.requires_grad),
-            "train_steps": method.steps,
-            "train_seconds": method.seconds,
-            "ms_per_volume": statistics.median([score["ms"] for score in scores[label]]),
-            **figures,
-        }
     return {
         "name": settings["name"],
         "seed": settings["seed"],
@@ -126,7 +116,17 @@ def results(
         "device": device,
         "threads": torch.get_num_threads(),
         "units": {**UNITS, "ms_per_volume": "ms", "train_seconds": "s", "data_range": data.unit},
-        "methods": table,
+        "methods": {label: _row(method, scores[label]) for label, method in found.items()},
+    }
+
+
+def _row(method: Trained, scores: list[dict[str, float]]) -> dict[str, Any]:
+    return {
+        "parameters": sum(p.numel() for p in method.module.model.parameters() if p.requires_grad),
+        "train_steps": method.steps,
+        "train_seconds": method.seconds,
+        "ms_per_volume": statistics.median([score["ms"] for score in scores]),
+        **{name: mean_and_spread([score[name] for score in scores]) for name in UNITS},
     }
 
 
