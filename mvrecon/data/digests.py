@@ -56,8 +56,10 @@ def compare(got: Mapping[str, str], expected: Mapping[str, str], where: str | Pa
     """
     changed = [name for name in got if name in expected and got[name] != expected[name]]
     if changed:
-        told = "; ".join(f"{name}: got sha256 {got[name][:16]}, expected {expected[name][:16]}" for name in changed)
-        raise Refused(f"What the run was made with has changed since, as {where} tells: {told}. Put it back as it was")
+        values = "; ".join(f"{name}: got sha256 {got[name][:16]}, expected {expected[name][:16]}" for name in changed)
+        raise Refused(
+            f"What the run was made with has changed since, as {where} tells: {values}. Put it back as it was"
+        )
 
 
 def _rounded(value: Any) -> Any:

@@ -45,12 +45,12 @@ def show(found: Mapping[str, Any], folder: Path) -> None:
     console.print(f"Kept in {folder}", soft_wrap=True)
 
 
-def _scenes(count: int, seen: list[str] | None) -> str:
+def _scenes(count: int, overlap: list[str] | None) -> str:
     noun, moments = ("scenes", ", mean ± standard deviation") if count > 1 else ("scene", "")
-    if seen is None:
+    if overlap is None:
         return f"{count} {noun}, not known whether seen in training{moments}"
-    if seen:
-        return f"{count} {noun}, {len(seen)} of them seen in training{moments}"
+    if overlap:
+        return f"{count} {noun}, {len(overlap)} of them seen in training{moments}"
     return f"{count} unseen {noun}{moments}"
 
 

@@ -80,9 +80,13 @@ def test_settings_that_differ_are_named_and_nothing_is_written(run, capsys):
     folder, options = run
     before = contents(folder)
     assert call(mvrecon.train, *options, "seed=9", "optimizer.lr=0.5", "+compare.sirt.name=sirt") == 1
-    said = capsys.readouterr().err
-    assert "got seed=9, expected 3" in said and "got optimizer.lr=0.5, expected " in said and "compare.sirt" in said
-    assert "model" not in said.split("other settings:")[1].split("hydra.run.dir")[0]
+    message = capsys.readouterr().err
+    assert (
+        "got seed=9, expected 3" in message
+        and "got optimizer.lr=0.5, expected " in message
+        and "compare.sirt" in message
+    )
+    assert "model" not in message.split("other settings:")[1].split("hydra.run.dir")[0]
     assert contents(folder) == before
 
 
@@ -154,8 +158,8 @@ def test_a_new_folder_is_never_one_that_is_there(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
 def test_apps_of_the_same_second_have_folders_of_their_own(tmp_path):
     """Two trainings, two evaluations and two simulations of the same second each keep their own results."""
-    answers, said = crowd("apps", tmp_path)
-    assert [code for code, _ in answers] == [0] * 6, said
+    answers, message = crowd("apps", tmp_path)
+    assert [code for code, _ in answers] == [0] * 6, message
     outputs, folders = tmp_path / "outputs", (NOON, f"{NOON}_2")
     for name in ("train", "eval", "simulate"):
         assert sorted(path.name for path in (outputs / name).iterdir()) == [*folders]
@@ -182,9 +186,9 @@ def test_a_run_that_another_process_resumes_is_refused(run):
     """A run that another process is at work on cannot be resumed meanwhile, and keeps its results."""
     folder, _ = run
     before = (folder / "results.json").read_bytes()
-    answers, said = crowd("resuming", folder)
+    answers, message = crowd("resuming", folder)
     assert [code for code, _ in answers] == [0, 1]
-    assert "is in use by process" in said and (folder / "results.json").read_bytes() == before
+    assert "is in use by process" in message and (folder / "results.json").read_bytes() == before
 
 
 def test_a_run_keeps_its_rig_and_the_digests_of_rig_and_data(run):
@@ -313,6 +317,6 @@ def test_a_projector_that_does_not_make_the_views_is_told(projector, warned, rec
     settings = compose(*OPTIONS)
     settings["projector"] = {"name": projector}
     agreement.warn_of_other_views(settings, fit.build_data(settings))
-    told = [str(w.message) for w in recwarn if "add up to" in str(w.message)]
-    assert len(told) == warned
-    assert all("projector=halved" in line and "line integrals (drr, radon)" in line for line in told)
+    lines = [str(w.message) for w in recwarn if "add up to" in str(w.message)]
+    assert len(lines) == warned
+    assert all("projector=halved" in line and "line integrals (drr, radon)" in line for line in lines)
