@@ -18,9 +18,11 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
+from hydra.experimental.callback import Callback
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf, open_dict, read_write
 
+from mvrecon.durable import new_folder
 from mvrecon.guard import guarded
 from mvrecon.limits import shown
 from mvrecon.registry import importing, installed, locate
@@ -76,6 +78,40 @@ class PluginConf(SearchPathPlugin):
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in plugin_conf_dirs():
             search_path.append(provider="mvrecon plugin", path=f"file://{folder}")
+
+
+class OwnFolder(Callback):
+    """Makes the folder of a run or a sweep before Hydra writes into it, so that no two have the same.
+
+    A folder that the command line names is taken as it is, and a resumed run has its folder already. Hydra's log file
+    is made by the first message in it, so that a run that is refused leaves none.
+    """
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """A run's folder."""
+        self._prepare(config, "hydra.run.dir")
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """A sweep's folder."""
+        self._prepare(config, "hydra.sweep.dir")
+
+    def _prepare(self, config: DictConfig, key: str) -> None:
+        overrides, log, changes = config.hydra.overrides.hydra, "hydra.job_logging.handlers.file", {}
+        if OmegaConf.select(config, log):
+            changes[f"{log}.delay"] = "true"
+        if not any(line.lstrip("+").startswith(f"{key}=") for line in overrides):
+            changes[key] = str(self._folder(config, key))
+        with read_write(config), open_dict(config):
+            for name, value in changes.items():
+                OmegaConf.update(config, name, value)
+                quoted = value.replace("'", r"\'")
+                overrides.append(f"++{name}='{quoted}'")  # a sweep's jobs are composed anew
+
+    def _folder(self, config: DictConfig, key: str) -> Path:
+        if not config.get("resume"):
+            return new_folder(OmegaConf.select(config, key))
+        path = Path(config.resume).expanduser()
+        return path if path.is_dir() else path.parent
 
 
 def conf_dir() -> Path:

@@ -1,9 +1,10 @@
-"""Files that are there whole or not at all, and folders that one process at a time writes to."""
+"""Files that are there whole or not at all, folders of one's own, and folders that one process at a time writes to."""
 
 import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 try:
@@ -73,6 +74,24 @@ def claimed(folder: Path) -> Iterator[None]:
         for left in folder.rglob(f".*{PART}"):
             left.unlink(missing_ok=True)
         yield
+
+
+def new_folder(wanted: str | Path) -> Path:
+    """A new folder: the path wanted, or where another process or run has that, with _2, _3, ... at its end.
+
+    Raises:
+        OSError: no space, no permission.
+    """
+    wanted = Path(wanted)
+    wanted.parent.mkdir(parents=True, exist_ok=True)
+    for number in count(1):
+        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
+        try:
+            folder.mkdir()  # by one process alone: the system sees to that
+            break
+        except FileExistsError:
+            continue
+    return folder
 
 
 def _flush(path: Path, flags: int) -> None:

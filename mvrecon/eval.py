@@ -15,13 +15,16 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
     Args:
         given: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the run: `test_scene`,
             `data`, further `compare`; `device` and `save`.
-        folder: where the results go.
+        folder: where the results go, with `eval.yaml`, which is `given`, and `versions.txt`.
 
     Raises:
         FileNotFoundError: no checkpoint or no run is there.
+        RuntimeError: another process is at work in the folder.
+        ValueError: the run was made with another rig or other data; the folder is another evaluation's.
+        FileExistsError: the folder is a run's own.
     """
     import_plugins(given["plugins"])
-    from mvrecon.engine import checkpoints, evaluation, export, fit, record
+    from mvrecon.engine import agreement, checkpoints, evaluation, export, fit, record, run_folder
 
     run = checkpoints.run_folder(given["checkpoint"])
     settings = merged(record.read_settings(run), given)
@@ -32,9 +35,12 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
         export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
 
     see = save if given["save"] else None
-    found = evaluation.results(settings, run, data, evaluation.device_of(given["device"]), see)
-    found["checkpoint"] = str(run)
-    record.write_results(folder, found)
+    run_folder.compare_measurement(run, data.digests("test"))
+    with run_folder.taken(folder, given, record.EVALUATION):
+        agreement.warn_of_other_views(settings, data)
+        found = evaluation.results(settings, run, data, evaluation.device_of(given["device"]), see)
+        found["checkpoint"] = str(run)
+        record.write_results(folder, found)
     return found
 
 

@@ -14,6 +14,10 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
 
     The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`, for `camera=from_file`.
     A view is a line integral: its unit is the scene's times mm.
+
+    Raises:
+        RuntimeError: another process is at work in the folder.
+        ValueError: the folder's run has other settings.
     """
     import_plugins(settings["plugins"])
     from rich.console import Console
@@ -21,19 +25,19 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
 
     from mvrecon.cameras import files
     from mvrecon.data.dataset import SceneDataset
-    from mvrecon.engine import export, record
+    from mvrecon.engine import export, run_folder
     from mvrecon.geometry.grid import Grid
     from mvrecon.parts import CAMERAS, SCENES
 
     grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
     scene = SCENES.from_config(settings["scene"])
     cases = SceneDataset(scene, grid, cameras, settings["cases"], settings["seed"], cache=False)
-    record.start(folder, settings)
-    files.save(cameras, folder / "cameras.json")
     saved = []
-    for item in track(range(len(cases)), "Simulating", transient=True, console=Console(stderr=True)):
-        case = cases[item]
-        saved.append(export.save_views(folder / "cases", case["name"], case["views"][0], f"{scene.unit} * mm"))
+    with run_folder.taken(folder, settings):
+        files.save(cameras, folder / "cameras.json")
+        for item in track(range(len(cases)), "Simulating", transient=True, console=Console(stderr=True)):
+            case = cases[item]
+            saved.append(export.save_views(folder / "cases", case["name"], case["views"][0], f"{scene.unit} * mm"))
     return saved
 
 

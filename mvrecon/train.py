@@ -16,19 +16,21 @@ from mvrecon.config import import_plugins, launch, to_plain
 def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Train every method of `settings` in a run folder, go on where it was left, and return its results.
 
-    The folder then holds `config.yaml`, `versions.txt`, logs, `checkpoints/`, `review/` and `results.json`.
+    The folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs, `checkpoints/`, `review/` and
+    `results.json`.
 
     Raises:
         RuntimeError: another process is at work in the folder.
+        ValueError: the folder's run has other settings, another rig or other data.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.durable import claimed
-    from mvrecon.engine import evaluation, fit, record
+    from mvrecon.engine import agreement, evaluation, fit, record, run_folder
 
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    with claimed(folder):
-        record.start(folder, settings)
-        data = fit.build_data(settings)
+    data = fit.build_data(settings)
+    with run_folder.taken(folder, settings):
+        run_folder.keep_measurement(folder, data)
+        agreement.warn_of_other_views(settings, data)
         for method in fit.methods(settings):
             fit.fit(method, settings, data, folder)
         device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
@@ -54,6 +56,7 @@ def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's mean PSNR in dB, for sweepers."""
+    from mvrecon.engine import run_folder
     from mvrecon.engine.record import anchored
     from mvrecon.engine.report import show
 
@@ -62,6 +65,7 @@ def task(config: DictConfig) -> float:
     if settings["resume"]:
         given = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
         settings, folder = resumed(settings["resume"], given)
+    run_folder.check(folder, settings)
     found = train(settings, folder)
     show(found, folder)
     return next(iter(found["methods"].values()))["psnr"]["mean"]

@@ -9,6 +9,7 @@ import lightning.pytorch as L
 import torch
 from torch.utils.data import DataLoader
 
+from mvrecon.data import digests as sha256
 from mvrecon.data.dataset import EpochOrder, SceneDataset
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
@@ -66,6 +67,8 @@ class SceneData(L.LightningDataModule):
         if ranges["train"] != ranges["test"]:
             raise ValueError(f"The training and the test scene must share their data_range, got {ranges}")
         self.shared = same_cases(scenes["train"], scenes["test"])
+        self._files = {key: list(sha256.files_in(scenes[key])) for key in ("train", "test")}
+        self._digests: dict[str, str] = {}
         self.sets: dict[str, SceneDataset] = {}
         self._order: EpochOrder | None = None
 
@@ -138,20 +141,35 @@ class SceneData(L.LightningDataModule):
             generator=order.generator if order else torch.Generator(),  # or each epoch draws from the global one
         )
 
-    def state_dict(self) -> dict[str, int]:
-        """How far the training has come, for a checkpoint."""
+    def digests(self, *parts: str) -> dict[str, str]:
+        """SHA-256 of the rig, and of every file by its path that the scenes of `parts` ("train", "test") read.
+
+        Each is read once.
+        """
+        paths = sorted({path for part in parts for path in self._files[part]})
+        self._digests |= {path: sha256.of_file(path) for path in paths if path not in self._digests}
+        return {sha256.RIG: sha256.of_rig(self.cameras), **{path: self._digests[path] for path in paths}}
+
+    def state_dict(self) -> dict[str, Any]:
+        """For a checkpoint: how far the training has come, its cases by name, and the digests of its rig and files."""
         loop = self.trainer.fit_loop if self.trainer else None
         if loop is None or self._order is None:
             return {}
         done = int(loop.epoch_loop.batch_progress.current.processed)  # pyright: ignore[reportAttributeAccessIssue]
         seen = done * self.batch_size
         whole = seen >= len(self._order)  # the epoch: then the next one goes on
-        return {"epoch": self._order.epoch + whole, "seen": 0 if whole else seen}
+        place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else seen}
+        return {**place, "cases": list(self.sets["train"].prepare()["name"]), "digests": self.digests("train")}
 
-    def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Go on from a checkpoint with the cases that the broken epoch has not seen."""
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a checkpoint with the cases that the broken epoch has not seen.
+
+        Raises:
+            Refused: the rig or a file is not what the checkpoint was trained with.
+        """
         if self._order is not None and state_dict:
-            self._order.resume(**state_dict)
+            sha256.compare(self.digests("train"), state_dict.get("digests", {}), "the checkpoint")
+            self._order.resume(state_dict["epoch"], state_dict["seen"])
             # Lightning looks for this at the loader and does not find it there.
             warnings.filterwarnings("ignore", ".*ended before the epoch ended and your dataloader is not resumable")
 

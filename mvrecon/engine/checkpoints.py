@@ -1,8 +1,9 @@
 """Where a run keeps its checkpoints, and how its methods come back from them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from mvrecon.data.module import SceneData
 from mvrecon.engine.archive import check_archive, check_settings
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.record import SETTINGS
@@ -18,11 +19,15 @@ class Trained:
         module: with its weights.
         seconds: of training.
         steps: of the optimiser.
+        cases: names of those that it was trained on; none: the checkpoint is of a version that did not tell.
+        digests: SHA-256 of the rig and of the files that it was trained with.
     """
 
     module: ReconstructionModule
     seconds: float
     steps: int
+    cases: list[str] | None = field(default_factory=list)
+    digests: dict[str, str] = field(default_factory=dict)
 
 
 def finished(folder: Path, method: str) -> Path:
@@ -67,4 +72,6 @@ def load(path: Path) -> Trained:
         module = ReconstructionModule(**check_settings(path, state["hyper_parameters"]))
         module.load_state_dict(state["state_dict"])
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
-        return Trained(module.eval(), seconds, int(state["global_step"]))
+        data = state.get(SceneData.__qualname__, {})
+        cases = list(map(str, data["cases"])) if "cases" in data else None
+        return Trained(module.eval(), seconds, int(state["global_step"]), cases, dict(data.get("digests", {})))

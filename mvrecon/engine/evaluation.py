@@ -1,4 +1,4 @@
-"""The result table: every method on the same unseen scenes."""
+"""The result table: every method on the same scenes, and which of them a training has seen."""
 
 import math
 import statistics
@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
@@ -86,8 +87,15 @@ def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[st
 def results(
     settings: Settings, folder: Path, data: SceneData, device: str = "cpu", see: See | None = None
 ) -> dict[str, Any]:
-    """Everything that the table of a run tells, evaluated on the test scenes of `data` from the run's checkpoints."""
+    """Everything that the table of a run tells, evaluated on the test scenes of `data` from the run's checkpoints.
+
+    Raises:
+        FileNotFoundError: a method whose training has not ended.
+        Refused: a method that was trained with another rig, or with other contents of a file.
+    """
     found = load_methods(settings, folder, data.data_range)
+    for label, method in found.items():
+        digests.compare(data.digests("test"), method.digests, finished(folder, label))
     models: dict[str, nn.Module] = {label: method.module.model for label, method in found.items()}
     A = next(iter(found.values())).module.projector
     names: list[str] = []
@@ -99,26 +107,36 @@ def results(
 
     data.setup("test")
     scores = evaluate(models, data.test_dataloader(), A, data.data_range, device, watch)
-    table = {}
-    for label, method in found.items():
-        figures = {name: mean_and_spread([score[name] for score in scores[label]]) for name in UNITS}
-        table[label] = {
-            "parameters": sum(p.numel() for p in method.module.model.parameters() if p.requires_grad),
-            "train_steps": method.steps,
-            "train_seconds": method.seconds,
-            "ms_per_volume": statistics.median([score["ms"] for score in scores[label]]),
-            **figures,
-        }
     return {
         "name": settings["name"],
         "seed": settings["seed"],
         "scenes": names,
+        "seen_in_training": seen_in_training(found.values(), names),
         "data_range": data.data_range,
         "device": device,
         "threads": torch.get_num_threads(),
         "units": {**UNITS, "ms_per_volume": "ms", "train_seconds": "s", "data_range": data.unit},
-        "methods": table,
+        "methods": {label: _row(method, scores[label]) for label, method in found.items()},
     }
+
+
+def _row(method: Trained, scores: list[dict[str, float]]) -> dict[str, Any]:
+    return {
+        "parameters": sum(p.numel() for p in method.module.model.parameters() if p.requires_grad),
+        "train_steps": method.steps,
+        "train_seconds": method.seconds,
+        "ms_per_volume": statistics.median([score["ms"] for score in scores]),
+        **{name: mean_and_spread([score[name] for score in scores]) for name in UNITS},
+    }
+
+
+def seen_in_training(methods: Iterable[Trained], names: Iterable[str]) -> list[str] | None:
+    """The scenes, by name, that any method was trained on; none where a checkpoint does not tell its training cases."""
+    trained = [method.cases for method in methods if method.steps]
+    if None in trained:
+        return None
+    cases = {case for of_method in trained for case in of_method or ()}
+    return [name for name in names if name in cases]
 
 
 def device_of(accelerator: str) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 import lightning.pytorch as L
 from lightning.pytorch.callbacks import ProgressBar
+from rich.console import Console
 
 from mvrecon.config import instantiate
 from mvrecon.data.module import SceneData
@@ -68,7 +69,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     done, last = finished(folder, method), unfinished(folder, method)
     models = methods(settings)
     if done.exists():
-        return
+        return _tell(f"{method}: its training has ended already, in {done}")
     L.seed_everything(settings["seed"], workers=True, verbose=False)
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
@@ -77,13 +78,20 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     board = folder if method == next(iter(models)) else folder / method
     trainer = build_trainer(settings, board, last)
     begun = last.exists() or previous(last).exists()
+    step = read_newest(last)["global_step"] if begun else 0
+    if begun:
+        _tell(f"{method}: going on from step {step}")
     for logger in trainer.loggers:
         if isinstance(logger, Board | MetricsFile):
-            logger.rewind(read_newest(last)["global_step"] if begun else 0)
+            logger.rewind(step)
     with remembered(last):
         trainer.fit(module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True)
         trainer.save_checkpoint(done)
     shutil.rmtree(last.parent, ignore_errors=True)
+
+
+def _tell(line: str) -> None:
+    Console(stderr=True, markup=False, highlight=False).print(line, soft_wrap=True)
 
 
 def build_trainer(settings: Settings, board: Path, last: Path) -> L.Trainer:

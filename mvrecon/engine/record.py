@@ -14,24 +14,30 @@ from mvrecon import __version__
 from mvrecon.durable import written_whole
 from mvrecon.limits import yaml_of
 
-PACKAGES = ("torch", "lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
-SETTINGS, VERSIONS, RESULTS = "config.yaml", "versions.txt", "results.json"
+PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
+SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, of mvrecon and of what its numbers depend on."""
-    found = {"mvrecon": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    """Versions of Python, of mvrecon and of what its numbers depend on.
+
+    Torch's is its own, which tells the build (2.13.0+cu130) that the package index leaves out (2.13.0).
+    """
+    import torch
+
+    known = {"mvrecon": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    known["torch"] = str(torch.__version__)
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            known[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            known[name] = "not installed"
+    return known
 
 
-def start(folder: Path, settings: dict[str, Any]) -> None:
+def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
     """Write down a run's settings, plain and resolved, and the versions it runs with."""
-    write(folder / SETTINGS, yaml.safe_dump(settings, sort_keys=False))
+    write(folder / file, yaml.safe_dump(settings, sort_keys=False))
     write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
 
 

@@ -23,9 +23,8 @@ COLUMNS = {
 
 def table(found: Mapping[str, Any]) -> Table:
     """The result table for a terminal: mean over the scenes, and the standard deviation below it."""
-    count = len(found["scenes"])
-    over = f"{count} unseen scenes, mean ± standard deviation" if count > 1 else "1 unseen scene"
-    shown = Table(title=f"{found['name']}: {over}", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    title = f"{found['name']}: {_scenes(len(found['scenes']), found['seen_in_training'])}"
+    shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     shown.add_column("method\n", no_wrap=True)
     shown.add_column("parameters\n", justify="right", no_wrap=True)
     for heading, _ in COLUMNS.values():
@@ -44,6 +43,15 @@ def show(found: Mapping[str, Any], folder: Path) -> None:
     console = Console(width=max(Console().width, WIDTH))
     console.print(table(found))
     console.print(f"Kept in {folder}", soft_wrap=True)
+
+
+def _scenes(count: int, overlap: list[str] | None) -> str:
+    noun, moments = ("scenes", ", mean ± standard deviation") if count > 1 else ("scene", "")
+    if overlap is None:
+        return f"{count} {noun}, not known whether seen in training{moments}"
+    if overlap:
+        return f"{count} {noun}, {len(overlap)} of them seen in training{moments}"
+    return f"{count} unseen {noun}{moments}"
 
 
 def _cell(figure: Mapping[str, Any], form: str) -> str:

@@ -1,10 +1,12 @@
-"""Processes at once on the same files: `python -m tests.engine.crowd {readers|sweep|folder} FOLDER`."""
+"""Processes at once on the same files: `python -m tests.engine.crowd KIND FOLDER`."""
 
 import json
 import os
 import sys
 import time
 from collections.abc import Callable
+from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 
 READERS, REWRITES, RUNS = 8, 12, 4
@@ -86,7 +88,62 @@ def training(folder: Path, same: bool) -> list[tuple[int, str]]:
     return together([run(k) for k in range(RUNS)], folder)
 
 
+def app(name: str, *options: str) -> Callable[[], str]:
+    """An app as its command line starts it, but for the clock, which stands still."""
+    import hydra.core.utils
+
+    class Noon:
+        """One moment."""
+
+        @staticmethod
+        def now() -> datetime:
+            """The moment."""
+            return datetime(2026, 1, 1, 12)
+
+    def task() -> str:
+        hydra.core.utils.datetime = Noon
+        sys.argv = [f"mvrecon-{name}", *options, "hydra/job_logging=none"]
+        import_module(f"mvrecon.{name}").main()
+        return ""
+
+    return task
+
+
+def apps(folder: Path) -> list[tuple[int, str]]:
+    """Two trainings, two evaluations of the first, and two simulations, each pair at once and in the same second."""
+    import torch
+
+    from mvrecon.engine import agreement, evaluation, fit  # noqa: F401  (all imports once, for every process)
+    from tests.engine.lives import OPTIONS
+
+    torch.set_num_threads(1)
+    os.chdir(folder)
+    run = "checkpoint=outputs/train/2026-01-01_12-00-00"
+    simulation = [*(o for o in OPTIONS if o.startswith(("grid", "camera"))), "cases=[0]"]
+    pairs = [
+        [app("train", *OPTIONS, f"seed={k}") for k in (1, 2)],
+        [app("eval", run, f"+data.sizes.test={k}") for k in (1, 2)],
+        [app("simulate", *simulation, f"seed={k}") for k in (1, 2)],
+    ]
+    return [answer for pair in pairs for answer in together(pair, folder)]
+
+
+def resuming(folder: Path) -> list[tuple[int, str]]:
+    """One process is at work in a run folder until another has tried to resume it."""
+    from mvrecon.durable import claimed
+
+    def hold() -> str:
+        with claimed(folder):
+            while not (folder / "1.answer").exists():
+                time.sleep(0.05)
+        return ""
+
+    return together([hold, app("train", f"resume={folder}")], folder)
+
+
+KINDS = {"readers": readers, "apps": apps, "resuming": resuming}
+
 if __name__ == "__main__":
     kind, place = sys.argv[1], Path(sys.argv[2])
-    found = readers(place) if kind == "readers" else training(place, kind == "folder")
+    found = KINDS[kind](place) if kind in KINDS else training(place, kind == "folder")
     sys.stdout.write(json.dumps(found) + "\n")

@@ -82,12 +82,28 @@ def test_the_table_tells_every_method_and_both_moments():
     row = {name: {"mean": 0.5, "std": 0.125, "values": [0.5]} for name in UNITS}
     row |= {"parameters": 12345, "ms_per_volume": 1.25, "train_seconds": 61.0, "train_steps": 7}
     sharp = {**row, "psnr": {"mean": math.inf, "std": math.nan, "values": []}, "train_steps": 0}
-    found = {"name": "trial", "scenes": ["a", "b"], "methods": {"cross_view": row, "sirt": sharp}}
+    found = {"name": "trial", "scenes": ["a", "b"], "seen_in_training": []}
+    found["methods"] = {"cross_view": row, "sirt": sharp}
     text = shown(found)
     for piece in ("trial: 2 unseen scenes", "cross_view", "sirt", "12,345", "0.500", "± 0.125", "± 0.12", "inf", "61"):
         assert piece in text, piece
     assert "nan" not in text and "…" not in text
     assert "1 unseen scene\n" in shown({**found, "scenes": ["a"]}).replace(" \n", "\n").replace("  ", "")
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("scenes", "seen", "title"),
+    [
+        (["a", "b"], ["b"], "trial: 2 scenes, 1 of them seen in training, mean"),
+        (["a"], ["a"], "trial: 1 scene, 1 of them seen in training"),
+        (["a", "b"], None, "trial: 2 scenes, not known whether seen in training"),
+    ],
+)
+def test_a_table_calls_no_scene_unseen_that_a_training_may_have_seen(scenes, seen, title):
+    """The table of scenes that a training has seen, or may have, does not call them unseen."""
+    text = shown({"name": "trial", "scenes": scenes, "seen_in_training": seen, "methods": {}})
+    assert title in text and "unseen" not in text
 
 
 def shown(found):

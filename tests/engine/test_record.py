@@ -5,6 +5,7 @@ import json
 import math
 
 import pytest
+import torch
 
 from mvrecon.engine import record
 from mvrecon.engine.loggers import MetricsFile
@@ -31,6 +32,14 @@ def test_results_are_strict_json_with_versions(tmp_path):
     found = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
     assert found["psnr"] is None and found["values"] == [None, 1.5] and found["deep"] == {"x": None}
     assert found["versions"]["mvrecon"] and found["command"]
+
+
+@pytest.mark.door
+def test_the_version_of_torch_tells_its_build(monkeypatch):
+    """A run's versions tell the build of torch, which the metadata of an installed wheel leaves out."""
+    monkeypatch.setattr(torch, "__version__", "2.13.0+cu130")
+    monkeypatch.setattr(record.metadata, "version", lambda name: "2.13.0")
+    assert record.versions()["torch"] == "2.13.0+cu130"
 
 
 def test_a_failed_write_keeps_the_old_file(tmp_path):
