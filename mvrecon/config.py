@@ -23,6 +23,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from mvrecon.guard import guarded
 from mvrecon.limits import shown
+from mvrecon.places import check_places, placed
 from mvrecon.registry import importing, installed, locate
 
 #: Where the classes that a `_target_` may name are defined, and what they must be.
@@ -52,7 +53,7 @@ class Simulation(Measurement):
 
 @dataclass
 class Settings(Measurement):
-    """Every top-level key of a run, so that a mistyped one is an error instead of a silent extra."""
+    """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a silent extra."""
 
     test_scene: Any = None
     projector: Any = None
@@ -65,9 +66,51 @@ class Settings(Measurement):
     callbacks: Any = None
     logger: Any = None
     resume: str | None = None
-    checkpoint: str | None = MISSING
+
+
+@dataclass
+class Evaluation:
+    """Every top-level key of `mvrecon-eval`: what the run itself decides, such as its camera, is not among them."""
+
+    name: str = MISSING
+    checkpoint: str = MISSING
+    test_scene: Any = None
+    data: Any = None
+    compare: Any = field(default_factory=dict)
     device: str = "auto"
     save: bool = False
+    plugins: Any = field(default_factory=list)
+
+
+@dataclass
+class Benchmarks:
+    """Every top-level key of `mvrecon-bench`."""
+
+    bench: Any = None
+    out: str = MISSING
+    plugins: Any = field(default_factory=list)
+
+
+@dataclass
+class Plan:
+    """Every top-level key of `mvrecon-stress`."""
+
+    parts: Any = MISSING
+    cases: Any = None
+    device: str = MISSING
+    dtypes: Any = MISSING
+    limit_s: Any = MISSING
+    out: str = MISSING
+    plugins: Any = field(default_factory=list)
+
+
+SCHEMAS = {
+    "schema": Settings,
+    "evaluation_schema": Evaluation,
+    "simulation_schema": Simulation,
+    "bench_schema": Benchmarks,
+    "stress_schema": Plan,
+}
 
 
 class PluginConf(SearchPathPlugin):
@@ -105,8 +148,8 @@ def app_file(config_name: str) -> Path:
 
 def prepare_hydra() -> None:
     """Make the schemas and the plugins' config groups known to Hydra, in this process only."""
-    ConfigStore.instance().store(name="schema", node=Settings)
-    ConfigStore.instance().store(name="simulation_schema", node=Simulation)
+    for name, schema in SCHEMAS.items():
+        ConfigStore.instance().store(name=name, node=schema)
     Plugins.instance().register(PluginConf)
 
 
@@ -204,19 +247,26 @@ def _for_mvrecon(module: str) -> bool:
     return any(name.split(".")[0] == "mvrecon" for name in names)
 
 
-def instantiate(node: Mapping[str, Any], **given: Any) -> Any:
+def instantiate(node: Mapping[str, Any], folder: Path, **given: Any) -> Any:
     """Build the callback or the logger that a node's `_target_` names, with the node's other entries as options.
 
+    Args:
+        node: `_target_` and options; places among these, such as `dirpath`, are taken from `folder`.
+        folder: the run folder, out of which nothing is written.
+        given: further options, which are trusted.
+
     Raises:
-        PermissionError: the target is not a class of that kind that is defined below one of `ALLOWED`, or the options
-            hold instructions of Hydra's such as another target.
+        PermissionError: the target is not a class of that kind that is defined below one of `ALLOWED`, every run has it
+            already, or the options hold instructions of Hydra's such as another target, or lead out of the folder.
     """
     options = {key: value for key, value in node.items() if key != "_target_"}
     if instructions := _instructions(options):
         raise PermissionError(
             f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain values"
         )
-    return _allowed(str(node["_target_"]))(**options, **given)
+    made = _allowed(str(node["_target_"]))(**placed(options, folder), **given)
+    check_places(made, folder)
+    return made
 
 
 def _instructions(node: Any) -> list[str]:
@@ -231,6 +281,8 @@ def _allowed(target: str) -> type:
     and a function of an allowed library may call whatever it is told to."""
     found = _found(target) if target.startswith(tuple(f"{name}." for name in ALLOWED)) else None
     if isinstance(found, type) and issubclass(found, tuple(map(_found, BASES))):
+        if getattr(found, "of_every_run", False):
+            raise PermissionError(f"_target_ {target!r} is not allowed; expected none that every run has already")
         if found.__module__.startswith(tuple(f"{name}." for name in ALLOWED)):
             return found
     raise PermissionError(

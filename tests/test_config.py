@@ -139,6 +139,6 @@ def test_plugin_modules_are_imported_and_a_broken_one_is_named(tmp_path: Path, m
         import_plugins(["bad_plugin_module"])
 
 
-def test_a_target_of_an_allowed_library_is_built():
-    timer = instantiate({"_target_": "lightning.pytorch.callbacks.Timer", "duration": "00:00:01:00"}, interval="epoch")
+def test_a_target_of_an_allowed_library_is_built(tmp_path: Path):
+    timer = instantiate({"_target_": "lightning.pytorch.callbacks.Timer", "duration": "00:00:01:00"}, tmp_path)
     assert timer.time_remaining() == 60.0

@@ -23,7 +23,7 @@ def sentinel(tmp_path: Path) -> Path:
 def test_a_target_is_a_callback_or_a_logger_or_refused(name: str, sentinel: Path):
     torch.save(Payload(f"touch {sentinel}"), sentinel.with_name("payload.ckpt"))
     with pytest.raises(PermissionError, match="not allowed; expected"):
-        instantiate(targets(sentinel)[name])
+        instantiate(targets(sentinel)[name], sentinel.parent)
     assert not sentinel.exists()
 
 
@@ -37,7 +37,7 @@ callbacks:
     for name in ("by_alias", "by_reference"):
         assert settings["callbacks"][name]["_target_"] == "os.system"
         with pytest.raises(PermissionError, match="'os.system' is not allowed"):
-            instantiate(settings["callbacks"][name])
+            instantiate(settings["callbacks"][name], sentinel.parent)
     assert not sentinel.exists()
 
 
