@@ -82,35 +82,7 @@ class Evaluation:
     plugins: Any = field(default_factory=list)
 
 
-@dataclass
-class Benchmarks:
-    """Every top-level key of `mvrecon-bench`."""
-
-    bench: Any = None
-    out: str = MISSING
-    plugins: Any = field(default_factory=list)
-
-
-@dataclass
-class Plan:
-    """Every top-level key of `mvrecon-stress`."""
-
-    parts: Any = MISSING
-    cases: Any = None
-    device: str = MISSING
-    dtypes: Any = MISSING
-    limit_s: Any = MISSING
-    out: str = MISSING
-    plugins: Any = field(default_factory=list)
-
-
-SCHEMAS = {
-    "schema": Settings,
-    "evaluation_schema": Evaluation,
-    "simulation_schema": Simulation,
-    "bench_schema": Benchmarks,
-    "stress_schema": Plan,
-}
+SCHEMAS = {"schema": Settings, "evaluation_schema": Evaluation, "simulation_schema": Simulation}
 
 
 class PluginConf(SearchPathPlugin):

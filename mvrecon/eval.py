@@ -19,11 +19,14 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: no checkpoint or no run is there.
+        ValueError: settings for a method that the run has trained, which its checkpoint decides.
     """
     import_plugins(given["plugins"])
     from mvrecon.engine import checkpoints, evaluation, export, fit, record
 
     run = checkpoints.run_folder(given["checkpoint"])
+    if trained := [label for label, model in given["compare"].items() if model and checkpoints.finished(run, label).exists()]:
+        raise ValueError(f"compare describes {trained}, which the run has trained already; expected other labels")
     settings = merged(record.read_settings(run), given)
     import_plugins(settings["plugins"])
     data = fit.build_data(settings)
