@@ -25,7 +25,8 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.engine import checkpoints, evaluation, export, fit, record
 
     run = checkpoints.run_folder(given["checkpoint"])
-    if trained := [label for label, model in given["compare"].items() if model and checkpoints.finished(run, label).exists()]:
+    described = (label for label, model in given["compare"].items() if model)
+    if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
         raise ValueError(f"compare describes {trained}, which the run has trained already; expected other labels")
     settings = merged(record.read_settings(run), given)
     import_plugins(settings["plugins"])

@@ -49,7 +49,8 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
             if not any((folder / f"{config_name}.yaml").is_file() for folder in (main, *others)):
                 raise PermissionError(f"--config-name={config_name} is no app of mvrecon's; choose an experiment=...")
             check_foreign(config, foreign, overrides, composed)
-        check_used(config)
+        if overrides:
+            check_used(config, composed([]))
         return _named(config)
 
     def bounded(source: Any, config_path: str) -> Any:
@@ -71,8 +72,9 @@ def check_used(config: DictConfig, own: DictConfig) -> None:
     Raises:
         LookupError: a key that the app does not have, so that nothing would come of it; the message names it.
     """
-    if unused := [str(key) for key in config if key not in own]:
-        raise LookupError(f"This app does not use the setting {unused[0]!r}{hint(unused[0], map(str, own))}")
+    known = {str(key) for key in own}  # `key in own` is false for a setting that is still to be given
+    if unused := [str(key) for key in config if key not in known]:
+        raise LookupError(f"This app does not use the setting {unused[0]!r}{hint(unused[0], known - {'hydra'})}")
 
 
 def _named(config: DictConfig) -> DictConfig:

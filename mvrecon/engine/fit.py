@@ -97,5 +97,5 @@ def build_trainer(settings: Settings, folder: Path, board: Path, last: Path) -> 
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
     loggers = [instantiate(node, board, save_dir=str(board)) for node in (settings["logger"] or {}).values() if node]
     options = {"enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks), **settings["trainer"]}
-    given = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board, "plugins": [DurableCheckpoints(folder)]}
-    return L.Trainer(**options, **given)
+    given = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
+    return L.Trainer(**options, **given, plugins=[DurableCheckpoints(folder)])

@@ -87,6 +87,16 @@ def test_a_name_does_not_lead_out_of_the_outputs(name: str, folder):
         compose(*folder(f"name: {name!r}"))
 
 
+@pytest.mark.door
+@pytest.mark.parametrize(("text", "error"), [("out: {}", PermissionError), ("bench: {{name: ../..{}}}", Refused)])
+def test_a_fetched_benchmark_does_not_choose_its_folder(text: str, error: type, tmp_path: Path):
+    """The folder of a benchmark is chosen by the command line, and not by a config that was fetched."""
+    files = {"bench/evil.yaml": f"# @package _global_\n{text.format(tmp_path / 'x')}\n"}
+    place = experiment(tmp_path, "name: mine", **files)[0]
+    with pytest.raises(error, match=r"sets \['out'\]; only a command line may|has the name '\.\.'"):
+        compose(place, "bench=evil", config_name="bench")
+
+
 def test_a_yaml_file_that_unfolds_is_refused_at_once(folder, tmp_path: Path):
     with pytest.raises(Refused, match=r"evil\.yaml: unfolds to more than"):
         compose(*folder(BOMB))
