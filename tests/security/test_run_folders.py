@@ -196,7 +196,8 @@ def test_a_checkpoint_gives_a_callback_no_place_outside(home: Path, tmp_path: Pa
     """A checkpoint to go on from that tells a callback to write elsewhere lets no training begin."""
     settings = compose(*OPTIONS)
     settings["callbacks"] = {"spikes": {"_target_": "lightning.pytorch.callbacks.spike.SpikeDetection"}}
-    trainer = fit.build_trainer(settings, tmp_path, tmp_path, tmp_path / "last.ckpt")
+    folder = tmp_path / "run"
+    trainer = fit.build_trainer(settings, folder, folder, folder / "last.ckpt")
     spikes = next(callback for callback in trainer.callbacks if type(callback).__name__ == "SpikeDetection")
     guards = [callback for callback in trainer.callbacks if isinstance(callback, Confined)]
     spikes.exclude_batches_path = str(home / "Documents" / "thesis.txt")
