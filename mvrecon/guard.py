@@ -49,9 +49,7 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
             if not any((folder / f"{config_name}.yaml").is_file() for folder in (main, *others)):
                 raise PermissionError(f"--config-name={config_name} is no app of mvrecon's; choose an experiment=...")
             check_foreign(config, foreign, overrides, composed)
-        if overrides:
-            check_used(config, composed([]))
-        return _named(config)
+        return _named(used(config, composed([]) if overrides else config))
 
     def bounded(source: Any, config_path: str) -> Any:
         path = Path(source.path) / source._normalize_file_name(config_path)
@@ -66,8 +64,8 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
         ConfigLoaderImpl.load_configuration, files.load_config = load, read
 
 
-def check_used(config: DictConfig, own: DictConfig) -> None:
-    """Compare the top-level keys of a config with the app's own, to which `+key=...` on a command line adds unasked.
+def used(config: DictConfig, own: DictConfig) -> DictConfig:
+    """A config whose top-level keys are the app's own; `+key=...` on a command line adds any other unasked.
 
     Raises:
         LookupError: a key that the app does not have, so that nothing would come of it; the message names it.
@@ -75,6 +73,7 @@ def check_used(config: DictConfig, own: DictConfig) -> None:
     known = {str(key) for key in own}  # `key in own` is false for a setting that is still to be given
     if unused := [str(key) for key in config if key not in known]:
         raise LookupError(f"This app does not use the setting {unused[0]!r}{hint(unused[0], known - {'hydra'})}")
+    return config
 
 
 def _named(config: DictConfig) -> DictConfig:
