@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from mvrecon.cameras.rigs import circular as circular
     from mvrecon.cameras.rigs import dome as dome
     from mvrecon.cameras.rigs import parallel as parallel
-    from mvrecon.data.nifti import read_nifti as read_volume
-    from mvrecon.data.nifti import save_nifti as save_volume
+    from mvrecon.data.nifti import read_nifti as read_volume  # noqa: F401
     from mvrecon.engine.checkpoints import load as load
+    from mvrecon.engine.export import save_nifti as save_volume  # noqa: F401
     from mvrecon.geometry.grid import Grid as Grid
     from mvrecon.projectors.drr import Drr as Drr
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
@@ -48,7 +48,7 @@ _DOOR = {
     "mlem": "mvrecon.reconstruct.mlem:mlem",
     "parallel": "mvrecon.cameras.rigs:parallel",
     "read_volume": "mvrecon.data.nifti:read_nifti",
-    "save_volume": "mvrecon.data.nifti:save_nifti",
+    "save_volume": "mvrecon.engine.export:save_nifti",
     "sirt": "mvrecon.reconstruct.iterative:sirt",
 }
 

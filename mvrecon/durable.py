@@ -2,6 +2,7 @@
 
 import os
 import socket
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
@@ -56,8 +57,10 @@ def claimed(folder: Path) -> Iterator[None]:
 
     Raises:
         RuntimeError: another process has the folder; the message names it.
+        PermissionError: anything but files and folders is in it; see `check_plain`.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    check_plain(folder)
     with open(folder / LOCK, "a+", encoding="utf-8") as lock:
         if fcntl is not None:
             try:
@@ -71,7 +74,7 @@ def claimed(folder: Path) -> Iterator[None]:
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         lock.flush()
-        for left in folder.rglob(f".*{PART}"):
+        for left in folder.rglob(f".*.[0-9]*{PART}"):
             left.unlink(missing_ok=True)
         yield
 
@@ -92,6 +95,30 @@ def new_folder(wanted: str | Path) -> Path:
         except FileExistsError:
             continue
     return folder
+
+
+def check_plain(folder: Path) -> None:
+    """Refuse a folder that leads to other places: with a link in it, or a pipe or a device, at any depth.
+
+    The folder itself may be reached by a link.
+
+    Raises:
+        PermissionError: it holds such a thing; the message names the first.
+    """
+    for parent, folders, files in os.walk(folder):  # does not follow links
+        for path in (Path(parent, name) for name in (*folders, *files)):
+            if _leads_elsewhere(path):
+                raise PermissionError(
+                    f"{folder} holds {path.relative_to(folder)}, a link, a pipe or a device; expected files and folders"
+                )
+
+
+def _leads_elsewhere(path: Path) -> bool:
+    try:
+        kind = path.lstat().st_mode
+    except FileNotFoundError:  # its writer has just put it in its place
+        return False
+    return not (stat.S_ISREG(kind) or stat.S_ISDIR(kind))
 
 
 def _flush(path: Path, flags: int) -> None:

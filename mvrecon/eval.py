@@ -6,7 +6,8 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.config import import_plugins, launch, to_plain
+from mvrecon.config import launch, to_plain
+from mvrecon.config.plugins import import_plugins
 
 
 def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -20,13 +21,17 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
     Raises:
         FileNotFoundError: no checkpoint or no run is there.
         RuntimeError: another process is at work in the folder.
-        ValueError: the run was made with another rig or other data; the folder is another evaluation's.
+        ValueError: the run was made with another rig or other data; the folder is another evaluation's; settings for
+            a method that the run has trained, which its checkpoint decides.
         FileExistsError: the folder is a run's own.
     """
     import_plugins(given["plugins"])
     from mvrecon.engine import agreement, checkpoints, evaluation, export, fit, record, run_folder
 
     run = checkpoints.run_folder(given["checkpoint"])
+    described = (label for label, model in given["compare"].items() if model)
+    if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
+        raise ValueError(f"compare describes {trained}, which the run has trained already; expected other labels")
     settings = merged(record.read_settings(run), given)
     import_plugins(settings["plugins"])
     data = fit.build_data(settings)

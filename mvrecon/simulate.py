@@ -6,7 +6,8 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.config import import_plugins, launch, to_plain
+from mvrecon.config import launch, to_plain
+from mvrecon.config.plugins import import_plugins
 
 
 def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:

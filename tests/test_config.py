@@ -12,7 +12,9 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
 from mvrecon import config
-from mvrecon.config import compose, conf_dir, help_text, import_plugins, instantiate
+from mvrecon.config import compose, conf_dir, help_text
+from mvrecon.config.plugins import import_plugins
+from mvrecon.config.targets import instantiate
 from mvrecon.registry import GROUP
 
 EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))
@@ -139,6 +141,6 @@ def test_plugin_modules_are_imported_and_a_broken_one_is_named(tmp_path: Path, m
         import_plugins(["bad_plugin_module"])
 
 
-def test_a_target_of_an_allowed_library_is_built():
-    timer = instantiate({"_target_": "lightning.pytorch.callbacks.Timer", "duration": "00:00:01:00"}, interval="epoch")
+def test_a_target_of_an_allowed_library_is_built(tmp_path: Path):
+    timer = instantiate({"_target_": "lightning.pytorch.callbacks.Timer", "duration": "00:00:01:00"}, tmp_path)
     assert timer.time_remaining() == 60.0

@@ -18,6 +18,7 @@ from mvrecon.engine.export import save_png
 from mvrecon.engine.record import versions
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
+from mvrecon.places import check_places
 from mvrecon.viz import montage
 from mvrecon.viz.planes import Image
 
@@ -35,6 +36,8 @@ class Clock(L.Callback):
 
     Validation and pictures do not count. The seconds go into the checkpoint, so a resumed run adds to them.
     """
+
+    of_every_run = True
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -67,6 +70,30 @@ class Clock(L.Callback):
         figures = {"step_ms": 1e3 * step, "volumes_per_s": count / step, "seconds": self.seconds}
         figures["peak_mb"] = peak_megabytes()
         pl_module.log_dict({f"time/{name}": value for name, value in figures.items()}, batch_size=count)
+
+
+class Confined(L.Callback):
+    """Lets no training begin whose callbacks or loggers would write outside the run folder.
+
+    Their options were looked at when they were built; a checkpoint to go on from may hold other places.
+
+    Args:
+        folder: the run folder.
+    """
+
+    of_every_run = True
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Look, once all states are restored.
+
+        Raises:
+            PermissionError: a place outside the folder.
+        """
+        for thing in (*trainer.callbacks, *trainer.loggers):  # pyright: ignore[reportAttributeAccessIssue]
+            check_places(thing, self.folder)
 
 
 class CompileModel(L.Callback):

@@ -1,9 +1,11 @@
 """Where a run keeps its checkpoints, and how its methods come back from them."""
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from mvrecon.data.module import SceneData
+from mvrecon.durable import check_plain
 from mvrecon.engine.archive import check_archive, check_settings
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.record import SETTINGS
@@ -45,13 +47,15 @@ def run_folder(path: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: the path is not there, or no run folder is around it.
+        PermissionError: anything but files and folders is in the run folder.
     """
-    path = Path(path).expanduser().resolve()
+    path = Path(os.path.abspath(Path(path).expanduser()))  # links in it are not followed yet
     if not path.exists():
         raise FileNotFoundError(f"No checkpoint or run folder is at {path}")
     for folder in (path, *path.parents[:3]):
         if (folder / SETTINGS).is_file():
-            return folder
+            check_plain(folder)
+            return folder.resolve()
     raise FileNotFoundError(f"Expected a checkpoint in a run folder (one with {SETTINGS}), got {path}")
 
 

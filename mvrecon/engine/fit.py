@@ -1,6 +1,5 @@
 """One run: its data, its methods, and the training of each that has something to learn."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,27 +7,28 @@ import lightning.pytorch as L
 from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 
-from mvrecon.config import instantiate
+from mvrecon.config.targets import instantiate
 from mvrecon.data.module import SceneData
-from mvrecon.engine.callbacks import Clock
+from mvrecon.engine.callbacks import Clock, Confined
 from mvrecon.engine.checkpoints import finished, unfinished
 from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
-from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest
+from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
+from mvrecon.limits import plain_name
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
     """The models of a run's result table by label: the main one first, then those of `compare` that are not null.
 
     Raises:
-        ValueError: the main model's label is taken twice.
+        ValueError: the main model's label is taken twice, or a label is no plain name: files are called by it.
     """
     main = settings["model"]
     others = {label: model for label, model in settings["compare"].items() if model}
     if main["name"] in others:
         raise ValueError(f"compare holds {main['name']!r}, which is the main model's own label; give it another")
-    return {main["name"]: main, **others}
+    return {plain_name(label, "a method"): model for label, model in {main["name"]: main, **others}.items()}
 
 
 def build_data(settings: Settings) -> SceneData:
@@ -76,7 +76,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         return
     L.seed_everything(settings["seed"], workers=True, verbose=False)  # initial weights have used up random numbers
     board = folder if method == next(iter(models)) else folder / method
-    trainer = build_trainer(settings, board, last)
+    trainer = build_trainer(settings, folder, board, last)
     begun = last.exists() or previous(last).exists()
     step = read_newest(last)["global_step"] if begun else 0
     if begun:
@@ -87,19 +87,23 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     with remembered(last):
         trainer.fit(module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True)
         trainer.save_checkpoint(done)
-    shutil.rmtree(last.parent, ignore_errors=True)
+    remove(last)
 
 
 def _tell(line: str) -> None:
     Console(stderr=True, markup=False, highlight=False).print(line, soft_wrap=True)
 
 
-def build_trainer(settings: Settings, board: Path, last: Path) -> L.Trainer:
-    """Lightning's trainer, its logs and pictures flat in `board`, its last checkpoint at every validation in `last`."""
+def build_trainer(settings: Settings, folder: Path, board: Path, last: Path) -> L.Trainer:
+    """Lightning's trainer, its logs and pictures flat in `board`, its last checkpoint at every validation in `last`.
+
+    Raises:
+        PermissionError: a callback or a logger that would write outside `board`.
+    """
     board.mkdir(parents=True, exist_ok=True)
-    callbacks: list[Any] = [instantiate(node) for node in (settings["callbacks"] or {}).values() if node]
-    callbacks += [Clock(), RandomNumbers(), KeepLast(last)]
-    loggers = [instantiate(node, save_dir=str(board)) for node in (settings["logger"] or {}).values() if node]
+    callbacks: list[Any] = [instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node]
+    callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
+    loggers = [instantiate(node, board, save_dir=str(board)) for node in (settings["logger"] or {}).values() if node]
     options = {"enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks), **settings["trainer"]}
-    given = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board, "plugins": [DurableCheckpoints()]}
-    return L.Trainer(**options, **given)
+    given = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
+    return L.Trainer(**options, **given, plugins=[DurableCheckpoints(folder)])

@@ -9,6 +9,7 @@ import io
 import struct
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,7 +19,8 @@ from torch import Tensor
 
 from mvrecon.durable import written_whole
 from mvrecon.engine.archive import check_archive
-from mvrecon.limits import Refused
+from mvrecon.limits import Refused, blaming, shown
+from mvrecon.places import inside
 
 TAG = b"sha256:"
 COMMENT = len(TAG) + 64
@@ -29,24 +31,48 @@ class DamagedCheckpoint(Refused):
 
 
 class DurableCheckpoints(CheckpointIO):
-    """How Lightning writes and reads checkpoints of a run; see `write` and `read_newest`."""
+    """How Lightning writes, reads and removes checkpoints of a run; see `write` and `read_newest`.
+
+    A checkpoint to go on from may tell Lightning of older ones, to be removed: none outside the run folder is.
+
+    Args:
+        folder: the run folder.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write; see `write`."""
-        write(Path(path), checkpoint)
+        """Write; see `write`.
+
+        Raises:
+            PermissionError: a path outside the folder.
+        """
+        write(inside(path, self.folder, "A checkpoint's path"), checkpoint)
 
     def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None) -> dict[str, Any]:
         """Read; see `read_newest`. Nothing but plain values and tensors is ever read."""
         return read_newest(Path(path))
 
     def remove_checkpoint(self, path: Any) -> None:
-        """Remove a file."""
-        Path(path).unlink(missing_ok=True)
+        """Remove a file.
+
+        Raises:
+            PermissionError: a path outside the folder.
+        """
+        inside(path, self.folder, "A checkpoint's path").unlink(missing_ok=True)
 
 
 def previous(path: Path) -> Path:
     """Where the checkpoint goes that was at `path` before."""
     return path.with_stem(f"{path.stem}.previous")
+
+
+def not_finite(checkpoint: Mapping[str, Any]) -> list[str]:
+    """The names of the weights, averaged or not, among which is an infinite number or none."""
+    states = (checkpoint.get(key) or {} for key in ("state_dict", "current_model_state"))
+    weights = (pair for state in states for pair in state.items())
+    return [name for name, value in weights if isinstance(value, Tensor) and not value.isfinite().all()]
 
 
 def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
@@ -58,8 +84,7 @@ def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
         FloatingPointError: weights that are not finite, which must not take a good checkpoint's place.
         OSError: no space, no permission.
     """
-    weights = checkpoint.get("state_dict", {})
-    if bad := [name for name, value in weights.items() if isinstance(value, Tensor) and not value.isfinite().all()]:
+    if bad := not_finite(checkpoint):
         raise FloatingPointError(f"{path} is not written: {len(bad)} weights are not finite, {bad[0]} among them")
     buffer = io.BytesIO()
     torch.save(dict(checkpoint), buffer)
@@ -75,12 +100,26 @@ def read(path: Path) -> dict[str, Any]:
 
     Raises:
         DamagedCheckpoint: the checksum does not fit, or the file is cut short.
+        Refused: more than tensors and plain values, or weights that are not finite.
     """
     with open(path, "rb") as file:
         _verify(path, file)
         check_archive(path)
         file.seek(0)
-        return torch.load(file, map_location="cpu", weights_only=True)
+        checkpoint = torch.load(file, map_location="cpu", weights_only=True)
+    with blaming(path, "is no checkpoint"):
+        bad = not_finite(checkpoint)
+    if bad:
+        raise Refused(f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them; expected numbers")
+    return checkpoint
+
+
+def remove(path: Path) -> None:
+    """Remove a checkpoint and the one before it; then their folder, unless anything else is in it."""
+    for file in (path, previous(path)):
+        file.unlink(missing_ok=True)
+    with suppress(OSError):
+        path.parent.rmdir()
 
 
 def read_newest(path: Path) -> dict[str, Any]:

@@ -22,6 +22,8 @@ class KeepLast(Checkpoint):
         path: of the checkpoint; the one before stays beside it.
     """
 
+    of_every_run = True
+
     def __init__(self, path: Path):
         self.path = path
 
@@ -71,6 +73,8 @@ class RandomNumbers(L.Callback):
 
     Data, its order and its augmentation do not: they are pure functions of seed, epoch and index.
     """
+
+    of_every_run = True
 
     def __init__(self) -> None:
         self._loaded: dict[str, Any] | None = None

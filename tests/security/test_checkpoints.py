@@ -12,6 +12,7 @@ import torch
 
 from mvrecon.engine.archive import check_archive
 from mvrecon.engine.checkpoints import finished, load, unfinished
+from mvrecon.engine.storage import read_newest
 from mvrecon.limits import Refused
 from mvrecon.testing.hostile import SETTINGS, Payload, pickle_of, pickles, saved, with_pickle
 from mvrecon_bench.stresses.samples import checkpoint
@@ -141,3 +142,17 @@ def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
     weights = {**kept["state_dict"], first: torch.zeros(3, 3)}
     with pytest.raises(Refused, match=rf"a\.ckpt: does not fit (.|\n)*{first}"):
         load(written(tmp_path / "a.ckpt", saved({**kept, "state_dict": weights})))
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_weights_that_are_not_finite_are_refused(value: float, kept: dict, tmp_path: Path):
+    """A checkpoint with a weight that is not a finite number is refused, to be evaluated and to be gone on from."""
+    name = next(name for name, weight in kept["state_dict"].items() if weight.is_floating_point() and weight.numel())
+    weight = kept["state_dict"][name].clone()
+    weight.view(-1)[-1] = value
+    for key in ("state_dict", "current_model_state"):
+        path = written(tmp_path / f"{key}.ckpt", saved({**kept, key: {**kept["state_dict"], name: weight}}))
+        for reader in (load, read_newest):
+            with pytest.raises(Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'model.* among them"):
+                reader(path)

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.config import compose, import_plugins, instantiate
+from mvrecon.config import compose
+from mvrecon.config.plugins import import_plugins
+from mvrecon.config.targets import instantiate
 from mvrecon.limits import Refused, yaml_of
 from mvrecon.testing.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
 
@@ -23,7 +25,7 @@ def sentinel(tmp_path: Path) -> Path:
 def test_a_target_is_a_callback_or_a_logger_or_refused(name: str, sentinel: Path):
     torch.save(Payload(f"touch {sentinel}"), sentinel.with_name("payload.ckpt"))
     with pytest.raises(PermissionError, match="not allowed; expected"):
-        instantiate(targets(sentinel)[name])
+        instantiate(targets(sentinel)[name], sentinel.parent)
     assert not sentinel.exists()
 
 
@@ -37,7 +39,7 @@ callbacks:
     for name in ("by_alias", "by_reference"):
         assert settings["callbacks"][name]["_target_"] == "os.system"
         with pytest.raises(PermissionError, match="'os.system' is not allowed"):
-            instantiate(settings["callbacks"][name])
+            instantiate(settings["callbacks"][name], sentinel.parent)
     assert not sentinel.exists()
 
 
@@ -85,6 +87,16 @@ def test_environment_variables_are_not_read(folder, monkeypatch: pytest.MonkeyPa
 def test_a_name_does_not_lead_out_of_the_outputs(name: str, folder):
     with pytest.raises(Refused, match="has the name"):
         compose(*folder(f"name: {name!r}"))
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(("text", "error"), [("out: {}", PermissionError), ("bench: {{name: ../..{}}}", Refused)])
+def test_a_fetched_benchmark_does_not_choose_its_folder(text: str, error: type, tmp_path: Path):
+    """The folder of a benchmark is chosen by the command line, and not by a config that was fetched."""
+    files = {"bench/evil.yaml": f"# @package _global_\n{text.format(tmp_path / 'x')}\n"}
+    place = experiment(tmp_path, "name: mine", **files)[0]
+    with pytest.raises(error, match=r"sets \['out'\]; only a command line may|has the name '\.\.'"):
+        compose(place, "bench=evil", config_name="bench")
 
 
 def test_a_yaml_file_that_unfolds_is_refused_at_once(folder, tmp_path: Path):

@@ -6,7 +6,8 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.config import import_plugins, launch, to_plain
+from mvrecon.config import launch, to_plain
+from mvrecon.config.plugins import import_plugins
 
 
 def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
@@ -14,15 +15,21 @@ def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
 
     The folder then holds `results.csv`, `table.md`, `targets.md`, a plot, `config.yaml`, `versions.txt`, and all of it
     on TensorBoard.
+
+    Raises:
+        RuntimeError: another process is at work in the folder.
+        PermissionError: anything but files and folders is in it.
     """
     import_plugins(settings["plugins"])
+    from mvrecon.durable import claimed
     from mvrecon.engine import record
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.benchmarks.kinds import BENCHES
 
     kind = BENCHES.from_config(settings["bench"])
-    record.start(folder, settings)
-    return runner.run(kind, folder)
+    with claimed(folder):
+        record.start(folder, settings)
+        return runner.run(kind, folder)
 
 
 def task(config: DictConfig) -> None:

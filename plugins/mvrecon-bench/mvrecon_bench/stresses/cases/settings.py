@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mvrecon.config import import_plugins, instantiate
+from mvrecon.config.plugins import import_plugins
+from mvrecon.config.targets import instantiate
 from mvrecon.engine.checkpoints import finished, load, unfinished
 from mvrecon.geometry.grid import Grid
 from mvrecon.limits import Refused, yaml_of
@@ -243,7 +244,9 @@ def evil_configs(subject: Subject) -> float:
         path, sentinel = Path(folder) / "evil.yaml", Path(folder) / "sentinel"
         sentinel.with_name("payload.ckpt").write_bytes(hostile.saved(hostile.Payload(f"touch {sentinel}")))
         for name, node in hostile.targets(sentinel).items():
-            wrong[name] = refusal(lambda node=node: instantiate(node), "not allowed; expected", PermissionError)
+            wrong[name] = refusal(
+                lambda node=node: instantiate(node, Path(folder)), "not allowed; expected", PermissionError
+            )
         for text, saying in ((hostile.BOMB, "unfolds"), ("a: &a [*a]", "unfolds"), ("x: " + "[" * 10_000, "not YAML")):
             path.write_text(text)
             wrong[f"{text[:20]!r}"] = refusal(lambda: yaml_of(path), rf"evil\.yaml: .*{saying}")

@@ -15,6 +15,7 @@ from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
 
 from mvrecon.limits import plain_name, shown, yaml_of
+from mvrecon.registry import hint
 
 #: Keys of the section `hydra` that may come from anywhere, and those that tell of a composition.
 OPEN = {"mode", "verbose", "help", "sweeper.params", "runtime", "overrides", "job.override_dirname"}
@@ -30,6 +31,7 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
 
     Raises:
         PermissionError: a file from elsewhere sets what only the command line may, or reads environment variables.
+        LookupError: a setting that the app does not use.
         Refused: a YAML file that is too large, or a `name` that leads out of the folder of outputs.
     """
     Plugins.instance()  # fills the registry with classes of its own, other than those that an import gives
@@ -47,7 +49,7 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
             if not any((folder / f"{config_name}.yaml").is_file() for folder in (main, *others)):
                 raise PermissionError(f"--config-name={config_name} is no app of mvrecon's; choose an experiment=...")
             check_foreign(config, foreign, overrides, composed)
-        return _named(config)
+        return _named(used(config, composed([]) if overrides else config))
 
     def bounded(source: Any, config_path: str) -> Any:
         path = Path(source.path) / source._normalize_file_name(config_path)
@@ -62,6 +64,18 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
         ConfigLoaderImpl.load_configuration, files.load_config = load, read
 
 
+def used(config: DictConfig, own: DictConfig) -> DictConfig:
+    """A config whose top-level keys are the app's own; `+key=...` on a command line adds any other unasked.
+
+    Raises:
+        LookupError: a key that the app does not have, so that nothing would come of it; the message names it.
+    """
+    known = {str(key) for key in own}  # `key in own` is false for a setting that is still to be given
+    if unused := [str(key) for key in config if key not in known]:
+        raise LookupError(f"This app does not use the setting {unused[0]!r}{hint(unused[0], known - {'hydra'})}")
+    return config
+
+
 def _named(config: DictConfig) -> DictConfig:
     for part in str(config.name).split("/") if "name" in config else []:
         plain_name(part, f"The setting name={config.name}")
@@ -71,10 +85,11 @@ def _named(config: DictConfig) -> DictConfig:
 def check_foreign(
     config: DictConfig, folders: list[str], overrides: list[str], compose: Callable[[list[str]], DictConfig]
 ) -> None:
-    """Compare Hydra's own section with what it is without the folders' files.
+    """Compare Hydra's own section, and `out`, the folder that an app writes to, with what they are without the files.
 
     Raises:
         PermissionError: they differ, or the folders' files cannot be told apart.
+        Refused: an `out` that is made of settings which lead out of the folder of outputs.
     """
     if any((Path(folder) / "hydra").exists() for folder in folders):
         raise PermissionError(f"{shown(folders)} has configs of Hydra's own; expected none in a folder of experiments")
@@ -82,18 +97,27 @@ def check_foreign(
         source.provider == "main" and source.path not in folders for source in config.hydra.runtime.config_sources
     ):
         raise PermissionError("--config-path and --config-name of other apps are not allowed; use --config-dir")
-    own = compose([line for line in overrides if line.lstrip("+~").startswith("hydra")])
-    found, expected = (dict(_leaves(OmegaConf.to_container(c.hydra, resolve=False))) for c in (config, own))
+    own = compose([line for line in overrides if line.lstrip("+~").startswith(("hydra", "out="))])
+    found, expected = (dict(_leaves(_hydra(c))) for c in (config, own))
     changed = sorted(key for key in {**found, **expected} if found.get(key) != expected.get(key) and not _open(key))
     if changed:
-        raise PermissionError(f"A config sets {shown([f'hydra.{key}' for key in changed])}; only a command line may")
+        raise PermissionError(f"A config sets {shown(changed)}; only a command line may")
+    if "out" in config and not any(line.startswith("out=") for line in overrides):
+        for part in str(config.out).split("/"):
+            plain_name(part, f"The setting out={config.out}")
     settings = OmegaConf.to_yaml(OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"]))
     if "oc.env" in settings and not any("oc.env" in line for line in overrides):
         raise PermissionError("A config reads environment variables by ${oc.env:...}; only a command line may")
 
 
+def _hydra(config: DictConfig) -> dict[str, Any]:
+    """Hydra's own section as it is written, and the folder of outputs that it refers to."""
+    written: Any = OmegaConf.to_container(config, resolve=False)
+    return {key: written[key] for key in ("hydra", "out") if key in written}
+
+
 def _open(key: str) -> bool:
-    return any(f"{key}.".startswith(f"{prefix}.") for prefix in OPEN)
+    return any(f"{key}.".startswith(f"hydra.{prefix}.") for prefix in OPEN)
 
 
 def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

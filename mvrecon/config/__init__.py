@@ -1,0 +1,128 @@
+"""Settings: where they live, how they are composed, and what may be built from them. The one door to Hydra.
+
+Below this door everything is a plain dict of names and numbers, so that checkpoints load with torch's defaults
+and no loop pays for a config object. Importing this file imports neither torch nor Lightning.
+"""
+
+import sys
+from collections.abc import Callable
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from mvrecon.config.guard import guarded
+from mvrecon.config.schemas import SCHEMAS
+from mvrecon.limits import shown
+from mvrecon.registry import installed, locate
+
+VERSION_BASE = "1.3"
+
+
+class PluginConf(SearchPathPlugin):
+    """Adds the config folders of installed plugins to Hydra's search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in plugin_conf_dirs():
+            search_path.append(provider="mvrecon plugin", path=f"file://{folder}")
+
+
+def conf_dir() -> Path:
+    """Where the YAML files are: beside the code in a wheel, one level up in a checkout."""
+    here = Path(__file__).resolve().parents[1]
+    return here / "conf" if (here / "conf").is_dir() else here.parent / "conf"
+
+
+def plugin_conf_dirs() -> list[Path]:
+    """The config folders that installed plugins declare (entry points named "conf.*"), found without an import."""
+    packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
+    return [Path(folder) for package in packages if package for folder in package.submodule_search_locations or ()]
+
+
+def app_file(config_name: str) -> Path:
+    """The YAML file of an app's settings: mvrecon's own, or that of an installed plugin.
+
+    Raises:
+        FileNotFoundError: no app has such a file.
+    """
+    folders = [conf_dir(), *plugin_conf_dirs()]
+    for file in (folder / f"{config_name}.yaml" for folder in folders):
+        if file.is_file():
+            return file
+    raise FileNotFoundError(f"No app has the settings {config_name}.yaml in any of {shown(map(str, folders))}")
+
+
+def prepare_hydra() -> None:
+    """Make the schemas and the plugins' config groups known to Hydra, in this process only."""
+    for name, schema in SCHEMAS.items():
+        ConfigStore.instance().store(name=name, node=schema)
+    Plugins.instance().register(PluginConf)
+
+
+def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
+    """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once.
+
+    Raises:
+        PermissionError: the flag of Hydra's that unpickles a file.
+    """
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        sys.stdout.write(help_text(config_name))
+        return
+    if any(argument.startswith("--e") for argument in sys.argv[1:]):
+        raise PermissionError("--experimental-rerun unpickles a file, which can run anything; use resume=<run folder>")
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: a path that it cannot write must not end a run
+    prepare_hydra()
+    with guarded(conf_dir(), plugin_conf_dirs()):
+        hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(task)()
+
+
+def help_text(config_name: str) -> str:
+    """What an app can be told: every group with its choices, and the settings with their comments."""
+    choices: dict[str, set[str]] = {}
+    for folder in (conf_dir(), *plugin_conf_dirs()):
+        for file in folder.glob("*/*.yaml"):
+            choices.setdefault(file.parent.name, set()).add(file.stem)
+    groups = "\n".join(f"  {group:<12}{', '.join(sorted(names))}" for group, names in sorted(choices.items()))
+    settings = app_file(config_name).read_text(encoding="utf-8")
+    return (
+        f"Usage: mvrecon-{config_name} [group=choice ...] [key=value ...]\n\nGroups and their choices:\n{groups}\n\n"
+        f"{settings}\n"
+        "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of your own\n"
+        "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's options.\n"
+    )
+
+
+def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
+    """The plain settings that a command line with these overrides would run with.
+
+    Raises:
+        RuntimeError: another program in this process is using Hydra; it is left alone.
+    """
+    if GlobalHydra.instance().is_initialized():
+        raise RuntimeError("Hydra is in use already in this process: compose() must be called outside a Hydra app")
+    prepare_hydra()
+    own = guarded(conf_dir(), plugin_conf_dirs())
+    with own, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+        return to_plain(hydra.compose(config_name, list(overrides)))
+
+
+def to_plain(config: DictConfig) -> dict[str, Any]:
+    """A composed config as plain dicts, lists, strings and numbers, all references resolved.
+
+    Raises:
+        LookupError: a setting marked `???` was not given.
+    """
+    if missing := OmegaConf.missing_keys(config):
+        raise LookupError(f"These settings must be given: {', '.join(f'{key}=...' for key in sorted(missing))}")
+    plain = OmegaConf.to_container(config, resolve=True)
+    if not isinstance(plain, dict):
+        raise TypeError(f"Settings must be a mapping, got {type(plain).__name__}")
+    return {str(key): value for key, value in plain.items()}

@@ -1,0 +1,59 @@
+"""The top-level settings of the apps, so that a mistyped one is an error instead of a silent extra."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import MISSING
+
+
+@dataclass
+class Measurement:
+    """The top-level keys that all apps share: what is measured, and by which rig."""
+
+    name: str = MISSING
+    seed: int = 0
+    grid: Any = None
+    scene: Any = None
+    camera: Any = None
+    plugins: Any = field(default_factory=list)
+
+
+@dataclass
+class Simulation(Measurement):
+    """Every top-level key of `mvrecon-simulate`."""
+
+    cases: list[int] = MISSING
+
+
+@dataclass
+class Settings(Measurement):
+    """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a silent extra."""
+
+    test_scene: Any = None
+    projector: Any = None
+    model: Any = None
+    compare: Any = field(default_factory=dict)
+    loss: Any = field(default_factory=dict)
+    optimizer: Any = None
+    data: Any = None
+    trainer: Any = None
+    callbacks: Any = None
+    logger: Any = None
+    resume: str | None = None
+
+
+@dataclass
+class Evaluation:
+    """Every top-level key of `mvrecon-eval`: what the run itself decides, such as its camera, is not among them."""
+
+    name: str = MISSING
+    checkpoint: str = MISSING
+    test_scene: Any = None
+    data: Any = None
+    compare: Any = field(default_factory=dict)
+    device: str = "auto"
+    save: bool = False
+    plugins: Any = field(default_factory=list)
+
+
+SCHEMAS = {"schema": Settings, "evaluation_schema": Evaluation, "simulation_schema": Simulation}

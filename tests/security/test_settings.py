@@ -1,0 +1,69 @@
+"""What is typed on a command line is used, or named in an error before anything is written."""
+
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from mvrecon.config import compose
+from mvrecon.eval import evaluate
+
+APPS = {
+    "eval": "mvrecon.eval",
+    "train": "mvrecon.train",
+    "simulate": "mvrecon.simulate",
+    "bench": "mvrecon_bench.bench",
+    "stress": "mvrecon_bench.stress",
+}
+UNUSED = [
+    ("eval", "+camera.views=12"),
+    ("eval", "+camera=circular"),
+    ("eval", "+grid.spacing=2.0"),
+    ("eval", "+projector.name=drr"),
+    ("eval", "+model.name=sirt"),
+    ("eval", "+seed=5"),
+    ("eval", "+resume=x"),
+    ("train", "+checkpoint=x"),
+    ("train", "+device=cpu"),
+    ("train", "+save=true"),
+    ("train", "+camra.views=12"),
+    ("simulate", "+projector.name=drr"),
+    ("simulate", "+model.name=sirt"),
+    ("bench", "+device=cpu"),
+    ("stress", "+bench.name=operators"),
+]
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(("app", "option"), UNUSED)
+def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypatch, capsys):
+    """A setting that an app does not use is an error that names it, and nothing is written."""
+    needed = ["checkpoint=x"] if app == "eval" else []
+    monkeypatch.setattr(sys, "argv", [app, *needed, option, f"hydra.run.dir={tmp_path}/out"])
+    with pytest.raises(SystemExit) as stopped:
+        import_module(APPS[app]).main()
+    assert stopped.value.code == 1
+    key = option.lstrip("+").partition("=")[0].partition(".")[0]
+    assert re.search(f"(does not use the setting|Key) '{key}'", capsys.readouterr().err)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("option", ["seed=5", "camera.views=12", "grid.spacing=2.0", "projector=drr"])
+def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
+    """The seed, the rig, the grid and the projector of an evaluation are those of the run, and cannot be typed."""
+    with pytest.raises(Exception, match=f"Could not override '{option.partition('=')[0]}'"):
+        compose("checkpoint=x", option, config_name="eval")
+
+
+@pytest.mark.door
+def test_an_evaluation_does_not_describe_a_trained_method_anew(tmp_path: Path):
+    """Settings of a method that the run has trained are refused by its evaluation: its checkpoint decides."""
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "config.yaml").touch()
+    (tmp_path / "checkpoints" / "mine.ckpt").touch()
+    settings = compose(f"checkpoint={tmp_path}", "+compare.mine={name: sirt}", config_name="eval")
+    with pytest.raises(ValueError, match=r"compare describes \['mine'\], which the run has trained already"):
+        evaluate(settings, tmp_path / "out")
