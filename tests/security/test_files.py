@@ -2,9 +2,7 @@
 
 import json
 import re
-import resource
 import struct
-import time
 import tracemalloc
 import zlib
 from collections.abc import Callable
@@ -15,6 +13,7 @@ import nibabel
 import numpy as np
 import pytest
 
+from mvrecon import memory
 from mvrecon.cameras.files import from_file, save
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.nifti import read_nifti
@@ -25,17 +24,16 @@ from tests.data.conftest import RIG, stored
 
 
 def refused(read: Callable[[], object], message: str, megabytes: float = 64) -> None:
-    """Reading raises within a second of computing and without holding much."""
-    begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """Reading raises, and takes less than `megabytes` (2^20 bytes)."""
+    before = memory.peak() or 0
     tracemalloc.start()
     try:
         with pytest.raises(Refused, match=message):
             read()
-        taken, peak = time.process_time() - begun, tracemalloc.get_traced_memory()[1]
+        traced = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert taken < 1
-    assert max(peak / 2**20, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**10) < megabytes
+    assert max(traced, (memory.peak() or 0) - before) < megabytes * 2**20
 
 
 def volume_file(path: Path, change: Callable[[h5py.File], object]) -> VolumeFile:
