@@ -33,8 +33,10 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
     return found, said
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("reader", READERS)
 def test_a_reader_survives_damaged_files(reader: str, survey: tuple[dict, str]):
+    """A damaged file is read or refused with its name, within 256 MB, and the interpreter lives."""
     found, said = survey
     assert reader in found, said
     result = found[reader]
