@@ -114,7 +114,8 @@ def page(found: dict[str, Any], seed: int) -> str:
     broken = [fact for fact, counts in found["doors"].items() if counts[FAIL]]
     failed = *found["stress"]["failed"], *found["kills"]["runs that differ"], *broken
     text += "".join(f"\nFailed: {line.removesuffix('.')}.\n" for line in failed)
-    text += "\n## Doors: files, folders, settings, runs\n\nA row is a test, in its own words; its cases.\n\n"
+    text += "\n## Doors: files, folders, settings, runs\n\n"
+    text += "A row is a test: the fact that it asserts, and how many of its cases say so.\n\n"
     counted = [(fact, *(str(counts[verdict]) for verdict in VERDICTS)) for fact, counts in found["doors"].items()]
     text += markdown(("what holds", *VERDICTS), counted)
     text += "\n## Damaged files, reader by reader\n\nRead all the same: damaged where nothing is.\n\n"
