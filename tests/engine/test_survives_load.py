@@ -21,7 +21,7 @@ def crowded(root, tmp_path):
         command = [sys.executable, "-m", "tests.engine.crowd", kind, str(tmp_path)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         done = subprocess.run(
-            command, cwd=root, env=environment, capture_output=True, text=True, timeout=120, check=False
+            command, cwd=root, env=environment, capture_output=True, text=True, timeout=900, check=False
         )
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout.splitlines()[-1])

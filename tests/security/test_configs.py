@@ -66,7 +66,7 @@ def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, root: Path, t
     folder(experiments(sentinel)["a callback"])
     command = [sys.executable, "-m", "mvrecon.simulate", f"--config-dir={tmp_path}", "+experiment=evil", "cases=[0]"]
     command += [f"hydra.run.dir={tmp_path}/out"]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 1 and "only a command line may" in done.stderr
     assert not sentinel.exists() and not (tmp_path / "out").exists()
 
