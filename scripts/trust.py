@@ -45,6 +45,11 @@ def stress(_: argparse.Namespace) -> Any:
     return {"parts": parts, "rows": len(rows), "cases": len(cases), "numbers": len(numbers), "failed": failed}
 
 
+def doors(_: argparse.Namespace) -> Any:
+    """What guards files, folders, settings and runs: the verdicts, fact by fact."""
+    return json.loads(done(sys.executable, "-m", "tests.doors").splitlines()[-1])
+
+
 def fuzz(given: argparse.Namespace) -> Any:
     """What became of damaged files, reader by reader."""
     with tempfile.TemporaryDirectory() as folder:
@@ -77,6 +82,7 @@ def soak(given: argparse.Namespace) -> Any:
 STEPS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "stress": stress,
     "properties": properties,
+    "doors": doors,
     "fuzz": fuzz,
     "kills": kills,
     "soak": soak,
@@ -105,18 +111,27 @@ def page(found: dict[str, Any], seed: int) -> str:
     parts = [(part, *(str(counts.get(verdict, 0)) for verdict in VERDICTS)) for part, counts in tried.items()]
     text += "\n## The stress plan, part by part\n\nWithout the parts of plugins whose packages are not installed.\n\n"
     text += markdown(("part", *VERDICTS), parts)
-    failed = *found["stress"]["failed"], *found["kills"]["runs that differ"]
-    text += "".join(f"\nFailed: {line}.\n" for line in failed)
+    broken = [fact for fact, counts in found["doors"].items() if counts[FAIL]]
+    failed = *found["stress"]["failed"], *found["kills"]["runs that differ"], *broken
+    text += "".join(f"\nFailed: {line.removesuffix('.')}.\n" for line in failed)
+    text += "\n## Doors: files, folders, settings, runs\n\n"
+    text += "A row is a test: the fact that it asserts, and how many of its cases say so.\n\n"
+    counted = [(fact, *(str(counts[verdict]) for verdict in VERDICTS)) for fact, counts in found["doors"].items()]
+    text += markdown(("what holds", *VERDICTS), counted)
     text += "\n## Damaged files, reader by reader\n\nRead all the same: damaged where nothing is.\n\n"
     text += markdown(("reader", "inputs", "read", "failures", "slowest s", "most MB"), list(readers(found["fuzz"])))
     made = ", ".join(f"{name} {versions()[name]}" for name in ("python", "torch", "numba"))
     return f"{text}\nMade by `python scripts/trust.py --seed {seed}` with {made}.\n"
 
 
-def figures(stress: Any, properties: Any, fuzz: Any, kills: Any, soak: Any) -> list[tuple[str, str, str]]:
+def total(rows: dict[str, dict[str, int]]) -> str:
+    """The verdicts of all rows of a table, in words."""
+    counts = sum(map(Counter, rows.values()), Counter())
+    return ", ".join(f"{counts[name]} {name}" for name in VERDICTS)
+
+
+def figures(stress: Any, properties: Any, doors: Any, fuzz: Any, kills: Any, soak: Any) -> list[tuple[str, str, str]]:
     """What was done, how often, and the command that does it."""
-    verdicts = sum((Counter(counts) for counts in stress["parts"].values()), Counter())
-    said = ", ".join(f"{verdicts[name]} {name}" for name in VERDICTS)
     inputs, hurt = sum(one["inputs"] for one in fuzz.values()), sum(len(one["failures"]) for one in fuzz.values())
     slowest, largest = (max(one[name] for one in fuzz.values()) for name in ("seconds", "peak"))
     lost = len(kills["runs that differ"])
@@ -126,10 +141,12 @@ def figures(stress: Any, properties: Any, fuzz: Any, kills: Any, soak: Any) -> l
             f"{stress['cases']} ({stress['numbers']})",
             "`mvrecon-stress`",
         ),
-        ("verdicts on all parts", said, ""),
+        ("verdicts on all parts", total(stress["parts"]), ""),
         ("properties", str(properties["properties"]), "`pytest tests/properties`"),
         ("random geometries that they were tried on", str(properties["examples"]), ""),
         ("of these, failures", str(properties["failing"]), ""),
+        ("facts about doors: files, folders, settings, runs", str(len(doors)), "`python -m tests.doors`"),
+        ("verdicts on their cases", total(doors), ""),
         ("damaged files given to readers", str(inputs), "`python -m mvrecon_bench.stresses.fuzzing`"),
         ("of these, failures", str(hurt), ""),
         ("the slowest; the most memory", f"{slowest:.2f} s; {largest / 2**20:.0f} MB", ""),

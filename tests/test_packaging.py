@@ -1,6 +1,7 @@
 """What `pip install .` installs: the code, the configs, the data files, the console scripts, the licence."""
 
 import configparser
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -15,7 +16,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     """The wheel of this checkout, built without any download."""
     root, out = Path(__file__).parents[1], tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(root)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return zipfile.ZipFile(next(out.glob("*.whl")))
 
@@ -61,7 +62,7 @@ def test_an_unpacked_wheel_finds_its_own_configs(wheel: zipfile.ZipFile, tmp_pat
     wheel.extractall(tmp_path)
     code = "from mvrecon.config import compose, conf_dir; print(conf_dir()); compose('experiment=quickstart')"
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()) == tmp_path / "mvrecon" / "conf"
 
@@ -82,3 +83,35 @@ def test_every_dependency_is_pinned(root: Path):
     for requirement in map(Requirement, wanted):
         if requirement.name != "mvrecon":
             assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), requirement
+
+
+SHELL = """#!/bin/sh
+# In place of Python and pip: makes .venv, writes down what it is to install; a CPU build of torch is there if $CPU is.
+case "$*" in
+*--version) echo "Python 3.11.0" ;;
+"-m venv .venv") mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
+*"pip "*) for last; do :; done; case "$last" in *+cpu) [ -n "$CPU" ] || exit 1 ;; esac; echo "$last" >>installed ;;
+esac
+"""
+BUILDS = {
+    "no GPU, a CPU build": ("", "yes", "torch==1.2+cpu", "0.2 GB"),
+    "no GPU, no CPU build": ("", "", "torch==1.2", "PIP_EXTRA_INDEX_URL="),
+    "a GPU": ("GPU 0: some", "yes", "torch==1.2", "There is an NVIDIA GPU: torch==1.2, the build of pip's"),
+}
+
+
+@pytest.mark.parametrize("machine", BUILDS)
+def test_the_set_up_says_which_torch_it_takes_and_how_large_it_is(machine: str, root: Path, tmp_path: Path):
+    gpu, cpu, torch, message = BUILDS[machine]
+    for name, text in {"python3.11": SHELL, "nvidia-smi": f"#!/bin/sh\necho '{gpu}'\n"}.items():
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    (tmp_path / "scripts").mkdir()
+    for name, text in {"constraints.txt": "torch==1.2\ntorchmetrics==3\n", "pyproject.toml": ""}.items():
+        (tmp_path / name).write_text(text)
+    script = shutil.copy(root / "scripts" / "setup.sh", tmp_path / "scripts")
+    environment = {"PATH": f"{tmp_path}:/usr/local/bin:/usr/bin:/bin", "CPU": cpu}
+    done = subprocess.run(["bash", script], env=environment, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stderr
+    assert message in done.stdout and " GB to download" in done.stdout
+    assert (tmp_path / "installed").read_text().split() == [torch, ".[io]"]

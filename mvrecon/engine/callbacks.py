@@ -1,6 +1,5 @@
 """What happens beside the training: time and memory, and the pictures on the board."""
 
-import resource
 import sys
 import time
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.engine.export import save_png
 from mvrecon.engine.record import versions
+from mvrecon.memory import peak
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
 from mvrecon.places import check_places
@@ -23,18 +23,17 @@ from mvrecon.viz import montage
 from mvrecon.viz.planes import Image
 
 
-def peak_megabytes() -> float:
-    """The most memory in use so far: the GPU's where there is one, else this process's."""
-    if torch.cuda.is_available():
-        return torch.cuda.max_memory_allocated() / 2**20
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+def peak_megabytes() -> dict[str, float]:
+    """The most memory in use so far, 2^20 bytes: the GPU's where there is one, else this process's, else nothing."""
+    most = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
+    return {} if most is None else {"peak_mb": most / 2**20}
 
 
 class Clock(L.Callback):
     """Logs `time/*`: milliseconds per step, volumes per second, seconds of training so far, peak memory.
 
-    Validation and pictures do not count. The seconds go into the checkpoint, so a resumed run adds to them.
+    Validation and pictures do not count. The seconds go into the checkpoint, so a resumed run adds to them. Windows
+    does not tell the memory.
     """
 
     of_every_run = True
@@ -68,7 +67,7 @@ class Clock(L.Callback):
         self.seconds += step
         count = len(batch["views"])
         figures = {"step_ms": 1e3 * step, "volumes_per_s": count / step, "seconds": self.seconds}
-        figures["peak_mb"] = peak_megabytes()
+        figures |= peak_megabytes()
         pl_module.log_dict({f"time/{name}": value for name, value in figures.items()}, batch_size=count)
 
 

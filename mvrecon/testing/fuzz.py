@@ -1,12 +1,13 @@
 """Damaged copies of a file, and what a reader makes of them; for tests of any reader, a plugin's included."""
 
 import struct
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
+
+from mvrecon.memory import peak
 
 #: What a reader may raise; its message names the file.
 REFUSALS = (ValueError, OSError, KeyError)
@@ -94,7 +95,7 @@ class Tally:
 
 def tally(read: Callable[[Path], object], cases: Iterable[bytes], path: Path) -> Tally:
     """Give every case to a reader, as the file `path`, and note what it does; nothing is raised."""
-    found, before = Tally(), _largest()
+    found, before = Tally(), peak() or 0
     for case in cases:
         path.write_bytes(case)
         start = time.process_time()
@@ -108,13 +109,5 @@ def tally(read: Callable[[Path], object], cases: Iterable[bytes], path: Path) ->
             found.failures.append(f"case {found.inputs}: {type(error).__name__}: {error}")
         found.seconds = max(found.seconds, time.process_time() - start)
         found.inputs += 1
-    found.peak = _largest() - before
+    found.peak = (peak() or 0) - before
     return found
-
-
-def _largest() -> int:
-    if sys.platform == "win32":
-        return 0
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -85,7 +85,7 @@ def test_workers_load_what_the_main_process_loads(volume_file, tmp_path, root, s
     script.write_text(WORKERS)
     environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, script, start, cache, volume_file]
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
 
 

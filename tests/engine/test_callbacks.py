@@ -1,4 +1,4 @@
-"""What the board shows of a support."""
+"""What is logged beside the training: a support on the board, time and memory."""
 
 import copy
 
@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.config import compose
 from mvrecon.engine import fit
-from mvrecon.engine.callbacks import outlined
+from mvrecon.engine.callbacks import Clock, outlined
 
 
 def test_an_outline_is_the_masks_outermost_voxels():
@@ -30,3 +30,18 @@ def test_the_board_tells_the_support_at_validation(support, tmp_path):
     header = next(tmp_path.rglob("metrics.csv")).read_text().splitlines()[0]
     assert ("val/support_fraction" in header) == (support == "hull")
     assert (tmp_path / "review" / "planes.png").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the GPU's memory is told everywhere")
+def test_where_the_system_tells_no_memory_the_clock_logs_the_rest(monkeypatch):
+    logged: dict[str, float] = {}
+
+    class Module:
+        def log_dict(self, figures, batch_size):
+            logged.update(figures)
+
+    for known in ({"time/peak_mb"}, set()):
+        logged.clear()
+        Clock().on_train_batch_end(None, Module(), None, {"views": torch.zeros(2, 1)}, 0)
+        assert set(logged) == {"time/step_ms", "time/volumes_per_s", "time/seconds"} | known
+        monkeypatch.setattr("mvrecon.memory.resource", None)

@@ -47,7 +47,9 @@ def test_other_programs_read_the_file_as_any_checkpoint_of_torch(last):
     assert step(plain) == 9, "nor does a checkpoint need a checksum"
 
 
+@pytest.mark.door
 def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
+    """One flipped bit in a checkpoint leads to the checkpoint before it, and both are named."""
     whole, rng = last.read_bytes(), random.Random(SEED)
     for place in [0, 21, *rng.sample(range(len(whole) - storage.COMMENT), 60), len(whole) - 1, len(whole) - 20]:
         damaged = bytearray(whole)
@@ -57,15 +59,19 @@ def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
             assert step(last) == 3, f"seed {SEED}, byte {place}"
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.99, 1.0])
 def test_a_file_cut_short_leads_to_the_one_before(last, kept):
+    """A checkpoint that is cut short leads to the one before it."""
     whole = last.read_bytes()
     last.write_bytes(whole[: min(int(kept * len(whole)), len(whole) - 1)])
     with pytest.warns(RuntimeWarning, match=r"last\.ckpt is (damaged|cut short).*last\.previous\.ckpt"):
         assert step(last) == 3
 
 
+@pytest.mark.door
 def test_a_kill_between_the_two_renames_leaves_the_one_before(last):
+    """A kill between the two renames of a checkpoint leaves the one before it."""
     last.unlink()
     with pytest.warns(RuntimeWarning, match=r"last\.ckpt is missing.*last\.previous\.ckpt"):
         assert step(last) == 3
@@ -74,7 +80,9 @@ def test_a_kill_between_the_two_renames_leaves_the_one_before(last):
         step(last)
 
 
+@pytest.mark.door
 def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
+    """Two damaged checkpoints are an error, not a fresh start."""
     for path in (last, storage.previous(last)):
         path.write_bytes(path.read_bytes()[:-1] + b"?")
     with (
@@ -84,9 +92,12 @@ def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
         step(last)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(("owner", "name"), [("os", "fsync"), ("pathlib.Path", "write_bytes"), ("torch", "save")])
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), MemoryError("no memory left")])
 def test_what_goes_wrong_in_writing_is_told_and_leaves_both(last, monkeypatch, owner, name, error):
+    """A full disk or too little memory while a checkpoint is written is an error, and both older ones stay."""
+
     def fail(*_, **__):
         raise error
 
@@ -98,7 +109,9 @@ def test_what_goes_wrong_in_writing_is_told_and_leaves_both(last, monkeypatch, o
     assert len(list(last.parent.iterdir())) == 2
 
 
+@pytest.mark.door
 def test_weights_that_are_not_finite_take_no_good_ones_place(last):
+    """Weights that are not finite never replace good ones on the disk."""
     bad = checkpoint(9)
     bad["state_dict"]["w"][3] = float("nan")
     with pytest.raises(FloatingPointError, match=r"last\.ckpt is not written: 1 weights are not finite, w among them"):
@@ -106,7 +119,9 @@ def test_weights_that_are_not_finite_take_no_good_ones_place(last):
     assert step(last) == 6
 
 
+@pytest.mark.door
 def test_a_file_is_written_whole_or_not_at_all(tmp_path):
+    """A file is written whole or not at all."""
     path = tmp_path / "results.json"
     path.write_text("before")
     with pytest.raises(RuntimeError, match="power cut"), written_whole(path) as part:
@@ -115,7 +130,9 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path):
     assert path.read_text() == "before" and [p.name for p in tmp_path.iterdir()] == ["results.json"]
 
 
+@pytest.mark.door
 def test_a_claim_clears_away_what_a_killed_writer_left(tmp_path):
+    """What a killed writer left half done is cleared away by the next one."""
     left = tmp_path / "checkpoints" / ".last.ckpt.123.part"
     left.parent.mkdir()
     left.write_text("half")

@@ -22,9 +22,11 @@ def rows(folder):
         return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in csv.DictReader(file)]
 
 
+@pytest.mark.door
 @pytest.mark.long
 @pytest.mark.parametrize("workers", [0, 2])
 def test_kills_at_random_steps_and_while_writing_change_no_bit(workers, tmp_path):
+    """A training that is killed, in a step or while it writes, and goes on ends with the bits of an unbroken one."""
     rng = random.Random(f"{SEED} {workers}")
     first = rng.randrange(1, lives.STEPS)
     sys.stdout.write(f"seed {SEED}: killed at step {first}, then at others")

@@ -21,7 +21,7 @@ def crowded(root, tmp_path):
         command = [sys.executable, "-m", "tests.engine.crowd", kind, str(tmp_path)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         done = subprocess.run(
-            command, cwd=root, env=environment, capture_output=True, text=True, timeout=120, check=False
+            command, cwd=root, env=environment, capture_output=True, text=True, timeout=900, check=False
         )
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout.splitlines()[-1])
@@ -29,13 +29,17 @@ def crowded(root, tmp_path):
     return run
 
 
+@pytest.mark.door
 def test_readers_of_a_file_that_is_replaced_see_one_edition_whole(crowded):
+    """Readers of a volume file that is replaced meanwhile see one edition of it, whole."""
     answers = crowded("readers")
     assert len(answers) == 1 + crowd.READERS and all(code == 0 for code, _ in answers), answers
     assert all(int(times) >= 1 for _, times in answers[1:])
 
 
+@pytest.mark.door
 def test_runs_of_one_sweep_at_once_each_leave_their_own_results(crowded, tmp_path):
+    """Runs of a sweep at once leave their own results in their own folders."""
     answers = crowded("sweep")
     assert [code for code, _ in answers] == [0] * crowd.RUNS, answers
     assert len({answer.split()[1] for _, answer in answers}) == crowd.RUNS, "four seeds, four results"
@@ -46,7 +50,9 @@ def test_runs_of_one_sweep_at_once_each_leave_their_own_results(crowded, tmp_pat
         assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == k
 
 
+@pytest.mark.door
 def test_of_several_runs_in_one_folder_one_goes_on_and_the_others_say_why_not(crowded, tmp_path):
+    """Of several runs at once in one folder one goes on, and the others are refused."""
     answers = crowded("folder")
     done = [answer for code, answer in answers if code == 0]
     refused = [answer for code, answer in answers if code]

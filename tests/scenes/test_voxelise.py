@@ -1,12 +1,12 @@
 import math
-import time
+from dataclasses import replace
 
 import pytest
 import torch
 
+import mvrecon.scenes.voxelise as voxelise_module
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.scenes.derenzo import derenzo
 from mvrecon.scenes.solids import ROUND_AXES, Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
 
@@ -67,14 +67,21 @@ def test_chunks_change_nothing(monkeypatch):
     assert torch.equal(voxelise(phantom, grid), whole)
 
 
-def test_a_derenzo_phantom_is_quick():
-    phantom, grid = derenzo(height=48, euler_degrees=(20, 50, 10)), Grid.centred((32, 32, 32), 4.0)
-    voxelise(phantom, grid)
-    start = time.process_time()
-    voxelise(phantom, grid)
-    assert time.process_time() - start < 0.3
+def test_the_voxels_that_are_subdivided_grow_with_the_surface_not_with_the_volume(monkeypatch):
+    ball, counts = solids("ellipsoid", n=1, spread=0.0), []
+    ball = replace(ball, semi_axes=torch.full((1, 3), 25.0, dtype=torch.float64))
+
+    def counted(p, *rest):
+        counts.append(p.shape[1])
+        return shares(p, *rest)
+
+    shares = voxelise_module._shares
+    monkeypatch.setattr(voxelise_module, "_shares", counted)
+    for n in (16, 32, 64):
+        voxelise(Phantom((ball,)), Grid.centred((n,) * 3, 64 / n))
+    assert counts[0] < 16**3 / 2 and all(b < 4.8 * a for a, b in zip(counts, counts[1:], strict=False)), counts
 
 
 def test_a_factor_below_one_is_refused():
     with pytest.raises(ValueError, match="at least 1, got 0"):
-        voxelise(derenzo(), Grid.centred((4, 4, 4), 10.0), 0)
+        voxelise(Phantom((solids("box"),)), Grid.centred((4, 4, 4), 10.0), 0)

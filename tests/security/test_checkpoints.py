@@ -55,8 +55,10 @@ def test_a_valid_checkpoint_loads(kept: dict, tmp_path: Path):
     assert all(torch.equal(weights[name], value) for name, value in kept["state_dict"].items())
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("name", sorted(pickles(Path("sentinel"))))
 def test_a_pickle_builds_tensors_and_plain_values_only(name: str, kept: dict, sentinel: Path, tmp_path: Path):
+    """A checkpoint whose pickle names anything but tensors and plain values is refused, and none of it runs."""
     evil = pickles(sentinel)[name]
     for raw in (with_pickle(saved(kept), evil), evil):
         with pytest.raises(Refused, match=r"evil\.ckpt: (its pickle names|is cut short or no checkpoint)"):
@@ -81,8 +83,10 @@ def test_the_sample_would_work_if_it_were_unpickled(sentinel: Path, tmp_path: Pa
     assert sentinel.exists()
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("name", SETTINGS)
 def test_settings_in_a_checkpoint_are_names_and_numbers(name: str, kept: dict, tmp_path: Path):
+    """Settings in a checkpoint that are no names and numbers are refused."""
     evil = {**kept, "hyper_parameters": {**kept["hyper_parameters"], **SETTINGS[name]}}
     with pytest.raises(Refused, match=r"evil\.ckpt: has the settings .*expected names and numbers"):
         load(written(tmp_path / "evil.ckpt", saved(evil)))
@@ -94,14 +98,18 @@ def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: P
         load(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
+@pytest.mark.door
 def test_an_archive_does_not_unfold(kept: dict, tmp_path: Path):
+    """A checkpoint with packed members is refused before they unfold."""
     members = repacked(saved(kept), **{"archive/data/0": bytes(2**26)})
     raw = zipped(members, zipfile.ZIP_DEFLATED)
     with pytest.raises(Refused, match="packed or overlap"):
         load(written(tmp_path / "bomb.ckpt", raw))
 
 
+@pytest.mark.door
 def test_members_that_share_their_bytes_are_refused(kept: dict, tmp_path: Path):
+    """A checkpoint whose members share their bytes is refused."""
     raw = saved({**kept, "x": torch.zeros(2**16)})
     start, entries = raw.index(b"PK\x01\x02"), []
     while raw[start : start + 4] == b"PK\x01\x02":
@@ -116,28 +124,36 @@ def test_members_that_share_their_bytes_are_refused(kept: dict, tmp_path: Path):
         check_archive(written(tmp_path / "bomb.ckpt", overlapping + end))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("name", ["../evil", "/etc/evil", "archive/../../evil", "archive/code/evil.py", "evil"])
 def test_members_lead_nowhere(name: str, kept: dict, tmp_path: Path):
+    """A checkpoint with a member that no checkpoint has, or that leads out of it, is refused."""
     raw = zipped(repacked(saved(kept), **{name: b"x"}))
     with pytest.raises(Refused, match="which no checkpoint does"):
         load(written(tmp_path / "evil.ckpt", raw))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("method", ["../../evil", "/etc/evil", "..", "a/b"])
 def test_a_methods_name_leads_nowhere(method: str, tmp_path: Path):
+    """A method's name never leads out of the run folder."""
     for place in (finished, unfinished):
         with pytest.raises(Refused, match="has the name"):
             place(tmp_path, method)
 
 
+@pytest.mark.door
 def test_a_storage_is_no_longer_than_its_file(kept: dict, tmp_path: Path):
+    """A checkpoint that declares more numbers than its file holds is refused."""
     archive = saved({**kept, "x": torch.zeros(300)})
     longer = pickle_of(archive).replace(b"M\x2c\x01", b"J" + struct.pack("<i", 2**30))
     with pytest.raises(ValueError, match=r"evil\.ckpt"):
         load(written(tmp_path / "evil.ckpt", with_pickle(archive, longer)))
 
 
+@pytest.mark.door
 def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
+    """Weights that do not fit the settings beside them are refused, with their names."""
     first = next(iter(kept["state_dict"]))
     weights = {**kept["state_dict"], first: torch.zeros(3, 3)}
     with pytest.raises(Refused, match=rf"a\.ckpt: does not fit (.|\n)*{first}"):

@@ -1,4 +1,4 @@
-"""Damaged files of every kind: a reader reads them or says what is wrong, in time, within memory, and lives."""
+"""Damaged files of every kind: a reader reads them or says what is wrong, within memory, and lives."""
 
 import json
 import os
@@ -33,14 +33,16 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
     return found, said
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("reader", READERS)
 def test_a_reader_survives_damaged_files(reader: str, survey: tuple[dict, str]):
+    """A damaged file is read or refused with its name, within 256 MB, and the interpreter lives."""
     found, said = survey
     assert reader in found, said
     result = found[reader]
     assert not result["failures"], f"{said}\n" + "\n".join(result["failures"][:10])
     assert result["inputs"] >= COUNT and result["read"] < result["inputs"]
-    assert result["seconds"] < 1 and result["peak"] < 2**28
+    assert result["peak"] < 2**28
 
 
 def test_every_reader_is_fuzzed_and_the_process_ends_well(survey: tuple[dict, str]):

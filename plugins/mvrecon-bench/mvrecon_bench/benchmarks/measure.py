@@ -2,7 +2,6 @@
 
 import ctypes
 import os
-import resource
 import statistics
 import sys
 import time
@@ -13,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+from mvrecon.memory import peak
 
 Call = Callable[[], Any]
 #: A fast call is repeated until it took so many seconds, or MORE times as often as asked.
@@ -67,7 +68,8 @@ def with_memory(call: Call, device: str) -> tuple[Any, float]:
     included.
 
     On a GPU what torch's allocator gave out; on Linux the high-water mark of resident memory, reset before the call;
-    elsewhere the growth of the process's lifetime maximum, which misses what an earlier call has used already.
+    elsewhere the growth of the process's lifetime maximum, which misses what an earlier call has used already; NaN on
+    Windows.
     """
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats(device)
@@ -76,7 +78,7 @@ def with_memory(call: Call, device: str) -> tuple[Any, float]:
         return found, (torch.cuda.max_memory_allocated(device) - before) / 2**20
     before = _fresh_mark()
     found = call()
-    return found, max(0.0, _high_mark() - before)
+    return found, max(_high_mark() - before, 0.0)  # in this order a NaN stays
 
 
 def _fresh_mark() -> float:
@@ -93,8 +95,7 @@ def _fresh_mark() -> float:
 def _high_mark() -> float:
     if sys.platform == "linux":
         return _status("VmHWM")
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    return float("nan") if (most := peak()) is None else most / 2**20
 
 
 def _status(name: str) -> float:

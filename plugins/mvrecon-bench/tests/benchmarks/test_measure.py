@@ -1,10 +1,11 @@
 """Times and memory of calls whose cost is known."""
 
-import time
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from mvrecon_bench.benchmarks import measure
 from mvrecon_bench.benchmarks.measure import interleaved, once, threads, with_memory
 from mvrecon_bench.benchmarks.scaling import exponent
 
@@ -23,20 +24,23 @@ def test_memory_sees_what_is_known_to_be_allocated():
     assert with_memory(lambda: held.sum(), "cpu")[1] < 8
 
 
-def test_times_are_medians_taken_in_turns():
-    order = []
+def test_times_are_medians_taken_in_turns(monkeypatch):
+    order, clock = [], [0.0]
+    monkeypatch.setattr(measure, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
 
-    def sleeper(name, seconds):
+    def worker(name, *seconds):
+        taken = iter(seconds)
+
         def act():
             order.append(name)
-            time.sleep(seconds)
+            clock[0] += next(taken)
 
         return act
 
-    found = interleaved({0: sleeper("a", 0.02), 1: sleeper("b", 0.04)}, {0: 0.2, 1: 0.2}, 3, "cpu")
+    calls = {0: worker("a", 0.02, 0.5, 0.01), 1: worker("b", 0.04, 0.03, 0.06)}
+    found = interleaved(calls, {0: 0.2, 1: 0.2}, 3, "cpu")
     assert order == ["a", "b"] * 3
-    assert {key: timing.calls for key, timing in found.items()} == {0: 3, 1: 3}
-    assert 20 <= found[0].ms < found[1].ms
+    assert [(key, round(timing.ms, 9), timing.calls) for key, timing in found.items()] == [(0, 20, 3), (1, 40, 3)]
     assert interleaved({0: lambda: None}, {0: 1e-6}, 5, "cpu")[0].calls == 25 - 5
     assert once(lambda: 7, "cpu")[0] == 7
 

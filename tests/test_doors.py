@@ -1,0 +1,56 @@
+"""Tests that guard a file, a folder, a setting or a run say so in one sentence: a row of docs/trust.md."""
+
+import ast
+import json
+from collections import Counter
+from pathlib import Path
+
+SAMPLE = '''
+import pytest
+
+@pytest.mark.door
+@pytest.mark.parametrize("k", range(3))
+def test_numbers(k):
+    """A number below two is kept.
+
+    More of it.
+    """
+    if k == 0:
+        pytest.skip("not here")
+    assert k < 2
+
+@pytest.fixture
+def broken():
+    raise OSError("no file")
+
+@pytest.mark.door
+def test_files(broken):
+    """A file is there."""
+
+def test_no_door():
+    """Is not told."""
+'''
+
+
+def facts(file: Path) -> list[str]:
+    """First lines of the docstrings of a file's doors; a door without one gives its name."""
+    functions = [node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)]
+    doors = [f for f in functions if any(ast.unparse(mark) == "pytest.mark.door" for mark in f.decorator_list)]
+    return [(ast.get_docstring(f) or f.name).splitlines()[0] for f in doors]
+
+
+def test_a_door_says_its_fact_in_one_sentence_of_its_own(root):
+    files = [f for folder in (root / "tests", *root.glob("plugins/*/tests")) for f in folder.rglob("test_*.py")]
+    told = [text for file in files for text in facts(file)]
+    assert len(told) > 20
+    assert [text for text in told if not (text.endswith(".") and " " in text)] == []
+    assert [text for text, times in Counter(told).items() if times > 1] == []
+
+
+def test_the_verdicts_on_doors_are_counted_fact_by_fact(run_python, tmp_path):
+    (tmp_path / "test_sample.py").write_text(SAMPLE)
+    done = run_python("-m", "tests.doors", str(tmp_path))
+    assert json.loads(done.stdout.splitlines()[-1]) == {
+        "A number below two is kept.": {"pass": 1, "FAIL": 1, "n/a": 1},
+        "A file is there.": {"pass": 0, "FAIL": 1, "n/a": 0},
+    }
