@@ -10,8 +10,8 @@ import pytest
 
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.durable import written_whole
-from tests.faults.damage import LINKS, instead, linked
 from tests.data.conftest import SPACING, head, stored
+from tests.faults.damage import LINKS, instead, linked
 
 
 def test_what_is_written_is_read(tmp_path):
