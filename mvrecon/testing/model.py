@@ -56,9 +56,8 @@ def _check_volume(model: nn.Module, views: Float[Tensor, "2 1 m v u"], shape: tu
 def _check_scale(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
     volume = model(views).volume
     for factor in (2.0**-10, 2.0**10):
-        assert close(model(factor * views).volume / factor, volume, TOLERANCE), (
-            f"{factor} y does not give {factor} f(y)"
-        )
+        multiple = model(factor * views).volume
+        assert close(multiple / factor, volume, TOLERANCE), f"f({factor} y) is not {factor} f(y)"
     assert not model(torch.zeros_like(views)).volume.any(), "views of zero do not give a volume of zero"
 
 
