@@ -54,7 +54,7 @@ def fuzz(given: argparse.Namespace) -> Any:
     """What became of damaged files, reader by reader."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.json"
-        done(sys.executable, "-m", "mvrecon_bench.stresses.fuzzing", str(given.seed), str(given.fuzz), str(out))
+        done(sys.executable, "-m", "tests.faults.fuzzing", str(given.seed), str(given.fuzz), str(out))
         return json.loads(out.read_text())
 
 
@@ -147,7 +147,7 @@ def figures(stress: Any, properties: Any, doors: Any, fuzz: Any, kills: Any, soa
         ("of these, failures", str(properties["failing"]), ""),
         ("facts about doors: files, folders, settings, runs", str(len(doors)), "`python -m tests.doors`"),
         ("verdicts on their cases", total(doors), ""),
-        ("damaged files given to readers", str(inputs), "`python -m mvrecon_bench.stresses.fuzzing`"),
+        ("damaged files given to readers", str(inputs), "`python -m tests.faults.fuzzing`"),
         ("of these, failures", str(hurt), ""),
         ("the slowest; the most memory", f"{slowest:.2f} s; {largest / 2**20:.0f} MB", ""),
         ("trainings killed at random, and resumed", str(kills["kills"]), "`python -m tests.engine.lives`"),

@@ -84,6 +84,18 @@ def test_a_mistyped_choice_in_an_experiment_lists_what_there_is(user_conf):
         compose(*user_conf("defaults:\n  - override /projector: dr\nname: mine"))
 
 
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [("projectr=drr", "projectr"), ("projector=dr", "drr(.|\n)*radon"), ("gird.shape=[4,4,4]", "gird")],
+)
+def test_a_mistyped_override_is_an_error_that_names_it(override: str, message: str):
+    """A misspelt key or choice on the command line is refused, named or with the choices that there are."""
+    with pytest.raises((ConfigCompositionException, MissingConfigException)) as error:
+        compose(override)
+    assert re.search(message, f"{error.value}{error.value.__cause__}")
+
+
 def test_an_experiment_may_add_compared_models(user_conf):
     settings = compose(*user_conf("defaults:\n  - /model@compare.sirt: sirt\nname: mine\nseed: 4"))
     assert settings["seed"] == 4

@@ -50,6 +50,26 @@ def test_an_unknown_name_gives_the_nearest_and_all(cameras: Registry):
         cameras.origin("xyzzy")
 
 
+@pytest.mark.door
+@pytest.mark.parametrize("kind", REGISTRIES)
+def test_a_misspelt_part_gives_the_nearest(kind: str):
+    """The misspelt name of a part is refused with the nearest one."""
+    name = REGISTRIES[kind].names()[0]
+    with pytest.raises(LookupError, match=f"did you mean '{name}'"):
+        REGISTRIES[kind].build(name[:-2] + name[:-3:-1])  # the last two letters swapped
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("kind", "name", "option", "nearest"),
+    [("projector", "drr", "methd", "method"), ("scene", "ellipsoids", "valeu", "value")],
+)
+def test_a_misspelt_option_of_a_part_gives_the_nearest(kind: str, name: str, option: str, nearest: str):
+    """The misspelt option of a part is refused with the nearest one."""
+    with pytest.raises(TypeError, match=f"'{option}'; did you mean '{nearest}'"):
+        REGISTRIES[kind].build(name, **{option: 1})
+
+
 def test_an_unknown_option_gives_the_nearest_and_all(cameras: Registry):
     with pytest.raises(TypeError, match=r"'ring' has no option 'view'; did you mean 'views'\? Known: radius, views"):
         cameras.build("ring", view=3)

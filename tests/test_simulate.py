@@ -1,5 +1,7 @@
 """`mvrecon-simulate` as a user calls it: what it writes is what the scene measures."""
 
+import os
+import subprocess
 import sys
 
 import h5py
@@ -105,3 +107,19 @@ def test_what_goes_wrong_is_said_and_the_exit_is_not_zero(options, message, tmp_
         call(tmp_path, *GRID, *PARALLEL, *options)
     assert stopped.value.code != 0
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.door
+def test_the_app_works_in_foreign_places(root, tmp_path):
+    """mvrecon-simulate works in the locale C, in folders with spaces and foreign letters, without a home."""
+    here, out, home = tmp_path / "où ça", tmp_path / "ausgabe für 目录", tmp_path / "home"
+    here.mkdir()
+    home.touch()
+    options = ("grid.shape=[4,4,4]", "camera.views=1", "camera.detector.pixels=[4,4]", "cases=[0]")
+    place = {"PYTHONPATH": str(root), "HOME": str(home), "LC_ALL": "C", "LANG": "C", "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-m", "mvrecon.simulate", *options, f"hydra.run.dir='{out}'"]
+    done = subprocess.run(
+        command, cwd=here, env={**os.environ, **place}, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(list(out.rglob("views.h5"))) == 1 and not list(here.iterdir())

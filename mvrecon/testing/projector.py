@@ -43,10 +43,10 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
         gap = (_dot(views, y) - _dot(x, volume)).abs() / (views.double().norm() * y.double().norm())
         assert gap < tolerance, f"<A x, y> and <x, A.T y> differ by {gap:.2g} in {dtype}"
         other = torch.randn_like(x)
-        assert _close(A(2 * x - other), 2 * views - A(other), tolerance), f"not linear in {dtype}"
+        assert close(A(2 * x - other), 2 * views - A(other), tolerance), f"not linear in {dtype}"
         assert not A(torch.zeros_like(x)).any(), "views of nothing"
         assert torch.equal(A(x), views) and torch.equal(A.T(y), volume), "not the same twice"
-        assert _close(A(x[1:]), views[1:], tolerance), "a volume's views depend on the others of its batch"
+        assert close(A(x[1:]), views[1:], tolerance), "a volume's views depend on the others of its batch"
     _check_support(A)
     _check_motion(name, grid, cameras, **options)
     if gradients:
@@ -57,7 +57,8 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a.double() * b.double()).sum()
 
 
-def _close(a: Tensor, b: Tensor, tolerance: float) -> bool:
+def close(a: Tensor, b: Tensor, tolerance: float) -> bool:
+    """Whether a differs from b by no more than a fraction of b, in the L2 norm."""
     return bool((a - b).norm() <= tolerance * b.norm())
 
 
@@ -67,8 +68,8 @@ def _check_support(A: Projector) -> None:
     masked, x = A.with_support(M), torch.randn(1, 1, *A.grid.shape, dtype=torch.float64)
     views = A(x * M)
     y = torch.randn_like(views)
-    assert _close(masked(x), views, 1e-12), "with a support M it is not A diag(M)"
-    assert _close(masked.T(y), A.T(y) * M, 1e-12), "with a support M its adjoint is not diag(M) A^T"
+    assert close(masked(x), views, 1e-12), "with a support M it is not A diag(M)"
+    assert close(masked.T(y), A.T(y) * M, 1e-12), "with a support M its adjoint is not diag(M) A^T"
 
 
 def _check_motion(name: str, grid: Grid, cameras: Cameras, **options) -> None:
@@ -80,7 +81,7 @@ def _check_motion(name: str, grid: Grid, cameras: Cameras, **options) -> None:
     x = torch.rand(1, 1, *grid.shape, dtype=torch.float64)
     moved = PROJECTORS.build(name, grid=Grid(grid.shape, affine), cameras=cameras, **options)(x)
     back = PROJECTORS.build(name, grid=grid, cameras=cameras.moved(R.mT, -R.mT @ t), **options)(x)
-    assert _close(moved, back, 1e-9), "moving the object is not un-moving the cameras"
+    assert close(moved, back, 1e-9), "moving the object is not un-moving the cameras"
 
 
 def _check_gradients(name: str, grid: Grid, cameras: Cameras, **options) -> None:
@@ -95,6 +96,6 @@ def _check_gradients(name: str, grid: Grid, cameras: Cameras, **options) -> None
     A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)
     y = torch.rand(1, 1, len(cameras), *cameras.shape, dtype=torch.float64, requires_grad=True)
     (change,) = torch.autograd.grad(A(x), x, y.detach())
-    assert _close(change, A.T(y.detach()), 1e-12), "the gradient in the volume is not the adjoint"
+    assert close(change, A.T(y.detach()), 1e-12), "the gradient in the volume is not the adjoint"
     torch.autograd.gradcheck(A.T, (y,))
     torch.autograd.gradgradcheck(lambda x, y: (A(x) * y).sum(), (x, y))

@@ -68,23 +68,24 @@ from mvrecon.data.dataset import SceneDataset
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 if __name__ == "__main__":
-    start, cache = sys.argv[1], sys.argv[2] == "cache"
+    start, cache, workers = sys.argv[1], sys.argv[2] == "cache", int(sys.argv[4])
     cameras = CAMERAS.build("circular", views=2, sid=300.0, sdd=450.0, detector={"pixels": [6, 6], "pixel_mm": 9.0})
     scene = SCENES.build("hdf5", path=sys.argv[3])
     data = SceneDataset(scene, Grid.centred((6, 6, 6), 8.0), cameras, range(4), 1, cache)
     here = list(DataLoader(data, 2))
-    there = list(DataLoader(data, 2, num_workers=1, multiprocessing_context=start))
-    for a, b in zip(here, there, strict=True):
-        assert a["name"] == b["name"] and all(torch.equal(a[k], b[k]) for k in ("views", "volume", "inside"))
+    there = DataLoader(data, 2, num_workers=workers, multiprocessing_context=start, persistent_workers=workers > 1)
+    for _ in range(workers):  # those that stay go through all of it again
+        for a, b in zip(here, there, strict=True):
+            assert a["name"] == b["name"] and all(torch.equal(a[k], b[k]) for k in ("views", "volume", "inside"))
 """
 
 
-@pytest.mark.parametrize(("start", "cache"), [("spawn", "no"), ("fork", "cache")])
-def test_workers_load_what_the_main_process_loads(volume_file, tmp_path, root, start, cache):
+@pytest.mark.parametrize(("start", "cache", "workers"), [("spawn", "no", 1), ("fork", "cache", 1), ("fork", "no", 2)])
+def test_workers_load_what_the_main_process_loads(volume_file, tmp_path, root, start, cache, workers):
     script = tmp_path / "workers.py"
     script.write_text(WORKERS)
     environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, script, start, cache, volume_file]
+    command = [sys.executable, script, start, cache, volume_file, str(workers)]
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
 

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import pickle
+from random import Random
 
 import h5py
 import numpy as np
@@ -9,8 +10,8 @@ import pytest
 
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.durable import written_whole
-from mvrecon.testing.damage import LINKS, instead, linked
 from tests.data.conftest import SPACING, head, stored
+from tests.faults.damage import LINKS, instead, linked
 
 
 def test_what_is_written_is_read(tmp_path):
@@ -54,6 +55,26 @@ def test_the_new_file_takes_the_place_of_the_old_at_the_end_only(tmp_path):
     assert path.read_text() == "new" and not part.exists()
 
 
+@pytest.mark.door
+def test_while_a_file_is_written_anew_readers_see_the_old_one_whole(tmp_path):
+    """Readers of a volume file see its old edition whole until the new one is written whole."""
+    path = tmp_path / "a.h5"
+
+    def values(file):
+        return {int(value) for k in range(len(file)) for value in np.unique(file.read(k).ct)}
+
+    def edition(number):
+        for k in range(3):
+            assert not number or values(VolumeFile(path)) == {0}, "while the new one is written"
+            yield Stored(f"pt_{k}", np.full((4, 6, 6), number, np.int16), SPACING)
+
+    write_volumes(path, edition(0))
+    opened = VolumeFile(path)
+    assert values(opened) == {0}
+    write_volumes(path, edition(1))
+    assert values(opened) == {0} and values(VolumeFile(path)) == {1}
+
+
 def test_volumes_that_do_not_fit_together_are_refused(tmp_path):
     label = np.zeros((20, 30, 30), np.uint8)
     for second in (Stored("b", head(shape=(20, 30, 31)), SPACING), Stored("b", head(), SPACING, label)):
@@ -69,11 +90,43 @@ def test_a_missing_file_is_named(tmp_path):
         len(VolumeFile(tmp_path / "no.h5"))
 
 
-def test_a_truncated_file_is_an_error(volume_file):
-    whole = volume_file.read_bytes()
-    volume_file.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=r"heads\.h5: cannot be opened .*cut short\? Expected"):
-        len(VolumeFile(volume_file))
+SPOILT = {
+    "a tenth": lambda whole: whole[: len(whole) // 10],
+    "half": lambda whole: whole[: len(whole) // 2],
+    "all but a byte": lambda whole: whole[:-1],
+    "nothing": lambda whole: b"",
+    "zeros": lambda whole: bytes(4096),
+    "text": lambda whole: b"hello",
+}
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_volume_file_that_is_cut_short_or_none_is_refused(volume_file, name):
+    """A volume file that is cut short, empty, or no HDF5 file is refused with its name."""
+    volume_file.write_bytes(SPOILT[name](volume_file.read_bytes()))
+    with pytest.raises(ValueError, match=r"heads\.h5: (not an HDF5 file; e|cannot be opened .*cut short\? E)xpected"):
+        VolumeFile(volume_file).read(0)
+
+
+@pytest.mark.door
+def test_a_flipped_bit_never_changes_a_volume_silently(tmp_path):
+    """A flipped bit in a volume's numbers is an error, or the volume is read as it was written."""
+    rng, path = Random(0), tmp_path / "a.h5"
+    noise = np.random.default_rng(0).integers(-(2**15), 2**15, (20, 30, 30)).astype("i2")  # packed, it does not shrink
+    written = [*stored(1), Stored("noise", noise, SPACING)]
+    write_volumes(path, written)
+    whole = path.read_bytes()
+    with h5py.File(path) as file:
+        chunks = [file["ct"].id.get_chunk_info(k) for k in range(2)]
+    for k in (0, 1) * 12:
+        raw, place = bytearray(whole), chunks[k].byte_offset + rng.randrange(chunks[k].size)
+        raw[place] ^= 1 << rng.randrange(8)
+        path.write_bytes(raw)
+        try:
+            assert np.array_equal(VolumeFile(path).read(k).ct, written[k].ct), f"volume {k}, byte {place}"
+        except ValueError as error:
+            assert f"a.h5: volume {k} cannot be read" in str(error)
 
 
 def test_damaged_bytes_are_an_error(volume_file):
@@ -100,6 +153,8 @@ def rewritten(path, change):
         (lambda f: f.pop("ct"), r"no dataset 'ct', only \['id', 'spacing'\]"),
         (instead("ct", data=np.zeros((7, 4, 4))), r"'ct': \(7, 4, 4\).*ct \[n d h w\]"),
         (instead("ct", shape=(7, 4, 4, 4), dtype="c8"), "ct complex64.*expected numbers"),
+        (instead("ct", data=np.full((7, 1, 1, 1), b"a", "S3")), "expected numbers"),
+        (instead("ct", data=1.0), r"'ct': \(\)"),
         (instead("spacing", data=np.ones((6, 3))), r"'spacing': \(6, 3\)"),
         (
             instead("spacing", data=np.diag([1.0, 1, 1, 0, 0, 0, 0])[:, :3]),
@@ -108,18 +163,13 @@ def rewritten(path, change):
         (instead("spacing", data=np.full((7, 3), np.nan)), "expected positive mm"),
         (lambda f: f.attrs.update(axes="x, y, z"), "'axes': 'x, y, z'.*expected"),
         (lambda f: f.attrs.pop("units"), "'units': None"),
+        (lambda f: f.attrs.update(units="cm"), "'units': 'cm'"),
+        (instead("id", data=[b"a"]), r"'ct': \(7, .*'spacing': \(7, 3\), 'id': \(1,\)"),
     ],
 )
 def test_a_file_of_another_layout_says_what_is_wrong(volume_file, change, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=rf"(?s)heads\.h5: .*{message}"):
         len(VolumeFile(rewritten(volume_file, change)))
-
-
-def test_a_file_that_is_not_hdf5_is_refused(tmp_path):
-    path = tmp_path / "a.h5"
-    path.write_text("hello")
-    with pytest.raises(ValueError, match=r"a\.h5: not an HDF5 file; expected"):
-        VolumeFile(path).read(0)
 
 
 @pytest.mark.parametrize("kind", LINKS)

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from mvrecon.testing.trouble import counted, different, raising, signalled
+from tests.faults.fault_injection import counted, different, raising, signalled
 
 METHOD, STEPS = "geometry_free", 14
 #: A run of a second: five steps an epoch, a checkpoint every three, averaged weights, a falling rate.

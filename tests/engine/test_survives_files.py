@@ -3,6 +3,7 @@
 import errno
 import os
 import random
+import signal
 import zipfile
 
 import numpy as np
@@ -12,6 +13,8 @@ import torch
 from mvrecon.durable import claimed, written_whole
 from mvrecon.engine import storage
 from mvrecon.engine.survival import RandomNumbers
+from mvrecon.limits import Refused
+from tests.faults.fault_injection import counted, signalled
 
 SEED = int(os.environ.get("MVRECON_SEED", "0"))
 
@@ -90,6 +93,9 @@ def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
         pytest.raises(storage.DamagedCheckpoint, match=r"last\.previous\.ckpt is damaged"),
     ):
         step(last)
+    storage.previous(last).write_bytes(storage.previous(last).read_bytes()[:-1])
+    with pytest.warns(RuntimeWarning), pytest.raises(Refused, match=r"last\.previous\.ckpt is cut"):
+        step(last)
 
 
 @pytest.mark.door
@@ -151,3 +157,43 @@ def test_global_random_numbers_go_on_where_they_were():
     assert drawn() != first, "until training starts, nothing is put back"
     again.on_train_start(None, None)
     assert drawn() == first
+
+
+@pytest.mark.door
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a process is forked and killed as on POSIX")
+@pytest.mark.parametrize(("name", "n"), [("fsync", 1), ("fsync", 2), ("replace", 1), ("replace", 2)])
+def test_a_kill_at_any_flush_or_rename_leaves_a_whole_checkpoint(last, name, n):
+    """A kill at any flush or rename while a checkpoint is written leaves the old or the new one, whole."""
+    child = os.fork()
+    if not child:
+        try:
+            counted(os, name, n, signalled(signal.SIGKILL))
+            storage.write(last, checkpoint(9))
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    assert step(last) in (6, 9)
+    storage.write(last, checkpoint(12))
+    assert step(last) == 12
+
+
+@pytest.mark.door
+def test_a_file_that_may_not_grow_leaves_the_last_checkpoint(last):
+    """A checkpoint that the kernel does not let grow is an error; the last one stays and nothing is left half done."""
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            storage.write(last, checkpoint(9))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert step(last) == 6 and len(list(last.parent.iterdir())) == 2
+
+
+@pytest.mark.door
+def test_a_folder_that_is_a_file_is_an_error(last):
+    """A checkpoint in a folder that is a file is an error; that file stays as it was."""
+    with pytest.raises(OSError, match=r"last\.ckpt"):
+        storage.write(last / "below.ckpt", checkpoint(9))
+    assert step(last) == 6 and len(list(last.parent.iterdir())) == 2

@@ -14,6 +14,7 @@ import pytest
 from tests.engine import lives
 
 SEED = int(os.environ.get("MVRECON_SEED", "0"))
+SHORT = ("trainer.max_steps=7", "data.workers=0")
 
 
 def rows(folder):
@@ -23,6 +24,15 @@ def rows(folder):
 
 
 @pytest.mark.door
+def test_a_training_killed_in_a_step_and_begun_again_ends_with_the_same_bits(tmp_path):
+    """A training that is killed in a step and begun again ends with the bits of one that was not."""
+    ended = lives.play(tmp_path, {"whole": [], "killed": [{"what": "step", "n": 5}, {"what": "look"}]}, *SHORT)
+    assert [life["exit"] for life in ended["whole"]] == [0]
+    assert [life["exit"] for life in ended["killed"]] == [-signal.SIGKILL, 0, 0]
+    assert ended["killed"][1]["said"] == "step 3", "it goes on from the last checkpoint"
+    assert lives.different(lives.state(tmp_path / "whole"), lives.state(tmp_path / "killed")) == []
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("workers", [0, 2])
 def test_kills_at_random_steps_and_while_writing_change_no_bit(workers, tmp_path):

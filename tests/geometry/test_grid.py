@@ -1,3 +1,5 @@
+import re
+
 import pytest
 import torch
 
@@ -31,14 +33,15 @@ def test_refined_grid_fills_the_same_box():
 
 @pytest.mark.parametrize("spacing", [-1.0, 0.0, (1.0, -2.0, 1.0), float("nan")])
 def test_spacing_must_be_positive(spacing):
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match="positive.* mm, got"):
         Grid.centred((2, 2, 2), spacing)
 
 
-@pytest.mark.parametrize("shape", [(0, 2, 2), (2, 2), (2, 2, 2, 2)])
+@pytest.mark.parametrize("shape", [(0, 2, 2), (8, 0, 8), (2, 2), (2, 2, 2, 2)])
 def test_shape_must_be_three_positive_sizes(shape):
-    with pytest.raises(ValueError, match="three positive sizes"):
-        Grid(shape, torch.eye(4))
+    for build in (lambda: Grid(shape, torch.eye(4)), lambda: Grid.centred(shape, 1.0)):
+        with pytest.raises(ValueError, match=rf"three positive sizes \(z, y, x\), got {re.escape(str(shape))}"):
+            build()
 
 
 def test_left_handed_and_flat_grids_are_refused():

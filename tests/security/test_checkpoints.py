@@ -14,8 +14,8 @@ from mvrecon.engine.archive import check_archive
 from mvrecon.engine.checkpoints import finished, load, unfinished
 from mvrecon.engine.storage import read_newest
 from mvrecon.limits import Refused
-from mvrecon.testing.hostile import SETTINGS, Payload, pickle_of, pickles, saved, with_pickle
-from mvrecon_bench.stresses.samples import checkpoint
+from tests.faults.hostile import SETTINGS, Payload, pickle_of, pickles, saved, with_pickle
+from tests.faults.samples import checkpoint
 
 
 @pytest.fixture
@@ -172,3 +172,33 @@ def test_weights_that_are_not_finite_are_refused(value: float, kept: dict, tmp_p
         for reader in (load, read_newest):
             with pytest.raises(Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'model.* among them"):
                 reader(path)
+
+
+def without(mapping: dict, name: str) -> dict:
+    return {key: value for key, value in mapping.items() if key != name}
+
+
+FUTURE = {"model": {"name": "sirt", "warp": 9}}
+#: What is done to a checkpoint whose first weight has this name, and what the refusal names.
+AMISS = {
+    "a weight too few": (lambda kept, first: {**kept, "state_dict": without(kept["state_dict"], first)}, None),
+    "a weight too many": (
+        lambda kept, first: {**kept, "state_dict": {**kept["state_dict"], "spare.weight": torch.zeros(3)}},
+        "spare.weight",
+    ),
+    "no settings": (lambda kept, first: without(kept, "hyper_parameters"), "hyper_par"),
+    "an option of the future": (
+        lambda kept, first: {**kept, "hyper_parameters": {**kept["hyper_parameters"], **FUTURE}},
+        "warp",
+    ),
+}
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", AMISS)
+def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss(name: str, kept: dict, tmp_path: Path):
+    """A checkpoint that lacks weights or settings, or has those of another version, is refused with their names."""
+    change, named = AMISS[name]
+    first = next(iter(kept["state_dict"]))
+    with pytest.raises(Refused, match=rf"(?s)a\.ckpt: .*{named or first}"):
+        load(written(tmp_path / "a.ckpt", saved(change(kept, first))))

@@ -12,7 +12,7 @@ from mvrecon.config import compose
 from mvrecon.config.plugins import import_plugins
 from mvrecon.config.targets import instantiate
 from mvrecon.limits import Refused, yaml_of
-from mvrecon.testing.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
+from tests.faults.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
 
 
 @pytest.fixture
@@ -154,3 +154,12 @@ def test_a_pickled_config_is_not_run_again(run_python):
         "-c", "import sys; sys.argv = ['x', '--experimental-rerun=a.pickle']; import mvrecon.train as t; t.main()"
     )
     assert done.returncode == 1 and "unpickles a file" in done.stderr
+
+
+@pytest.mark.door
+def test_a_settings_file_of_a_gigabyte_is_not_read(tmp_path: Path):
+    """A settings file of a gigabyte is refused without reading it."""
+    with (tmp_path / "evil.yaml").open("wb") as file:
+        file.truncate(2**30)  # a hole: a gigabyte on no disk
+    with pytest.raises(Refused, match=r"evil\.yaml: is larger than"):
+        yaml_of(tmp_path / "evil.yaml")

@@ -19,8 +19,8 @@ from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.nifti import read_nifti
 from mvrecon.limits import Refused, plain_name, text_of
 from mvrecon.parts import CAMERAS
-from mvrecon.testing.damage import DECLARED, HEADERS, instead, nifti
 from tests.data.conftest import RIG, stored
+from tests.faults.damage import DECLARED, HEADERS, instead, nifti
 
 
 def refused(read: Callable[[], object], message: str, megabytes: float = 64) -> None:

@@ -9,7 +9,7 @@ from random import Random
 
 import pytest
 
-from mvrecon.testing.fuzz import mutations, tally
+from tests.faults.fuzz import mutations, tally
 
 COUNT = 240
 READERS = [
@@ -26,7 +26,7 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
     """
     seed, count = os.environ.get("MVRECON_FUZZ_SEED", "5"), os.environ.get("MVRECON_FUZZ_COUNT", str(COUNT))
     out = tmp_path_factory.mktemp("fuzz") / "found.json"
-    command = [sys.executable, "-m", "mvrecon_bench.stresses.fuzzing", seed, count, str(out)]
+    command = [sys.executable, "-m", "tests.faults.fuzzing", seed, count, str(out)]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
     found = json.loads(out.read_text()) if out.exists() else {}
     said = f"seed {seed}, exit status {done.returncode}\n{done.stderr[-2000:]}"

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-#: What a case is about: a part of that kind, or mvrecon's own machinery, which is stressed once.
+#: What a case is about: a part of that kind, or what is under all parts (tensors, geometry, threads), stressed once.
 KINDS = ("projector", "camera", "head", "model", "mvrecon")
 #: Relative, where a case does not say otherwise; halves are storage, summed in float32.
 PRECISE = {torch.float64: 1e-12, torch.float32: 1e-5, torch.bfloat16: 1e-5, torch.float16: 1e-5}
@@ -42,8 +42,3 @@ class Case:
     def allowed(self, dtype: torch.dtype) -> float:
         """The tolerance for a dtype."""
         return self.tolerance[dtype] if isinstance(self.tolerance, Mapping) else self.tolerance
-
-
-def once(number: int, name: str, holds: str, measure: Callable[[Any], float]) -> Case:
-    """A case of mvrecon's own machinery to which no dtype matters: done once, and nothing may be wrong."""
-    return Case(number, name, holds, "mvrecon", measure, 0.0, (torch.float32,))

@@ -18,7 +18,7 @@ from mvrecon.engine.checkpoints import load
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.limits import yaml_of
 from mvrecon.parts import CAMERAS
-from mvrecon.testing.hostile import pickle_of, saved, with_pickle
+from tests.faults.hostile import pickle_of, saved, with_pickle
 
 Wrap = Callable[[bytes], bytes]
 HU = np.arange(6 * 7 * 8, dtype=np.int16).reshape(6, 7, 8)

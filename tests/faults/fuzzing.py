@@ -1,4 +1,4 @@
-"""Fuzz every reader here and write what came of it as JSON: python -m mvrecon_bench.stresses.fuzzing SEED COUNT OUT."""
+"""Fuzz every reader here and write what came of it as JSON: python -m tests.faults.fuzzing SEED COUNT OUT."""
 
 import faulthandler
 import json
@@ -8,8 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 from random import Random
 
-from mvrecon.testing.fuzz import mutations, tally
-from mvrecon_bench.stresses.samples import samples
+from tests.faults.fuzz import mutations, tally
+from tests.faults.samples import samples
 
 #: Bytes that may be added to what the process uses once all is imported; seconds for all cases of a reader.
 MEMORY, SECONDS = 2 * 2**30, 60

@@ -1,0 +1,29 @@
+"""Python in a process of its own: what must not run in this one, because it ends it or needs a fresh one."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import mvrecon
+
+#: Seconds after which a process counts as hanging.
+LIMIT = 100.0
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A Python of its own, with this mvrecon on its path: how it ended, and what it wrote.
+
+    Raises:
+        TimeoutExpired: it takes longer than `LIMIT`; it is ended.
+    """
+    here = str(Path(mvrecon.__file__).parents[1])
+    path = os.pathsep.join([here, *filter(None, [os.environ.get("PYTHONPATH")])])
+    return subprocess.run(
+        [sys.executable, *arguments],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LIMIT,
+    )

@@ -1,0 +1,34 @@
+"""A case that does not end: told as a failure, or a loud exit where no Python runs."""
+
+import os
+
+import pytest
+
+from mvrecon_bench.stresses.subprocess_run import python
+
+HANGING = """
+import signal, sys, time
+from mvrecon_bench.stresses.case import Case
+from mvrecon_bench.stresses.subject import Subject
+from mvrecon_bench.stresses.verdict import judge
+from mvrecon_bench.stresses.watchdog import watched
+
+def hang(subject):
+    while True:
+        pass
+
+row = judge(Case(77, "x", "y", "mvrecon", hang), Subject("mvrecon"), 0.2)
+sys.stdout.write(f"{row['verdict']} {row['note']}\\n")
+sys.stdout.flush()
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})  # as compiled code, which no signal reaches
+with watched(0.2, 0.3):
+    time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="an alarm interrupts Python on POSIX systems alone")
+def test_a_case_that_hangs_fails_and_one_beyond_python_ends_the_app_with_a_traceback():
+    done = python("-c", HANGING)
+    assert "FAIL TimeoutError: still at work after 0.2 s" in done.stdout, done.stderr
+    assert done.returncode == 1
+    assert "Timeout" in done.stderr and "most recent call first" in done.stderr
