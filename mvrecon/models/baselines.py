@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, anything, content_scale, normalised
+from mvrecon.models.consistency import Consistency, anything, content_scale, normalised, typical_chord
 from mvrecon.models.door import admitted
 from mvrecon.models.model import CrossView
 from mvrecon.models.output import Reconstruction
@@ -95,7 +95,7 @@ class GeometryFree(nn.Module):
     def __init__(self, projector: Projector, width: int = 18):
         super().__init__()
         self.projector = projector
-        self.chord = max(projector.grid.shape) * min(projector.grid.spacing)
+        self.chord = typical_chord(projector.grid)
         self.net = UNet3d(len(projector.cameras), 1, width)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
