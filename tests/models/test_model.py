@@ -3,7 +3,6 @@ import torch
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.consistency import typical_chord
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS, PROJECTORS
 from tests.models.rig import small_projector, small_rig
@@ -191,7 +190,7 @@ def test_models_that_skip_nothing_answer_as_they_did(name):
     model = _build(name, projector)
     _stir(model)
     if name != "backprojection_unet":  # these weights are from when the depth network saw views in mm
-        model.opinions.pixels.weight.data *= typical_chord(projector.grid)
+        model.opinions.pixels.weight.data *= model.opinions.unit
     volume, views = _blob_views(projector)
     out = model(views)
     loss = ReconstructionLoss(1.0, edges=0.1)(out, {"volume": volume, "views": views})["total"]
