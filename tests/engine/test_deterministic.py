@@ -172,3 +172,15 @@ def test_the_compiled_loops_keep_their_threads_in_one_order(threads):
     assert sorted(parts) == [(0, 10), (10, 20), (20, 30)] and torch.get_num_threads() == 3
     with in_one_order(wanted=False):
         assert torch.get_num_threads() == 3
+
+
+@pytest.mark.parametrize("method", ["sirt", "backprojection"])
+def test_methods_without_a_network_have_the_same_bits_on_any_number_of_threads(method, threads):
+    settings = compose("grid.shape=[40,40,40]")
+    module = fit.build_module(settings, {"name": method}, 1.0)
+    volumes = []
+    for number in (1, 2, 3, 7):
+        threads(number)
+        volume = torch.rand(2, 1, 40, 40, 40, generator=torch.Generator().manual_seed(0))
+        volumes.append(module.model(module.projector(volume)).volume)
+    assert volumes[0].any() and all(torch.equal(volumes[0], other) for other in volumes[1:])
