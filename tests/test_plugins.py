@@ -2,7 +2,7 @@
 
 import pytest
 
-from mvrecon.config import import_plugins
+from mvrecon.config.plugins import import_plugins
 from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.drr import Drr
 from mvrecon.registry import Registry

@@ -15,6 +15,7 @@ from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
 from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
+from mvrecon.kernels.threads import in_one_order
 from mvrecon.limits import plain_name
 
 
@@ -59,7 +60,8 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     """Train one method of a run and leave `checkpoints/<method>.ckpt`, unless it is there or nothing can be learnt.
 
     Goes on from the method's last checkpoint where there is one, and on the CPU ends with the same bits as a run that
-    never broke off. Every method starts from the same seed and sees the same scenes in the same order.
+    never broke off on as many threads; with `trainer.deterministic`, on any number. Every method starts from the same
+    seed and sees the same scenes in the same order.
 
     Raises:
         FloatingPointError: a loss that is not finite.
@@ -84,7 +86,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     for logger in trainer.loggers:
         if isinstance(logger, Board | MetricsFile):
             logger.rewind(step)
-    with remembered(last):
+    with in_one_order(settings["trainer"].get("deterministic", False)), remembered(last):
         trainer.fit(module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True)
         trainer.save_checkpoint(done)
     remove(last)

@@ -18,6 +18,8 @@ from mvrecon.geometry.grid import Grid
 #: What turns an index into a place in another lattice: numerators of the three axes, denominator of the first two,
 #: denominator of the third; each a bilinear function (c_i i + c_j j + c) + k (c_ik i + c_jk j + c_k) of the index.
 NUMERATORS, ACROSS, DEPTH = slice(0, 3), 3, 4
+#: Of half a box: a sample so little outside of a face lies on it, but for rounding.
+FACE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +82,15 @@ def lifted_maps(
 
 def spread_map(maps: Float[Tensor, "*n r 2 3"], shape: tuple[int, int, int]) -> Float[Tensor, "*n d h w r"]:
     """The values of bilinear maps at the centred indices of all samples of a volume of `shape`."""
-    k, j, i = (torch.arange(n, dtype=maps.dtype, device=maps.device) - (n - 1) / 2 for n in shape)
-    planes = maps[..., 0, None, :] + k[:, None] * maps[..., 1, None, :]  # [*n r d 3]
+    planes, j, i = _planes(maps, shape)
     x, y, one = planes[..., None, None, :].unbind(dim=-1)
     return (x * i + y * j[:, None] + one).movedim(-4, -1)
+
+
+def _planes(maps: Tensor, shape: tuple[int, int, int]) -> tuple[Float[Tensor, "*n r d 3"], Tensor, Tensor]:
+    """Bilinear maps on each plane k, where they are x i + y j + one, and the centred indices j and i."""
+    k, j, i = (torch.arange(n, dtype=maps.dtype, device=maps.device) - (n - 1) / 2 for n in shape)
+    return maps[..., 0, None, :] + k[:, None] * maps[..., 1, None, :], j, i
 
 
 def places(
@@ -97,3 +104,22 @@ def places(
     under = rows[..., [ACROSS, ACROSS, DEPTH]]
     counts = (under > 0).all(dim=-1)
     return rows[..., NUMERATORS] / torch.where(counts[..., None], under, 1.0), counts
+
+
+def enclosed(
+    maps: Float[Tensor, "*n 5 2 3"], source: tuple[int, int, int], shape: tuple[int, int, int]
+) -> Bool[Tensor, "*n d h w"]:
+    """Which samples of an output of `shape` lie in the source lattice's box, ahead of its source; its faces count.
+
+    Every face is a half-space, which cuts a row of samples at one place: no sample's own place is worked out.
+    """
+    planes, j, i = _planes(maps, shape)
+    half = maps.new_tensor(source[::-1])[:, None, None] / 2 * (1 + FACE)
+    top, under = planes[..., NUMERATORS, :, :], planes[..., [ACROSS, ACROSS, DEPTH], :, :] * half
+    x, y, one = torch.cat([under - top, under + top], dim=-3).unbind(dim=-1)  # [*n 6 d], positive within
+    rest = y[..., None] * j + one[..., None]
+    x = x[..., None].expand_as(rest)
+    cut, never = -rest / x, torch.where(rest > 0, -torch.inf, torch.inf)
+    low = torch.where(x > 0, cut, torch.where(x < 0, -torch.inf, never)).amax(dim=-3)
+    high = torch.where(x < 0, cut, torch.inf).amin(dim=-3)
+    return (i > low[..., None]) & (i < high[..., None])

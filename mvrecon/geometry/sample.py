@@ -8,7 +8,7 @@ from itertools import product
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -46,8 +46,3 @@ def gathered(volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 
         share = along_x * along_y * along_z * held
         found = found + flat.gather(2, index).unflatten(2, held.shape[1:]) * share[:, None]
     return found
-
-
-def inside(points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-    """Which normalised points lie in the box of the volume; its faces count, whatever their rounding."""
-    return (points.abs() <= 1 + 1e-9).all(dim=-1)

@@ -4,14 +4,40 @@ numba's own `parallel=True` aborts under concurrent calls, and its OpenMP layer 
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 
 import torch
 
 #: Steps along rays that are worth a thread of their own.
 LEAST = 2**18
+
+_threads: int | None = None  # of the compiled loops, where torch has another number
+
+
+@contextmanager
+def in_one_order(wanted: bool = True) -> Iterator[None]:
+    """Leave torch one thread, and these loops as many as it had: every bit is then the same for any number of them.
+
+    The compiled loops add up in one order whatever the threads. torch does not: its convolutions' gradients, 1x1x1
+    convolutions, matrix products, group norms, sums and even SiLU round otherwise on another number of threads (up to
+    1e-5 of the maximum). Whole training steps have to be inside, backward passes too. Costs what torch's own threads
+    save.
+    """
+    global _threads
+    threads, before = torch.get_num_threads(), _threads
+    if not wanted:
+        yield
+        return
+    _threads = before or threads
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _threads = before
 
 
 @cache
@@ -23,7 +49,7 @@ def share(work: Callable[[int, int], None], count: int, samples: int, per_thread
     """Do work(first, last) for ranges that cover `count` items, on the threads that torch has and `samples` deserve."""
     if not count:
         return
-    threads = torch.get_num_threads()
+    threads = _threads or torch.get_num_threads()
     parts = min(count, threads * per_thread, 1 + samples // LEAST) if threads > 1 else 1
     if parts <= 1:
         work(0, count)

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, anything, content_scale, normalised
+from mvrecon.models.consistency import Consistency, anything, content_scale, normalised, typical_chord
+from mvrecon.models.door import admitted
 from mvrecon.models.model import CrossView
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.regions import Regions
@@ -67,6 +68,7 @@ class BackprojectionUNet(nn.Module):
         self.consistency = Consistency(consistency)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
+        views = admitted(views, self.regions.cameras, self.consistency.lengths)
         region = self.regions(views)
         y, x0, scale = normalised(region, views, self.iterations)
         seen = torch.cat([x0, region.back(y), region.residual(x0, y)], dim=1)
@@ -94,11 +96,11 @@ class GeometryFree(nn.Module):
     def __init__(self, projector: Projector, width: int = 18):
         super().__init__()
         self.projector = projector
-        self.chord = max(projector.grid.shape) * min(projector.grid.spacing)
+        self.chord = typical_chord(projector.grid)
         self.net = UNet3d(len(projector.cameras), 1, width)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        check_views(views, self.projector.cameras)
+        views = admitted(views, self.projector.cameras, self.net.last.weight)
         views = views.contiguous()  # other strides are rounded in another order
         scale = content_scale(views) / self.chord
         depth, *across = self.projector.grid.shape
@@ -137,4 +139,5 @@ class Backprojection(nn.Module):
         self.regions = Regions(projector, Skip())
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
+        check_views(views, self.regions.cameras)
         return Reconstruction(volume=self.regions(views).back(views))

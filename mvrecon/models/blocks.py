@@ -39,7 +39,9 @@ class ConvBlock(nn.Module):
 def _step(steps: nn.Sequential, x: Tensor, on: Voxels | None) -> Tensor:
     conv, norm = cast(nn.Conv3d, steps[0]), cast(nn.GroupNorm, steps[1])
     if on is None:
-        return F.silu(norm(convolution(x, conv.weight)))
+        values = convolution(x, conv.weight)
+        # not the module's own call: it refuses a group of one value, of which the shift is left
+        return F.silu(torch.group_norm(values, norm.num_groups, norm.weight, norm.bias, norm.eps))
     x = convolved(x, conv.weight, on)
     return F.silu(group_norm(x, on.counts, norm.num_groups, (norm.weight, norm.bias), norm.eps))
 

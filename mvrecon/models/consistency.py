@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.geometry.grid import Grid
 from mvrecon.models.region import Region
 from mvrecon.reconstruct.iterative import sirt
 
@@ -71,6 +72,14 @@ def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 
     part = (volume / peak).abs()
     scale = part.square().sum(dim=(1, 2, 3, 4), keepdim=True) / part.sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
     return torch.where(scale > 0, scale * peak, 1.0)
+
+
+def typical_chord(grid: Grid) -> float:
+    """The length in mm by which a network's views are divided, so that it sees densities and no unit of length.
+
+    Of the whole grid, since a crop's would change with the crop.
+    """
+    return max(grid.shape) * min(grid.spacing)
 
 
 def anything(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:

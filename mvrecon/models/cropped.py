@@ -38,4 +38,4 @@ class CroppedFrusta(Frusta):
     def ramp(self, like: Tensor) -> Float[Tensor, "m 1 D 1 1"]:
         """The bins' depth, from -1 to 1 in the whole frustum."""
         index = (self.window.first[:, :1] + torch.arange(self.shape[0])).to(like)
-        return (2 * index / (self.depth - 1) - 1)[:, None, :, None, None]
+        return (2 * index / max(1, self.depth - 1) - 1)[:, None, :, None, None]

@@ -73,7 +73,7 @@ def whole_geometry(projector: Projector, binning: int | None = None) -> Geometry
         return Geometry(projector, sirt_weights(projector))
     grid, cameras = projector.grid, projector.cameras
     depth = max(grid.shape)
-    frusta = Frusta(grid, cameras, depth), Frusta(grid, cameras.binned(binning), depth // 2)
+    frusta = Frusta(grid, cameras, depth), Frusta(grid, cameras.binned(binning), max(1, depth // 2))
     return Geometry(projector, sirt_weights(projector), frusta)
 
 

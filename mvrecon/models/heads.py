@@ -1,6 +1,6 @@
 """Heads: from a network's logits in a camera's frustum to that camera's density.
 
-A head says by `keeps_views` whether its density reproduces the camera's own view exactly.
+A head says by `keeps_views` whether its density, in its own frustum, sums to the camera's own view (3e-7 in float32).
 It is called with logits [b m 1 D v u] (zero logits mean: nothing to add to the prior), the prior density of the
 same shape, the measured views and the frusta's bins, and returns a density [b m 1 D v u] in the unit of (views / mm).
 """
@@ -18,8 +18,9 @@ FLOOR = 1e-2
 class SoftmaxDepth(nn.Module):
     """Shares the measured integral out along its ray: p * softmax_d(logits + log prior) / step.
 
-    The sum over a ray's bins times the bins' lengths is the measurement exactly, whatever the logits; so every camera's
-    density reproduces its own view, and a ray that measured nothing is empty. Rays outside the region stay zero.
+    The sum over a ray's bins times the bins' lengths is the measurement, to rounding, whatever the logits; so in its
+    own frustum every camera's density reproduces its own view, and a ray that measured nothing is empty. Warped to the
+    world, it does so no longer (docs/model.md). Rays outside the region stay zero.
     """
 
     keeps_views = True

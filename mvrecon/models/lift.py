@@ -13,9 +13,7 @@ from mvrecon.cameras.culling import seen_depth_range
 from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import Spacing, depth_edges
 from mvrecon.geometry.grid import Grid
-from mvrecon.geometry.lattice import grid_lattice, lattice_maps
-from mvrecon.geometry.sample import inside
-from mvrecon.kernels.warps.reference import normalised_places
+from mvrecon.geometry.lattice import enclosed, grid_lattice, lattice_maps
 from mvrecon.kernels.warps.warp import warp
 from mvrecon.models.bins import Bins
 
@@ -45,8 +43,8 @@ class Frusta(Bins, nn.Module):
         edges = depth_edges(seen_depth_range(cameras, grid), depth, spacing)
         self._place(grid, cameras, edges, spacing)
         ahead = frusta_lattice(cameras, grid, edges, spacing).ahead[:, None, :, None, None]
-        held = inside(normalised_places(self.world_from_frusta, grid.shape, self.shape)).transpose(0, 1)
-        visible = inside(normalised_places(self.frusta_from_world, self.shape, grid.shape))
+        held = enclosed(self.world_from_frusta, grid.shape, self.shape).transpose(0, 1)
+        visible = enclosed(self.frusta_from_world, self.shape, grid.shape)
         start, end = cameras.rays()
         per_mm = (end - start).norm(dim=-1) / cameras.distance[:, None, None]  # mm of ray per mm of depth
         step = (edges[:, 1:] - edges[:, :-1]).abs()[:, :, None, None] * per_mm[:, None]

@@ -20,7 +20,7 @@ class _Halved(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor) -> Tensor:
-        return F.avg_pool3d(x, 2, ceil_mode=True)
+        return F.avg_pool3d(x, [min(2, size) for size in x.shape[2:]], ceil_mode=True)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:

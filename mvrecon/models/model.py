@@ -14,6 +14,7 @@ from torch.nn.functional import max_pool3d
 
 from mvrecon.models.consistency import Consistency, normalised
 from mvrecon.models.cross_view import pooled
+from mvrecon.models.door import admitted
 from mvrecon.models.geometry import MULTIPLE
 from mvrecon.models.opinion import Opinions
 from mvrecon.models.output import Reconstruction
@@ -44,7 +45,7 @@ class CrossView(nn.Module):
 
     Raises:
         TypeError: an option that there is not.
-        ValueError: an unknown fusion; views whose shape, device or values do not fit (at the call).
+        ValueError: an unknown fusion; views that `admitted` refuses (at the call).
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class CrossView(nn.Module):
         self.consistency = Consistency(consistency)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
+        views = admitted(views, self.regions.cameras, self.consistency.lengths)
         region = self.regions(views)
         y, x0, scale = normalised(region, views, self.iterations)
         expected = region.A(x0)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.models.bins import Bins
+from mvrecon.models.consistency import typical_chord
 from mvrecon.models.cross_view import leave_one_out
 from mvrecon.models.masks import upsampled
 from mvrecon.models.region import Region
@@ -17,12 +18,15 @@ from mvrecon.projectors.operator import Projector
 
 Prior = Literal["learned", "uniform"]
 
+#: The depth network counts lengths in so many parts of the grid's own: numbers of the size that it was tuned with.
+PARTS = 128
+
 
 class Opinions(nn.Module):
     """M camera volumes from M views.
 
     The network works in frusta of binned pixels, since depth varies slowly across a detector; the head works at the
-    detector's own resolution, so that a fine view is met exactly.
+    detector's own resolution, so that in its frustum a fine view is met, to rounding.
 
     Args:
         projector: holds the grid and the rig.
@@ -47,7 +51,7 @@ class Opinions(nn.Module):
         super().__init__()
         if prior not in ("learned", "uniform"):
             raise ValueError(f"depth prior must be 'learned' or 'uniform', got {prior!r}")
-        self.binning = binning
+        self.binning, self.unit = binning, typical_chord(projector.grid) / PARTS
         self.head = HEADS.from_config(head)
         self.learned = prior == "learned"
         self.features = features if self.learned else 0
@@ -93,7 +97,7 @@ class Opinions(nn.Module):
         binned = nn.functional.avg_pool2d(pixels[:, :, :, 0].flatten(0, 1), self.pixels.kernel_size).unflatten(
             0, (b, 1)
         )
-        pixels = self.pixels(pixels.flatten(0, 2))  # [b*m c v u]
+        pixels = self.pixels(pixels.flatten(0, 2) / self.unit)  # [b*m c v u]
         pixels = pixels[:, :, None].expand(-1, -1, coarse.shape[0], -1, -1).unflatten(0, (b, m))
         lifted = bins.spread(binned)
         world = region.within(coarse.to_world(lifted))

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import Box
 from mvrecon.models.geometry import MULTIPLE, Geometry, crop_of, whole_geometry
 from mvrecon.models.region import Region
 from mvrecon.models.skip import Skip
 from mvrecon.models.window import held_bricks
-from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import inverse_sums
 from mvrecon.support.support import WORTH, support_from_views
@@ -36,14 +36,14 @@ class Regions(nn.Module):
         self.skip = skip
         self.crops: OrderedDict[Any, Geometry] = OrderedDict()
 
-    def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Region:
-        """The region of views.
+    @property
+    def cameras(self) -> Cameras:
+        """The whole rig."""
+        return self.whole.projector.cameras
 
-        Raises:
-            ValueError: views whose shape, device or values do not fit.
-        """
+    def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Region:
+        """The region of views."""
         A, skip = self.whole.projector, self.skip
-        check_views(views, A.cameras)
         everything = Region(self.whole, A.grid.shape, len(A.cameras), (self.whole.row, self.whole.column))
         if skip.support == "none":
             return everything

@@ -14,7 +14,7 @@ from mvrecon.models.voxels import Voxels, pyramid
 
 
 class UNet3d(nn.Module):
-    """Encoder and decoder over `levels` scales; any spatial size of at least 2^(levels - 1).
+    """Encoder and decoder over `levels` scales; any spatial size, since an axis of one voxel stays one when halved.
 
     With a mask the network is another one, of the same weights: after every convolution the features are zero outside
     the mask (max-pooled on coarser levels), and normalisation, pooling and upsampling look at its voxels alone. What it

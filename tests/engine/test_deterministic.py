@@ -8,6 +8,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mvrecon.config import compose
 from mvrecon.engine import checkpoints, fit
 from mvrecon.kernels import backends
+from mvrecon.kernels.threads import in_one_order, share
 
 #: What torch.use_deterministic_algorithms refuses on CUDA (its documentation, torch 2.13), of what a network may hold.
 REFUSED = {
@@ -121,16 +122,65 @@ def test_the_adjoint_of_a_gpu_adds_up_in_a_fixed_order_or_not_at_all(detector, s
     assert not gathers(shape, detector, 3, "siddon")
 
 
-def test_deterministic_training_has_the_bits_of_any_other_on_the_cpu(tmp_path, strict):
+@pytest.fixture
+def threads():
+    """Sets torch's number of threads for one test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(tmp_path, strict, threads):
+    """Those that any training has on one thread."""
     settings = compose("experiment=smoke")
     data = fit.build_data(settings)
     weights = []
-    for deterministic in (False, True, True):
+    for number, deterministic in ((1, False), (1, True), (2, True), (3, True)):
         torch.use_deterministic_algorithms(False)
+        threads(number)
         run = tmp_path / str(len(weights))
         fit.fit(
             "cross_view", {**settings, "trainer": settings["trainer"] | {"deterministic": deterministic}}, data, run
         )
+        assert torch.get_num_threads() == number
         weights.append(checkpoints.load(checkpoints.finished(run, "cross_view")).module.state_dict())
     assert torch.are_deterministic_algorithms_enabled()
     assert all(torch.equal(weights[0][name], other[name]) for other in weights[1:] for name in weights[0])
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_volumes_and_gradients_have_the_same_bits_in_one_order(model, threads):
+    settings = compose(f"model={model.split(maxsplit=1)[0].strip(',')}", *SMALL, *MODELS[model])
+    module = fit.build_module(settings, settings["model"], 1.0)
+    views, answers = torch.rand(2, 1, 4, 12, 12, generator=torch.Generator().manual_seed(0)), []
+    for number in (1, 2, 3, 7):
+        threads(number)
+        module.zero_grad()
+        with in_one_order():
+            volume = module.model(views).volume
+            volume.square().sum().backward()
+        answers.append([volume, *[p.grad for p in module.parameters() if p.grad is not None]])
+    assert all(torch.equal(a, b) for other in answers[1:] for a, b in zip(answers[0], other, strict=True))
+
+
+def test_the_compiled_loops_keep_their_threads_in_one_order(threads):
+    threads(3)
+    parts: list[tuple[int, int]] = []
+    with in_one_order(), in_one_order():
+        share(lambda first, last: parts.append((first, last)), 30, 2**20)
+        assert torch.get_num_threads() == 1
+    assert sorted(parts) == [(0, 10), (10, 20), (20, 30)] and torch.get_num_threads() == 3
+    with in_one_order(wanted=False):
+        assert torch.get_num_threads() == 3
+
+
+@pytest.mark.parametrize("method", ["sirt", "backprojection"])
+def test_methods_without_a_network_have_the_same_bits_on_any_number_of_threads(method, threads):
+    settings = compose("grid.shape=[40,40,40]")
+    module = fit.build_module(settings, {"name": method}, 1.0)
+    volumes = []
+    for number in (1, 2, 3, 7):
+        threads(number)
+        volume = torch.rand(2, 1, 40, 40, 40, generator=torch.Generator().manual_seed(0))
+        volumes.append(module.model(module.projector(volume)).volume)
+    assert volumes[0].any() and all(torch.equal(volumes[0], other) for other in volumes[1:])

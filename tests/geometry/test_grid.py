@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid, pixel_centres, voxel_centres
-from mvrecon.geometry.sample import inside, normalised, sample
+from mvrecon.geometry.sample import normalised, sample
 
 
 def test_voxel_centres_surround_the_grid_centre():
@@ -63,7 +63,7 @@ def test_sampling_at_voxel_centres_is_exact_and_axes_are_xyz():
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30])
 def test_points_that_are_nowhere_sample_to_zero(bad):
     points = normalised(torch.full((1, 1, 1, 1, 3), bad), (3, 4, 5))
-    assert not inside(points).any()
+    assert (points.abs() > 1).any(dim=-1).all()
     assert sample(torch.ones(1, 1, 3, 4, 5), points).item() == 0
 
 

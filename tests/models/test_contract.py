@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from mvrecon.projectors.base import check_views
 
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
+from mvrecon.projectors.checks import check_views
 from mvrecon.testing import check_model
 from tests.models.rig import small_projector
 from tests.models.test_model import OPTIONS

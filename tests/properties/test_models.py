@@ -5,6 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mvrecon.geometry.lattice import enclosed
+from mvrecon.kernels.warps.reference import normalised_places
 from mvrecon.models.cross_view import leave_one_out, pooled
 from mvrecon.models.lift import Frusta
 from mvrecon.models.weighting import fuse
@@ -24,6 +26,20 @@ def frusta_of(case: Case, depth: int, spacing: str) -> Frusta:
 
 
 FRUSTA = st.builds(frusta_of, cases(), st.integers(1, 12), st.sampled_from(["z", "k"]))
+
+
+@given(case=cases(), depth=st.integers(1, 12), spacing=st.sampled_from(["z", "k"]))
+def test_a_box_holds_the_samples_whose_places_lie_in_it(case, depth, spacing):
+    """Voxels in every frustum, and its bins in the grid; within 1e-12 of a face rounding decides."""
+    frusta = frusta_of(case, depth, spacing)
+    ways = (
+        (frusta.frusta_from_world, frusta.shape, case.grid.shape),
+        (frusta.world_from_frusta, case.grid.shape, frusta.shape),
+    )
+    for maps, source, shape in ways:
+        reach = normalised_places(maps, source, shape).abs().amax(dim=-1) - 1 - 1e-9
+        within = enclosed(maps, source, shape)
+        assert within[reach < -1e-12].all() and not within[reach > 1e-12].any()
 
 
 def measured(frusta: Frusta, data: st.DataObject) -> torch.Tensor:
