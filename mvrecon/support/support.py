@@ -1,5 +1,6 @@
 """The part of a grid that is worked on, told from the views of a case."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,8 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.support.hull import expand, visual_hull
+from mvrecon.support.footprints import ray_gap
+from mvrecon.support.hull import expand, thin_witnesses, visual_hull
 from mvrecon.support.noise import WITNESSES, Evidence, bounded_hull, noise_threshold
 
 KINDS = ("auto", "hull", "box", "none")
@@ -59,11 +61,16 @@ def support_from_views(
         grid: where the voxels lie.
         kind: "none" all of the grid; "hull" the visual hull; "box" all of its box; "auto" the hull where its box holds
             less than 0.7 of the grid, else all of the grid.
-        noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of `noise_threshold` and `witnesses`;
-            {sensitivity, tolerance} of counts, with `delta`, as of `bounded_hull`.
+        noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of `noise_threshold`;
+            {sensitivity, tolerance} of counts, with `delta`, as of `bounded_hull`. Exact views and X-rays also take
+            `witnesses`, the views that must agree: by default `thin_witnesses`, with photons at least 3. 1 gives the
+            tightest hull of exact views; no body is lost that is nowhere thinner than `ray_gap`.
         brick: edge in voxels; by default `brick_edge`.
         keep_unseen: as of `visual_hull`; of counts, whether to keep bricks to which no view is sensitive. Without, the
             support is of what the views show, and not of all that may be there.
+
+    Warns:
+        UserWarning: voxels are smaller than rays are apart, so that what is as small as they are can be lost.
 
     Raises:
         ValueError: an unknown kind or noise, explicit rays with a kind other than "none", views of another size than
@@ -76,8 +83,22 @@ def support_from_views(
     if isinstance(cameras, ExplicitRays):
         raise ValueError(f"A support is told from cameras with frusta, got explicit rays and kind {kind!r}; use 'none'")
     brick = brick_edge(grid) if brick is None else brick
+    if not noise or "sensitivity" not in noise:
+        warn_of_gaps(min(grid.spacing), "voxels", cameras, grid)
     bricks, evidence = _bricks((views, cameras, grid, brick), dict(noise or {}), keep_unseen)
     return _chosen(kind, expand(bricks, brick, grid.shape), _middle(grid, brick), evidence)
+
+
+def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid) -> None:
+    """A UserWarning where a size in mm is below `ray_gap`: such things can pass between rays, and be cut off a hull."""
+    gap = ray_gap(cameras, grid)
+    if size < gap * (1 - 1e-9):
+        warnings.warn(
+            f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), {what} are {size:.3g} mm: what is "
+            f"thinner than {gap:.3g} mm can pass between them, and be cut off by a visual hull",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _chosen(kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None) -> Support:
@@ -107,15 +128,17 @@ def _middle(grid: Grid, brick: int) -> Box:
 def _bricks(
     case: tuple[Float[Tensor, "b 1 m v u"], Cameras, Grid, int], noise: dict[str, Any], keep_unseen: bool
 ) -> tuple[Bool[Tensor, "b z y x"], Evidence | None]:
-    if not noise:
-        return visual_hull(*case, keep_unseen=keep_unseen), None
+    enough = thin_witnesses(len(case[1]))
+    if noise.keys() <= {"witnesses"}:
+        return visual_hull(*case, witnesses=noise.get("witnesses", enough), keep_unseen=keep_unseen), None
     if "photons" in noise and noise.keys() <= {"photons", "sigmas", "witnesses"}:
-        witnesses = noise.pop("witnesses", WITNESSES)
+        witnesses = noise.pop("witnesses", max(WITNESSES, enough))
         return visual_hull(*case, noise_threshold(case[0], **noise), witnesses, keep_unseen), None
     if {"sensitivity", "tolerance"} <= noise.keys() <= {"sensitivity", "tolerance", "delta"}:
         bricks, evidence = bounded_hull(*case, **noise)
         return bricks & ((noise["sensitivity"] > 0).any(dim=0).to(bricks.device) | keep_unseen), evidence
     raise ValueError(
-        "Noise is {photons} of X-rays (sigmas, witnesses) or {sensitivity, tolerance} of counts (delta), "
+        "Noise is {witnesses} of exact views, {photons} of X-rays (sigmas, witnesses) or {sensitivity, tolerance} of "
+        "counts (delta), "
         f"got {sorted(noise)}"
     )
