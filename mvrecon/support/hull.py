@@ -38,8 +38,7 @@ def visual_hull(
 
     A brick is empty where at least `witnesses` views that see all of it have no pixel above the threshold in its
     footprint. What is seen in part only, or not at all, stays. With exact views, threshold 0 and one witness no
-    occupied brick is lost, as long as the object is nowhere thinner than rays are apart there (`footprints`, gaps).
-    A thinner one can pass between all rays near a brick in one view, but hardly so in many (`thin_witnesses`).
+    occupied brick is lost, as long as the object is nowhere thinner than `ray_gap`; else see `thin_witnesses`.
 
     Args:
         views: line integrals, one a ray, finite.

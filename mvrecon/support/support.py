@@ -52,29 +52,25 @@ def support_from_views(
 ) -> Support:
     """The support of the volumes that views show.
 
-    Views in which nothing is seen leave no brick: the mask is then empty, and the box is the brick at the grid's
-    centre, for want of a better place.
+    Views in which nothing is seen leave no brick: the mask is then empty, and the box is the brick at the centre.
 
     Args:
         views: line integrals, or counts.
-        cameras: the rig.
-        grid: where the voxels lie.
+        cameras, grid: the rig, and where the voxels lie.
         kind: "none" all of the grid; "hull" the visual hull; "box" all of its box; "auto" the hull where its box holds
             less than 0.7 of the grid, else all of the grid.
         noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of `noise_threshold`;
             {sensitivity, tolerance} of counts, with `delta`, as of `bounded_hull`. Exact views and X-rays also take
-            `witnesses`, the views that must agree: by default `thin_witnesses`, with photons at least 3. 1 gives the
-            tightest hull of exact views; no body is lost that is nowhere thinner than `ray_gap`.
+            `witnesses`, the views that must agree: by default `thin_witnesses`, with photons at least 3.
         brick: edge in voxels; by default `brick_edge`.
         keep_unseen: as of `visual_hull`; of counts, whether to keep bricks to which no view is sensitive. Without, the
             support is of what the views show, and not of all that may be there.
 
     Warns:
-        UserWarning: voxels are smaller than rays are apart, so that what is as small as they are can be lost.
+        UserWarning: voxels are smaller than rays are apart, so that what is no larger can be lost.
 
     Raises:
-        ValueError: an unknown kind or noise, explicit rays with a kind other than "none", views of another size than
-            the rig's or not finite.
+        ValueError: an unknown kind or noise, explicit rays with a kind but "none", views of a wrong size or not finite.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown support {kind!r}. Known: {', '.join(KINDS)}")
@@ -83,13 +79,11 @@ def support_from_views(
     if isinstance(cameras, ExplicitRays):
         raise ValueError(f"A support is told from cameras with frusta, got explicit rays and kind {kind!r}; use 'none'")
     brick = brick_edge(grid) if brick is None else brick
-    if not noise or "sensitivity" not in noise:
-        warn_of_gaps(min(grid.spacing), "voxels", cameras, grid)
     bricks, evidence = _bricks((views, cameras, grid, brick), dict(noise or {}), keep_unseen)
     return _chosen(kind, expand(bricks, brick, grid.shape), _middle(grid, brick), evidence)
 
 
-def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid) -> None:
+def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stacklevel: int = 3) -> None:
     """A UserWarning where a size in mm is below `ray_gap`: such things can pass between rays, and be cut off a hull."""
     gap = ray_gap(cameras, grid)
     if size < gap * (1 - 1e-9):
@@ -97,7 +91,7 @@ def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid) -> None:
             f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), {what} are {size:.3g} mm: what is "
             f"thinner than {gap:.3g} mm can pass between them, and be cut off by a visual hull",
             UserWarning,
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
 
 
@@ -128,7 +122,10 @@ def _middle(grid: Grid, brick: int) -> Box:
 def _bricks(
     case: tuple[Float[Tensor, "b 1 m v u"], Cameras, Grid, int], noise: dict[str, Any], keep_unseen: bool
 ) -> tuple[Bool[Tensor, "b z y x"], Evidence | None]:
-    enough = thin_witnesses(len(case[1]))
+    _, cameras, grid, _ = case
+    if "sensitivity" not in noise:
+        warn_of_gaps(min(grid.spacing), "voxels", cameras, grid, stacklevel=4)
+    enough = thin_witnesses(len(cameras))
     if noise.keys() <= {"witnesses"}:
         return visual_hull(*case, witnesses=noise.get("witnesses", enough), keep_unseen=keep_unseen), None
     if "photons" in noise and noise.keys() <= {"photons", "sigmas", "witnesses"}:
