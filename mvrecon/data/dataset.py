@@ -11,7 +11,8 @@ from torch.utils.data import Dataset, Sampler
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import generator, mixed
-from mvrecon.scenes.sample import Sample, Scene
+from mvrecon.scenes.sample import Sample, Scene, Thin
+from mvrecon.support.support import warn_of_gaps
 
 TENSORS = ("views", "volume", "inside")
 
@@ -29,6 +30,9 @@ class SceneDataset(Dataset[dict[str, Any]]):
         seed: the series of cases.
         cache: keep every case in memory once it was made; `prepare` makes them all.
 
+    Warns:
+        UserWarning: rays are further apart than the scene's wells are wide.
+
     Raises:
         ValueError: a case whose views or volume are not finite.
     """
@@ -39,6 +43,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         self.scene, self.grid, self.cameras = scene, grid, cameras
         self.indices, self.seed, self.cache = tuple(indices), seed, cache
         self._ready: dict[str, Any] | None = None
+        if isinstance(scene, Thin):
+            warn_of_gaps(scene.thinnest(grid), "wells", cameras, grid)
 
     def __len__(self) -> int:
         return len(self.indices)

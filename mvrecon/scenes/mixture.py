@@ -1,11 +1,12 @@
 """Several scenes taken in turn."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import SCENES
-from mvrecon.scenes.sample import Rays, Sample, Scene
+from mvrecon.scenes.sample import Rays, Sample, Scene, Thin
 
 
 class Mixture:
@@ -33,6 +34,11 @@ class Mixture:
         lengths = [scene.length for scene in self.scenes]
         finite = [n for n in lengths if n is not None]
         return len(lengths) * max(finite) if len(finite) == len(lengths) else None
+
+    def thinnest(self, grid: Grid) -> float:
+        """The least that any scene with such a figure states, in mm; infinite where none does."""
+        sizes = [scene.thinnest(grid) for scene in self.scenes if isinstance(scene, Thin)]
+        return min(sizes, default=math.inf)
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
         """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""

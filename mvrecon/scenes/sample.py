@@ -1,7 +1,7 @@
 """What a scene is, and what it gives: the measured views of a case and the truth behind them."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -59,4 +59,13 @@ class Scene(Protocol):
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
         """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
+        ...
+
+
+@runtime_checkable
+class Thin(Protocol):
+    """A scene that knows how thin what is in it can be."""
+
+    def thinnest(self, grid: Grid) -> float:
+        """The least width in mm of anything in any case on `grid`."""
         ...

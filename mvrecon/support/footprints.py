@@ -50,8 +50,8 @@ class Footprints:
     Args:
         low: first column and row (u, v), within the detector.
         high: one behind the last; equal to `low` where the brick is not seen.
-        whole: the camera sees all of the brick: its footprint ends within the detector, and it lies in the part of the
-            rays that counts.
+        whole: the camera sees all of the brick: its footprint, grown by a diagonal of a pixel at most, ends within the
+            detector, and it lies in the part of the rays that counts.
     """
 
     low: Int[Tensor, "2 m n"]
@@ -59,7 +59,7 @@ class Footprints:
     whole: Bool[Tensor, "m n"]
 
 
-def footprints(cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5, gaps: bool = False) -> Footprints:
+def footprints(cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5, gaps: float = 0.0) -> Footprints:
     """The footprints of bricks in all views, in float64.
 
     Args:
@@ -68,22 +68,23 @@ def footprints(cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5,
         bricks: N of them; all cameras' corners are held at once, 500 bytes a brick and camera.
         reach: voxels by which interpolation carries a value beyond the faces of its voxel: 0.5 for joseph and trilinear
             (a voxel from its centre), 0 for siddon.
-        gaps: grow them by what may lie between rays, too. The thin rays of a brick's own footprint may all miss the
-            bit of a body that is in it. Where every point of the body lies in a ball of it as wide as a pixel's
-            diagonal magnified to there, a ray of the grown footprint meets that ball.
+        gaps: from 1 on, grow them by what may lie between rays, too: by half a pixel and half of so many diagonals of
+            one. The thin rays of a brick's own footprint may all miss the bit of a body that is in it. With 1, where
+            every point of the body lies in a ball of it as wide as a pixel's diagonal magnified to there (`ray_gap`), a
+            ray of the grown footprint meets that ball; the further it is grown, the more it meets of thinner bodies.
     """
     images, w = _images(cameras, grid, bricks, reach)
     margin, slack = _gaps(cameras) if gaps else (w.new_zeros(2, len(w), 1), w.new_zeros(len(w), 1))
+    more = max(0.0, gaps - 1) * (margin - 0.5)
     near, far = w.amin(dim=1), w.amax(dim=1)
     first, last = cameras.limits
     across = (near <= 0) & (far >= 0) & (not cameras.parallel)  # such a brick may have an image anywhere
     unseen = (far <= first) | (near >= last)
-    low = (images.amin(dim=2) - margin - ROUNDING).ceil()
-    high = (images.amax(dim=2) + margin + ROUNDING).floor() + 1
+    low, high = images.amin(dim=2) - margin - ROUNDING, images.amax(dim=2) + margin + ROUNDING
     size = low.new_tensor(cameras.shape[::-1]).reshape(2, 1, 1)
-    whole = ((low >= 0) & (high <= size)).all(dim=0) & (near >= first + slack) & (far <= last - slack) & ~across
-    low = torch.where(across, 0, low).clamp(min=0).minimum(size)
-    high = torch.where(across, size, high).minimum(size)
+    whole = ((low > -1) & (high < size)).all(dim=0) & (near >= first + slack) & (far <= last - slack) & ~across
+    low = torch.where(across, 0, (low - more).ceil()).clamp(min=0).minimum(size)
+    high = torch.where(across, size, (high + more).floor() + 1).minimum(size)
     return Footprints(low.long(), torch.where(unseen, low, torch.maximum(low, high)).long(), whole)
 
 
@@ -103,14 +104,30 @@ def _images(
     return (q[:2] if cameras.parallel else q[:2] / q[2]), q[2]
 
 
+def ray_gap(cameras: Cameras, grid: Grid) -> float:
+    """The widest diagonal of a pixel, magnified to where in the grid its rays count, in mm: a ball of that diameter
+    cannot pass between the rays of any view; 0 where no view's rays pass the grid."""
+    diagonal = _diagonals(cameras)
+    if cameras.parallel:
+        return diagonal.amax().item()
+    w = cameras.depth_range(grid).detach() / cameras.distance.detach()[:, None]
+    first, last = cameras.limits
+    return (diagonal * w.clamp(first, last).abs().amax(dim=-1)).amax().item()
+
+
+def _diagonals(cameras: Cameras) -> Float[Tensor, " m"]:
+    """The longer diagonal of each camera's pixels in mm."""
+    u, v = cameras.u.detach(), cameras.v.detach()
+    return torch.maximum((u + v).norm(dim=-1), (u - v).norm(dim=-1))
+
+
 def _gaps(cameras: Cameras) -> tuple[Float[Tensor, "2 m 1"], Float[Tensor, "m 1"]]:
     """How far from the image of a point the nearest ray is through any ball that holds it and is a pixel's diagonal
     wide: (u, v) in pixels; and that diagonal as a fraction of the way from source to detector.
 
     The ball's centre is half a diagonal away at most, and half a pixel along each axis from a ray.
     """
-    u, v = cameras.u.detach(), cameras.v.detach()
-    diagonal = torch.maximum((u + v).norm(dim=-1), (u - v).norm(dim=-1))
+    u, v, diagonal = cameras.u.detach(), cameras.v.detach(), _diagonals(cameras)
     area = torch.linalg.cross(u, v).norm(dim=-1)
     pitch = torch.stack([area / v.norm(dim=-1), area / u.norm(dim=-1)])  # between columns, between rows
     return 0.5 + (diagonal / (2 * pitch))[..., None], (diagonal / cameras.distance.detach())[:, None]

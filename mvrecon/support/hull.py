@@ -16,6 +16,11 @@ from mvrecon.support.footprints import Bricks, footprints, sums, tables
 VIEWS = 8
 #: Footprints at a time, which bounds the memory (500 bytes each).
 AT_ONCE = 2**15
+#: Diagonals of a pixel by which footprints are grown: 1 proves bodies absent that are nowhere thinner than that, and
+#: 2 takes in twice the length of what is half as wide, which so covers as much of the detector.
+GAPS = 2.0
+#: One view in so many must see a brick to be empty, where bodies may be thinner than rays are apart.
+SHARE = 10
 #: Bricks of so many times the edge are tried first; what is empty of them has only empty ones in it.
 COARSER = 4
 
@@ -33,7 +38,7 @@ def visual_hull(
 
     A brick is empty where at least `witnesses` views that see all of it have no pixel above the threshold in its
     footprint. What is seen in part only, or not at all, stays. With exact views, threshold 0 and one witness no
-    occupied brick is lost, as long as the object is nowhere thinner than rays are apart there (`footprints`, gaps).
+    occupied brick is lost, as long as the object is nowhere thinner than `ray_gap`; else see `thin_witnesses`.
 
     Args:
         views: line integrals, one a ray, finite.
@@ -60,6 +65,15 @@ def visual_hull(
         kept = kept.clone()
         kept[:, *places.T] &= (empty < witnesses) & (~dark | keep_unseen)
     return kept
+
+
+def thin_witnesses(views: int) -> int:
+    """How many of a rig's views must agree, so that what is thinner than rays are apart is not lost: a tenth.
+
+    If a view misses such a thing with a probability q, a fixed number of views that all miss it turns up in a rig of
+    enough views; a share of them above q hardly does, and the less, the more views there are.
+    """
+    return max(1, views // SHARE)
 
 
 def expand(bricks: Bool[Tensor, "b z y x"], brick: int, shape: Sequence[int]) -> Bool[Tensor, "b 1 d h w"]:
@@ -116,7 +130,7 @@ def _witnesses(
         chosen = list(range(turn, len(cameras), rounds))  # far apart on most rigs, so that they differ in what they see
         table = tables(views[:, chosen] > limit[:, chosen])
         for some in undecided.split(max(1, AT_ONCE // (batch * len(chosen)))):
-            prints = footprints(cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), gaps=True)
+            prints = footprints(cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), gaps=GAPS)
             none = sums(table, prints) == 0
             empty[:, some] += (none & prints.whole).sum(dim=1, dtype=torch.int32)
             dark[:, some] &= none.all(dim=1)

@@ -1,5 +1,6 @@
 """The part of a grid that is worked on, told from the views of a case."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,8 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.support.hull import expand, visual_hull
+from mvrecon.support.footprints import ray_gap
+from mvrecon.support.hull import expand, thin_witnesses, visual_hull
 from mvrecon.support.noise import WITNESSES, Evidence, bounded_hull, noise_threshold
 
 KINDS = ("auto", "hull", "box", "none")
@@ -50,24 +52,25 @@ def support_from_views(
 ) -> Support:
     """The support of the volumes that views show.
 
-    Views in which nothing is seen leave no brick: the mask is then empty, and the box is the brick at the grid's
-    centre, for want of a better place.
+    Views in which nothing is seen leave no brick: the mask is then empty, and the box is the brick at the centre.
 
     Args:
         views: line integrals, or counts.
-        cameras: the rig.
-        grid: where the voxels lie.
+        cameras, grid: the rig, and where the voxels lie.
         kind: "none" all of the grid; "hull" the visual hull; "box" all of its box; "auto" the hull where its box holds
             less than 0.7 of the grid, else all of the grid.
-        noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of `noise_threshold` and `witnesses`;
-            {sensitivity, tolerance} of counts, with `delta`, as of `bounded_hull`.
+        noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of `noise_threshold`;
+            {sensitivity, tolerance} of counts, with `delta`, as of `bounded_hull`. Exact views and X-rays also take
+            `witnesses`, the views that must agree: by default `thin_witnesses`, with photons at least 3.
         brick: edge in voxels; by default `brick_edge`.
         keep_unseen: as of `visual_hull`; of counts, whether to keep bricks to which no view is sensitive. Without, the
             support is of what the views show, and not of all that may be there.
 
+    Warns:
+        UserWarning: voxels are smaller than rays are apart, so that what is no larger can be lost.
+
     Raises:
-        ValueError: an unknown kind or noise, explicit rays with a kind other than "none", views of another size than
-            the rig's or not finite.
+        ValueError: an unknown kind or noise, explicit rays with a kind but "none", views of a wrong size or not finite.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown support {kind!r}. Known: {', '.join(KINDS)}")
@@ -78,6 +81,18 @@ def support_from_views(
     brick = brick_edge(grid) if brick is None else brick
     bricks, evidence = _bricks((views, cameras, grid, brick), dict(noise or {}), keep_unseen)
     return _chosen(kind, expand(bricks, brick, grid.shape), _middle(grid, brick), evidence)
+
+
+def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stacklevel: int = 3) -> None:
+    """A UserWarning where a size in mm is below `ray_gap`: such things can pass between rays, and be cut off a hull."""
+    gap = ray_gap(cameras, grid)
+    if size < gap * (1 - 1e-9):
+        warnings.warn(
+            f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), {what} are {size:.3g} mm: what is "
+            f"thinner than {gap:.3g} mm can pass between them, and be cut off by a visual hull",
+            UserWarning,
+            stacklevel=stacklevel,
+        )
 
 
 def _chosen(kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None) -> Support:
@@ -107,15 +122,20 @@ def _middle(grid: Grid, brick: int) -> Box:
 def _bricks(
     case: tuple[Float[Tensor, "b 1 m v u"], Cameras, Grid, int], noise: dict[str, Any], keep_unseen: bool
 ) -> tuple[Bool[Tensor, "b z y x"], Evidence | None]:
-    if not noise:
-        return visual_hull(*case, keep_unseen=keep_unseen), None
+    _, cameras, grid, _ = case
+    if "sensitivity" not in noise:
+        warn_of_gaps(min(grid.spacing), "voxels", cameras, grid, stacklevel=4)
+    enough = thin_witnesses(len(cameras))
+    if noise.keys() <= {"witnesses"}:
+        return visual_hull(*case, witnesses=noise.get("witnesses", enough), keep_unseen=keep_unseen), None
     if "photons" in noise and noise.keys() <= {"photons", "sigmas", "witnesses"}:
-        witnesses = noise.pop("witnesses", WITNESSES)
+        witnesses = noise.pop("witnesses", max(WITNESSES, enough))
         return visual_hull(*case, noise_threshold(case[0], **noise), witnesses, keep_unseen), None
     if {"sensitivity", "tolerance"} <= noise.keys() <= {"sensitivity", "tolerance", "delta"}:
         bricks, evidence = bounded_hull(*case, **noise)
         return bricks & ((noise["sensitivity"] > 0).any(dim=0).to(bricks.device) | keep_unseen), evidence
     raise ValueError(
-        "Noise is {photons} of X-rays (sigmas, witnesses) or {sensitivity, tolerance} of counts (delta), "
+        "Noise is {witnesses} of exact views, {photons} of X-rays (sigmas, witnesses) or {sensitivity, tolerance} of "
+        "counts (delta), "
         f"got {sorted(noise)}"
     )

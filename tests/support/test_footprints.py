@@ -9,7 +9,7 @@ from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.solids import Phantom
-from mvrecon.support.footprints import Bricks, Footprints, footprints, sums, tables
+from mvrecon.support.footprints import Bricks, Footprints, footprints, ray_gap, sums, tables
 from tests.support.cases import KINDS, World, operator, random_world
 
 DETECTOR = {"pixels": [9, 12], "pixel_mm": 1.0}
@@ -126,3 +126,11 @@ def test_sums_over_footprints_are_those_of_their_pixels():
 def test_sums_of_counts_lose_no_count():
     table = tables(torch.full((1, 40, 50), 2.0**31 - 128))
     assert table[0, -1, -1].item() == 2000 * (2**31 - 128)
+
+
+def test_the_gap_between_rays_is_a_pixels_diagonal_magnified_to_where_they_count():
+    grid, detector = Grid.centred((4, 4, 4), 10.0), {"pixels": [9, 12], "pixel_mm": [3.0, 4.0]}
+    assert ray_gap(parallel(3, detector, 100.0), grid) == pytest.approx(5.0)
+    cone = circular(1, 100.0, 200.0, detector)
+    assert ray_gap(cone, grid) == pytest.approx(5.0 * 120 / 200)  # the far face
+    assert ray_gap(circular(1, 100.0, 110.0, detector), grid) == pytest.approx(5.0)  # rays end in the grid

@@ -1,13 +1,21 @@
 """The support of a case: its kinds, and what it is not told from."""
 
+import warnings
+from dataclasses import replace
+
 import pytest
 import torch
 
 from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.cameras.rigs import parallel
+from mvrecon.data.dataset import SceneDataset
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import random_rotation
+from mvrecon.parts import SCENES
+from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
-from mvrecon.support.hull import expand, visual_hull
+from mvrecon.support.hull import expand, thin_witnesses, visual_hull
 from mvrecon.support.noise import noise_threshold
 from mvrecon.support.support import brick_edge, support_from_views
 from tests.support.cases import World, random_world
@@ -80,7 +88,7 @@ def test_noise_chooses_how_emptiness_is_told():
     for keep in (True, False):
         counts = support_from_views(SMALL.views.round(), SMALL.cameras, SMALL.grid, "hull", told, 4, keep)
         assert bool(counts.mask[0, 0, 0, 0, 0]) == keep
-    for unknown in ({"photon": 1e5}, {"photons": 1e5, "tolerance": 1.0}, {"tolerance": 1.0}):
+    for unknown in ({"photon": 1e5}, {"witness": 1}, {"photons": 1e5, "tolerance": 1.0}, {"tolerance": 1.0}):
         with pytest.raises(ValueError, match="got \\['"):
             of(SMALL, noise=unknown)
 
@@ -102,3 +110,51 @@ def test_a_support_is_told_from_finite_views_of_cameras(kind: str):
 @pytest.mark.parametrize(("longest", "edge"), [(5, 1), (48, 1), (64, 2), (128, 4), (256, 8), (512, 8)])
 def test_bricks_are_fine_on_small_grids(longest: int, edge: int):
     assert brick_edge(Grid.centred((3, longest, 4), 1.0)) == edge
+
+
+def rods(pixel: float) -> World:
+    """Four rods of 1 mm, each turned its own way, in voxels of 1 mm, seen by 40 parallel views."""
+    rng = torch.Generator().manual_seed(4)
+    grid, rig = Grid.centred((24, 24, 24), 1.0), parallel(40, {"pixels": [24, 24], "pixel_mm": pixel}, 90.0)
+    centres = 8 * torch.rand(4, 3, generator=rng, dtype=torch.float64) - 4
+    sizes = torch.tensor([[0.5, 0.5, 5.0]] * 4, dtype=torch.float64)
+    return World(grid, rig, Phantom((Solids("cylinder", centres, random_rotation(rng, 4), sizes, torch.ones(4)),)))
+
+
+def test_a_tenth_of_many_views_must_agree_so_that_thin_rods_stay():
+    """Rods of half a pixel pass between the rays of some views: one view is no proof for them, four of 40 are."""
+    world = rods(2.0)
+    thin = voxelise(world.phantom, world.grid, 4) > 0
+    one, tenth = (of(world, "hull", noise=noise).mask for noise in ({"witnesses": 1}, None))
+    assert torch.equal(tenth[0, 0], visual_hull(world.views, world.cameras, world.grid, 1, witnesses=4)[0])
+    assert (thin & ~one[0, 0]).any()
+    assert not (thin & ~tenth[0, 0]).any()
+    assert tenth.float().mean() < 0.5
+    assert [thin_witnesses(n) for n in (1, 8, 19, 20, 80)] == [1, 1, 1, 2, 8]
+
+
+@pytest.mark.door
+def test_voxels_that_are_smaller_than_rays_are_apart_are_warned_of():
+    """A hull says when things as small as a voxel can pass between rays, and how far apart the rays are."""
+    with pytest.warns(UserWarning, match=r"up to 2.83 mm apart .*, voxels are 1 mm: .* thinner than 2.83 mm"):
+        of(rods(2.0), "hull")
+    fine = rods(0.7)  # a diagonal of 0.99 mm
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        of(fine, "hull")
+        of(replace(fine, cameras=rods(2.0).cameras), "none")
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("mixed", [False, True])
+def test_wells_that_are_thinner_than_rays_are_apart_are_warned_of(mixed: bool):
+    """A data set says when rays can pass by the smallest wells of its phantoms."""
+    wells = {"name": "derenzo", "fill": None, "field": 0.5, "unit": "1/mm"}
+    scene = {"name": "mixture", "scenes": [{"name": "ellipsoids"}, wells]} if mixed else wells
+    grid = Grid.centred((24, 24, 24), 4.0)
+    for pixel, warned in ((2.0, 1), (1.4, 0)):  # diagonals of 2.83 and 1.98 mm, wells of 2 mm
+        rig = parallel(4, {"pixels": [8, 8], "pixel_mm": pixel}, 200.0)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            SceneDataset(SCENES.from_config(scene), grid, rig, [0], 0)
+        assert ["wells are 2 mm" in str(w.message) for w in caught] == [True] * warned
