@@ -1,4 +1,5 @@
-"""mvrecon: volumes from several cameras' views, by operators, classical methods and networks that know the geometry.
+"""mvrecon: volumes from several cameras' views, by operators, classical methods and networks that
+know the geometry.
 
 The front door. Every name is imported when it is first used, so `import mvrecon` costs nothing::
 

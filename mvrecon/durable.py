@@ -1,4 +1,6 @@
-"""Files that are there whole or not at all, folders of one's own, and folders that one process at a time writes to."""
+"""Files that are there whole or not at all, folders of one's own, and folders that one process at a
+time writes to.
+"""
 
 import os
 import socket
@@ -18,14 +20,17 @@ LOCK, PART = ".lock", ".part"
 
 @contextmanager
 def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place once all is written: a crash leaves what was there before.
+    """A temporary path beside `path` that takes its place once all is written: a crash leaves what
+    was there before.
 
-    The contents reach the disk before the name does, so that a loss of power cannot leave half a file either. The
-    temporary file of a killed process, `.<name>.<process>.part`, is cleared away by the next `claimed`.
+    The contents reach the disk before the name does, so that a loss of power cannot leave half a
+    file either. The temporary file of a killed process, `.<name>.<process>.part`, is cleared away
+    by the next `claimed`.
 
     Args:
         path: of the file.
-        previous: where the file that was there goes; none: nowhere. At any moment one of both paths holds a whole file.
+        previous: where the file that was there goes; none: nowhere. At any moment one of both paths
+            holds a whole file.
 
     Raises:
         OSError: no space, no permission; the message names `path`.
@@ -51,7 +56,8 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """A folder that no other process writes to meanwhile; what killed writers left half done in it is cleared away.
+    """A folder that no other process writes to meanwhile; what killed writers left half done in it
+    is cleared away.
 
     The claim ends with the process, however that ends; worker processes do not inherit it.
 
@@ -80,7 +86,8 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def new_folder(wanted: str | Path) -> Path:
-    """A new folder: the path wanted, or where another process or run has that, with _2, _3, ... at its end.
+    """A new folder: the path wanted, or where another process or run has that, with _2, _3, ... at
+    its end.
 
     Raises:
         OSError: no space, no permission.
@@ -98,7 +105,8 @@ def new_folder(wanted: str | Path) -> Path:
 
 
 def check_plain(folder: Path) -> None:
-    """Refuse a folder that leads to other places: with a link in it, or a pipe or a device, at any depth.
+    """Refuse a folder that leads to other places: with a link in it, or a pipe or a device, at any
+    depth.
 
     The folder itself may be reached by a link.
 
@@ -109,7 +117,8 @@ def check_plain(folder: Path) -> None:
         for path in (Path(parent, name) for name in (*folders, *files)):
             if _leads_elsewhere(path):
                 raise PermissionError(
-                    f"{folder} holds {path.relative_to(folder)}, a link, a pipe or a device; expected files and folders"
+                    f"{folder} holds {path.relative_to(folder)}, a link, a pipe or a device; "
+                    f"expected files and folders"
                 )
 
 

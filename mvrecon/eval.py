@@ -1,4 +1,6 @@
-"""`mvrecon-eval`: the result table of a run again, from its checkpoints, on its own test scenes or on others."""
+"""`mvrecon-eval`: the result table of a run again, from its checkpoints, on its own test scenes or
+on others.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -14,15 +16,16 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Evaluate a run's methods and write `results.json` (with `save`, the cases too) into a folder.
 
     Args:
-        given: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the run: `test_scene`,
-            `data`, further `compare`; `device` and `save`.
+        given: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the
+            run: `test_scene`, `data`, further `compare`; `device` and `save`.
         folder: where the results go, with `eval.yaml`, which is `given`, and `versions.txt`.
 
     Raises:
         FileNotFoundError: no checkpoint or no run is there.
         RuntimeError: another process is at work in the folder.
-        ValueError: the run was made with another rig or other data; the folder is another evaluation's; settings for
-            a method that the run has trained, which its checkpoint decides.
+        ValueError: the run was made with another rig or other data; the folder is another
+            evaluation's; settings for a method that the run has trained, which its checkpoint
+            decides.
         FileExistsError: the folder is a run's own.
     """
     import_plugins(given["plugins"])
@@ -31,7 +34,9 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
     run = checkpoints.run_folder(given["checkpoint"])
     described = (label for label, model in given["compare"].items() if model)
     if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
-        raise ValueError(f"compare describes {trained}, which the run has trained already; expected other labels")
+        raise ValueError(
+            f"compare describes {trained}, which the run has trained already; expected other labels"
+        )
     settings = merged(record.read_settings(run), given)
     import_plugins(settings["plugins"])
     data = fit.build_data(settings)
@@ -50,12 +55,20 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def merged(run: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """A run's settings with the test scene, the data options and the compared methods that an evaluation gives."""
+    """A run's settings with the test scene, the data options and the compared methods that an
+    evaluation gives.
+    """
     data = {**run["data"], **(given["data"] or {})}
     data["sizes"] = {**run["data"]["sizes"], **(data["sizes"] or {})}
     scene = given["test_scene"] or run["test_scene"]
     compare = {**run["compare"], **given["compare"]}
-    return {**run, "name": f"{run['name']} ({given['name']})", "test_scene": scene, "data": data, "compare": compare}
+    return {
+        **run,
+        "name": f"{run['name']} ({given['name']})",
+        "test_scene": scene,
+        "data": data,
+        "compare": compare,
+    }
 
 
 def task(config: DictConfig) -> float:

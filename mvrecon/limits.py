@@ -1,4 +1,6 @@
-"""How far a file from elsewhere is believed: its size, its text and its names are looked at before they are used."""
+"""How far a file from elsewhere is believed: its size, its text and its names are looked at before
+they are used.
+"""
 
 import reprlib
 from collections.abc import Iterator
@@ -6,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-#: Bytes: the most that are read of a text file, of a YAML file (whose parser is slow), and that one volume or one chunk
-#: of a file may unfold to.
+#: Bytes: the most that are read of a text file, of a YAML file (whose parser is slow), and that one
+#: volume or one chunk of a file may unfold to.
 TEXT, YAML, VOLUME = 16 * 2**20, 64 * 2**10, 8 * 2**30
 #: Bytes that a name may have; values of a YAML file.
 NAME, NODES = 200, 100_000
@@ -22,8 +24,11 @@ class Refused(ValueError):
 
 
 @contextmanager
-def blaming(path: str | Path, what: str, hint: str = "is it cut short or damaged?") -> Iterator[None]:
-    """Whatever a library raises over a file's contents names the file: a damaged one makes libraries raise anything.
+def blaming(
+    path: str | Path, what: str, hint: str = "is it cut short or damaged?"
+) -> Iterator[None]:
+    """Whatever a library raises over a file's contents names the file: a damaged one makes
+    libraries raise anything.
 
     Raises:
         Refused: in place of any error but these: a `Refused`, a missing import.
@@ -54,11 +59,13 @@ def text_of(path: str | Path, limit: int = TEXT) -> str:
 
 
 def yaml_of(path: str | Path) -> Any:
-    """The plain values of a YAML file whose aliases, written out, make no more than `NODES` of them.
+    """The plain values of a YAML file whose aliases, written out, make no more than `NODES` of
+    them.
 
     Raises:
         OSError: it cannot be read.
-        Refused: too large, not UTF-8, not YAML, a tag that asks for an object, or lines that unfold to a mountain.
+        Refused: too large, not UTF-8, not YAML, a tag that asks for an object, or lines that unfold
+            to a mountain.
     """
     import yaml
 
@@ -72,7 +79,9 @@ def yaml_of(path: str | Path) -> Any:
 
 
 def _unfolded(node: Any, sizes: dict[int, float]) -> float:
-    """How many values a node has once its aliases are written out; one that holds itself has no end."""
+    """How many values a node has once its aliases are written out; one that holds itself has no
+    end.
+    """
     if id(node) not in sizes:
         sizes[id(node)] = float("inf")  # until its parts are known
         parts = node.value if isinstance(node.value, list) else []
@@ -91,10 +100,18 @@ def plain_name(name: Any, where: str | Path) -> str:
     Raises:
         Refused: not printable text of 1 to 200 bytes, or one with / \\ or :, or of dots alone.
     """
-    if isinstance(name, str) and name.isprintable() and not set(name) & set("/\\:") and name.strip(". "):
+    if (
+        isinstance(name, str)
+        and name.isprintable()
+        and not set(name) & set("/\\:")
+        and name.strip(". ")
+    ):
         if len(name.encode()) <= NAME:
             return name
-    raise Refused(f"{where}: has the name {shown(name)}; expected at most {NAME} bytes of text without / \\ and :")
+    raise Refused(
+        f"{where}: has the name {shown(name)}; expected at most {NAME} bytes of text without / \\ "
+        f"and :"
+    )
 
 
 def shown(value: Any) -> str:

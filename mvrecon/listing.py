@@ -1,6 +1,7 @@
 """`mvrecon-list`: every part by name, what it is, its options, and where it comes from.
 
-Sources are read, not imported, so the answer comes at once and a broken plugin disturbs nobody; `--check` imports.
+Sources are read, not imported, so the answer comes at once and a broken plugin disturbs nobody;
+`--check` imports.
 """
 
 import argparse
@@ -21,8 +22,8 @@ Definition = ast.ClassDef | ast.FunctionDef
 
 @dataclass(frozen=True)
 class Part:
-    """What a reader wants to know of one part: `options` maps names to defaults as written ("" is none);
-    `error` says why it cannot be used or described."""
+    """What a reader wants to know of one part: `options` maps names to defaults as written ("" is
+    none); `error` says why it cannot be used or described."""
 
     kind: str
     name: str
@@ -33,7 +34,9 @@ class Part:
 
 
 def describe(kind: str, name: str, check: bool = False) -> Part:
-    """One part, from its source alone; with `check` it is imported too, and `error` tells what that raised."""
+    """One part, from its source alone; with `check` it is imported too, and `error` tells what that
+    raised.
+    """
     origin = ""
     try:
         origin = REGISTRIES[kind].origin(name)
@@ -72,7 +75,9 @@ def _tree(module: str) -> ast.Module:
 
 
 def _options(module: str, node: Definition) -> dict[str, str]:
-    """Each option's default: a function's, a class's `__init__`'s, or a dataclass's fields with its bases'."""
+    """Each option's default: a function's, a class's `__init__`'s, or a dataclass's fields with its
+    bases'.
+    """
     if isinstance(node, ast.FunctionDef):
         return _arguments(node)
     for member in node.body:
@@ -92,8 +97,13 @@ def _arguments(function: ast.FunctionDef) -> dict[str, str]:
     a = function.args
     positional = [*a.posonlyargs, *a.args]
     defaults = [None] * (len(positional) - len(a.defaults)) + a.defaults
-    pairs = [*zip(positional, defaults, strict=True), *zip(a.kwonlyargs, a.kw_defaults, strict=True)]
-    return {argument.arg: _written(default) for argument, default in pairs if argument.arg not in GIVEN}
+    pairs = [
+        *zip(positional, defaults, strict=True),
+        *zip(a.kwonlyargs, a.kw_defaults, strict=True),
+    ]
+    return {
+        argument.arg: _written(default) for argument, default in pairs if argument.arg not in GIVEN
+    }
 
 
 def _fields(node: ast.ClassDef) -> dict[str, str]:
@@ -133,7 +143,9 @@ def show(parts: Sequence[Part]) -> None:
         rest = Text(part.summary)
         if part.error:
             rest.append(f"broken: {part.error}", style="red")
-        options = ", ".join(f"{name}={default}" if default else name for name, default in part.options.items())
+        options = ", ".join(
+            f"{name}={default}" if default else name for name, default in part.options.items()
+        )
         for line in (options, part.origin):
             rest.append(f"\n{line}" if line else "", style="dim")
         table.add_row(Text(f"  {part.name}", style="cyan"), rest)
@@ -142,12 +154,20 @@ def show(parts: Sequence[Part]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The console script; its exit status is 1 if a part that was checked is broken."""
-    parser = argparse.ArgumentParser(prog="mvrecon-list", description="Lists the parts that a configuration can name.")
-    parser.add_argument("kind", nargs="?", choices=sorted(REGISTRIES), help="only this kind of part")
-    parser.add_argument("--check", action="store_true", help="import every part, and say which are broken and why")
+    parser = argparse.ArgumentParser(
+        prog="mvrecon-list", description="Lists the parts that a configuration can name."
+    )
+    parser.add_argument(
+        "kind", nargs="?", choices=sorted(REGISTRIES), help="only this kind of part"
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="import every part, and say which are broken and why"
+    )
     options = parser.parse_args(arguments)
     kinds = [options.kind] if options.kind else REGISTRIES
-    parts = [describe(kind, name, options.check) for kind in kinds for name in REGISTRIES[kind].names()]
+    parts = [
+        describe(kind, name, options.check) for kind in kinds for name in REGISTRIES[kind].names()
+    ]
     show(parts)
     return int(options.check and any(part.error for part in parts))
 

@@ -1,4 +1,6 @@
-"""Training losses, all relative to the data's value range so that one set of weights serves every unit."""
+"""Training losses, all relative to the data's value range so that one set of weights serves every
+unit.
+"""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,9 +10,12 @@ from mvrecon.models.output import Reconstruction
 
 
 def edge_difference(
-    a: Float[Tensor, "b 1 d h w"], b: Float[Tensor, "b 1 d h w"], support: Bool[Tensor, "b 1 d h w"] | None = None
+    a: Float[Tensor, "b 1 d h w"],
+    b: Float[Tensor, "b 1 d h w"],
+    support: Bool[Tensor, "b 1 d h w"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean squared difference of the first differences along the three axes: edges count, offsets do not.
+    """Mean squared difference of the first differences along the three axes: edges count, offsets
+    do not.
 
     With a support only differences between two of its voxels count.
     """
@@ -37,15 +42,17 @@ def _neighbours(support: Bool[Tensor, "b 1 d h w"], axis: int) -> Tensor:
 class ReconstructionLoss(nn.Module):
     """Error of the volume, of each camera's own volume, and of what each predicts for the others.
 
-    Where a model works on a support, the means of the volumes' errors are over its voxels: all others are 0 by
-    definition, and nothing could be learnt there. The figures of merit see the whole grid.
+    Where a model works on a support, the means of the volumes' errors are over its voxels: all
+    others are 0 by definition, and nothing could be learnt there. The figures of merit see the
+    whole grid.
 
     Args:
         data_range: value range of the volumes, in their unit.
         volume: weight of the mean squared error.
         edges: weight of the squared error of first differences.
         opinions: weight of the mean squared error of the opinions, where the cameras see.
-        cross_view: weight of the squared error of opinions seen by the other cameras, relative to the views.
+        cross_view: weight of the squared error of opinions seen by the other cameras, relative to
+            the views.
     """
 
     def __init__(
@@ -60,9 +67,16 @@ class ReconstructionLoss(nn.Module):
         if not data_range > 0:
             raise ValueError(f"data_range must be positive, got {data_range}")
         self.data_range = data_range
-        self.weights = {"volume": volume, "edges": edges, "opinions": opinions, "cross_view": cross_view}
+        self.weights = {
+            "volume": volume,
+            "edges": edges,
+            "opinions": opinions,
+            "cross_view": cross_view,
+        }
 
-    def forward(self, out: Reconstruction, batch: dict[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
+    def forward(
+        self, out: Reconstruction, batch: dict[str, Tensor]
+    ) -> dict[str, Float[Tensor, ""]]:
         """Each term unweighted, and their weighted sum as "total"."""
         truth, views = batch["volume"] / self.data_range, batch["views"]
         volume = out.volume / self.data_range

@@ -9,7 +9,9 @@ except ImportError:  # Windows has no such module
 
 
 def peak() -> int | None:
-    """The most memory that this process has had so far, in bytes; None on Windows, where Python cannot ask for it."""
+    """The most memory that this process has had so far, in bytes; None on Windows, where Python
+    cannot ask for it.
+    """
     if resource is None:
         return None
     unit = 1 if sys.platform == "darwin" else 1024

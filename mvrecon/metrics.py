@@ -1,8 +1,9 @@
-"""How far a reconstruction is from the truth: error of one volume, and of the views that it predicts.
+"""How far a reconstruction is from the truth: error of one volume, and of the views that it
+predicts.
 
-PSNR and SSIM are torchmetrics' (imported late: it is slow); SSIM has a Gaussian window of 1.5 voxels and reflected
-borders (Wang et al. 2004, IEEE TIP 13(4)). The data range is always given, never taken from the data, so that numbers
-of different volumes compare.
+PSNR and SSIM are torchmetrics' (imported late: it is slow); SSIM has a Gaussian window of 1.5
+voxels and reflected borders (Wang et al. 2004, IEEE TIP 13(4)). The data range is always given,
+never taken from the data, so that numbers of different volumes compare.
 """
 
 import math
@@ -24,7 +25,9 @@ UNITS = {
 
 
 def nrmse(x: Float[Tensor, "*n"], truth: Float[Tensor, "*n"]) -> float:
-    """||x - truth|| / ||truth||; for a truth of zeros, 0 where x is zero too and infinite where it is not."""
+    """||x - truth|| / ||truth||; for a truth of zeros, 0 where x is zero too and infinite where it
+    is not.
+    """
     error, size = torch.linalg.vector_norm(x - truth).item(), torch.linalg.vector_norm(truth).item()
     if size == 0:
         return 0.0 if error == 0 else math.inf
@@ -37,18 +40,25 @@ def volume_metrics(
     inside: Bool[Tensor, "1 d h w"],
     data_range: float,
 ) -> dict[str, float]:
-    """PSNR in dB (infinite for equal volumes), SSIM and NRMSE of one volume, over all of it and inside the object.
+    """PSNR in dB (infinite for equal volumes), SSIM and NRMSE of one volume, over all of it and
+    inside the object.
 
-    SSIM inside is the mean of the SSIM map over the object's voxels. Without any voxel inside, those figures are nan.
+    SSIM inside is the mean of the SSIM map over the object's voxels. Without any voxel inside,
+    those figures are nan.
 
     Raises:
-        ValueError: shapes that differ, fewer than 6 voxels along an axis, or a data range that is not positive.
+        ValueError: shapes that differ, fewer than 6 voxels along an axis, or a data range that is
+            not positive.
     """
     if not volume.shape == truth.shape == inside.shape or volume.ndim != 4:
         shapes = [tuple(x.shape) for x in (volume, truth, inside)]
-        raise ValueError(f"Metrics need volume, truth and inside of one shape [1 d h w], got {shapes}")
+        raise ValueError(
+            f"Metrics need volume, truth and inside of one shape [1 d h w], got {shapes}"
+        )
     if min(volume.shape[1:]) < 6:
-        raise ValueError(f"SSIM's window needs at least 6 voxels along each axis, got {tuple(volume.shape[1:])}")
+        raise ValueError(
+            f"SSIM's window needs at least 6 voxels along each axis, got {tuple(volume.shape[1:])}"
+        )
     if not data_range > 0:
         raise ValueError(f"data_range must be positive, got {data_range}")
     from torchmetrics.functional.image import structural_similarity_index_measure
@@ -57,7 +67,11 @@ def volume_metrics(
     similarity, local = structural_similarity_index_measure(
         volume[None], truth[None], data_range=data_range, return_full_image=True
     )
-    whole = {"psnr": _psnr(volume, truth, data_range), "ssim": float(similarity), "nrmse": nrmse(volume, truth)}
+    whole = {
+        "psnr": _psnr(volume, truth, data_range),
+        "ssim": float(similarity),
+        "nrmse": nrmse(volume, truth),
+    }
     if not inside.any():
         return whole | {"psnr_inside": math.nan, "ssim_inside": math.nan, "nrmse_inside": math.nan}
     return whole | {
@@ -67,14 +81,19 @@ def volume_metrics(
     }
 
 
-def view_metrics(views: Float[Tensor, "*n m v u"], measured: Float[Tensor, "*n m v u"]) -> dict[str, float]:
+def view_metrics(
+    views: Float[Tensor, "*n m v u"], measured: Float[Tensor, "*n m v u"]
+) -> dict[str, float]:
     """NRMSE of predicted views against measured ones, over all cameras together.
 
     Raises:
         ValueError: shapes that differ.
     """
     if views.shape != measured.shape:
-        raise ValueError(f"Predicted views are {tuple(views.shape)}, but the measured ones {tuple(measured.shape)}")
+        raise ValueError(
+            f"Predicted views are {tuple(views.shape)}, but the measured ones "
+            f"{tuple(measured.shape)}"
+        )
     return {"view_nrmse": nrmse(views.detach().double(), measured.double())}
 
 

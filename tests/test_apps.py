@@ -18,7 +18,9 @@ FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside"
 def call(app, folder, *options):
     """Run an app's entry point with a command line; its folder and what it wrote."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(sys, "argv", [app.__name__, *options, f"hydra.run.dir={folder}", "hydra/job_logging=none"])
+    patch.setattr(
+        sys, "argv", [app.__name__, *options, f"hydra.run.dir={folder}", "hydra/job_logging=none"]
+    )
     try:
         app.main()
     finally:
@@ -42,7 +44,14 @@ def run(tmp_path_factory):
 def test_a_run_folder_holds_what_it_should(run):
     folder, _ = run
     names = {p.name for p in folder.iterdir()}
-    assert {"config.yaml", "versions.txt", "metrics.csv", "results.json", "checkpoints", "review"} <= names
+    assert {
+        "config.yaml",
+        "versions.txt",
+        "metrics.csv",
+        "results.json",
+        "checkpoints",
+        "review",
+    } <= names
     assert any(name.startswith("events.") for name in names) and "hparams.yaml" not in names
     settings = yaml.safe_load((folder / "config.yaml").read_text())
     assert settings["name"] == "smoke" and settings["seed"] == 3 and "hydra" not in settings
@@ -65,8 +74,12 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
 
     board = EventAccumulator(str(run[0])).Reload()
     tags = board.Tags()
-    assert {f"review/{name}" for name in ("planes", "mip", "views", "opinions", "weights")} <= set(tags["images"])
-    assert {"loss/total", "val/psnr", "time/step_ms", "hp/psnr", "hp/seconds", "hp/peak_mb"} <= set(tags["scalars"])
+    assert {f"review/{name}" for name in ("planes", "mip", "views", "opinions", "weights")} <= set(
+        tags["images"]
+    )
+    assert {"loss/total", "val/psnr", "time/step_ms", "hp/psnr", "hp/seconds", "hp/peak_mb"} <= set(
+        tags["scalars"]
+    )
     assert any("text/run" in tag for tag in tags["tensors"])
     assert "hp_metric" not in tags["scalars"]
 
@@ -74,15 +87,24 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
 def test_results_hold_every_figure_with_units_seed_and_versions(run):
     _, found = run
     assert found["seed"] == 3 and found["versions"]["torch"] == torch.__version__
-    assert len(found["scenes"]) == 3 and found["units"]["psnr"] == "dB" and found["units"]["ms_per_volume"] == "ms"
+    assert (
+        len(found["scenes"]) == 3
+        and found["units"]["psnr"] == "dB"
+        and found["units"]["ms_per_volume"] == "ms"
+    )
     assert list(found["methods"]) == ["cross_view", "sirt"]
     for row in found["methods"].values():
         for figure in FIGURES:
             assert len(row[figure]["values"]) == 3
             assert row[figure]["mean"] == pytest.approx(sum(row[figure]["values"]) / 3)
         assert row["ms_per_volume"] > 0
-    assert found["methods"]["cross_view"]["train_steps"] == 3 and found["methods"]["cross_view"]["parameters"] > 0
-    assert found["methods"]["sirt"]["train_steps"] == 0 and found["methods"]["sirt"]["parameters"] == 0
+    assert (
+        found["methods"]["cross_view"]["train_steps"] == 3
+        and found["methods"]["cross_view"]["parameters"] > 0
+    )
+    assert (
+        found["methods"]["sirt"]["train_steps"] == 0 and found["methods"]["sirt"]["parameters"] == 0
+    )
 
 
 @pytest.mark.parametrize("part", ["", "checkpoints", "checkpoints/cross_view.ckpt"])
@@ -92,7 +114,9 @@ def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
     assert again["scenes"] == first["scenes"]
     for method, row in first["methods"].items():
         for figure in FIGURES:
-            assert again["methods"][method][figure]["values"] == pytest.approx(row[figure]["values"], abs=1e-6)
+            assert again["methods"][method][figure]["values"] == pytest.approx(
+                row[figure]["values"], abs=1e-6
+            )
         assert again["methods"][method]["train_seconds"] == row["train_seconds"]
     printed = capsys.readouterr().out
     assert "cross_view" in printed and f"{first['methods']['sirt']['psnr']['mean']:.2f}" in printed
@@ -103,7 +127,9 @@ def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
     found = call(mvrecon.eval, tmp_path / "eval", f"checkpoint={run[0]}", *options)
     assert len(found["scenes"]) == 1 and found["scenes"] != run[1]["scenes"][:1]
     case = next((tmp_path / "eval" / "cases").iterdir())
-    assert {"views.png", "planes.png", "truth.nii.gz", "cross_view.nii.gz"} <= {p.name for p in case.iterdir()}
+    assert {"views.png", "planes.png", "truth.nii.gz", "cross_view.nii.gz"} <= {
+        p.name for p in case.iterdir()
+    }
 
 
 def test_resume_goes_on_in_the_same_folder(run, tmp_path):
@@ -124,7 +150,11 @@ def test_resume_goes_on_in_the_same_folder(run, tmp_path):
         (mvrecon.eval, ["checkpoint=nowhere.ckpt"], "No checkpoint or run folder is at"),
         (mvrecon.train, ["experiment=smoke", "optimizer.lr=1e30"], "is not finite at step"),
         (mvrecon.train, ["experiment=smoke", "model.name=cros_view"], "did you mean 'cross_view'"),
-        (mvrecon.train, ["experiment=smoke", "test_scene=ellipsoids"], "by scene@test_scene=ellipsoids"),
+        (
+            mvrecon.train,
+            ["experiment=smoke", "test_scene=ellipsoids"],
+            "by scene@test_scene=ellipsoids",
+        ),
         (mvrecon.train, ["experiment=smoke", "resume=nowhere"], "but got also"),
         (mvrecon.train, ["resume=nowhere"], "No checkpoint or run folder is at"),
     ],

@@ -6,15 +6,25 @@ import pytest
 
 from mvrecon.durable import claimed
 
-CLAIM = "import sys, pathlib; from mvrecon.durable import claimed\nwith claimed(pathlib.Path(sys.argv[1])): pass"
+CLAIM = (
+    "import sys, pathlib; from mvrecon.durable import claimed\nwith "
+    "claimed(pathlib.Path(sys.argv[1])): pass"
+)
 
 
 @pytest.mark.door
 @pytest.mark.skipif(os.name != "posix", reason="folders are locked on POSIX systems alone")
-def test_a_second_process_is_refused_in_a_run_folder_until_the_first_leaves_it(run_python, tmp_path):
-    """A second process is refused in a run folder, told the number of the first, and may have it afterwards."""
+def test_a_second_process_is_refused_in_a_run_folder_until_the_first_leaves_it(
+    run_python, tmp_path
+):
+    """A second process is refused in a run folder, told the number of the first, and may have it
+    afterwards.
+    """
     with claimed(tmp_path):
         refused = run_python("-c", CLAIM, str(tmp_path))
     assert refused.returncode == 1
-    assert f"is in use by process {os.getpid()} on" in refused.stderr and "hydra.run.dir" in refused.stderr
+    assert (
+        f"is in use by process {os.getpid()} on" in refused.stderr
+        and "hydra.run.dir" in refused.stderr
+    )
     assert run_python("-c", CLAIM, str(tmp_path)).returncode == 0

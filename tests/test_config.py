@@ -1,4 +1,6 @@
-"""Every experiment composes; a typing mistake is an error; only allowed classes are built from a config."""
+"""Every experiment composes; a typing mistake is an error; only allowed classes are built from a
+config.
+"""
 
 import re
 import sys
@@ -50,8 +52,12 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
     assert files
     for file in files:
         key = "head@model.head" if group == "head" else group
-        needed = [name for name, value in yaml.safe_load(file.read_text()).items() if value == "???"]
-        node = compose(f"{key}={file.stem}", *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed))
+        needed = [
+            name for name, value in yaml.safe_load(file.read_text()).items() if value == "???"
+        ]
+        node = compose(
+            f"{key}={file.stem}", *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed)
+        )
         part = node["model"]["head"] if group == "head" else node[group]
         assert part["name"] in REGISTRIES[group].names()
 
@@ -80,17 +86,25 @@ def test_a_mistyped_key_in_an_experiment_is_an_error(user_conf):
 
 
 def test_a_mistyped_choice_in_an_experiment_lists_what_there_is(user_conf):
-    with pytest.raises(MissingConfigException, match=r"Could not find 'projector/dr'(.|\n)*drr(.|\n)*radon"):
+    with pytest.raises(
+        MissingConfigException, match=r"Could not find 'projector/dr'(.|\n)*drr(.|\n)*radon"
+    ):
         compose(*user_conf("defaults:\n  - override /projector: dr\nname: mine"))
 
 
 @pytest.mark.door
 @pytest.mark.parametrize(
     ("override", "message"),
-    [("projectr=drr", "projectr"), ("projector=dr", "drr(.|\n)*radon"), ("gird.shape=[4,4,4]", "gird")],
+    [
+        ("projectr=drr", "projectr"),
+        ("projector=dr", "drr(.|\n)*radon"),
+        ("gird.shape=[4,4,4]", "gird"),
+    ],
 )
 def test_a_mistyped_override_is_an_error_that_names_it(override: str, message: str):
-    """A misspelt key or choice on the command line is refused, named or with the choices that there are."""
+    """A misspelt key or choice on the command line is refused, named or with the choices that there
+    are.
+    """
     with pytest.raises((ConfigCompositionException, MissingConfigException)) as error:
         compose(override)
     assert re.search(message, f"{error.value}{error.value.__cause__}")
@@ -115,7 +129,9 @@ def test_a_running_hydra_is_left_alone():
     assert not GlobalHydra.instance().is_initialized()
 
 
-def test_a_plugin_brings_its_own_choices_even_if_its_code_is_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_plugin_brings_its_own_choices_even_if_its_code_is_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     folder = tmp_path / "a_plugin" / "conf"
     (folder / "projector").mkdir(parents=True)
     for package in (folder, folder.parent):
@@ -123,7 +139,10 @@ def test_a_plugin_brings_its_own_choices_even_if_its_code_is_broken(tmp_path: Pa
     (folder / "projector" / "mine.yaml").write_text("name: mine\nwidth: 2\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     (folder.parent / "__init__.py").write_text("raise OSError('this plugin is broken')\n")
-    points = (EntryPoint("conf.mine", "a_plugin.conf", GROUP), EntryPoint("conf.gone", "no_such_plugin.conf", GROUP))
+    points = (
+        EntryPoint("conf.mine", "a_plugin.conf", GROUP),
+        EntryPoint("conf.gone", "no_such_plugin.conf", GROUP),
+    )
     monkeypatch.setattr(config, "installed", lambda: points)
     assert compose("projector=mine")["projector"] == {"name": "mine", "width": 2}
     assert re.search(r"^  projector +drr, mine, radon", help_text("train"), re.MULTILINE)
@@ -137,13 +156,17 @@ def test_the_help_shows_every_choice_and_setting():
         assert (conf_dir() / f"{app}.yaml").read_text() in text
 
 
-def test_the_app_answers_help_itself(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_the_app_answers_help_itself(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     monkeypatch.setattr(sys, "argv", ["mvrecon-train", "experiment=quickstart", "--help"])
     config.launch(lambda settings: pytest.fail("the task must not run"), "train")
     assert capsys.readouterr().out == help_text("train")
 
 
-def test_plugin_modules_are_imported_and_a_broken_one_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_plugin_modules_are_imported_and_a_broken_one_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     (tmp_path / "good_plugin_module.py").write_text("from mvrecon import parts\nmade = 1\n")
     (tmp_path / "bad_plugin_module.py").write_text("import mvrecon\n1 / 0\n")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -154,5 +177,7 @@ def test_plugin_modules_are_imported_and_a_broken_one_is_named(tmp_path: Path, m
 
 
 def test_a_target_of_an_allowed_library_is_built(tmp_path: Path):
-    timer = instantiate({"_target_": "lightning.pytorch.callbacks.Timer", "duration": "00:00:01:00"}, tmp_path)
+    timer = instantiate(
+        {"_target_": "lightning.pytorch.callbacks.Timer", "duration": "00:00:01:00"}, tmp_path
+    )
     assert timer.time_remaining() == 60.0

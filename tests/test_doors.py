@@ -1,4 +1,6 @@
-"""Tests that guard a file, a folder, a setting or a run say so in one sentence: a row of docs/trust.md."""
+"""Tests that guard a file, a folder, a setting or a run say so in one sentence: a row of
+docs/trust.md.
+"""
 
 import ast
 import json
@@ -34,13 +36,23 @@ def test_no_door():
 
 def facts(file: Path) -> list[str]:
     """First lines of the docstrings of a file's doors; a door without one gives its name."""
-    functions = [node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)]
-    doors = [f for f in functions if any(ast.unparse(mark) == "pytest.mark.door" for mark in f.decorator_list)]
+    functions = [
+        node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)
+    ]
+    doors = [
+        f
+        for f in functions
+        if any(ast.unparse(mark) == "pytest.mark.door" for mark in f.decorator_list)
+    ]
     return [(ast.get_docstring(f) or f.name).splitlines()[0] for f in doors]
 
 
 def test_a_door_says_its_fact_in_one_sentence_of_its_own(root):
-    files = [f for folder in (root / "tests", *root.glob("plugins/*/tests")) for f in folder.rglob("test_*.py")]
+    files = [
+        f
+        for folder in (root / "tests", *root.glob("plugins/*/tests"))
+        for f in folder.rglob("test_*.py")
+    ]
     told = [text for file in files for text in facts(file)]
     assert len(told) > 20
     assert [text for text in told if not (text.endswith(".") and " " in text)] == []

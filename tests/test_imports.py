@@ -2,8 +2,13 @@
 
 import pytest
 
-HEAVY = "{'torch', 'lightning', 'kornia', 'torchmetrics', 'numba', 'h5py', 'tensorboard', 'matplotlib'}"
-REPORT = f"import atexit, sys; atexit.register(lambda: print('HEAVY', sorted({HEAVY} & set(sys.modules))));"
+HEAVY = (
+    "{'torch', 'lightning', 'kornia', 'torchmetrics', 'numba', 'h5py', 'tensorboard', 'matplotlib'}"
+)
+REPORT = (
+    f"import atexit, sys; atexit.register(lambda: print('HEAVY', sorted({HEAVY} & "
+    f"set(sys.modules))));"
+)
 COMMANDS = {
     "train --help": "train",
     "eval --help": "eval",
@@ -18,7 +23,10 @@ COMMANDS = {
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_quick_answer_imports_nothing_heavy(run_python, command: str):
     argv = [f"mvrecon-{command.split()[0]}", *command.split()[1:]]
-    code = f"{REPORT} sys.argv = {argv!r}; from mvrecon.{COMMANDS[command]} import main; sys.exit(main())"
+    code = (
+        f"{REPORT} sys.argv = {argv!r}; from mvrecon.{COMMANDS[command]} import main; "
+        "sys.exit(main())"
+    )
     done = run_python("-c", code)
     assert "HEAVY []" in done.stdout, done.stdout + done.stderr
     assert done.returncode == ("projectr" in command), done.stderr
@@ -39,13 +47,16 @@ def test_importing_says_nothing_and_imports_nothing_heavy(run_python):
 def modules(root) -> list[str]:
     """Every module of mvrecon."""
     files = sorted((root / "mvrecon").rglob("*.py"))
-    return [".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__") for f in files]
+    return [
+        ".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__") for f in files
+    ]
 
 
 def test_importing_every_module_changes_no_global_setting(run_python, modules):
     code = (
         "import torch, warnings, importlib, lightning, torchmetrics, kornia\n"
-        "def state(): return (torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_num_threads(),"
+        "def state(): return (torch.get_default_dtype(), torch.is_grad_enabled(), "
+        "torch.get_num_threads(),"
         " torch.random.get_rng_state().sum().item(), len(warnings.filters))\n"
         "before = state()\n"
         f"for name in {modules}: importlib.import_module(name)\n"

@@ -1,4 +1,6 @@
-"""Imports run downward only, and each outside library is known where it should be (contracts in pyproject.toml)."""
+"""Imports run downward only, and each outside library is known where it should be (contracts in
+pyproject.toml).
+"""
 
 import ast
 from pathlib import Path
@@ -7,7 +9,10 @@ import pytest
 
 
 def test_the_layers_hold(run_python):
-    code = "from importlinter.cli import lint_imports; import sys; sys.exit(lint_imports(no_cache=True))"
+    code = (
+        "from importlinter.cli import lint_imports; import sys; "
+        "sys.exit(lint_imports(no_cache=True))"
+    )
     done = run_python("-c", code)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 broken" in done.stdout
@@ -25,7 +30,10 @@ def imported(file: Path) -> set[str]:
 
 @pytest.mark.parametrize(
     ("name", "home"),
-    [("torch.utils.tensorboard", "engine/callbacks.py"), ("torch.nn.functional.grid_sample", "geometry/sample.py")],
+    [
+        ("torch.utils.tensorboard", "engine/callbacks.py"),
+        ("torch.nn.functional.grid_sample", "geometry/sample.py"),
+    ],
 )
 def test_a_part_of_torch_is_imported_in_one_place(root: Path, name: str, home: str):
     users = {f for f in (root / "mvrecon").rglob("*.py") if name in imported(f)}

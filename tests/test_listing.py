@@ -1,4 +1,6 @@
-"""mvrecon-list reads sources: names, first lines and options are those that an import would give."""
+"""mvrecon-list reads sources: names, first lines and options are those that an import would
+give.
+"""
 
 import inspect
 from importlib.metadata import EntryPoint
@@ -18,7 +20,9 @@ def test_what_is_read_is_what_an_import_gives(kind: str, name: str):
     part = describe(kind, name)
     imported = REGISTRIES[kind].get(name)
     assert not part.error
-    parameters = {n: p for n, p in inspect.signature(imported).parameters.items() if p.kind not in CATCH_ALL}
+    parameters = {
+        n: p for n, p in inspect.signature(imported).parameters.items() if p.kind not in CATCH_ALL
+    }
     assert set(part.options) == set(parameters) - listing.GIVEN
     needed = {n for n, p in parameters.items() if p.default is p.empty}
     assert {n for n, default in part.options.items() if not default} == needed - listing.GIVEN
@@ -62,8 +66,14 @@ def test_a_plugin_that_breaks_at_import_is_named_when_checked(tmp_path, monkeypa
 def test_sources_that_are_missing_or_wrong_are_said(tmp_path, monkeypatch):
     (tmp_path / "half_plugin.py").write_text("def f(:\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    points = {"gone": "no_such_package.at.all:Head", "half": "half_plugin:Head", "hollow": "json:Nothing"}
-    found = tuple(EntryPoint(f"head.{name}", value, registry.GROUP) for name, value in points.items())
+    points = {
+        "gone": "no_such_package.at.all:Head",
+        "half": "half_plugin:Head",
+        "hollow": "json:Nothing",
+    }
+    found = tuple(
+        EntryPoint(f"head.{name}", value, registry.GROUP) for name, value in points.items()
+    )
     monkeypatch.setattr(registry, "installed", lambda: found)
     assert "No source found for module 'no_such_package.at.all'" in describe("head", "gone").error
     assert "invalid syntax" in describe("head", "half").error

@@ -31,7 +31,9 @@ def test_the_data_range_is_the_given_one():
 
 def test_nrmse_is_the_relative_norm_of_the_error():
     truth, inside = case()
-    assert volume_metrics(0.75 * truth, truth, inside, 1.0)["nrmse"] == pytest.approx(0.25, abs=1e-6)
+    assert volume_metrics(0.75 * truth, truth, inside, 1.0)["nrmse"] == pytest.approx(
+        0.25, abs=1e-6
+    )
 
 
 def test_inside_figures_see_the_object_only():
@@ -51,7 +53,9 @@ def test_ssim_of_two_constants_is_its_luminance_term():
     a, b, c1 = 0.3, 0.7, 0.01**2
     shape = (1, 12, 12, 12)
     expected = (2 * a * b + c1) / (a * a + b * b + c1)
-    found = volume_metrics(torch.full(shape, a), torch.full(shape, b), torch.ones(shape, dtype=torch.bool), 1.0)
+    found = volume_metrics(
+        torch.full(shape, a), torch.full(shape, b), torch.ones(shape, dtype=torch.bool), 1.0
+    )
     assert found["ssim"] == pytest.approx(expected, abs=1e-6)
     assert found["ssim_inside"] == pytest.approx(expected, abs=1e-6)
 

@@ -1,4 +1,6 @@
-"""What `pip install .` installs: the code, the configs, the data files, the console scripts, the licence."""
+"""What `pip install .` installs: the code, the configs, the data files, the console scripts, the
+licence.
+"""
 
 import configparser
 import shutil
@@ -15,7 +17,16 @@ import pytest
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     """The wheel of this checkout, built without any download."""
     root, out = Path(__file__).parents[1], tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(root)]
+    command = [
+        sys.executable,
+        "-m",
+        "build",
+        "--wheel",
+        "--no-isolation",
+        "--outdir",
+        str(out),
+        str(root),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return zipfile.ZipFile(next(out.glob("*.whl")))
@@ -23,12 +34,18 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 def test_the_wheel_holds_all_code_configs_and_data(wheel: zipfile.ZipFile, root: Path):
     def wanted(folder: str) -> set[str]:
-        found = (f for f in (root / folder).rglob("*") if f.is_file() and "__pycache__" not in f.parts)
+        found = (
+            f for f in (root / folder).rglob("*") if f.is_file() and "__pycache__" not in f.parts
+        )
         return {str(f.relative_to(root)) for f in found}
 
     held = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert held == wanted("mvrecon") | {f"mvrecon/{name}" for name in wanted("conf")}
-    assert {"mvrecon/py.typed", "mvrecon/conf/train.yaml", "mvrecon/conf/experiment/quickstart.yaml"} <= held
+    assert {
+        "mvrecon/py.typed",
+        "mvrecon/conf/train.yaml",
+        "mvrecon/conf/experiment/quickstart.yaml",
+    } <= held
     assert any(name.endswith(".csv") for name in held), "the dcspect80 geometry is missing"
 
 
@@ -36,7 +53,9 @@ def test_no_file_of_the_package_is_hidden_from_git(root: Path):
     if not (root / ".git").exists():
         pytest.skip("not a git checkout")
     command = ["git", "status", "--short", "--ignored", "--untracked-files=all", "mvrecon", "conf"]
-    status = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.splitlines()
+    status = subprocess.run(
+        command, cwd=root, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
     assert not [line for line in status if line.startswith("!!") and "__pycache__" not in line]
 
 
@@ -60,9 +79,14 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
 
 def test_an_unpacked_wheel_finds_its_own_configs(wheel: zipfile.ZipFile, tmp_path: Path):
     wheel.extractall(tmp_path)
-    code = "from mvrecon.config import compose, conf_dir; print(conf_dir()); compose('experiment=quickstart')"
+    code = (
+        "from mvrecon.config import compose, conf_dir; print(conf_dir()); "
+        "compose('experiment=quickstart')"
+    )
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()) == tmp_path / "mvrecon" / "conf"
 
@@ -79,39 +103,60 @@ def test_every_dependency_is_pinned(root: Path):
             pin = Requirement(line)
             pins[canonicalize_name(pin.name)] = next(iter(pin.specifier)).version
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
-    wanted = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
+    wanted = [
+        *project["dependencies"],
+        *(r for extra in project["optional-dependencies"].values() for r in extra),
+    ]
     for requirement in map(Requirement, wanted):
         if requirement.name != "mvrecon":
-            assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), requirement
+            assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), (
+                requirement
+            )
 
 
 SHELL = """#!/bin/sh
-# In place of Python and pip: makes .venv, writes down what it is to install; a CPU build of torch is there if $CPU is.
+# In place of Python and pip: makes .venv, writes down what it is to install;
+# a CPU build of torch is there if $CPU is.
 case "$*" in
 *--version) echo "Python 3.11.0" ;;
 "-m venv .venv") mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
-*"pip "*) for last; do :; done; case "$last" in *+cpu) [ -n "$CPU" ] || exit 1 ;; esac; echo "$last" >>installed ;;
+*"pip "*)
+    for last; do :; done
+    case "$last" in *+cpu) [ -n "$CPU" ] || exit 1 ;; esac
+    echo "$last" >>installed ;;
 esac
 """
 BUILDS = {
     "no GPU, a CPU build": ("", "yes", "torch==1.2+cpu", "0.2 GB"),
     "no GPU, no CPU build": ("", "", "torch==1.2", "PIP_EXTRA_INDEX_URL="),
-    "a GPU": ("GPU 0: some", "yes", "torch==1.2", "There is an NVIDIA GPU: torch==1.2, the build of pip's"),
+    "a GPU": (
+        "GPU 0: some",
+        "yes",
+        "torch==1.2",
+        "There is an NVIDIA GPU: torch==1.2, the build of pip's",
+    ),
 }
 
 
 @pytest.mark.parametrize("machine", BUILDS)
-def test_the_set_up_says_which_torch_it_takes_and_how_large_it_is(machine: str, root: Path, tmp_path: Path):
+def test_the_set_up_says_which_torch_it_takes_and_how_large_it_is(
+    machine: str, root: Path, tmp_path: Path
+):
     gpu, cpu, torch, message = BUILDS[machine]
     for name, text in {"python3.11": SHELL, "nvidia-smi": f"#!/bin/sh\necho '{gpu}'\n"}.items():
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
     (tmp_path / "scripts").mkdir()
-    for name, text in {"constraints.txt": "torch==1.2\ntorchmetrics==3\n", "pyproject.toml": ""}.items():
+    for name, text in {
+        "constraints.txt": "torch==1.2\ntorchmetrics==3\n",
+        "pyproject.toml": "",
+    }.items():
         (tmp_path / name).write_text(text)
     script = shutil.copy(root / "scripts" / "setup.sh", tmp_path / "scripts")
     environment = {"PATH": f"{tmp_path}:/usr/local/bin:/usr/bin:/bin", "CPU": cpu}
-    done = subprocess.run(["bash", script], env=environment, capture_output=True, text=True, timeout=900, check=False)
+    done = subprocess.run(
+        ["bash", script], env=environment, capture_output=True, text=True, timeout=900, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert message in done.stdout and " GB to download" in done.stdout
     assert (tmp_path / "installed").read_text().split() == [torch, ".[io]"]

@@ -1,4 +1,6 @@
-"""Plugins as an installer leaves them: names that are taken twice, and modules that do not import."""
+"""Plugins as an installer leaves them: names that are taken twice, and modules that do not
+import.
+"""
 
 import pytest
 
@@ -33,7 +35,9 @@ def test_a_name_that_is_taken_keeps_its_part_and_both_are_named(tmp_path):
 
 @pytest.mark.door
 def test_two_plugins_with_one_name_are_refused_when_it_is_used_and_others_work(tmp_path):
-    """Two installed plugins with a part of one name are refused when it is used, both named; other parts work."""
+    """Two installed plugins with a part of one name are refused when it is used, both named; other
+    parts work.
+    """
     registry = Registry("projector", text="json:dumps")
     with plugin(tmp_path / "a", {"projector.twin": "json:loads"}, name="a"):
         assert registry.build("twin", "1") == 1
@@ -51,12 +55,16 @@ BROKEN = {
     "exits": ("raise SystemExit(3)\n", "does not import"),
 }
 SOUND = "from mvrecon.projectors.drr import Drr as Part\n"
-HALF = "from mvrecon.parts import PROJECTORS\n@PROJECTORS.register('half')\ndef half(): ...\n1 / 0\n"
+HALF = (
+    "from mvrecon.parts import PROJECTORS\n@PROJECTORS.register('half')\ndef half(): ...\n1 / 0\n"
+)
 
 
 @pytest.mark.door
 def test_broken_plugins_disturb_only_who_asks_for_them_each_time_with_the_same_cause(tmp_path):
-    """A plugin that does not import is listed, says why each time it is used, and disturbs no other part."""
+    """A plugin that does not import is listed, says why each time it is used, and disturbs no other
+    part.
+    """
     modules = {f"stressed_{name}": source for name, (source, _) in BROKEN.items()}
     modules |= {"stressed_sound": SOUND, "stressed_half": HALF}
     points = {f"projector.{name}": f"stressed_{name}:Part" for name in (*BROKEN, "sound")}

@@ -30,7 +30,9 @@ def plugins(monkeypatch: pytest.MonkeyPatch):
     """Declares entry points as installed plugins would."""
 
     def declare(**points: str) -> None:
-        found = tuple(EntryPoint(k.replace("__", "."), v, registry.GROUP) for k, v in points.items())
+        found = tuple(
+            EntryPoint(k.replace("__", "."), v, registry.GROUP) for k, v in points.items()
+        )
         monkeypatch.setattr(registry, "installed", lambda: found)
 
     return declare
@@ -44,7 +46,10 @@ def test_a_part_is_built_from_its_name_and_options(cameras: Registry):
 
 
 def test_an_unknown_name_gives_the_nearest_and_all(cameras: Registry):
-    with pytest.raises(LookupError, match=r"No camera is named 'rng'; did you mean 'ring'\? Known: dome, ring, text"):
+    with pytest.raises(
+        LookupError,
+        match=r"No camera is named 'rng'; did you mean 'ring'\? Known: dome, ring, text",
+    ):
         cameras.build("rng")
     with pytest.raises(LookupError, match=r"No camera is named 'xyzzy'\. Known: dome, ring, text"):
         cameras.origin("xyzzy")
@@ -64,14 +69,18 @@ def test_a_misspelt_part_gives_the_nearest(kind: str):
     ("kind", "name", "option", "nearest"),
     [("projector", "drr", "methd", "method"), ("scene", "ellipsoids", "valeu", "value")],
 )
-def test_a_misspelt_option_of_a_part_gives_the_nearest(kind: str, name: str, option: str, nearest: str):
+def test_a_misspelt_option_of_a_part_gives_the_nearest(
+    kind: str, name: str, option: str, nearest: str
+):
     """The misspelt option of a part is refused with the nearest one."""
     with pytest.raises(TypeError, match=f"'{option}'; did you mean '{nearest}'"):
         REGISTRIES[kind].build(name, **{option: 1})
 
 
 def test_an_unknown_option_gives_the_nearest_and_all(cameras: Registry):
-    with pytest.raises(TypeError, match=r"'ring' has no option 'view'; did you mean 'views'\? Known: radius, views"):
+    with pytest.raises(
+        TypeError, match=r"'ring' has no option 'view'; did you mean 'views'\? Known: radius, views"
+    ):
         cameras.build("ring", view=3)
 
 
@@ -81,10 +90,14 @@ def test_a_config_without_a_name_says_so(cameras: Registry):
 
 
 def test_a_taken_name_is_refused(cameras: Registry, plugins):
-    with pytest.raises(LookupError, match="exists already: test_registry:ring|exists already: .*ring"):
+    with pytest.raises(
+        LookupError, match="exists already: test_registry:ring|exists already: .*ring"
+    ):
         cameras.register("ring")(dome)
     plugins(camera__ring="other.module:Ring")
-    with pytest.raises(LookupError, match="2 parts of kind 'camera' are named 'ring'.*other.module:Ring"):
+    with pytest.raises(
+        LookupError, match="2 parts of kind 'camera' are named 'ring'.*other.module:Ring"
+    ):
         cameras.get("ring")
 
 
@@ -97,8 +110,12 @@ def test_a_part_that_is_defined_anew_takes_its_own_place(cameras: Registry):
     assert cameras.build("ring") == (9, 1.0)
 
 
-def test_two_plugins_with_one_name_are_refused_but_one_seen_twice_is_not(cameras: Registry, monkeypatch):
-    first, second = (EntryPoint("camera.spect", f"json:{name}", registry.GROUP) for name in ("dumps", "loads"))
+def test_two_plugins_with_one_name_are_refused_but_one_seen_twice_is_not(
+    cameras: Registry, monkeypatch
+):
+    first, second = (
+        EntryPoint("camera.spect", f"json:{name}", registry.GROUP) for name in ("dumps", "loads")
+    )
     monkeypatch.setattr(registry, "installed", lambda: (first, second))
     with pytest.raises(LookupError, match="named 'spect': json:dumps, json:loads"):
         cameras.get("spect")
@@ -118,7 +135,8 @@ def test_a_broken_plugin_disturbs_only_whoever_asks(cameras: Registry, plugins):
     assert cameras.build("ring") == (8, 400.0)
     assert cameras.origin("broken") == "no_such_module_anywhere:Camera"
     with pytest.raises(
-        ImportError, match=r"camera 'broken' \(no_such_module_anywhere:Camera\) does not import: No mod"
+        ImportError,
+        match=r"camera 'broken' \(no_such_module_anywhere:Camera\) does not import: No mod",
     ):
         cameras.get("broken")
     with pytest.raises(ImportError, match="camera 'hollow' .* has no attribute 'NoSuchClass'"):
@@ -127,14 +145,19 @@ def test_a_broken_plugin_disturbs_only_whoever_asks(cameras: Registry, plugins):
 
 def test_a_plugin_that_breaks_off_leaves_none_of_its_parts(cameras: Registry):
     for error in (ValueError("no"), SystemExit(3)):
-        with pytest.raises(ImportError, match="The plugin does not import: (no|3)"), importing("The plugin"):
+        with (
+            pytest.raises(ImportError, match="The plugin does not import: (no|3)"),
+            importing("The plugin"),
+        ):
             cameras.register("half")(dome)
             cameras.register("ring")(ring)
             raise error
         assert cameras.names() == ["dome", "ring", "text"] and cameras.get("ring") is ring
 
 
-@pytest.mark.parametrize(("kind", "name"), [(k, n) for k, r in REGISTRIES.items() for n in r.names()])
+@pytest.mark.parametrize(
+    ("kind", "name"), [(k, n) for k, r in REGISTRIES.items() for n in r.names()]
+)
 def test_every_part_imports_and_is_documented(kind: str, name: str):
     part = REGISTRIES[kind].get(name)
     assert callable(part)

@@ -17,13 +17,22 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 
 GRID = ("grid.shape=[16,16,16]", "grid.spacing=8")
-PARALLEL = ("camera=parallel", "camera.views=3", "camera.detector.pixels=[40,44]", "camera.detector.pixel_mm=3.2")
+PARALLEL = (
+    "camera=parallel",
+    "camera.views=3",
+    "camera.detector.pixels=[40,44]",
+    "camera.detector.pixel_mm=3.2",
+)
 
 
 def call(folder, *options):
     """Run the app with a command line; the settings that it wrote down."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(sys, "argv", ["mvrecon-simulate", *options, f"hydra.run.dir={folder}", "hydra/job_logging=none"])
+    patch.setattr(
+        sys,
+        "argv",
+        ["mvrecon-simulate", *options, f"hydra.run.dir={folder}", "hydra/job_logging=none"],
+    )
     try:
         mvrecon.simulate.main()
     finally:
@@ -42,17 +51,30 @@ def views(folder):
     found = {}
     for case in sorted((folder / "cases").iterdir()):
         with h5py.File(case / "views.h5") as file:
-            numbers, attributes, name = file["views"][:], dict(file["views"].attrs), file.attrs["name"]
-        found[name] = numbers, attributes, [np.asarray(Pillow.open(p)) for p in sorted(case.glob("*.png"))]
+            numbers, attributes, name = (
+                file["views"][:],
+                dict(file["views"].attrs),
+                file.attrs["name"],
+            )
+        found[name] = (
+            numbers,
+            attributes,
+            [np.asarray(Pillow.open(p)) for p in sorted(case.glob("*.png"))],
+        )
     return found
 
 
 def test_the_folder_holds_cases_rig_settings_and_versions(run):
     folder, settings = run
-    assert {"cases", "cameras.json", "config.yaml", "versions.txt"} <= {p.name for p in folder.iterdir()}
+    assert {"cases", "cameras.json", "config.yaml", "versions.txt"} <= {
+        p.name for p in folder.iterdir()
+    }
     assert set(settings) == {"name", "seed", "grid", "scene", "camera", "cases", "plugins"}
     for case in (folder / "cases").iterdir():
-        assert sorted(p.name for p in case.iterdir()) == [*(f"view_00{m}.png" for m in range(3)), "views.h5"]
+        assert sorted(p.name for p in case.iterdir()) == [
+            *(f"view_00{m}.png" for m in range(3)),
+            "views.h5",
+        ]
 
 
 def test_the_numbers_are_the_scene_s_own_with_their_unit(run):
@@ -85,7 +107,10 @@ def test_images_are_bright_where_much_was_met(run):
 def test_the_rig_comes_back_and_measures_the_same(run, tmp_path):
     folder, settings = run
     rig, again = folder / "cameras.json", tmp_path / "again"
-    cameras, read = CAMERAS.from_config(settings["camera"]), CAMERAS.build("from_file", path=str(rig))
+    cameras, read = (
+        CAMERAS.from_config(settings["camera"]),
+        CAMERAS.build("from_file", path=str(rig)),
+    )
     assert all(torch.equal(getattr(cameras, name), getattr(read, name)) for name in VECTORS)
     call(again, *GRID, "camera=from_file", f"camera.path={rig}", "seed=7", "cases=[1]")
     (name,) = views(again)
@@ -111,15 +136,29 @@ def test_what_goes_wrong_is_said_and_the_exit_is_not_zero(options, message, tmp_
 
 @pytest.mark.door
 def test_the_app_works_in_foreign_places(root, tmp_path):
-    """mvrecon-simulate works in the locale C, in folders with spaces and foreign letters, without a home."""
+    """mvrecon-simulate works in the locale C, in folders with spaces and foreign letters, without a
+    home.
+    """
     here, out, home = tmp_path / "où ça", tmp_path / "ausgabe für 目录", tmp_path / "home"
     here.mkdir()
     home.touch()
     options = ("grid.shape=[4,4,4]", "camera.views=1", "camera.detector.pixels=[4,4]", "cases=[0]")
-    place = {"PYTHONPATH": str(root), "HOME": str(home), "LC_ALL": "C", "LANG": "C", "PYTHONIOENCODING": "ascii"}
+    place = {
+        "PYTHONPATH": str(root),
+        "HOME": str(home),
+        "LC_ALL": "C",
+        "LANG": "C",
+        "PYTHONIOENCODING": "ascii",
+    }
     command = [sys.executable, "-m", "mvrecon.simulate", *options, f"hydra.run.dir='{out}'"]
     done = subprocess.run(
-        command, cwd=here, env={**os.environ, **place}, capture_output=True, text=True, timeout=120, check=False
+        command,
+        cwd=here,
+        env={**os.environ, **place},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert len(list(out.rglob("views.h5"))) == 1 and not list(here.iterdir())

@@ -1,15 +1,19 @@
-"""The canonical record of a rig of M cameras; every other description (K, R, t, 3x4, frustum) is derived from it.
+"""The canonical record of a rig of M cameras; every other description (K, R, t, 3x4, frustum) is
+derived from it.
 
-A pixel (u, v) of camera m and the fraction w of the way from the source to the detector name the point
+A pixel (u, v) of camera m and the fraction w of the way from the source to the detector name the
+point
 
     central beam    X = S + w (u U + v V + D0 - S)
     parallel beam   X = S + u U + v V + w (D0 - S)
 
-so with the frame M = [U V D0-S] and q = M^-1 (X - S): w = q_3 and (u, v) = (q_1, q_2) / w for a central beam,
-(q_1, q_2) for a parallel one. That is P = M^-1 [I -S] of Hartley & Zisserman, Multiple View Geometry, ch. 6.
+so with the frame M = [U V D0-S] and q = M^-1 (X - S): w = q_3 and (u, v) = (q_1, q_2) / w for a
+central beam, (q_1, q_2) for a parallel one. That is P = M^-1 [I -S] of Hartley & Zisserman,
+Multiple View Geometry, ch. 6.
 
-Convention: right-handed, as OpenCV: u to the right, v downwards, looking towards the object. A pinhole's detector
-stands behind it, so its object points have w < 0 and its image is turned by 180 degrees with no code of its own.
+Convention: right-handed, as OpenCV: u to the right, v downwards, looking towards the object. A
+pinhole's detector stands behind it, so its object points have w < 0 and its image is turned by 180
+degrees with no code of its own.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,8 +29,9 @@ from mvrecon.geometry.rigid import check_rotation, unit
 
 Extent = Literal["segment", "behind", "ahead", "line"]
 
-#: Which fractions w of a ray count. X-ray, and a parallel beam between two stated planes: "segment". A pinhole with
-#: its detector behind it: "behind". A vision camera: "ahead". A parallel beam without end: "line".
+#: Which fractions w of a ray count. X-ray, and a parallel beam between two stated planes:
+#: "segment". A pinhole with its detector behind it: "behind". A vision camera: "ahead". A parallel
+#: beam without end: "line".
 EXTENTS: dict[str, tuple[float, float]] = {
     "segment": (0.0, 1.0),
     "behind": (-torch.inf, 0.0),
@@ -43,7 +48,8 @@ class Cameras:
     """M cameras with detectors of one size.
 
     Args:
-        source: source or pinhole S in world mm; for a parallel beam, the start of the ray of pixel (0, 0).
+        source: source or pinhole S in world mm; for a parallel beam, the start of the ray of pixel
+            (0, 0).
         origin: centre D0 of pixel (0, 0) in world mm.
         u: step from one column to the next, in mm.
         v: step from one row to the next, in mm.
@@ -52,7 +58,8 @@ class Cameras:
         extent: the part of a ray's line that counts; see `EXTENTS`.
 
     Raises:
-        ValueError: shapes that do not agree, values that are not finite, a flat or left-handed camera.
+        ValueError: shapes that do not agree, values that are not finite, a flat or left-handed
+            camera.
     """
 
     source: Float[Tensor, "m 3"]
@@ -70,16 +77,21 @@ class Cameras:
             expected = (len(self.source) if self.source.ndim == 2 else "m", 3)
             if vector.ndim != 2 or vector.shape != expected or not len(vector):
                 raise ValueError(
-                    f"Cameras need {name} as [{expected[0]} 3], one row a camera, got {list(vector.shape)}"
+                    f"Cameras need {name} as [{expected[0]} 3], one row a camera, got "
+                    f"{list(vector.shape)}"
                 )
             if vector.device != self.source.device:
                 raise ValueError(
-                    f"Cameras need one device, got {name} on {vector.device}, source on {self.source.device}"
+                    f"Cameras need one device, got {name} on {vector.device}, source on "
+                    f"{self.source.device}"
                 )
             if not vector.isfinite().all():
                 raise ValueError(f"Cameras need finite mm, got {name} = {vector.tolist()}")
         if len(self.shape) != 2 or any(int(n) != n or n < 1 for n in self.shape):
-            raise ValueError(f"A detector's shape must be (rows, columns), both positive integers, got {self.shape}")
+            raise ValueError(
+                f"A detector's shape must be (rows, columns), both positive integers, got "
+                f"{self.shape}"
+            )
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
         if self.extent not in EXTENTS:
             raise ValueError(f"Unknown extent {self.extent!r}. Known: {', '.join(EXTENTS)}")
@@ -91,13 +103,15 @@ class Cameras:
         if not (look.abs() > 1e-9).all():
             flat = int(look.abs().argmin())
             raise ValueError(
-                f"Cameras must not be flat, but u, v and origin - source of camera {flat} lie in one plane: the "
+                f"Cameras must not be flat, but u, v and origin - source of camera {flat} lie in "
+                f"one plane: the "
                 f"determinant of their directions is {look[flat]:.2g}, expected more than 1e-9"
             )
         if not (look > 0).all():
             raise ValueError(
                 "Cameras must be right-handed (u right, v down, looking at the object), but camera "
-                f"{int(look.argmin())} is left-handed; reverse u or v, and take origin at the other end of that axis"
+                f"{int(look.argmin())} is left-handed; reverse u or v, and take origin at the "
+                f"other end of that axis"
             )
 
     def __len__(self) -> int:
@@ -130,7 +144,9 @@ class Cameras:
 
     @property
     def distance(self) -> Float[Tensor, " m"]:
-        """Distance from the source to the detector's plane in mm (SDD; the collimator length of a pinhole)."""
+        """Distance from the source to the detector's plane in mm (SDD; the collimator length of a
+        pinhole).
+        """
         normal = unit(torch.linalg.cross(self.u, self.v))
         return (normal * (self.origin - self.source)).sum(-1).abs()
 
@@ -144,22 +160,27 @@ class Cameras:
         return P
 
     def project(self, xyz: Float[Tensor, "*n 3"]) -> Float[Tensor, "m *n 3"]:
-        """Pixel coordinates and depth (u, v, z) of world points, z in mm along the detector's normal.
+        """Pixel coordinates and depth (u, v, z) of world points, z in mm along the detector's
+        normal.
 
-        z has the sign of w: negative for points on the far side of a pinhole from its detector. A point in the plane
-        of a central source has no image: its u and v are NaN. All three are NaN of a point that is not finite. `valid`
-        tells which images there are; their gradients are finite, whatever points are beside them.
+        z has the sign of w: negative for points on the far side of a pinhole from its detector. A
+        point in the plane of a central source has no image: its u and v are NaN. All three are NaN
+        of a point that is not finite. `valid` tells which images there are; their gradients are
+        finite, whatever points are beside them.
         """
         points, known = _known(xyz.reshape(1, -1, 3).to(self.source))
         flat = (points - self.source[:, None]) @ torch.linalg.inv(self.frame).mT
         uv, w = flat[..., :2], flat[..., 2:]
         if not self.parallel:
             uv = torch.where(w == 0, torch.nan, uv / torch.where(w == 0, 1.0, w))
-        uvz = torch.where(known, torch.cat([uv, w * self.distance[:, None, None]], dim=-1), torch.nan)
+        uvz = torch.where(
+            known, torch.cat([uv, w * self.distance[:, None, None]], dim=-1), torch.nan
+        )
         return uvz.reshape(len(self), *xyz.shape[:-1], 3).to(xyz.dtype)
 
     def valid(self, uvz: Float[Tensor, "m *n 3"]) -> Bool[Tensor, "m *n"]:
-        """Which of the images that `project` gives there are: finite, on the part of a ray that counts (`extent`).
+        """Which of the images that `project` gives there are: finite, on the part of a ray that
+        counts (`extent`).
 
         They may lie beside the detector.
         """
@@ -168,7 +189,9 @@ class Cameras:
         return uvz.isfinite().all(dim=-1) & (least <= w) & (w <= most)
 
     def unproject(self, uvz: Float[Tensor, "m *n 3"]) -> Float[Tensor, "m *n 3"]:
-        """World points in mm of pixel coordinates and depth, NaN where these are not finite; undoes `project`."""
+        """World points in mm of pixel coordinates and depth, NaN where these are not finite; undoes
+        `project`.
+        """
         flat, known = _known(uvz.reshape(len(self), -1, 3).to(self.source))
         w = flat[..., 2:] / self.distance[:, None, None]
         across = flat[..., :2] if self.parallel else flat[..., :2] * w
@@ -191,7 +214,10 @@ class Cameras:
     def binned(self, factor: int) -> "Cameras":
         """The same detectors with `factor` x `factor` pixels joined into one."""
         if factor < 1 or any(n % factor for n in self.shape):
-            raise ValueError(f"Binning by {factor} needs a positive factor that divides the detector, got {self.shape}")
+            raise ValueError(
+                f"Binning by {factor} needs a positive factor that divides the detector, got "
+                f"{self.shape}"
+            )
         shift = (self.u + self.v) * (factor - 1) / 2
         shape = (self.shape[0] // factor, self.shape[1] // factor)
         source = self.source + shift if self.parallel else self.source
@@ -201,7 +227,9 @@ class Cameras:
     def refined(self, factor: int) -> "Cameras":
         """The same detectors with every pixel cut into `factor` x `factor`; undone by `binned`."""
         if factor < 1:
-            raise ValueError(f"A pixel is cut into a positive number of rays each way, got {factor}")
+            raise ValueError(
+                f"A pixel is cut into a positive number of rays each way, got {factor}"
+            )
         u, v = self.u / factor, self.v / factor
         shift = (u + v) * (1 - factor) / 2
         shape = (self.shape[0] * factor, self.shape[1] * factor)
@@ -218,10 +246,18 @@ class Cameras:
         check_rotation(R)
         if not t.isfinite().all():
             raise ValueError(f"A translation must be finite mm, got {t.tolist()}")
-        return replace(self, source=self.source @ R.T + t, origin=self.origin @ R.T + t, u=self.u @ R.T, v=self.v @ R.T)
+        return replace(
+            self,
+            source=self.source @ R.T + t,
+            origin=self.origin @ R.T + t,
+            u=self.u @ R.T,
+            v=self.v @ R.T,
+        )
 
 
 def _known(points: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n 1"]]:
-    """Points, zero in place of those that are not finite, and which are: a NaN that went in would spoil gradients."""
+    """Points, zero in place of those that are not finite, and which are: a NaN that went in would
+    spoil gradients.
+    """
     known = points.isfinite().all(dim=-1, keepdim=True)
     return torch.where(known, points, 0.0), known

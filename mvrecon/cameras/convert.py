@@ -1,8 +1,10 @@
-"""The record in the terms of other fields and libraries: K R t, 3x4 and 4x4 matrices, ASTRA, kornia, PyTorch3D.
+"""The record in the terms of other fields and libraries: K R t, 3x4 and 4x4 matrices, ASTRA,
+kornia, PyTorch3D.
 
-All are pure functions of tensors in float64; lengths are mm and pixel centres are integers unless a Convention says
-otherwise. A pinhole with its detector behind it equals a camera whose detector is mirrored through the pinhole, and
-so becomes an ordinary camera, turned by 180 degrees about its axis, where a description has no detector of its own.
+All are pure functions of tensors in float64; lengths are mm and pixel centres are integers unless a
+Convention says otherwise. A pinhole with its detector behind it equals a camera whose detector is
+mirrored through the pinhole, and so becomes an ordinary camera, turned by 180 degrees about its
+axis, where a description has no detector of its own.
 """
 
 from dataclasses import replace
@@ -21,8 +23,9 @@ KRt = tuple[Float[Tensor, "m 3 3"], Float[Tensor, "m 3 3"], Float[Tensor, "m 3"]
 def to_krt(cameras: Cameras) -> KRt:
     """K, R and t with pixels z (u, v, 1) = K (R X + t), z > 0 in mm on the object's side.
 
-    Convention: OpenCV; K is upper triangular with positive focal lengths and K[2, 2] = 1, R is a rotation whose rows
-    are the camera's axes right, down, forward. K holds a skew where u and v are not at right angles.
+    Convention: OpenCV; K is upper triangular with positive focal lengths and K[2, 2] = 1, R is a
+    rotation whose rows are the camera's axes right, down, forward. K holds a skew where u and v are
+    not at right angles.
 
     Raises:
         ValueError: parallel beams, which have no source.
@@ -49,14 +52,15 @@ def from_krt(
     Args:
         K, R, t: as `to_krt` gives them.
         shape: detector pixels (rows, columns).
-        distance: mm from the source or pinhole to the detector, fx times the pixel pitch. K, R, t do not hold it; a
-            vision camera may take any.
+        distance: mm from the source or pinhole to the detector, fx times the pixel pitch. K, R, t
+            do not hold it; a vision camera may take any.
         extent: the part of a ray that counts.
 
     Convention: OpenCV, as `to_krt`.
 
     Raises:
-        ValueError: wrong shapes, values not finite, K without the last row (0, 0, 1), R not a rotation.
+        ValueError: wrong shapes, values not finite, K without the last row (0, 0, 1), R not a
+            rotation.
     """
     K, R, t = _checked("K", K, 3, 3), _checked("R", R, 3, 3), _checked("t", t, 3)
     if not torch.allclose(K[:, 2], K.new_tensor([0, 0, 1]).expand(len(K), 3)):
@@ -73,29 +77,39 @@ def from_matrix(
     distance: float | Float[Tensor, " m"],
     extent: Extent = "segment",
 ) -> Cameras:
-    """The record of central cameras given as 3x4 matrices of any positive scale; the inverse of `Cameras.matrix`.
+    """The record of central cameras given as 3x4 matrices of any positive scale; the inverse of
+    `Cameras.matrix`.
 
-    Convention: P (X, 1) = w (u, v, 1) with w > 0 on the detector's side of the source, as `Cameras.matrix`. Turn the
-    sign of P first where w < 0 there (RTK).
+    Convention: P (X, 1) = w (u, v, 1) with w > 0 on the detector's side of the source, as
+    `Cameras.matrix`. Turn the sign of P first where w < 0 there (RTK).
 
     Raises:
-        ValueError: wrong shapes, values not finite, a singular left 3x3 (parallel beams), a distance not positive.
+        ValueError: wrong shapes, values not finite, a singular left 3x3 (parallel beams), a
+            distance not positive.
     """
     P = _checked("P", P, 3, 4)
     left = P[:, :, :3]
     if not (torch.linalg.det(unit(left)).abs() > 1e-12).all():
-        raise ValueError("P must have a left 3x3 that can be inverted; parallel beams have no source to find")
+        raise ValueError(
+            "P must have a left 3x3 that can be inverted; parallel beams have no source to find"
+        )
     frame = torch.linalg.inv(left)
     source = -(frame @ P[:, :, 3:])[..., 0]
-    unscaled = 1 / left[:, 2].norm(dim=-1)  # the frame's own distance: the last row of its inverse is n / distance
-    return _from_frame(source, frame * _distances(distance, P) / unscaled[:, None, None], shape, extent)
+    unscaled = 1 / left[:, 2].norm(
+        dim=-1
+    )  # the frame's own distance: the last row of its inverse is n / distance
+    return _from_frame(
+        source, frame * _distances(distance, P) / unscaled[:, None, None], shape, extent
+    )
 
 
 def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
-    """The frustum's homography H: X in mm to (u, v, k) with k = f / z; for parallel beams, to (u, v, z).
+    """The frustum's homography H: X in mm to (u, v, k) with k = f / z; for parallel beams, to (u,
+    v, z).
 
-    Convention: H = [P1; P2; (0, 0, 0, f); P3] with P scaled so that w = z in mm, signed as in `Cameras.project`; rows
-    3 and 4 stand as in PyTorch3D's K. For parallel beams H = [P1; P2; depth; (0, 0, 0, 1)].
+    Convention: H = [P1; P2; (0, 0, 0, f); P3] with P scaled so that w = z in mm, signed as in
+    `Cameras.project`; rows 3 and 4 stand as in PyTorch3D's K. For parallel beams H = [P1; P2;
+    depth; (0, 0, 0, 1)].
     """
     central = replace(cameras, parallel=False).matrix * cameras.distance[:, None, None]
     unit = central.new_tensor([0, 0, 0, 1]).expand(len(cameras), 4)
@@ -105,8 +119,12 @@ def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
     return torch.stack([central[:, 0], central[:, 1], f * unit, central[:, 2]], dim=1)
 
 
-def frustum_jacobian(cameras: Cameras, xyz: Float[Tensor, "*n 3"], f: float = 1.0) -> Float[Tensor, "m *n"]:
-    """Volume in (u, v, k) per mm^3 at world points, |det H| / w^4; a density that keeps its counts is divided by it."""
+def frustum_jacobian(
+    cameras: Cameras, xyz: Float[Tensor, "*n 3"], f: float = 1.0
+) -> Float[Tensor, "m *n"]:
+    """Volume in (u, v, k) per mm^3 at world points, |det H| / w^4; a density that keeps its counts
+    is divided by it.
+    """
     H = to_frustum(cameras, f)
     w = H[:, 3, :3] @ xyz.reshape(-1, 3).to(H).T + H[:, 3, 3:]
     return homography_jacobian(H[:, None], w).reshape(len(cameras), *xyz.shape[:-1])
@@ -115,7 +133,8 @@ def frustum_jacobian(cameras: Cameras, xyz: Float[Tensor, "*n 3"], f: float = 1.
 def to_astra(cameras: Cameras) -> Float[Tensor, "m 12"]:
     """Rows for ASTRA's "cone_vec" (or "parallel3d_vec"): source (or ray), detector centre, u, v.
 
-    Convention: ASTRA's world is our (x, y, z) in mm if its volume's window is given in mm; a ray is not normalised.
+    Convention: ASTRA's world is our (x, y, z) in mm if its volume's window is given in mm; a ray is
+    not normalised.
     """
     rows, columns = cameras.shape
     centre = cameras.origin + cameras.u * (columns - 1) / 2 + cameras.v * (rows - 1) / 2
@@ -139,7 +158,8 @@ def from_astra(
         extent: by default "segment", and "line" for parallel beams.
         flip_rows: count rows from the other end; the views' rows must be reversed with it.
 
-    Convention: ASTRA's own circular geometries have v upwards (left-handed here): they need `flip_rows`.
+    Convention: ASTRA's own circular geometries have v upwards (left-handed here): they need
+    `flip_rows`.
 
     Raises:
         ValueError: wrong shapes, values not finite, left-handed cameras.
@@ -148,15 +168,20 @@ def from_astra(
     v = -v if flip_rows else v
     origin = centre - u * (shape[1] - 1) / 2 - v * (shape[0] - 1) / 2
     source = origin - first if parallel else first
-    return Cameras(source, origin, u, v, shape, parallel, extent or ("line" if parallel else "segment"))
+    return Cameras(
+        source, origin, u, v, shape, parallel, extent or ("line" if parallel else "segment")
+    )
 
 
 def to_kornia(
     cameras: Cameras,
-) -> tuple[Float[Tensor, "m 4 4"], Float[Tensor, "m 4 4"], Float[Tensor, " m"], Float[Tensor, " m"]]:
+) -> tuple[
+    Float[Tensor, "m 4 4"], Float[Tensor, "m 4 4"], Float[Tensor, " m"], Float[Tensor, " m"]
+]:
     """Intrinsics, extrinsics, height and width for kornia's `PinholeCamera`.
 
-    Convention: kornia, which is OpenCV's: extrinsics take the world to the camera, pixel centres are integers.
+    Convention: kornia, which is OpenCV's: extrinsics take the world to the camera, pixel centres
+    are integers.
 
     Raises:
         ValueError: parallel beams.
@@ -177,31 +202,40 @@ def from_kornia(
     distance: float | Float[Tensor, " m"],
     extent: Extent = "ahead",
 ) -> Cameras:
-    """The record of kornia's cameras; arguments and errors as `from_krt`, the inverse of `to_kornia`.
+    """The record of kornia's cameras; arguments and errors as `from_krt`, the inverse of
+    `to_kornia`.
 
     Raises:
         ValueError: intrinsics that shift by a fourth column, which kornia would apply, too.
     """
     K, E = _checked("intrinsics", intrinsics, 4, 4), _checked("extrinsics", extrinsics, 4, 4)
     if K[:, :3, 3].any():
-        raise ValueError(f"Intrinsics must have zeros in the fourth column, got {K[:, :3, 3].tolist()}")
+        raise ValueError(
+            f"Intrinsics must have zeros in the fourth column, got {K[:, :3, 3].tolist()}"
+        )
     return from_krt(K[:, :3, :3], E[:, :3, :3], E[:, :3, 3], shape, distance, extent)
 
 
 def to_pytorch3d(
     cameras: Cameras,
-) -> tuple[Float[Tensor, "m 3 3"], Float[Tensor, "m 3"], Float[Tensor, "m 2"], Float[Tensor, "m 2"]]:
+) -> tuple[
+    Float[Tensor, "m 3 3"], Float[Tensor, "m 3"], Float[Tensor, "m 2"], Float[Tensor, "m 2"]
+]:
     """R, T, focal_length and principal_point for PyTorch3D's `PerspectiveCameras` in NDC.
 
-    Convention: PyTorch3D: row vectors X R + T, axes left, up, forward; NDC spans [-1, 1] over the shorter side, +1 left
-    and top; pixels have edges at integers, so the principal point moves by half a pixel.
+    Convention: PyTorch3D: row vectors X R + T, axes left, up, forward; NDC spans [-1, 1] over the
+    shorter side, +1 left and top; pixels have edges at integers, so the principal point moves by
+    half a pixel.
 
     Raises:
         ValueError: parallel beams, or a skew, which PyTorch3D cannot hold.
     """
     K, R, t = to_krt(cameras)
     if not (K[:, 0, 1].abs() < 1e-9 * K[:, 0, 0]).all():
-        raise ValueError(f"PyTorch3D has no skew, but u and v are not at right angles: skew {K[:, 0, 1].tolist()} px")
+        raise ValueError(
+            f"PyTorch3D has no skew, but u and v are not at right angles: skew "
+            f"{K[:, 0, 1].tolist()} px"
+        )
     half = min(cameras.shape) / 2
     turned = K.new_tensor([-1, -1, 1])
     focal = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=-1) / half
@@ -210,7 +244,10 @@ def to_pytorch3d(
 
 
 def _from_frame(
-    source: Float[Tensor, "m 3"], frame: Float[Tensor, "m 3 3"], shape: tuple[int, int], extent: Extent
+    source: Float[Tensor, "m 3"],
+    frame: Float[Tensor, "m 3 3"],
+    shape: tuple[int, int],
+    extent: Extent,
 ) -> Cameras:
     u, v, ray = frame.unbind(dim=-1)
     return Cameras(source, source + ray, u, v, shape, extent=extent)
@@ -219,14 +256,18 @@ def _from_frame(
 def _distances(distance: float | Tensor, like: Tensor) -> Float[Tensor, "m 1 1"]:
     distances = torch.as_tensor(distance).to(like).expand(len(like))
     if not ((distances > 0) & distances.isfinite()).all():
-        raise ValueError(f"The distance from source to detector must be positive mm, got {distance}")
+        raise ValueError(
+            f"The distance from source to detector must be positive mm, got {distance}"
+        )
     return distances[:, None, None]
 
 
 def _checked(name: str, given: Tensor, *shape: int) -> Tensor:
     tensor = torch.as_tensor(given, dtype=torch.float64)
     if tensor.ndim != len(shape) + 1 or tensor.shape[1:] != shape:
-        raise ValueError(f"{name} must be [m {' '.join(map(str, shape))}], got {list(tensor.shape)}")
+        raise ValueError(
+            f"{name} must be [m {' '.join(map(str, shape))}], got {list(tensor.shape)}"
+        )
     if not tensor.isfinite().all():
         raise ValueError(f"{name} must be finite, got {tensor.tolist()}")
     return tensor

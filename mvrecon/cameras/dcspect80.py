@@ -20,25 +20,30 @@ def dcspect80(
     rows: Sequence[int] | None = None,
     columns: Sequence[int] | None = None,
 ) -> Cameras:
-    """The 80-pinhole cardiac camera DC-SPECT: pinholes about the chest, all aimed at the heart's centre, the origin.
+    """The 80-pinhole cardiac camera DC-SPECT: pinholes about the chest, all aimed at the heart's
+    centre, the origin.
 
-    Each detector, 50 x 50 mm, stands one collimator length (50 to 89 mm) behind its pinhole, square to the pinhole's
-    axis; v runs downwards, towards -z as far as it can. Camera k of the whole rig is module 20 row + column.
+    Each detector, 50 x 50 mm, stands one collimator length (50 to 89 mm) behind its pinhole, square
+    to the pinhole's axis; v runs downwards, towards -z as far as it can. Camera k of the whole rig
+    is module 20 row + column.
 
     Args:
         pixels: the detector's pixels (rows, columns), or one number for both.
         rows: which of the 4 rows of modules, from -z to +z; all by default.
         columns: which of the 20 columns, from the azimuth 14 degrees on to 256; all by default.
 
-    Published: pinhole positions, detector size, and the collimator lengths of 8 modules (16 with the mirror symmetry).
-    Fitted: the other 64 lengths, linear in the distance to the heart. Not published: the pixel pitch, hence `pixels`.
-    Source: the header of `dcspect80.csv`, beside this file.
+    Published: pinhole positions, detector size, and the collimator lengths of 8 modules (16 with
+    the mirror symmetry). Fitted: the other 64 lengths, linear in the distance to the heart. Not
+    published: the pixel pitch, hence `pixels`. Source: the header of `dcspect80.csv`, beside this
+    file.
 
     Raises:
         ValueError: a row or a column that the camera does not have.
     """
     chosen = [
-        20 * row + column for row in _chosen("rows", rows, ROWS) for column in _chosen("columns", columns, COLUMNS)
+        20 * row + column
+        for row in _chosen("rows", rows, ROWS)
+        for column in _chosen("columns", columns, COLUMNS)
     ]
     table = torch.tensor(modules(), dtype=torch.float64)[chosen]
     pinhole, length = table[:, :3], table[:, 3:]

@@ -15,7 +15,8 @@ from mvrecon.registry import hint
 
 @dataclass(frozen=True)
 class Detector:
-    """A flat detector. Pairs are in the order (v, u): down a column, along a row; one number stands for both.
+    """A flat detector. Pairs are in the order (v, u): down a column, along a row; one number stands
+    for both.
 
     Args:
         pixels: rows and columns.
@@ -35,7 +36,9 @@ class Detector:
             given = getattr(self, field.name)
             pair = tuple(given) if isinstance(given, list | tuple) else (given, given)
             if len(pair) != 2 or not all(isinstance(x, Real) and math.isfinite(x) for x in pair):
-                raise ValueError(f"A detector's {field.name} must be one number or two (v, u), got {given!r}")
+                raise ValueError(
+                    f"A detector's {field.name} must be one number or two (v, u), got {given!r}"
+                )
             object.__setattr__(self, field.name, pair)
         if not (all(x == int(x) and x >= 1 for x in self.pixels) and min(self.pixel_mm) > 0):
             raise ValueError(
@@ -57,7 +60,9 @@ class Detector:
             if option not in known:
                 raise TypeError(f"A detector has no option {option!r}{hint(str(option), known)}")
         if absent := {"pixels", "pixel_mm"} - set(options):
-            raise TypeError(f"A detector needs {' and '.join(sorted(absent))}, got only {sorted(options)}")
+            raise TypeError(
+                f"A detector needs {' and '.join(sorted(absent))}, got only {sorted(options)}"
+            )
         return cls(**options)
 
     def carried(

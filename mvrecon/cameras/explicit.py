@@ -1,4 +1,6 @@
-"""Rays given one by one, for detectors that are no plane: curved ones, converging collimators, lines of response."""
+"""Rays given one by one, for detectors that are no plane: curved ones, converging collimators,
+lines of response.
+"""
 
 from dataclasses import dataclass
 
@@ -9,9 +11,11 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class ExplicitRays:
-    """The segments from source to target of every pixel of M detectors; a projector takes them instead of cameras.
+    """The segments from source to target of every pixel of M detectors; a projector takes them
+    instead of cameras.
 
-    A ray takes 96 bytes more than its two points. For a flat detector `Cameras` is smaller and faster.
+    A ray takes 96 bytes more than its two points. For a flat detector `Cameras` is smaller and
+    faster.
 
     Args:
         source: where each ray begins, in world mm.
@@ -33,15 +37,24 @@ class ExplicitRays:
             points = torch.as_tensor(getattr(self, name), dtype=torch.float64)
             object.__setattr__(self, name, points)
             if points.ndim != 4 or points.shape[3] != 3 or not points.numel():
-                raise ValueError(f"Explicit rays need {name} as [m v u 3], got {list(points.shape)}")
+                raise ValueError(
+                    f"Explicit rays need {name} as [m v u 3], got {list(points.shape)}"
+                )
             if not points.isfinite().all():
-                raise ValueError(f"Explicit rays need finite mm, but {name} holds values that are NaN or infinite")
+                raise ValueError(
+                    f"Explicit rays need finite mm, but {name} holds values that are NaN or "
+                    f"infinite"
+                )
         sizes = [(list(points.shape), str(points.device)) for points in (self.source, self.target)]
         if sizes[0] != sizes[1]:
-            raise ValueError(f"Explicit rays need source and target of one shape on one device, got {sizes}")
+            raise ValueError(
+                f"Explicit rays need source and target of one shape on one device, got {sizes}"
+            )
         short = (self.source == self.target).all(dim=-1)
         if short.any():
-            raise ValueError(f"Explicit rays need two different ends, but {int(short.sum())} have no length")
+            raise ValueError(
+                f"Explicit rays need two different ends, but {int(short.sum())} have no length"
+            )
 
     def __len__(self) -> int:
         return len(self.source)

@@ -36,14 +36,14 @@ def save(cameras: Cameras, path: str | Path) -> None:
 def from_file(path: str | Path) -> Cameras:
     """A rig from a JSON file that `mvrecon.cameras.files.save` wrote, or that follows its layout.
 
-    Layout: {"format": "mvrecon.cameras", "version": 1, "unit": "mm", "shape": [rows, columns], "parallel": false,
-    "extent": "segment", "cameras": [{"source": [x, y, z], "origin": [..], "u": [..], "v": [..]}, ..]}; the meaning of
-    each is that of `Cameras`.
+    Layout: {"format": "mvrecon.cameras", "version": 1, "unit": "mm", "shape": [rows, columns],
+    "parallel": false, "extent": "segment", "cameras": [{"source": [x, y, z], "origin": [..], "u":
+    [..], "v": [..]}, ..]}; the meaning of each is that of `Cameras`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: truncated, too large or not such a file, entries missing or not finite, or a rig that `Cameras`
-            refuses.
+        ValueError: truncated, too large or not such a file, entries missing or not finite, or a rig
+            that `Cameras` refuses.
     """
     path = Path(path)
     if not path.is_file():
@@ -52,7 +52,10 @@ def from_file(path: str | Path) -> Cameras:
         )
     try:
         record = json.loads(text_of(path))
-    except (ValueError, RecursionError) as error:  # too large, not UTF-8, not JSON, or brackets without end
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # too large, not UTF-8, not JSON, or brackets without end
         raise Refused(f"The camera file {path} is truncated or not JSON: {error}") from error
     try:
         return _cameras(record)
@@ -67,9 +70,13 @@ def _cameras(record: Any) -> Cameras:
     for key, value in {"version": VERSION, "unit": "mm"}.items():
         if record.get(key) != value:
             raise ValueError(f"expected the {key} {value!r}, got {shown(record.get(key))}")
-    shape, parallel, extent, rows = (record.get(key) for key in ("shape", "parallel", "extent", "cameras"))
+    shape, parallel, extent, rows = (
+        record.get(key) for key in ("shape", "parallel", "extent", "cameras")
+    )
     if not (isinstance(shape, list) and all(type(n) is int and n <= PIXELS for n in shape)):
-        raise ValueError(f"expected 'shape' as [rows, columns], each up to {PIXELS}, got {shown(shape)}")
+        raise ValueError(
+            f"expected 'shape' as [rows, columns], each up to {PIXELS}, got {shown(shape)}"
+        )
     if not isinstance(extent, str):
         raise ValueError(f"expected 'extent' as text, got {shown(extent)}")
     if not isinstance(parallel, bool):
@@ -82,7 +89,13 @@ def _cameras(record: Any) -> Cameras:
 
 def _vector(row: Any, name: str, m: int) -> list[float]:
     vector = row.get(name) if isinstance(row, dict) else None
-    if isinstance(vector, list) and len(vector) == 3 and all(type(x) in (int, float) for x in vector):
-        if all(abs(x) <= sys.float_info.max for x in vector):  # not so for nan, inf, and integers past them
+    if (
+        isinstance(vector, list)
+        and len(vector) == 3
+        and all(type(x) in (int, float) for x in vector)
+    ):
+        if all(
+            abs(x) <= sys.float_info.max for x in vector
+        ):  # not so for nan, inf, and integers past them
             return vector
     raise ValueError(f"expected {name!r} of camera {m} as three finite mm, got {shown(vector)}")

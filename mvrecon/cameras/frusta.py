@@ -11,8 +11,11 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import Lattice, centred_affine
 
 
-def frusta_lattice(cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"], spacing: Spacing = "z") -> Lattice:
-    """The bins (depth, row, column) of the cameras' frusta, in float64; differentiable in the cameras.
+def frusta_lattice(
+    cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"], spacing: Spacing = "z"
+) -> Lattice:
+    """The bins (depth, row, column) of the cameras' frusta, in float64; differentiable in the
+    cameras.
 
     Args:
         cameras: the rig; its pixels are the frusta's rows and columns.

@@ -1,7 +1,9 @@
-"""Rigs that are their own mirror image: what half of their rays tell, the other half need not be asked again.
+"""Rigs that are their own mirror image: what half of their rays tell, the other half need not be
+asked again.
 
-A mirror image of a camera is left-handed. Read from its other end, along rows or along columns, its detector is that of
-a right-handed camera again; if that camera is in the rig, each of the two sees the mirrored object as the other does.
+A mirror image of a camera is left-handed. Read from its other end, along rows or along columns, its
+detector is that of a right-handed camera again; if that camera is in the rig, each of the two sees
+the mirrored object as the other does.
 """
 
 from dataclasses import dataclass
@@ -20,7 +22,8 @@ ROWS, COLUMNS = -2, -1
 
 @dataclass(frozen=True, eq=False)
 class Mirror:
-    """A plane through a grid's centre that mirrors the grid and the rig into themselves: A(F x) = G(A x).
+    """A plane through a grid's centre that mirrors the grid and the rig into themselves: A(F x) =
+    G(A x).
 
     Args:
         axis: of the volume, -3, -2 or -1 for (z, y, x), which F reverses.
@@ -39,23 +42,28 @@ class Mirror:
     def views(self, views: Float[Tensor, "*b m v u"]) -> Float[Tensor, "*b m v u"]:
         """The views G y of the mirror image of what was seen as y."""
         other = views[..., self.partner.to(views.device), :, :]
-        return torch.where(self.rows[:, None, None].to(views.device), other.flip(ROWS), other.flip(COLUMNS))
+        return torch.where(
+            self.rows[:, None, None].to(views.device), other.flip(ROWS), other.flip(COLUMNS)
+        )
 
     @property
     def share(self) -> Float[Tensor, " m"]:
-        """Of each camera, in half of the rig: 1 and 0 for two partners, 1/2 for its own. With its image it is all."""
+        """Of each camera, in half of the rig: 1 and 0 for two partners, 1/2 for its own. With its
+        image it is all.
+        """
         return 0.5 * (1 + (self.partner - torch.arange(len(self.partner))).sign())
 
 
 @torch.no_grad()
 def mirror_pairs(cameras: Cameras, grid: Grid, tolerance: float = 1e-9) -> Mirror | None:
-    """The mirror symmetry of a rig about a central plane of a grid that pairs the most cameras; None if there is none.
+    """The mirror symmetry of a rig about a central plane of a grid that pairs the most cameras;
+    None if there is none.
 
     Args:
         cameras: the rig.
         grid: whose planes are meant; an axis that is not square to the others has none.
-        tolerance: by how much of the rig's size (the greatest distance from the grid's centre) a source or a detector's
-            corner may miss its mirror image.
+        tolerance: by how much of the rig's size (the greatest distance from the grid's centre) a
+            source or a detector's corner may miss its mirror image.
     """
     places = _places(cameras, grid)
     axes = unit(grid.affine[:3, :3], dim=0).T
@@ -69,10 +77,14 @@ def mirror_pairs(cameras: Cameras, grid: Grid, tolerance: float = 1e-9) -> Mirro
 
 
 def _places(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 2 2 2 3"]:
-    """Both ends of the rays through the outer corners (v, u) of each detector, in mm from the grid's centre."""
+    """Both ends of the rays through the outer corners (v, u) of each detector, in mm from the
+    grid's centre.
+    """
     v, u = (cameras.source.new_tensor([-0.5, n - 0.5])[:, None] for n in cameras.shape)
     across = (v * cameras.v[:, None])[:, :, None] + (u * cameras.u[:, None])[:, None]
-    start = cameras.source[:, None, None] + (across if cameras.parallel else torch.zeros_like(across))
+    start = cameras.source[:, None, None] + (
+        across if cameras.parallel else torch.zeros_like(across)
+    )
     end = cameras.origin[:, None, None] + across
     return torch.stack([start, end], dim=3) - grid.centre.to(across)
 
@@ -80,11 +92,16 @@ def _places(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 2 2 2 3"]:
 def _partners(
     places: Float[Tensor, "m 2 2 2 3"], normal: Float[Tensor, "3"], tolerance: float
 ) -> tuple[Int[Tensor, " m"], Bool[Tensor, " m"]] | None:
-    """Each camera's mirror image across a plane through zero, and whether rows are reversed; None if any has none."""
+    """Each camera's mirror image across a plane through zero, and whether rows are reversed; None
+    if any has none.
+    """
     normal = normal.to(places)
     mirrored = places - 2 * (places @ normal)[..., None] * normal
     near = tolerance * places.norm(dim=-1).max()
-    gaps = [torch.cdist(mirrored.flip(axis).flatten(1), places.flatten(1), p=torch.inf) for axis in (1, 2)]
+    gaps = [
+        torch.cdist(mirrored.flip(axis).flatten(1), places.flatten(1), p=torch.inf)
+        for axis in (1, 2)
+    ]
     by_rows, by_columns = (gap < near for gap in gaps)
     partner = [-1] * len(places)
     for m, images in enumerate((by_rows | by_columns).tolist()):

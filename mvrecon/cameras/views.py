@@ -12,4 +12,6 @@ def check_finite(views: Float[Tensor, "b c m v u"]) -> None:
     """
     if not views.isfinite().all():
         bad = int((~views.isfinite()).sum())
-        raise ValueError(f"Views must be finite, got {bad} of {views.numel()} values that are NaN or infinite")
+        raise ValueError(
+            f"Views must be finite, got {bad} of {views.numel()} values that are NaN or infinite"
+        )

@@ -1,7 +1,9 @@
-"""Settings: where they live, how they are composed, and what may be built from them. The one door to Hydra.
+"""Settings: where they live, how they are composed, and what may be built from them. The one door
+to Hydra.
 
-Below this door everything is a plain dict of names and numbers, so that checkpoints load with torch's defaults
-and no loop pays for a config object. Importing this file imports neither torch nor Lightning.
+Below this door everything is a plain dict of names and numbers, so that checkpoints load with
+torch's defaults and no loop pays for a config object. Importing this file imports neither torch nor
+Lightning.
 """
 
 import sys
@@ -41,9 +43,16 @@ def conf_dir() -> Path:
 
 
 def plugin_conf_dirs() -> list[Path]:
-    """The config folders that installed plugins declare (entry points named "conf.*"), found without an import."""
+    """The config folders that installed plugins declare (entry points named "conf.*"), found
+    without an import.
+    """
     packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
-    return [Path(folder) for package in packages if package for folder in package.submodule_search_locations or ()]
+    return [
+        Path(folder)
+        for package in packages
+        if package
+        for folder in package.submodule_search_locations or ()
+    ]
 
 
 def app_file(config_name: str) -> Path:
@@ -56,7 +65,9 @@ def app_file(config_name: str) -> Path:
     for file in (folder / f"{config_name}.yaml" for folder in folders):
         if file.is_file():
             return file
-    raise FileNotFoundError(f"No app has the settings {config_name}.yaml in any of {shown(map(str, folders))}")
+    raise FileNotFoundError(
+        f"No app has the settings {config_name}.yaml in any of {shown(map(str, folders))}"
+    )
 
 
 def prepare_hydra() -> None:
@@ -76,27 +87,40 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         sys.stdout.write(help_text(config_name))
         return
     if any(argument.startswith("--e") for argument in sys.argv[1:]):
-        raise PermissionError("--experimental-rerun unpickles a file, which can run anything; use resume=<run folder>")
+        raise PermissionError(
+            "--experimental-rerun unpickles a file, which can run anything; use resume=<run folder>"
+        )
     if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: a path that it cannot write must not end a run
+        sys.stdout.reconfigure(
+            errors="backslashreplace"
+        )  # as stderr: a path that it cannot write must not end a run
     prepare_hydra()
     with guarded(conf_dir(), plugin_conf_dirs()):
-        hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(task)()
+        hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(
+            task
+        )()
 
 
 def help_text(config_name: str) -> str:
-    """What an app can be told: every group with its choices, and the settings with their comments."""
+    """What an app can be told: every group with its choices, and the settings with their
+    comments.
+    """
     choices: dict[str, set[str]] = {}
     for folder in (conf_dir(), *plugin_conf_dirs()):
         for file in folder.glob("*/*.yaml"):
             choices.setdefault(file.parent.name, set()).add(file.stem)
-    groups = "\n".join(f"  {group:<12}{', '.join(sorted(names))}" for group, names in sorted(choices.items()))
+    groups = "\n".join(
+        f"  {group:<12}{', '.join(sorted(names))}" for group, names in sorted(choices.items())
+    )
     settings = app_file(config_name).read_text(encoding="utf-8")
     return (
-        f"Usage: mvrecon-{config_name} [group=choice ...] [key=value ...]\n\nGroups and their choices:\n{groups}\n\n"
+        f"Usage: mvrecon-{config_name} [group=choice ...] [key=value ...]\n\nGroups and their "
+        f"choices:\n{groups}\n\n"
         f"{settings}\n"
-        "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of your own\n"
-        "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's options.\n"
+        "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of "
+        "your own\n"
+        "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's "
+        "options.\n"
     )
 
 
@@ -107,7 +131,9 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
         RuntimeError: another program in this process is using Hydra; it is left alone.
     """
     if GlobalHydra.instance().is_initialized():
-        raise RuntimeError("Hydra is in use already in this process: compose() must be called outside a Hydra app")
+        raise RuntimeError(
+            "Hydra is in use already in this process: compose() must be called outside a Hydra app"
+        )
     prepare_hydra()
     own = guarded(conf_dir(), plugin_conf_dirs())
     with own, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
@@ -121,7 +147,9 @@ def to_plain(config: DictConfig) -> dict[str, Any]:
         LookupError: a setting marked `???` was not given.
     """
     if missing := OmegaConf.missing_keys(config):
-        raise LookupError(f"These settings must be given: {', '.join(f'{key}=...' for key in sorted(missing))}")
+        raise LookupError(
+            f"These settings must be given: {', '.join(f'{key}=...' for key in sorted(missing))}"
+        )
     plain = OmegaConf.to_container(config, resolve=True)
     if not isinstance(plain, dict):
         raise TypeError(f"Settings must be a mapping, got {type(plain).__name__}")

@@ -1,7 +1,9 @@
-"""What configs from elsewhere may tell Hydra: their own settings, and nothing about how Hydra itself runs.
+"""What configs from elsewhere may tell Hydra: their own settings, and nothing about how Hydra
+itself runs.
 
-Before it calls a task, Hydra builds callbacks, launchers and log handlers from its own section, sets environment
-variables and makes folders. A file that a user fetched must not choose these; the command line may.
+Before it calls a task, Hydra builds callbacks, launchers and log handlers from its own section,
+sets environment variables and makes folders. A file that a user fetched must not choose these; the
+command line may.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,11 +32,13 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
         others: further folders that are trusted: those of installed plugins.
 
     Raises:
-        PermissionError: a file from elsewhere sets what only the command line may, or reads environment variables.
+        PermissionError: a file from elsewhere sets what only the command line may, or reads
+            environment variables.
         LookupError: a setting that the app does not use.
         Refused: a YAML file that is too large, or a `name` that leads out of the folder of outputs.
     """
-    Plugins.instance()  # fills the registry with classes of its own, other than those that an import gives
+    # fills the registry with classes of its own, other than those that an import gives
+    Plugins.instance()
     files: Any = SourcesRegistry.instance().resolve("file")
     load, read = ConfigLoaderImpl.load_configuration, files.load_config
     trusted = {str(folder) for folder in (main, *others)}
@@ -44,10 +48,16 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
             return load(loader, config_name, of, **options)
 
         config = composed(overrides)
-        foreign = [s.path for s in config.hydra.runtime.config_sources if s.schema == "file" and s.path not in trusted]
+        foreign = [
+            s.path
+            for s in config.hydra.runtime.config_sources
+            if s.schema == "file" and s.path not in trusted
+        ]
         if foreign:
             if not any((folder / f"{config_name}.yaml").is_file() for folder in (main, *others)):
-                raise PermissionError(f"--config-name={config_name} is no app of mvrecon's; choose an experiment=...")
+                raise PermissionError(
+                    f"--config-name={config_name} is no app of mvrecon's; choose an experiment=..."
+                )
             check_foreign(config, foreign, overrides, composed)
         return _named(used(config, composed([]) if overrides else config))
 
@@ -65,14 +75,20 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
 
 
 def used(config: DictConfig, own: DictConfig) -> DictConfig:
-    """A config whose top-level keys are the app's own; `+key=...` on a command line adds any other unasked.
+    """A config whose top-level keys are the app's own; `+key=...` on a command line adds any other
+    unasked.
 
     Raises:
-        LookupError: a key that the app does not have, so that nothing would come of it; the message names it.
+        LookupError: a key that the app does not have, so that nothing would come of it; the message
+            names it.
     """
-    known = {str(key) for key in own}  # `key in own` is false for a setting that is still to be given
+    known = {
+        str(key) for key in own
+    }  # `key in own` is false for a setting that is still to be given
     if unused := [str(key) for key in config if key not in known]:
-        raise LookupError(f"This app does not use the setting {unused[0]!r}{hint(unused[0], known - {'hydra'})}")
+        raise LookupError(
+            f"This app does not use the setting {unused[0]!r}{hint(unused[0], known - {'hydra'})}"
+        )
     return config
 
 
@@ -83,31 +99,48 @@ def _named(config: DictConfig) -> DictConfig:
 
 
 def check_foreign(
-    config: DictConfig, folders: list[str], overrides: list[str], compose: Callable[[list[str]], DictConfig]
+    config: DictConfig,
+    folders: list[str],
+    overrides: list[str],
+    compose: Callable[[list[str]], DictConfig],
 ) -> None:
-    """Compare Hydra's own section, and `out`, the folder that an app writes to, with what they are without the files.
+    """Compare Hydra's own section, and `out`, the folder that an app writes to, with what they are
+    without the files.
 
     Raises:
         PermissionError: they differ, or the folders' files cannot be told apart.
         Refused: an `out` that is made of settings which lead out of the folder of outputs.
     """
     if any((Path(folder) / "hydra").exists() for folder in folders):
-        raise PermissionError(f"{shown(folders)} has configs of Hydra's own; expected none in a folder of experiments")
+        raise PermissionError(
+            f"{shown(folders)} has configs of Hydra's own; expected none in a folder of experiments"
+        )
     if not any(
-        source.provider == "main" and source.path not in folders for source in config.hydra.runtime.config_sources
+        source.provider == "main" and source.path not in folders
+        for source in config.hydra.runtime.config_sources
     ):
-        raise PermissionError("--config-path and --config-name of other apps are not allowed; use --config-dir")
+        raise PermissionError(
+            "--config-path and --config-name of other apps are not allowed; use --config-dir"
+        )
     own = compose([line for line in overrides if line.lstrip("+~").startswith(("hydra", "out="))])
     found, expected = (dict(_leaves(_hydra(c))) for c in (config, own))
-    changed = sorted(key for key in {**found, **expected} if found.get(key) != expected.get(key) and not _open(key))
+    changed = sorted(
+        key
+        for key in {**found, **expected}
+        if found.get(key) != expected.get(key) and not _open(key)
+    )
     if changed:
         raise PermissionError(f"A config sets {shown(changed)}; only a command line may")
     if "out" in config and not any(line.startswith("out=") for line in overrides):
         for part in str(config.out).split("/"):
             plain_name(part, f"The setting out={config.out}")
-    settings = OmegaConf.to_yaml(OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"]))
+    settings = OmegaConf.to_yaml(
+        OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    )
     if "oc.env" in settings and not any("oc.env" in line for line in overrides):
-        raise PermissionError("A config reads environment variables by ${oc.env:...}; only a command line may")
+        raise PermissionError(
+            "A config reads environment variables by ${oc.env:...}; only a command line may"
+        )
 
 
 def _hydra(config: DictConfig) -> dict[str, Any]:

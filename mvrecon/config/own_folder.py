@@ -10,10 +10,12 @@ from mvrecon.durable import check_plain, new_folder
 
 
 class OwnFolder(Callback):
-    """Makes the folder of a run or a sweep before Hydra writes into it, so that no two have the same.
+    """Makes the folder of a run or a sweep before Hydra writes into it, so that no two have the
+    same.
 
-    A folder that the command line names is taken as it is, and a resumed run has its folder already. Hydra's log file
-    is made by the first message in it, so that a run that is refused leaves none.
+    A folder that the command line names is taken as it is, and a resumed run has its folder
+    already. Hydra's log file is made by the first message in it, so that a run that is refused
+    leaves none.
     """
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
@@ -25,7 +27,11 @@ class OwnFolder(Callback):
         self._prepare(config, "hydra.sweep.dir")
 
     def _prepare(self, config: DictConfig, key: str) -> None:
-        overrides, log, changes = config.hydra.overrides.hydra, "hydra.job_logging.handlers.file", {}
+        overrides, log, changes = (
+            config.hydra.overrides.hydra,
+            "hydra.job_logging.handlers.file",
+            {},
+        )
         if OmegaConf.select(config, log):
             changes[f"{log}.delay"] = "true"
         if not any(line.lstrip("+").startswith(f"{key}=") for line in overrides):

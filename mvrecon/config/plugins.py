@@ -12,8 +12,8 @@ from mvrecon.registry import importing, locate
 def import_plugins(modules: Iterable[str]) -> None:
     """Import the modules that the setting `plugins` names; they add parts by `@REGISTRY.register`.
 
-    A setting can come from anywhere, so only a module that was written for mvrecon is imported: one whose source, read
-    and not run, imports it.
+    A setting can come from anywhere, so only a module that was written for mvrecon is imported: one
+    whose source, read and not run, imports it.
 
     Raises:
         ImportError: a module does not import; the message names it.
@@ -22,7 +22,8 @@ def import_plugins(modules: Iterable[str]) -> None:
     for module in modules:
         if not _for_mvrecon(module):
             raise PermissionError(
-                f"The setting 'plugins' names {shown(module)}; expected a module on Python's path whose own source "
+                f"The setting 'plugins' names {shown(module)}; expected a module on Python's path "
+                f"whose own source "
                 "imports mvrecon"
             )
         with importing(f"The plugin module {module!r} (setting 'plugins')"):
@@ -37,5 +38,7 @@ def _for_mvrecon(module: str) -> bool:
         return False
     nodes = list(ast.walk(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))))
     names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    names += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom) and not node.level]
+    names += [
+        node.module or "" for node in nodes if isinstance(node, ast.ImportFrom) and not node.level
+    ]
     return any(name.split(".")[0] == "mvrecon" for name in names)

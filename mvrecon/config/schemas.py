@@ -1,4 +1,6 @@
-"""The top-level settings of the apps, so that a mistyped one is an error instead of a silent extra."""
+"""The top-level settings of the apps, so that a mistyped one is an error instead of a silent
+extra.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,7 +29,9 @@ class Simulation(Measurement):
 
 @dataclass
 class Settings(Measurement):
-    """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a silent extra."""
+    """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a
+    silent extra.
+    """
 
     test_scene: Any = None
     projector: Any = None
@@ -44,7 +48,9 @@ class Settings(Measurement):
 
 @dataclass
 class Evaluation:
-    """Every top-level key of `mvrecon-eval`: what the run itself decides, such as its camera, is not among them."""
+    """Every top-level key of `mvrecon-eval`: what the run itself decides, such as its camera, is
+    not among them.
+    """
 
     name: str = MISSING
     checkpoint: str = MISSING

@@ -1,4 +1,6 @@
-"""Callbacks and loggers that a config names by `_target_`: which are allowed, and where they may write."""
+"""Callbacks and loggers that a config names by `_target_`: which are allowed, and where they may
+write.
+"""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -14,21 +16,25 @@ BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.loggers.Logg
 
 
 def instantiate(node: Mapping[str, Any], folder: Path, **given: Any) -> Any:
-    """Build the callback or the logger that a node's `_target_` names, with the node's other entries as options.
+    """Build the callback or the logger that a node's `_target_` names, with the node's other
+    entries as options.
 
     Args:
-        node: `_target_` and options; places among these, such as `dirpath`, are taken from `folder`.
+        node: `_target_` and options; places among these, such as `dirpath`, are taken from
+            `folder`.
         folder: the run folder, out of which nothing is written.
         given: further options, which are trusted.
 
     Raises:
-        PermissionError: the target is not a class of that kind that is defined below one of `ALLOWED`, every run has it
-            already, or the options hold instructions of Hydra's such as another target, or lead out of the folder.
+        PermissionError: the target is not a class of that kind that is defined below one of
+            `ALLOWED`, every run has it already, or the options hold instructions of Hydra's such as
+            another target, or lead out of the folder.
     """
     options = {key: value for key, value in node.items() if key != "_target_"}
     if instructions := _instructions(options):
         raise PermissionError(
-            f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain values"
+            f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain "
+            f"values"
         )
     made = _allowed(str(node["_target_"]))(**placed(options, folder), **given)
     check_places(made, folder)
@@ -39,20 +45,28 @@ def _instructions(node: Any) -> list[str]:
     if isinstance(node, Mapping):
         keys = [str(key) for key in node if str(key).startswith("_")]
         return keys + [found for value in node.values() for found in _instructions(value)]
-    return [found for value in node for found in _instructions(value)] if isinstance(node, list | tuple) else []
+    return (
+        [found for value in node for found in _instructions(value)]
+        if isinstance(node, list | tuple)
+        else []
+    )
 
 
 def _allowed(target: str) -> type:
-    """A class by its name. What it is decides, not how it is called: a name may lead out of a module (`a.b.os.system`),
-    and a function of an allowed library may call whatever it is told to."""
+    """A class by its name. What it is decides, not how it is called: a name may lead out of a
+    module (`a.b.os.system`), and a function of an allowed library may call whatever it is told
+    to."""
     found = _found(target) if target.startswith(tuple(f"{name}." for name in ALLOWED)) else None
     if isinstance(found, type) and issubclass(found, tuple(map(_found, BASES))):
         if getattr(found, "of_every_run", False):
-            raise PermissionError(f"_target_ {target!r} is not allowed; expected none that every run has already")
+            raise PermissionError(
+                f"_target_ {target!r} is not allowed; expected none that every run has already"
+            )
         if found.__module__.startswith(tuple(f"{name}." for name in ALLOWED)):
             return found
     raise PermissionError(
-        f"_target_ {target!r} is not allowed; expected a class from {' or '.join(ALLOWED)} derived from "
+        f"_target_ {target!r} is not allowed; expected a class from {' or '.join(ALLOWED)} "
+        f"derived from "
         f"{' or '.join(BASES)}"
     )
 

@@ -28,7 +28,9 @@ def body(mu: Float[Tensor, "d h w"], threshold: float) -> Bool[Tensor, "d h w"]:
 
 
 def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
-    """The part with the most voxels among those that touch by faces; of equal ones, the last. Up to 2^24 voxels."""
+    """The part with the most voxels among those that touch by faces; of equal ones, the last. Up to
+    2^24 voxels.
+    """
     labels = torch.arange(1, mask.numel() + 1, dtype=torch.float32).reshape(mask.shape) * mask
     while True:
         spread = labels
@@ -49,7 +51,9 @@ def _spread(values: Float[Tensor, "d h w"], kernel: int | list[int]) -> Float[Te
 
 
 def enclosed(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
-    """Voxels with the mask on all four sides in their slice of equal z, and the mask itself: lungs, not room air."""
+    """Voxels with the mask on all four sides in their slice of equal z, and the mask itself: lungs,
+    not room air.
+    """
     filled = torch.ones_like(mask)
     for axis in (1, 2):
         before = mask.cummax(dim=axis).values

@@ -38,7 +38,13 @@ class SceneDataset(Dataset[dict[str, Any]]):
     """
 
     def __init__(
-        self, scene: Scene, grid: Grid, cameras: Cameras, indices: Sequence[int], seed: int, cache: bool = True
+        self,
+        scene: Scene,
+        grid: Grid,
+        cameras: Cameras,
+        indices: Sequence[int],
+        seed: int,
+        cache: bool = True,
     ):
         self.scene, self.grid, self.cameras = scene, grid, cameras
         self.indices, self.seed, self.cache = tuple(indices), seed, cache
@@ -57,7 +63,9 @@ class SceneDataset(Dataset[dict[str, Any]]):
         return self._made(item)
 
     def prepare(self, what: str = "cases") -> dict[str, Any]:
-        """Make every case, once; stacked, so that worker processes share a few blocks of memory and not thousands."""
+        """Make every case, once; stacked, so that worker processes share a few blocks of memory and
+        not thousands.
+        """
         if self._ready is None:
             console = Console(stderr=True)
             steps = track(range(len(self)), f"Preparing {what}", transient=True, console=console)
@@ -67,25 +75,33 @@ class SceneDataset(Dataset[dict[str, Any]]):
         return self._ready
 
     def _made(self, item: int) -> dict[str, Any]:
-        with torch.random.fork_rng(devices=[]):  # a scene that draws from the global numbers is a pure function, too
+        with torch.random.fork_rng(
+            devices=[]
+        ):  # a scene that draws from the global numbers is a pure function, too
             torch.default_generator.manual_seed(mixed(self.seed, self.indices[item]))
-            sample: Sample = self.scene.sample(self.indices[item], self.seed, self.grid, self.cameras)
+            sample: Sample = self.scene.sample(
+                self.indices[item], self.seed, self.grid, self.cameras
+            )
         made = {key: getattr(sample, key) for key in TENSORS}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
-                raise ValueError(f"{sample.name}: expected finite {key}, got {bad} values that are not")
+                raise ValueError(
+                    f"{sample.name}: expected finite {key}, got {bad} values that are not"
+                )
         return {**made, "name": sample.name}
 
 
 class EpochOrder(Sampler[int]):
-    """A random order of `count` items that depends on (seed, epoch) alone, so that a resumed run sees what it missed.
+    """A random order of `count` items that depends on (seed, epoch) alone, so that a resumed run
+    sees what it missed.
 
     Args:
         count: of items.
         seed: of the orders.
 
     Attributes:
-        generator: for the loader, which seeds its worker processes from it; (seed, epoch) alone decide that, too.
+        generator: for the loader, which seeds its worker processes from it; (seed, epoch) alone
+            decide that, too.
     """
 
     def __init__(self, count: int, seed: int):
@@ -107,7 +123,8 @@ class EpochOrder(Sampler[int]):
         self.generator.manual_seed(mixed(self.seed, epoch))
 
     def resume(self, epoch: int, seen: int) -> None:
-        """Go on in an epoch and leave out its first `seen` items: the run had them before it broke off.
+        """Go on in an epoch and leave out its first `seen` items: the run had them before it broke
+        off.
 
         Worker processes ask for their first items before Lightning tells the epoch.
         """

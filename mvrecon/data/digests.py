@@ -1,4 +1,6 @@
-"""What a run was measured with, as SHA-256 digests: of the rig's record, and of the files that scenes read."""
+"""What a run was measured with, as SHA-256 digests: of the rig's record, and of the files that
+scenes read.
+"""
 
 import hashlib
 import json
@@ -15,9 +17,16 @@ DECIMALS = 9
 
 
 def of_rig(cameras: Cameras) -> str:
-    """Digest of a camera record: sources, origins, steps u and v in mm, shape, kind of beam, extent."""
+    """Digest of a camera record: sources, origins, steps u and v in mm, shape, kind of beam,
+    extent.
+    """
     vectors = {name: _rounded(getattr(cameras, name).tolist()) for name in VECTORS}
-    record = {**vectors, "shape": list(cameras.shape), "parallel": cameras.parallel, "extent": cameras.extent}
+    record = {
+        **vectors,
+        "shape": list(cameras.shape),
+        "parallel": cameras.parallel,
+        "extent": cameras.extent,
+    }
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
@@ -56,11 +65,19 @@ def compare(got: Mapping[str, str], expected: Mapping[str, str], where: str | Pa
     """
     changed = [name for name in got if name in expected and got[name] != expected[name]]
     if changed:
-        values = "; ".join(f"{name}: got sha256 {got[name][:16]}, expected {expected[name][:16]}" for name in changed)
+        values = "; ".join(
+            f"{name}: got sha256 {got[name][:16]}, expected {expected[name][:16]}"
+            for name in changed
+        )
         raise Refused(
-            f"What the run was made with has changed since, as {where} tells: {values}. Put it back as it was"
+            f"What the run was made with has changed since, as {where} tells: {values}. Put it "
+            f"back as it was"
         )
 
 
 def _rounded(value: Any) -> Any:
-    return [_rounded(item) for item in value] if isinstance(value, list) else round(value, DECIMALS) + 0.0
+    return (
+        [_rounded(item) for item in value]
+        if isinstance(value, list)
+        else round(value, DECIMALS) + 0.0
+    )

@@ -5,8 +5,9 @@
     id        [n]        name of each volume, UTF-8, of fixed length; one that can be a file's
     label     [n d h w]  optional, uint8: structures, 0 outside all of them; not read by the scenes
 
-Attributes of the file: `axes` = "z, y, x" and `units` = "HU"; optional `orientation`, three letters that say towards
-which side of the patient (L or R, P or A, I or S) the axes x, y, z run; others (`labels`, `source`) are for the reader.
+Attributes of the file: `axes` = "z, y, x" and `units` = "HU"; optional `orientation`, three letters
+that say towards which side of the patient (L or R, P or A, I or S) the axes x, y, z run; others
+(`labels`, `source`) are for the reader.
 """
 
 import os
@@ -25,7 +26,10 @@ from mvrecon.limits import NAME, SPACING, Refused, blaming, plain_name, shown
 
 LAYOUT = {"axes": "z, y, x", "units": "HU"}
 Texts = dict[str, list[str]]
-EXPECTED = "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU, spacing [n 3] in mm, id [n], axes z, y, x"
+EXPECTED = (
+    "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU, spacing [n 3] in mm, "
+    "id [n], axes z, y, x"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +50,12 @@ class Stored:
 
 
 def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str) -> int:
-    """Write a volume file whole, or not at all; returns how many volumes it holds. `attributes` go with the file.
+    """Write a volume file whole, or not at all; returns how many volumes it holds. `attributes` go
+    with the file.
 
     Raises:
-        ValueError: volumes of different shapes, only some with labels, or none; a name that cannot be a file's.
+        ValueError: volumes of different shapes, only some with labels, or none; a name that cannot
+            be a file's.
     """
     count = 0
     with written_whole(path) as part, h5py.File(part, "w") as file:
@@ -63,8 +69,14 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
             found = {name: array.shape for name, array in arrays.items()}
             expected = {name: file[name].shape[1:] for name in ("ct", "label") if name in file}  # type: ignore[union-attr]
             if found != expected:
-                raise ValueError(f"{path}: volume {volume.name!r} has {found}, expected {expected} as the first")
-            for name, array in {**arrays, "spacing": volume.spacing, "id": plain_name(volume.name, path)}.items():
+                raise ValueError(
+                    f"{path}: volume {volume.name!r} has {found}, expected {expected} as the first"
+                )
+            for name, array in {
+                **arrays,
+                "spacing": volume.spacing,
+                "id": plain_name(volume.name, path),
+            }.items():
                 dataset: Any = file[name]
                 dataset.resize(count, axis=0)
                 dataset[count - 1] = array
@@ -77,14 +89,23 @@ def _create(file: h5py.File, arrays: Mapping[str, np.ndarray]) -> None:
     for name, array in arrays.items():
         chunks = {"chunks": (1, *array.shape), "maxshape": (None, *array.shape)}
         file.create_dataset(
-            name, (0, *array.shape), array.dtype, **chunks, compression="gzip", compression_opts=9, shuffle=True
+            name,
+            (0, *array.shape),
+            array.dtype,
+            **chunks,
+            compression="gzip",
+            compression_opts=9,
+            shuffle=True,
         )
     file.create_dataset("spacing", (0, 3), "f8", maxshape=(None, 3), fletcher32=True)
-    file.create_dataset("id", (0,), h5py.string_dtype("utf-8", NAME), maxshape=(None,), fletcher32=True)
+    file.create_dataset(
+        "id", (0,), h5py.string_dtype("utf-8", NAME), maxshape=(None,), fletcher32=True
+    )
 
 
 class VolumeFile:
-    """A volume file for reading. It is opened at first use, anew in every process, and travels by its path alone.
+    """A volume file for reading. It is opened at first use, anew in every process, and travels by
+    its path alone.
 
     Args:
         path: of the file.
@@ -120,7 +141,9 @@ class VolumeFile:
 
     @property
     def orientation(self) -> str | None:
-        """Towards which sides of the patient the axes x, y, z run; none where the file does not say."""
+        """Towards which sides of the patient the axes x, y, z run; none where the file does not
+        say.
+        """
         return next(iter(self._checked()[1].get("@orientation", [])), None)
 
     def read(self, index: int) -> Stored:
@@ -155,7 +178,11 @@ def _check(path: Path, file: h5py.File) -> Texts:
     shapes = {"ct": ct.shape, "spacing": spacing.shape, "id": names.shape}
     if ct.ndim != 4 or 0 in ct.shape or spacing.shape != (len(ct), 3) or names.shape != (len(ct),):
         raise Refused(f"{path}: has {shapes}; expected {EXPECTED}")
-    if ct.dtype.kind not in "iuf" or spacing.dtype.kind != "f" or h5py.check_string_dtype(names.dtype) is None:
+    if (
+        ct.dtype.kind not in "iuf"
+        or spacing.dtype.kind != "f"
+        or h5py.check_string_dtype(names.dtype) is None
+    ):
         kinds = f"ct {ct.dtype}, spacing {spacing.dtype}, id {names.dtype}"
         raise Refused(f"{path}: has {kinds}; expected numbers, floats and text")
     for dataset in (spacing, names):
@@ -177,8 +204,15 @@ def _texts(path: Path, file: h5py.File, names: h5py.Dataset) -> Texts:
     """The attributes that are read, under "@<name>", and the names of the volumes."""
     kinds = {key: file.attrs.get_id(key) for key in (*LAYOUT, "orientation") if key in file.attrs}
     for key, kind in kinds.items():
-        if kind.shape != () or h5py.check_string_dtype(kind.dtype) is None or kind.dtype.itemsize > 2**16:
-            raise Refused(f"{path}: its attribute {key!r} is {kind.dtype} {kind.shape}, expected one short text")
+        if (
+            kind.shape != ()
+            or h5py.check_string_dtype(kind.dtype) is None
+            or kind.dtype.itemsize > 2**16
+        ):
+            raise Refused(
+                f"{path}: its attribute {key!r} is {kind.dtype} {kind.shape}, expected one short "
+                f"text"
+            )
     short = [key for key, kind in kinds.items() if not variable(kind.dtype)]
     fixed = {key: [bytes(file.attrs[key]).decode()] for key in short}  # type: ignore[arg-type]
     texts = texts_of(path) if len(fixed) < len(kinds) or variable(names.dtype) else {}

@@ -15,7 +15,8 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 from mvrecon.scenes.sample import Scene
 
-#: Series of random cases. Every run is judged on the same ones; its own seed makes the cases that it trains on.
+#: Series of random cases. Every run is judged on the same ones; its own seed makes the cases that
+#: it trains on.
 TEST, VAL, TRAIN = 0, 1, 2
 #: Which parts of the data each stage of Lightning needs.
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
@@ -24,9 +25,9 @@ STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "pre
 class SceneData(L.LightningDataModule):
     """The data of a run, from plain dicts of names and numbers.
 
-    Random scenes draw training, validation and test cases from different series. A scene from a file validates on its
-    last `val` cases and trains on those before; the test cases are the test scene's, or the first fifth where that is
-    the same file. So no case is in two sets.
+    Random scenes draw training, validation and test cases from different series. A scene from a
+    file validates on its last `val` cases and trains on those before; the test cases are the test
+    scene's, or the first fifth where that is the same file. So no case is in two sets.
 
     Args:
         scenes: name and options of the scenes "train" and "test".
@@ -34,11 +35,13 @@ class SceneData(L.LightningDataModule):
         camera: name and options of the rig.
         sizes: the number of cases for "train", "val" and "test"; a file may hold fewer.
         batch_size: cases in a batch.
-        workers: processes that load batches; cases are made once, so 0 is as fast for all but huge sets.
+        workers: processes that load batches; cases are made once, so 0 is as fast for all but huge
+            sets.
         seed: of the training cases and their order.
 
     Raises:
-        ValueError: sizes that leave nothing to train on, scenes of different data range, a number that is too small.
+        ValueError: sizes that leave nothing to train on, scenes of different data range, a number
+            that is too small.
     """
 
     def __init__(
@@ -53,19 +56,32 @@ class SceneData(L.LightningDataModule):
     ):
         super().__init__()
         if missing := {"train", "val", "test"} ^ set(sizes):
-            raise ValueError(f"sizes must give train, val and test; missing or unknown: {', '.join(sorted(missing))}")
+            raise ValueError(
+                f"sizes must give train, val and test; missing or unknown: "
+                f"{', '.join(sorted(missing))}"
+            )
         if min(sizes.values()) < 0 or batch_size < 1 or workers < 0 or seed < 0:
             got = f"sizes {dict(sizes)}, batch_size {batch_size}, workers {workers}, seed {seed}"
             raise ValueError(
-                f"Expected sizes, workers and seed of at least 0 and a batch_size of at least 1, got {got}"
+                f"Expected sizes, workers and seed of at least 0 and a batch_size of at least 1, "
+                f"got {got}"
             )
         self.grid = Grid.centred(**grid)
         self.cameras = CAMERAS.from_config(camera)
-        self.sizes, self.batch_size, self.workers, self.seed = dict(sizes), batch_size, workers, seed
-        self.scenes: dict[str, Scene] = {key: SCENES.from_config(scenes[key]) for key in ("train", "test")}
+        self.sizes, self.batch_size, self.workers, self.seed = (
+            dict(sizes),
+            batch_size,
+            workers,
+            seed,
+        )
+        self.scenes: dict[str, Scene] = {
+            key: SCENES.from_config(scenes[key]) for key in ("train", "test")
+        }
         ranges = {key: scene.data_range for key, scene in self.scenes.items()}
         if ranges["train"] != ranges["test"]:
-            raise ValueError(f"The training and the test scene must share their data_range, got {ranges}")
+            raise ValueError(
+                f"The training and the test scene must share their data_range, got {ranges}"
+            )
         self.shared = same_cases(scenes["train"], scenes["test"])
         self._files = {key: list(sha256.files_in(scenes[key])) for key in ("train", "test")}
         self._digests: dict[str, str] = {}
@@ -93,10 +109,14 @@ class SceneData(L.LightningDataModule):
             return list(range(size))
         if part == "test" and not self.shared:
             return list(range(min(size, scene.length)))
-        kept = scene.length // 5 if self.sizes["train"] else scene.length  # whatever `test` is: a model may be older
+        kept = (
+            scene.length // 5 if self.sizes["train"] else scene.length
+        )  # whatever `test` is: a model may be older
         first, last = kept * self.shared, scene.length - self.sizes["val"]
         if last < first or (size and not {"train": last - first, "val": size, "test": first}[part]):
-            raise ValueError(f"A scene with {scene.length} case(s) cannot be split into the sizes {self.sizes}")
+            raise ValueError(
+                f"A scene with {scene.length} case(s) cannot be split into the sizes {self.sizes}"
+            )
         if part == "test":
             return list(range(min(size, first)))
         if part == "val":
@@ -110,7 +130,9 @@ class SceneData(L.LightningDataModule):
         for part in STAGES[stage] if stage else ("train", "val", "test"):
             if part not in self.sets:
                 scene = self.scenes["test" if part == "test" else "train"]
-                made = SceneDataset(scene, self.grid, self.cameras, self.indices(part), series[part])
+                made = SceneDataset(
+                    scene, self.grid, self.cameras, self.indices(part), series[part]
+                )
                 made.prepare(f"{part} cases")
                 self.sets[part] = made
         if "train" in self.sets:
@@ -138,20 +160,28 @@ class SceneData(L.LightningDataModule):
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
             pin_memory=torch.cuda.is_available(),
-            generator=order.generator if order else torch.Generator(),  # or each epoch draws from the global one
+            generator=order.generator
+            if order
+            else torch.Generator(),  # or each epoch draws from the global one
         )
 
     def digests(self, *parts: str) -> dict[str, str]:
-        """SHA-256 of the rig, and of every file by its path that the scenes of `parts` ("train", "test") read.
+        """SHA-256 of the rig, and of every file by its path that the scenes of `parts` ("train",
+        "test") read.
 
         Each is read once.
         """
         paths = sorted({path for part in parts for path in self._files[part]})
         self._digests |= {path: sha256.of_file(path) for path in paths if path not in self._digests}
-        return {sha256.RIG: sha256.of_rig(self.cameras), **{path: self._digests[path] for path in paths}}
+        return {
+            sha256.RIG: sha256.of_rig(self.cameras),
+            **{path: self._digests[path] for path in paths},
+        }
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint: how far the training has come, its cases by name, and the digests of its rig and files."""
+        """For a checkpoint: how far the training has come, its cases by name, and the digests of
+        its rig and files.
+        """
         loop = self.trainer.fit_loop if self.trainer else None
         if loop is None or self._order is None:
             return {}
@@ -159,7 +189,11 @@ class SceneData(L.LightningDataModule):
         seen = done * self.batch_size
         whole = seen >= len(self._order)  # the epoch: then the next one goes on
         place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else seen}
-        return {**place, "cases": list(self.sets["train"].prepare()["name"]), "digests": self.digests("train")}
+        return {
+            **place,
+            "cases": list(self.sets["train"].prepare()["name"]),
+            "digests": self.digests("train"),
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from a checkpoint with the cases that the broken epoch has not seen.
@@ -171,7 +205,9 @@ class SceneData(L.LightningDataModule):
             sha256.compare(self.digests("train"), state_dict.get("digests", {}), "the checkpoint")
             self._order.resume(state_dict["epoch"], state_dict["seen"])
             # Lightning looks for this at the loader and does not find it there.
-            warnings.filterwarnings("ignore", ".*ended before the epoch ended and your dataloader is not resumable")
+            warnings.filterwarnings(
+                "ignore", ".*ended before the epoch ended and your dataloader is not resumable"
+            )
 
 
 def same_cases(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:

@@ -17,14 +17,18 @@ POINTS = 2**22
 def resample(volume: Float[Tensor, "d h w"], source: Grid, target: Grid) -> Float[Tensor, "e i j"]:
     """Mean of a volume over each voxel of another grid; zero outside of the volume.
 
-    Where the target is coarser, voxels of the source are first averaged in whole blocks of at most the target's size,
-    then the target's voxels over points at most one and a half such blocks apart; between centres the volume is
-    trilinear. Order of accuracy: second in the voxel size.
+    Where the target is coarser, voxels of the source are first averaged in whole blocks of at most
+    the target's size, then the target's voxels over points at most one and a half such blocks
+    apart; between centres the volume is trilinear. Order of accuracy: second in the voxel size.
     """
-    volume, source = pooled(volume, source, [max(1, int(step + 1e-6)) for step in _steps(source, target)])
+    volume, source = pooled(
+        volume, source, [max(1, int(step + 1e-6)) for step in _steps(source, target)]
+    )
     split = max(1, round(max(_steps(source, target))))
     fine = target.refined(split)
-    between = torch.linalg.inv(source.affine) @ fine.affine  # voxel indices of the target to those of the source
+    between = (
+        torch.linalg.inv(source.affine) @ fine.affine
+    )  # voxel indices of the target to those of the source
     slab = max(1, POINTS // (fine.shape[1] * fine.shape[2] * split)) * split
     parts = []
     for first in range(0, fine.shape[0], slab):
@@ -38,13 +42,19 @@ def resample(volume: Float[Tensor, "d h w"], source: Grid, target: Grid) -> Floa
 
 
 def _steps(source: Grid, target: Grid) -> list[float]:
-    """The greatest step along each axis (x, y, z) of the source, in its voxels, from one target voxel to the next."""
+    """The greatest step along each axis (x, y, z) of the source, in its voxels, from one target
+    voxel to the next.
+    """
     between = torch.linalg.inv(source.affine) @ target.affine
     return between[:3, :3].abs().amax(dim=1).tolist()
 
 
-def pooled(volume: Float[Tensor, "d h w"], grid: Grid, factors: Sequence[int]) -> tuple[Float[Tensor, "e i j"], Grid]:
-    """Means over whole blocks of voxels, `factors` along (x, y, z), and their grid; zeros fill up the last blocks."""
+def pooled(
+    volume: Float[Tensor, "d h w"], grid: Grid, factors: Sequence[int]
+) -> tuple[Float[Tensor, "e i j"], Grid]:
+    """Means over whole blocks of voxels, `factors` along (x, y, z), and their grid; zeros fill up
+    the last blocks.
+    """
     if max(factors) == 1:
         return volume, grid
     kernel = tuple(factors[::-1])

@@ -1,4 +1,6 @@
-"""What an HDF5 file may ask of its reader: data in the file itself, in chunks that unfold to what they declare."""
+"""What an HDF5 file may ask of its reader: data in the file itself, in chunks that unfold to what
+they declare.
+"""
 
 import math
 import zlib
@@ -10,27 +12,38 @@ import h5py
 
 from mvrecon.limits import DEFLATE, VOLUME, Refused, shown
 
-#: Filters that every HDF5 has; others would be loaded as libraries from wherever HDF5_PLUGIN_PATH says.
+#: Filters that every HDF5 has; others would be loaded as libraries from wherever HDF5_PLUGIN_PATH
+#: says.
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 CHUNKS = 2**16
 
 
 def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Dataset:
-    """A dataset whose bytes lie in this very file, in a form that unfolds to no more than it declares.
+    """A dataset whose bytes lie in this very file, in a form that unfolds to no more than it
+    declares.
 
     Raises:
-        Refused: it is not there, is a link or stored elsewhere, filtered by a plugin, or larger than the file can hold.
+        Refused: it is not there, is a link or stored elsewhere, filtered by a plugin, or larger
+            than the file can hold.
     """
     link = file.get(name, getlink=True)
     if link is None:
-        raise Refused(f"{path}: has no dataset {name!r}, only {shown(sorted(file))}; expected {expected}")
+        raise Refused(
+            f"{path}: has no dataset {name!r}, only {shown(sorted(file))}; expected {expected}"
+        )
     dataset = file[name] if isinstance(link, h5py.HardLink) else None
     if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
-        raise Refused(f"{path}: {name!r} is a link, a group or stored elsewhere; expected a dataset in the file")
+        raise Refused(
+            f"{path}: {name!r} is a link, a group or stored elsewhere; expected a dataset in the "
+            f"file"
+        )
     plist = dataset.id.get_create_plist()
     filters = [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]
     if not set(filters) <= FILTERS or len(set(filters)) < len(filters):
-        raise Refused(f"{path}: {name!r} has the filters {filters}; expected gzip, shuffle and fletcher32, each once")
+        raise Refused(
+            f"{path}: {name!r} has the filters {filters}; expected gzip, shuffle and fletcher32, "
+            f"each once"
+        )
     ratio = DEFLATE if h5py.h5z.FILTER_DEFLATE in filters else 1
     _check_size(path, dataset, ratio * path.stat().st_size)
     return dataset
@@ -44,11 +57,15 @@ def _check_size(path: Path, dataset: h5py.Dataset, most: int) -> None:
     chunk = math.prod(dataset.chunks or ()) * item
     if whole > most or max(one, chunk) > VOLUME:
         sizes = f"{dataset.shape} x {item} bytes, in chunks of {dataset.chunks}"
-        raise Refused(f"{path}: {dataset.name!r} declares {sizes}; expected at most {most} bytes, {VOLUME} at once")
+        raise Refused(
+            f"{path}: {dataset.name!r} declares {sizes}; expected at most {most} bytes, {VOLUME} "
+            f"at once"
+        )
 
 
 def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) -> None:
-    """Unfold the chunks of one volume, or of all, without keeping them: a few bytes must not become more than declared.
+    """Unfold the chunks of one volume, or of all, without keeping them: a few bytes must not become
+    more than declared.
 
     Raises:
         Refused: a chunk that is missing, or that unfolds to more than its size.
@@ -56,12 +73,15 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
     if dataset.chunks is None:
         return
     size = math.prod(dataset.chunks) * dataset.id.get_type().get_size()
-    slack = 2 * size + 64  # a reference to text takes 16 bytes and not 8; checksums and what does not shrink add some
+    slack = (
+        2 * size + 64
+    )  # a reference to text takes 16 bytes and not 8; checksums and what does not shrink add some
     for offset in _offsets(path, dataset, index):
         info = dataset.id.get_chunk_info_by_coord(offset)
         if info.byte_offset is None or not 0 < info.size <= slack:
             raise Refused(
-                f"{path}: {dataset.name!r} has {info.size} bytes for the chunk {offset}, expected 1 to {slack}"
+                f"{path}: {dataset.name!r} has {info.size} bytes for the chunk {offset}, expected "
+                f"1 to {slack}"
             )
         if dataset.compression == "gzip" and info.size * DEFLATE > 2**20:
             _unfold(path, dataset.id.read_direct_chunk(offset)[1], slack)
@@ -72,7 +92,10 @@ def _offsets(path: Path, dataset: h5py.Dataset, index: int | None) -> Iterator[t
     first = range(0, shape[0], chunks[0]) if index is None else [index - index % chunks[0]]
     axes = [first, *(range(0, n, c) for n, c in zip(shape[1:], chunks[1:], strict=True))]
     if (count := math.prod(map(len, axes))) > CHUNKS:
-        raise Refused(f"{path}: {dataset.name!r} is cut into {count} chunks, expected at most {CHUNKS}; store it anew")
+        raise Refused(
+            f"{path}: {dataset.name!r} is cut into {count} chunks, expected at most {CHUNKS}; "
+            f"store it anew"
+        )
     yield from product(*axes)
 
 
@@ -84,5 +107,8 @@ def _unfold(path: Path, raw: bytes, most: int) -> None:
         except zlib.error:
             return  # not a stream: stored as it is, or damaged, which reading it tells
         if total > most:
-            raise Refused(f"{path}: a chunk of {len(raw)} bytes unfolds to more than the {most} that it declares")
+            raise Refused(
+                f"{path}: a chunk of {len(raw)} bytes unfolds to more than the {most} that it "
+                f"declares"
+            )
         raw = stream.unconsumed_tail

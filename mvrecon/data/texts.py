@@ -1,7 +1,9 @@
-"""Texts of variable length in an HDF5 file, read by a process of its own with little memory and time.
+"""Texts of variable length in an HDF5 file, read by a process of its own with little memory and
+time.
 
-libhdf5 2.0 trusts the lengths and the heaps of such texts: a damaged one asks for gigabytes, or is walked for ever.
-Files that mvrecon writes have texts of fixed length instead, and need no such process.
+libhdf5 2.0 trusts the lengths and the heaps of such texts: a damaged one asks for gigabytes, or is
+walked for ever. Files that mvrecon writes have texts of fixed length instead, and need no such
+process.
 """
 
 import json
@@ -23,7 +25,8 @@ def variable(dtype: object) -> bool:
 
 
 def texts_of(path: Path) -> dict[str, list[str]]:
-    """The attributes that are one text each, under "@<name>", and the dataset of texts `id`, where it is there.
+    """The attributes that are one text each, under "@<name>", and the dataset of texts `id`, where
+    it is there.
 
     Raises:
         ValueError: the process was ended by its limits, or the file is damaged.
@@ -35,7 +38,9 @@ def texts_of(path: Path) -> dict[str, list[str]]:
         raise ValueError(f"its texts cannot be read within {SECONDS} s") from error
     if done.returncode:
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
-        raise ValueError(f"its texts cannot be read: {''.join(last) or f'exit status {done.returncode}'}")
+        raise ValueError(
+            f"its texts cannot be read: {''.join(last) or f'exit status {done.returncode}'}"
+        )
     return json.loads(done.stdout)
 
 

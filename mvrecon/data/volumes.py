@@ -1,6 +1,8 @@
-"""Scenes of CT volumes from files: HU to attenuation, the patient centred in the grid, views from a finer grid.
+"""Scenes of CT volumes from files: HU to attenuation, the patient centred in the grid, views from a
+finer grid.
 
-The grid is the field of view: what lies outside of its box is cut off in the truth and in the views alike.
+The grid is the field of view: what lies outside of its box is cut off in the truth and in the views
+alike.
 """
 
 from abc import ABC, abstractmethod
@@ -25,9 +27,11 @@ from mvrecon.parts import PROJECTORS
 from mvrecon.scenes.analytic import generator, uniform
 from mvrecon.scenes.sample import Sample
 
-#: Tissue begins at -400 HU where the patient is looked for, and at a quarter of water where voxels are judged.
+#: Tissue begins at -400 HU where the patient is looked for, and at a quarter of water where voxels
+#: are judged.
 SKIN, TISSUE = 0.6 * WATER, 0.25 * WATER
-#: How far a varied copy departs from its case: degrees about each axis, part of the size, mm along each axis.
+#: How far a varied copy departs from its case: degrees about each axis, part of the size, mm along
+#: each axis.
 TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
 Crop = Literal["body", "none"]
 
@@ -38,13 +42,14 @@ class FileScene(ABC):
 
     Args:
         path: of the file.
-        crop: "body" puts the centre of the patient's box at the grid's centre, "none" leaves the volume where its
-            file says it is (about the origin, if the file does not say).
+        crop: "body" puts the centre of the patient's box at the grid's centre, "none" leaves the
+            volume where its file says it is (about the origin, if the file does not say).
         fine: views are projected from a grid this many times finer than the truth's; at least 2.
         rays: a pixel measures the mean over rays x rays lines of sight.
-        vary: beyond the last case, count on with copies that are mirrored left to right, turned, scaled and shifted
-            at random, others every time round.
-        data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to 1000 HU.
+        vary: beyond the last case, count on with copies that are mirrored left to right, turned,
+            scaled and shifted at random, others every time round.
+        data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to
+            1000 HU.
 
     Raises:
         ValueError: an unknown crop, or numbers that are too small.
@@ -63,7 +68,10 @@ class FileScene(ABC):
             raise ValueError(f"crop must be 'body' or 'none', got {self.crop!r}")
         if self.fine < 2 or self.rays < 1 or not self.data_range > 0:
             got = f"fine {self.fine}, rays {self.rays}, data_range {self.data_range}"
-            raise ValueError(f"A scene from a file needs fine >= 2, rays >= 1 and a positive data_range, got {got}")
+            raise ValueError(
+                f"A scene from a file needs fine >= 2, rays >= 1 and a positive data_range, got "
+                f"{got}"
+            )
         self._operator: tuple[Grid, Cameras, Any] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -94,33 +102,57 @@ class FileScene(ABC):
         """Name of a case, and its attenuation in 1/mm on `grid.refined(fine)`."""
         turn, case = divmod(index, self.length)
         if index < 0 or (turn and not self.vary):
-            raise IndexError(f"{self.path} has {self.length} case(s), got index {index}; `vary: true` adds varied ones")
+            raise IndexError(
+                f"{self.path} has {self.length} case(s), got index {index}; `vary: true` adds "
+                f"varied ones"
+            )
         name, hu, source = self.case(case)
         if not hu.isfinite().all():
-            raise ValueError(f"{self.path}: {name} has {int((~hu.isfinite()).sum())} values that are not finite HU")
+            raise ValueError(
+                f"{self.path}: {name} has {int((~hu.isfinite()).sum())} values that are not "
+                f"finite HU"
+            )
         mu = attenuation(hu)
         rng = generator(seed, index) if turn else None
         if rng is not None and uniform(rng, 0, 1) < 0.5:
             mu = mu.flip(-1)
         patient = body(mu, SKIN) if self.crop == "body" or rng is not None else None
         if patient is not None and not patient.any():
-            raise ValueError(f"{self.path}: {name} shows no patient: expected values above -400 HU, all are below")
+            raise ValueError(
+                f"{self.path}: {name} shows no patient: expected values above -400 HU, all are "
+                f"below"
+            )
         pivot = grid.centre if patient is None else centre(patient, source)
         target = grid.centre if self.crop == "body" else pivot
         placed = moved(source, pivot, target, rng)
-        return f"{name}-{seed}-{turn}" if turn else name, resample(mu, placed, grid.refined(self.fine))
+        return f"{name}-{seed}-{turn}" if turn else name, resample(
+            mu, placed, grid.refined(self.fine)
+        )
 
     @torch.no_grad()
-    def _views(self, fine: Float[Tensor, "e i j"], grid: Grid, cameras: Cameras) -> Float[Tensor, "1 m v u"]:
-        if self._operator is None or self._operator[0] is not grid or self._operator[1] is not cameras:
-            geometry = {"grid": grid.refined(self.fine), "cameras": split_pixels(cameras, self.rays)}
-            A = PROJECTORS.build("radon" if cameras.parallel else "drr", **geometry, method="siddon")
+    def _views(
+        self, fine: Float[Tensor, "e i j"], grid: Grid, cameras: Cameras
+    ) -> Float[Tensor, "1 m v u"]:
+        if (
+            self._operator is None
+            or self._operator[0] is not grid
+            or self._operator[1] is not cameras
+        ):
+            geometry = {
+                "grid": grid.refined(self.fine),
+                "cameras": split_pixels(cameras, self.rays),
+            }
+            A = PROJECTORS.build(
+                "radon" if cameras.parallel else "drr", **geometry, method="siddon"
+            )
             self._operator = (grid, cameras, A)
         return F.avg_pool2d(self._operator[2](fine[None, None])[0], self.rays)
 
 
 def split_pixels(cameras: Cameras, factor: int) -> Cameras:
-    """The same detectors with each pixel cut into `factor` x `factor`; the inverse of `Cameras.binned`."""
+    """The same detectors with each pixel cut into `factor` x `factor`; the inverse of
+    `Cameras.binned`.
+    """
     u, v = cameras.u / factor, cameras.v / factor
     shift = (u + v) * (1 - factor) / 2
     shape = (cameras.shape[0] * factor, cameras.shape[1] * factor)
@@ -128,13 +160,19 @@ def split_pixels(cameras: Cameras, factor: int) -> Cameras:
     return replace(cameras, source=source, origin=cameras.origin + shift, u=u, v=v, shape=shape)
 
 
-def moved(grid: Grid, pivot: Float[Tensor, "3"], target: Float[Tensor, "3"], rng: torch.Generator | None) -> Grid:
-    """A grid carried from one point to another, with `rng` also turned, scaled and shifted about it at random."""
+def moved(
+    grid: Grid, pivot: Float[Tensor, "3"], target: Float[Tensor, "3"], rng: torch.Generator | None
+) -> Grid:
+    """A grid carried from one point to another, with `rng` also turned, scaled and shifted about it
+    at random.
+    """
     linear = torch.eye(3, dtype=torch.float64)
     if rng is not None:
         angles = [uniform(rng, -TURN, TURN) for _ in range(3)]
         linear = uniform(rng, 1 - SCALE, 1 + SCALE) * euler_rotation(angles, "xyz")
-        target = target + torch.tensor([uniform(rng, -SHIFT, SHIFT) for _ in range(3)], dtype=torch.float64)
+        target = target + torch.tensor(
+            [uniform(rng, -SHIFT, SHIFT) for _ in range(3)], dtype=torch.float64
+        )
     affine = grid.affine.clone()
     affine[:3, :3] = linear @ affine[:3, :3]
     affine[:3, 3] = linear @ (affine[:3, 3] - pivot) + target
@@ -146,8 +184,9 @@ class Hdf5Volumes(FileScene):
     """The volumes of an HDF5 file (`mvrecon.data.hdf5` tells its layout).
 
     Args:
-        orientation: towards which sides of the patient the file's axes x, y, z run, as three letters: L or R, P or A,
-            I or S. The world is RAS as in NIfTI. None: as the file says, or RAS. Others: see `FileScene`.
+        orientation: towards which sides of the patient the file's axes x, y, z run, as three
+            letters: L or R, P or A, I or S. The world is RAS as in NIfTI. None: as the file says,
+                or RAS. Others: see `FileScene`.
 
     Raises:
         ValueError: an orientation that is not such letters.
@@ -167,7 +206,9 @@ class Hdf5Volumes(FileScene):
         return len(self._file)
 
     def case(self, index: int) -> tuple[str, Float[Tensor, "d h w"], Grid]:
-        """Name, Hounsfield units and grid of a volume, centred on the origin, its axes running to RAS."""
+        """Name, Hounsfield units and grid of a volume, centred on the origin, its axes running to
+        RAS.
+        """
         stored = self._file.read(index)
         hu = torch.from_numpy(stored.ct.astype("float32"))
         axes = reversed_axes(self.orientation or self._file.orientation or "RAS")
@@ -180,14 +221,21 @@ def reversed_axes(orientation: str) -> list[int]:
     Raises:
         ValueError: letters that are not L or R, P or A, I or S, in this order.
     """
-    if len(orientation) != 3 or any(a not in pair for a, pair in zip(orientation, ("LR", "PA", "IS"), strict=True)):
-        raise ValueError(f"An orientation is L or R, then P or A, then I or S, such as 'LPI'; got {orientation!r}")
+    if len(orientation) != 3 or any(
+        a not in pair for a, pair in zip(orientation, ("LR", "PA", "IS"), strict=True)
+    ):
+        raise ValueError(
+            f"An orientation is L or R, then P or A, then I or S, such as 'LPI'; got "
+            f"{orientation!r}"
+        )
     return [2 - i for i, letter in enumerate(orientation) if letter in "LPI"]
 
 
 @dataclass(kw_only=True)
 class NiftiVolume(FileScene):
-    """One NIfTI volume in Hounsfield units, in world mm (RAS) by its affine. Options: see `FileScene`."""
+    """One NIfTI volume in Hounsfield units, in world mm (RAS) by its affine. Options: see
+    `FileScene`.
+    """
 
     @property
     def length(self) -> int:

@@ -1,4 +1,6 @@
-"""What the file of a checkpoint may hold: a plain zip archive of numbers, and a pickle that builds nothing else."""
+"""What the file of a checkpoint may hold: a plain zip archive of numbers, and a pickle that builds
+nothing else.
+"""
 
 import pickletools
 import re
@@ -15,7 +17,8 @@ MEMBERS = re.compile(
 )
 #: What a pickle may name, so that no library that widens torch's own list widens this one.
 GLOBALS = re.compile(
-    r"torch \w+Storage|torch\.storage UntypedStorage|torch (Size|device|bfloat16|(float|u?int|complex)\d+|bool)"
+    r"torch \w+Storage|torch\.storage UntypedStorage|torch "
+    r"(Size|device|bfloat16|(float|u?int|complex)\d+|bool)"
     r"|torch\._utils _rebuild_(tensor_v2|parameter)|collections OrderedDict"
 )
 #: Ways of a pickle to name things that `torch.save` does not use.
@@ -28,8 +31,8 @@ def check_archive(path: Path) -> None:
     """Look through a checkpoint before torch does; nothing of it is unpickled.
 
     Raises:
-        Refused: not a zip archive as `torch.save` writes it, packed so that it unfolds to more than it is, or with
-            anything in its pickle but tensors and plain values.
+        Refused: not a zip archive as `torch.save` writes it, packed so that it unfolds to more than
+            it is, or with anything in its pickle but tensors and plain values.
     """
     with blaming(path, "is cut short or no checkpoint"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
@@ -37,25 +40,34 @@ def check_archive(path: Path) -> None:
             raise Refused(f"{path}: holds {shown(foreign)}, which no checkpoint does")
         packed = any(m.compress_type != zipfile.ZIP_STORED for m in members)
         if packed or sum(m.file_size for m in members) > path.stat().st_size:
-            raise Refused(f"{path}: its files are packed or overlap; expected them stored, as torch.save does")
+            raise Refused(
+                f"{path}: its files are packed or overlap; expected them stored, as torch.save does"
+            )
         pickles = [m for m in members if m.filename.endswith("/data.pkl")]
         if len(pickles) != 1 or pickles[0].file_size > TEXT:
-            raise Refused(f"{path}: has {len(pickles)} pickles; expected one of at most {TEXT} bytes")
+            raise Refused(
+                f"{path}: has {len(pickles)} pickles; expected one of at most {TEXT} bytes"
+            )
         for op, what, _ in pickletools.genops(archive.read(pickles[0])):
             if op.name in FOREIGN or (op.name == "GLOBAL" and not GLOBALS.fullmatch(str(what))):
                 raise Refused(
-                    f"{path}: its pickle names {shown(what or op.name)}; expected tensors and plain values only"
+                    f"{path}: its pickle names {shown(what or op.name)}; expected tensors and "
+                    f"plain values only"
                 )
 
 
 def check_settings(path: Path, settings: Any) -> dict[str, Any]:
-    """The hyper-parameters of a checkpoint: names and numbers under the keys of a method, and nothing else.
+    """The hyper-parameters of a checkpoint: names and numbers under the keys of a method, and
+    nothing else.
 
     Raises:
         Refused: other keys or other values.
     """
     if not isinstance(settings, dict) or set(settings) != KEYS or not _plain(settings):
-        raise Refused(f"{path}: has the settings {shown(settings)}; expected names and numbers for {sorted(KEYS)}")
+        raise Refused(
+            f"{path}: has the settings {shown(settings)}; expected names and numbers for "
+            f"{sorted(KEYS)}"
+        )
     return settings
 
 
@@ -63,7 +75,10 @@ def _plain(value: Any, depth: int = 0) -> bool:
     if depth > 16:
         return False
     if isinstance(value, Mapping):
-        return all(type(k) is str and not k.startswith("_") and _plain(v, depth + 1) for k, v in value.items())
+        return all(
+            type(k) is str and not k.startswith("_") and _plain(v, depth + 1)
+            for k, v in value.items()
+        )
     if isinstance(value, list | tuple):
         return len(value) < 2**16 and all(_plain(item, depth + 1) for item in value)
     return value is None or type(value) in (bool, int, float, str)

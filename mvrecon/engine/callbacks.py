@@ -24,16 +24,19 @@ from mvrecon.viz.planes import Image
 
 
 def peak_megabytes() -> dict[str, float]:
-    """The most memory in use so far, 2^20 bytes: the GPU's where there is one, else this process's, else nothing."""
+    """The most memory in use so far, 2^20 bytes: the GPU's where there is one, else this process's,
+    else nothing.
+    """
     most = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
     return {} if most is None else {"peak_mb": most / 2**20}
 
 
 class Clock(L.Callback):
-    """Logs `time/*`: milliseconds per step, volumes per second, seconds of training so far, peak memory.
+    """Logs `time/*`: milliseconds per step, volumes per second, seconds of training so far, peak
+    memory.
 
-    Validation and pictures do not count. The seconds go into the checkpoint, so a resumed run adds to them. Windows
-    does not tell the memory.
+    Validation and pictures do not count. The seconds go into the checkpoint, so a resumed run adds
+    to them. Windows does not tell the memory.
     """
 
     of_every_run = True
@@ -60,7 +63,9 @@ class Clock(L.Callback):
         """Leave the validation out."""
         self._mark = time.perf_counter()
 
-    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         """One step, its data included."""
         now = time.perf_counter()
         step, self._mark = now - self._mark, now
@@ -68,13 +73,16 @@ class Clock(L.Callback):
         count = len(batch["views"])
         figures = {"step_ms": 1e3 * step, "volumes_per_s": count / step, "seconds": self.seconds}
         figures |= peak_megabytes()
-        pl_module.log_dict({f"time/{name}": value for name, value in figures.items()}, batch_size=count)
+        pl_module.log_dict(
+            {f"time/{name}": value for name, value in figures.items()}, batch_size=count
+        )
 
 
 class Confined(L.Callback):
     """Lets no training begin whose callbacks or loggers would write outside the run folder.
 
-    Their options were looked at when they were built; a checkpoint to go on from may hold other places.
+    Their options were looked at when they were built; a checkpoint to go on from may hold other
+    places.
 
     Args:
         folder: the run folder.
@@ -96,7 +104,9 @@ class Confined(L.Callback):
 
 
 class CompileModel(L.Callback):
-    """Compiles the network before training. Never the LightningModule, whose logging must not be traced."""
+    """Compiles the network before training. Never the LightningModule, whose logging must not be
+    traced.
+    """
 
     def setup(self, trainer: L.Trainer, pl_module: Any, stage: str) -> None:
         """Compile in place; names of parameters stay."""
@@ -113,7 +123,9 @@ class BoardReview(L.Callback):
         baselines: training-free models shown beside ours.
     """
 
-    def __init__(self, every: int = 1, cases: int = 2, baselines: Sequence[str] = ("backprojection", "sirt")):
+    def __init__(
+        self, every: int = 1, cases: int = 2, baselines: Sequence[str] = ("backprojection", "sirt")
+    ):
         self.every, self.cases, self.baselines = every, cases, tuple(baselines)
         self.seen = 0
         self._fixed: dict[str, Tensor] = {}
@@ -123,10 +135,20 @@ class BoardReview(L.Callback):
         """Write down what runs."""
         for board in _boards(trainer):
             lines = [f"    {name} {version}" for name, version in versions().items()]
-            board.add_text("text/run", "\n".join([f"    {' '.join(sys.argv)}", "", *lines]), trainer.global_step)
+            board.add_text(
+                "text/run",
+                "\n".join([f"    {' '.join(sys.argv)}", "", *lines]),
+                trainer.global_step,
+            )
 
     def on_validation_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        *_: Any,
     ) -> None:
         """Log the support's share of the grid; keep the first batch and its reconstruction."""
         out = outputs["out"]
@@ -144,7 +166,10 @@ class BoardReview(L.Callback):
         self.seen += 1
         if (self.seen - 1) % self.every:
             return
-        cases = [self._pictures(pl_module, batch, out, case) for case in range(min(self.cases, len(out.volume)))]
+        cases = [
+            self._pictures(pl_module, batch, out, case)
+            for case in range(min(self.cases, len(out.volume)))
+        ]
         for name in cases[0]:
             image = montage.tiled([[pictures[name]] for pictures in cases])
             save_png(Path(trainer.default_root_dir) / "review" / f"{name}.png", image)
@@ -160,11 +185,19 @@ class BoardReview(L.Callback):
             if isinstance(logger, TensorBoardLogger):
                 logger.log_hyperparams(dict(pl_module.hparams), figures)
 
-    def _pictures(self, module: Any, batch: Any, out: Reconstruction, case: int) -> dict[str, Image]:
-        truth, top, spacing = batch["volume"][case, 0], module.hparams["data_range"], module.projector.grid.spacing
+    def _pictures(
+        self, module: Any, batch: Any, out: Reconstruction, case: int
+    ) -> dict[str, Image]:
+        truth, top, spacing = (
+            batch["volume"][case, 0],
+            module.hparams["data_range"],
+            module.projector.grid.spacing,
+        )
         volumes = {module.hparams["model"]["name"]: out.volume[case, 0]}
         volumes |= {name: v[case, 0] for name, v in self._baselines(module, batch["views"]).items()}
-        support = {} if out.support is None else {"support": outlined(truth, out.support[case, 0], top)}
+        support = (
+            {} if out.support is None else {"support": outlined(truth, out.support[case, 0], top)}
+        )
         predicted = module.projector(out.volume[case][None])[0, 0]
         shown = {
             "planes": montage.planes(truth, volumes | support, top, spacing),
@@ -179,17 +212,26 @@ class BoardReview(L.Callback):
 
     def _baselines(self, module: Any, views: Tensor) -> dict[str, Tensor]:
         if not self._fixed:  # the scenes are the same at every review, so once is enough
-            models = {name: MODELS.build(name, projector=module.projector).to(views.device) for name in self.baselines}
+            models = {
+                name: MODELS.build(name, projector=module.projector).to(views.device)
+                for name in self.baselines
+            }
             self._fixed = {name: model(views).volume for name, model in models.items()}
         return self._fixed
 
 
-def outlined(volume: Float[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], value: float) -> Float[Tensor, "d h w"]:
-    """A volume with the outermost voxels of a mask set to a value; the grid's faces count as outside."""
+def outlined(
+    volume: Float[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], value: float
+) -> Float[Tensor, "d h w"]:
+    """A volume with the outermost voxels of a mask set to a value; the grid's faces count as
+    outside.
+    """
     outside = pad((~mask).to(volume.dtype)[None, None], [1] * 6, value=1.0)
     rim = mask & (max_pool3d(outside, 3, stride=1)[0, 0] > 0)
     return torch.where(rim, value, volume)
 
 
 def _boards(trainer: L.Trainer) -> list[Any]:
-    return [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    return [
+        logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)
+    ]

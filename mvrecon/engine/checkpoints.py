@@ -21,7 +21,8 @@ class Trained:
         module: with its weights.
         seconds: of training.
         steps: of the optimiser.
-        cases: names of those that it was trained on; none: the checkpoint is of a version that did not tell.
+        cases: names of those that it was trained on; none: the checkpoint is of a version that did
+            not tell.
         digests: SHA-256 of the rig and of the files that it was trained with.
     """
 
@@ -56,19 +57,25 @@ def run_folder(path: str | Path) -> Path:
         if (folder / SETTINGS).is_file():
             check_plain(folder)
             return folder.resolve()
-    raise FileNotFoundError(f"Expected a checkpoint in a run folder (one with {SETTINGS}), got {path}")
+    raise FileNotFoundError(
+        f"Expected a checkpoint in a run folder (one with {SETTINGS}), got {path}"
+    )
 
 
 def load(path: Path) -> Trained:
-    """A method from its checkpoint. Nothing in the file is run: it holds tensors, and the names of registered parts.
+    """A method from its checkpoint. Nothing in the file is run: it holds tensors, and the names of
+    registered parts.
 
     Raises:
         FileNotFoundError: the method's training has not ended.
         DamagedCheckpoint: the file is not what was written.
-        Refused: more than tensors and plain values, or not the weights of the method that it describes.
+        Refused: more than tensors and plain values, or not the weights of the method that it
+            describes.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it")
+        raise FileNotFoundError(
+            f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it"
+        )
     check_archive(path)
     with blaming(path, "cannot be read"):
         state = read(path)
@@ -78,4 +85,6 @@ def load(path: Path) -> Trained:
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
         data = state.get(SceneData.__qualname__, {})
         cases = list(map(str, data["cases"])) if "cases" in data else None
-        return Trained(module.eval(), seconds, int(state["global_step"]), cases, dict(data.get("digests", {})))
+        return Trained(
+            module.eval(), seconds, int(state["global_step"]), cases, dict(data.get("digests", {}))
+        )

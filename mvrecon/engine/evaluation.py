@@ -87,7 +87,8 @@ def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[st
 def results(
     settings: Settings, folder: Path, data: SceneData, device: str = "cpu", see: See | None = None
 ) -> dict[str, Any]:
-    """Everything that the table of a run tells, evaluated on the test scenes of `data` from the run's checkpoints.
+    """Everything that the table of a run tells, evaluated on the test scenes of `data` from the
+    run's checkpoints.
 
     Raises:
         FileNotFoundError: a method whose training has not ended.
@@ -131,7 +132,9 @@ def _row(method: Trained, scores: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def seen_in_training(methods: Iterable[Trained], names: Iterable[str]) -> list[str] | None:
-    """The scenes, by name, that any method was trained on; none where a checkpoint does not tell its training cases."""
+    """The scenes, by name, that any method was trained on; none where a checkpoint does not tell
+    its training cases.
+    """
     trained = [method.cases for method in methods if method.steps]
     if None in trained:
         return None
@@ -147,7 +150,10 @@ def device_of(accelerator: str) -> str:
 def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:
     for i in range(len(batch["views"])):
         alone = {key: value[i : i + 1] for key, value in batch.items()}
-        yield {key: value.to(device) if isinstance(value, Tensor) else value for key, value in alone.items()}
+        yield {
+            key: value.to(device) if isinstance(value, Tensor) else value
+            for key, value in alone.items()
+        }
 
 
 def _timed(model: nn.Module, views: Tensor) -> tuple[float, Tensor]:

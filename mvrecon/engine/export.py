@@ -18,9 +18,14 @@ from mvrecon.viz.planes import Image
 
 
 def save_case(
-    folder: Path, scene: Mapping[str, Any], volumes: Mapping[str, Tensor], grid: Grid, data_range: float
+    folder: Path,
+    scene: Mapping[str, Any],
+    volumes: Mapping[str, Tensor],
+    grid: Grid,
+    data_range: float,
 ) -> Path:
-    """Write one scene: `views.png`, `planes.png`, and with nibabel `truth.nii.gz` and one for each method.
+    """Write one scene: `views.png`, `planes.png`, and with nibabel `truth.nii.gz` and one for each
+    method.
 
     Returns the scene's own folder in `folder`.
     """
@@ -36,9 +41,11 @@ def save_case(
 
 
 def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str) -> Path:
-    """Write the views of one case: `view_<camera>.png` as radiographs, black at 0, and the numbers as `views.h5`.
+    """Write the views of one case: `view_<camera>.png` as radiographs, black at 0, and the numbers
+    as `views.h5`.
 
-    `views.h5` holds `views` [m v u], float32, with the attributes `axes` and `unit`, and the case's `name`.
+    `views.h5` holds `views` [m v u], float32, with the attributes `axes` and `unit`, and the case's
+    `name`.
 
     Args:
         folder: of all cases.
@@ -68,7 +75,8 @@ def save_png(path: Path, image: Image) -> None:
 def save_nifti(path: Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
     """Write a volume as NIfTI, whose first axis is x: the grid's affine goes with it unchanged.
 
-    Compressed (the name ends in .gz, the same bytes for the same volume) and replaced whole or not at all.
+    Compressed (the name ends in .gz, the same bytes for the same volume) and replaced whole or not
+    at all.
     """
     import nibabel
 

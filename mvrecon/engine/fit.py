@@ -20,16 +20,23 @@ from mvrecon.limits import plain_name
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
-    """The models of a run's result table by label: the main one first, then those of `compare` that are not null.
+    """The models of a run's result table by label: the main one first, then those of `compare` that
+    are not null.
 
     Raises:
-        ValueError: the main model's label is taken twice, or a label is no plain name: files are called by it.
+        ValueError: the main model's label is taken twice, or a label is no plain name: files are
+            called by it.
     """
     main = settings["model"]
     others = {label: model for label, model in settings["compare"].items() if model}
     if main["name"] in others:
-        raise ValueError(f"compare holds {main['name']!r}, which is the main model's own label; give it another")
-    return {plain_name(label, "a method"): model for label, model in {main["name"]: main, **others}.items()}
+        raise ValueError(
+            f"compare holds {main['name']!r}, which is the main model's own label; give it another"
+        )
+    return {
+        plain_name(label, "a method"): model
+        for label, model in {main["name"]: main, **others}.items()
+    }
 
 
 def build_data(settings: Settings) -> SceneData:
@@ -40,7 +47,10 @@ def build_data(settings: Settings) -> SceneData:
     """
     scenes = {"train": settings["scene"], "test": settings["test_scene"] or settings["scene"]}
     if isinstance(scenes["test"], str):
-        raise TypeError(f"test_scene holds a scene's settings; choose a file by scene@test_scene={scenes['test']}")
+        raise TypeError(
+            f"test_scene holds a scene's settings; choose a file by "
+            f"scene@test_scene={scenes['test']}"
+        )
     where = {key: settings[key] for key in ("grid", "camera", "seed")}
     return SceneData(scenes=scenes, **where, **settings["data"])
 
@@ -48,7 +58,9 @@ def build_data(settings: Settings) -> SceneData:
 def build_module(settings: Settings, model: Settings, data_range: float) -> ReconstructionModule:
     """A method of a run, with fresh weights."""
     geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
-    return ReconstructionModule(geometry, model, settings["loss"], settings["optimizer"], data_range)
+    return ReconstructionModule(
+        geometry, model, settings["loss"], settings["optimizer"], data_range
+    )
 
 
 def trainable(module: L.LightningModule) -> bool:
@@ -57,11 +69,12 @@ def trainable(module: L.LightningModule) -> bool:
 
 
 def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
-    """Train one method of a run and leave `checkpoints/<method>.ckpt`, unless it is there or nothing can be learnt.
+    """Train one method of a run and leave `checkpoints/<method>.ckpt`, unless it is there or
+    nothing can be learnt.
 
-    Goes on from the method's last checkpoint where there is one, and on the CPU ends with the same bits as a run that
-    never broke off on as many threads; with `trainer.deterministic`, on any number. Every method starts from the same
-    seed and sees the same scenes in the same order.
+    Goes on from the method's last checkpoint where there is one, and on the CPU ends with the same
+    bits as a run that never broke off on as many threads; with `trainer.deterministic`, on any
+    number. Every method starts from the same seed and sees the same scenes in the same order.
 
     Raises:
         FloatingPointError: a loss that is not finite.
@@ -76,7 +89,9 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
         return
-    L.seed_everything(settings["seed"], workers=True, verbose=False)  # initial weights have used up random numbers
+    L.seed_everything(
+        settings["seed"], workers=True, verbose=False
+    )  # initial weights have used up random numbers
     board = folder if method == next(iter(models)) else folder / method
     trainer = build_trainer(settings, folder, board, last)
     begun = last.exists() or previous(last).exists()
@@ -87,7 +102,9 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         if isinstance(logger, Board | MetricsFile):
             logger.rewind(step)
     with in_one_order(settings["trainer"].get("deterministic", False)), remembered(last):
-        trainer.fit(module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True)
+        trainer.fit(
+            module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True
+        )
         trainer.save_checkpoint(done)
     remove(last)
 
@@ -97,15 +114,25 @@ def _tell(line: str) -> None:
 
 
 def build_trainer(settings: Settings, folder: Path, board: Path, last: Path) -> L.Trainer:
-    """Lightning's trainer, its logs and pictures flat in `board`, its last checkpoint at every validation in `last`.
+    """Lightning's trainer, its logs and pictures flat in `board`, its last checkpoint at every
+    validation in `last`.
 
     Raises:
         PermissionError: a callback or a logger that would write outside `board`.
     """
     board.mkdir(parents=True, exist_ok=True)
-    callbacks: list[Any] = [instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node]
+    callbacks: list[Any] = [
+        instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
+    ]
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
-    loggers = [instantiate(node, board, save_dir=str(board)) for node in (settings["logger"] or {}).values() if node]
-    options = {"enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks), **settings["trainer"]}
+    loggers = [
+        instantiate(node, board, save_dir=str(board))
+        for node in (settings["logger"] or {}).values()
+        if node
+    ]
+    options = {
+        "enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks),
+        **settings["trainer"],
+    }
     given = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
     return L.Trainer(**options, **given, plugins=[DurableCheckpoints(folder)])

@@ -51,7 +51,9 @@ class MetricsFile(CSVLogger):
     """
 
     def __init__(self, save_dir: str, flush_logs_every_n_steps: int = 100):
-        super().__init__(save_dir, name="", version="", flush_logs_every_n_steps=flush_logs_every_n_steps)
+        super().__init__(
+            save_dir, name="", version="", flush_logs_every_n_steps=flush_logs_every_n_steps
+        )
 
     @property
     @rank_zero_experiment
@@ -67,7 +69,8 @@ class MetricsFile(CSVLogger):
 
 
 class Board(TensorBoardLogger):
-    """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has them.
+    """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has
+    them.
 
     Args:
         save_dir: the folder.
@@ -77,7 +80,9 @@ class Board(TensorBoardLogger):
         super().__init__(save_dir, name="", version="", default_hp_metric=False)
 
     def rewind(self, step: int) -> None:
-        """Let the board leave out what a broken run logged from a step on: a resumed one comes by again."""
+        """Let the board leave out what a broken run logged from a step on: a resumed one comes by
+        again.
+        """
         self._kwargs["purge_step"] = step
 
     def save(self) -> None:

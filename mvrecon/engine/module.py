@@ -18,15 +18,20 @@ from mvrecon.projectors.operator import Projector
 Settings = dict[str, Any]
 
 
-def build_projector(grid: Mapping[str, Any], camera: Mapping[str, Any], projector: Mapping[str, Any]) -> Projector:
+def build_projector(
+    grid: Mapping[str, Any], camera: Mapping[str, Any], projector: Mapping[str, Any]
+) -> Projector:
     """The projector of a grid (options of `Grid.centred`) and a rig (name and options)."""
-    return PROJECTORS.from_config(projector, grid=Grid.centred(**grid), cameras=CAMERAS.from_config(camera))
+    return PROJECTORS.from_config(
+        projector, grid=Grid.centred(**grid), cameras=CAMERAS.from_config(camera)
+    )
 
 
 class ReconstructionModule(L.LightningModule):
     """A model, its loss and its optimiser, all from plain dicts of names and numbers.
 
-    So a checkpoint loads with torch's defaults, and `load_from_checkpoint(path)` needs nothing else.
+    So a checkpoint loads with torch's defaults, and `load_from_checkpoint(path)` needs nothing
+    else.
 
     Args:
         geometry: `grid`, `camera` and `projector`.
@@ -36,7 +41,14 @@ class ReconstructionModule(L.LightningModule):
         data_range: value range of the volumes, in their unit.
     """
 
-    def __init__(self, geometry: Settings, model: Settings, loss: Settings, optimizer: Settings, data_range: float):
+    def __init__(
+        self,
+        geometry: Settings,
+        model: Settings,
+        loss: Settings,
+        optimizer: Settings,
+        data_range: float,
+    ):
         super().__init__()
         self.save_hyperparameters(logger=False)
         self.projector = build_projector(**geometry)
@@ -57,11 +69,18 @@ class ReconstructionModule(L.LightningModule):
         if not terms["total"].isfinite():
             shown = ", ".join(f"{name} {value.item():.4g}" for name, value in terms.items())
             raise FloatingPointError(
-                f"The loss of {self.hparams['model']['name']} is not finite at step {self.global_step}: {shown}. "
-                "Lower optimizer.lr, set trainer.gradient_clip_val, or look for bad values in the data"
+                f"The loss of {self.hparams['model']['name']} is not finite at step "
+                f"{self.global_step}: {shown}. "
+                "Lower optimizer.lr, set trainer.gradient_clip_val, or look for bad values in the "
+                "data"
             )
         for name, value in terms.items():
-            self.log(f"loss/{name}", value.detach(), prog_bar=name == "total", batch_size=len(batch["views"]))
+            self.log(
+                f"loss/{name}",
+                value.detach(),
+                prog_bar=name == "total",
+                batch_size=len(batch["views"]),
+            )
         return terms["total"]
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
@@ -70,7 +89,8 @@ class ReconstructionModule(L.LightningModule):
         terms = {f"loss_{name}": value for name, value in self.loss(out, batch).items()}
         predicted = self.projector(out.volume)
         figures = [
-            volume_metrics(volume, truth, inside, self.hparams["data_range"]) | view_metrics(view, measured)
+            volume_metrics(volume, truth, inside, self.hparams["data_range"])
+            | view_metrics(view, measured)
             for volume, truth, inside, view, measured in zip(
                 out.volume, batch["volume"], batch["inside"], predicted, batch["views"], strict=True
             )
@@ -81,9 +101,16 @@ class ReconstructionModule(L.LightningModule):
         return {"out": out}
 
     def configure_optimizers(self) -> Any:
-        """The optimiser, and its schedule over the whole number of steps, moved on at every step."""
+        """The optimiser, and its schedule over the whole number of steps, moved on at every
+        step.
+        """
         options = dict(self.hparams["optimizer"])
         schedule, warmup = options.pop("schedule", "cosine"), options.pop("warmup", 0.0)
         optimizer = build_optimizer((p for p in self.parameters() if p.requires_grad), **options)
-        scheduler = build_schedule(optimizer, schedule, self.trainer.estimated_stepping_batches, warmup)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+        scheduler = build_schedule(
+            optimizer, schedule, self.trainer.estimated_stepping_batches, warmup
+        )
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }

@@ -4,13 +4,22 @@ from typing import Any
 
 import lightning.pytorch as L
 from lightning.pytorch.callbacks import ProgressBar
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
 
 
 class StepProgress(ProgressBar):
-    """One line for each method in training: steps, time taken and left, loss, PSNR of the last validation."""
+    """One line for each method in training: steps, time taken and left, loss, PSNR of the last
+    validation.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -31,7 +40,9 @@ class StepProgress(ProgressBar):
             return
         figures = TextColumn("{task.fields[figures]}")
         times = (TimeElapsedColumn(), TimeRemainingColumn())
-        self._lines = Progress(TextColumn("{task.description}"), BarColumn(16), MofNCompleteColumn(), *times, figures)
+        self._lines = Progress(
+            TextColumn("{task.description}"), BarColumn(16), MofNCompleteColumn(), *times, figures
+        )
         name, total = pl_module.hparams["model"]["name"], trainer.estimated_stepping_batches
         self._lines.add_task(name, total=total, completed=trainer.global_step, figures="")
         self._lines.start()
@@ -40,9 +51,12 @@ class StepProgress(ProgressBar):
         """Move on by a step."""
         if self._lines is not None:
             shown = "  ".join(
-                f"{SHORT.get(name, name)} {value:.4g}" for name, value in trainer.progress_bar_metrics.items()
+                f"{SHORT.get(name, name)} {value:.4g}"
+                for name, value in trainer.progress_bar_metrics.items()
             )
-            self._lines.update(self._lines.task_ids[0], completed=trainer.global_step, figures=shown)
+            self._lines.update(
+                self._lines.task_ids[0], completed=trainer.global_step, figures=shown
+            )
 
     def on_train_end(self, *_: Any) -> None:
         """Leave the line as it is."""

@@ -1,4 +1,6 @@
-"""What a run folder tells: settings, versions and results, each file written whole or not at all."""
+"""What a run folder tells: settings, versions and results, each file written whole or not at
+all.
+"""
 
 import json
 import math
@@ -21,11 +23,16 @@ SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.
 def versions() -> dict[str, str]:
     """Versions of Python, of mvrecon and of what its numbers depend on.
 
-    Torch's is its own, which tells the build (2.13.0+cu130) that the package index leaves out (2.13.0).
+    Torch's is its own, which tells the build (2.13.0+cu130) that the package index leaves out
+    (2.13.0).
     """
     import torch
 
-    known = {"mvrecon": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    known = {
+        "mvrecon": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
     known["torch"] = str(torch.__version__)
     for name in PACKAGES:
         try:
@@ -54,14 +61,20 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def anchored(value: Any) -> Any:
-    """Settings with every `path` in them made absolute, so that they mean the same from any other folder."""
+    """Settings with every `path` in them made absolute, so that they mean the same from any other
+    folder.
+    """
     if isinstance(value, dict):
-        return {key: _absolute(item) if key == "path" else anchored(item) for key, item in value.items()}
+        return {
+            key: _absolute(item) if key == "path" else anchored(item) for key, item in value.items()
+        }
     return [anchored(item) for item in value] if isinstance(value, list) else value
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:
-    """Write `results.json` with the command and the versions; figures that are not finite become null."""
+    """Write `results.json` with the command and the versions; figures that are not finite become
+    null.
+    """
     whole = {**results, "command": sys.argv, "versions": versions()}
     write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
 

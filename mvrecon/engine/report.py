@@ -22,7 +22,9 @@ COLUMNS = {
 
 
 def table(found: Mapping[str, Any]) -> Table:
-    """The result table for a terminal: mean over the scenes, and the standard deviation below it."""
+    """The result table for a terminal: mean over the scenes, and the standard deviation below
+    it.
+    """
     title = f"{found['name']}: {_scenes(len(found['scenes']), found['seen_in_training'])}"
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     shown.add_column("method\n", no_wrap=True)
@@ -34,7 +36,9 @@ def table(found: Mapping[str, Any]) -> Table:
     for label, row in found["methods"].items():
         cells = [_cell(row[name], form) for name, (_, form) in COLUMNS.items()]
         seconds = f"{row['train_seconds']:.0f}" if row["train_steps"] else "-"
-        shown.add_row(label, f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds)
+        shown.add_row(
+            label, f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds
+        )
     return shown
 
 
@@ -56,4 +60,6 @@ def _scenes(count: int, overlap: list[str] | None) -> str:
 
 def _cell(figure: Mapping[str, Any], form: str) -> str:
     mean, spread = figure["mean"], figure["std"]
-    return form.format(mean) if math.isnan(spread) else f"{form.format(mean)}\n± {form.format(spread)}"
+    return (
+        form.format(mean) if math.isnan(spread) else f"{form.format(mean)}\n± {form.format(spread)}"
+    )

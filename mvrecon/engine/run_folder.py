@@ -1,4 +1,6 @@
-"""A folder that belongs to one run: locked while it is at work, with settings and measurements that do not change."""
+"""A folder that belongs to one run: locked while it is at work, with settings and measurements that
+do not change.
+"""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -16,13 +18,15 @@ from mvrecon.engine import record
 from mvrecon.limits import Refused, blaming, shown, text_of, yaml_of
 
 DIGESTS, RIG = "digests.json", "rig.json"
-#: What a folder without settings of its own must not hold: the work of a run that nobody could tell.
+#: What a folder without settings of its own must not hold: the work of a run that nobody could
+#: tell.
 WORK = (record.SETTINGS, record.RESULTS, "checkpoints", "cases")
 
 
 @contextmanager
 def taken(folder: Path, settings: Mapping[str, Any], file: str = record.SETTINGS) -> Iterator[None]:
-    """A run folder that is this process's meanwhile, new or with the very settings that it had; they are written down.
+    """A run folder that is this process's meanwhile, new or with the very settings that it had;
+    they are written down.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -44,11 +48,15 @@ def check(folder: Path, settings: Mapping[str, Any], file: str = record.SETTINGS
     remedy = "choose another folder by hydra.run.dir=..."
     if not (folder / file).is_file():
         if work := [name for name in WORK if (folder / name).exists()]:
-            raise FileExistsError(f"{folder} holds {', '.join(work)} of another run without its {file}; {remedy}")
+            raise FileExistsError(
+                f"{folder} holds {', '.join(work)} of another run without its {file}; {remedy}"
+            )
         return
     kept, plain = yaml_of(folder / file), yaml.safe_load(yaml.safe_dump(dict(settings)))
     if changed := differences(plain, kept):
-        raise ValueError(f"{folder} is the folder of a run with other settings: {'; '.join(changed)}; {remedy}")
+        raise ValueError(
+            f"{folder} is the folder of a run with other settings: {'; '.join(changed)}; {remedy}"
+        )
 
 
 def differences(got: Any, expected: Any, key: str = "") -> list[str]:
@@ -58,12 +66,17 @@ def differences(got: Any, expected: Any, key: str = "") -> list[str]:
     """
     if isinstance(got, Mapping) and isinstance(expected, Mapping):
         names = {f"{key}.{name}".lstrip("."): name for name in (*got, *expected)}
-        return [line for full, name in names.items() for line in differences(got.get(name), expected.get(name), full)]
+        return [
+            line
+            for full, name in names.items()
+            for line in differences(got.get(name), expected.get(name), full)
+        ]
     return [] if got == expected else [f"got {key}={shown(got)}, expected {shown(expected)}"]
 
 
 def keep_measurement(folder: Path, data: SceneData) -> None:
-    """Keep a run's rig, and the digests of its rig and its data files; or compare them with those kept before.
+    """Keep a run's rig, and the digests of its rig and its data files; or compare them with those
+    kept before.
 
     Raises:
         Refused: the rig or a file is not what the run began with.

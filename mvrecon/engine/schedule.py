@@ -21,8 +21,9 @@ SCHEDULES = ("cosine", "one_cycle", "constant")
 def share(name: str, step: int, steps: int, warmup: float) -> float:
     """The share of the highest learning rate at a step.
 
-    "cosine" and "constant" rise linearly over the first `warmup` of the steps, "one_cycle" along half a cosine from
-    1/25; "cosine" and "one_cycle" then fall to zero along half a cosine (Loshchilov & Hutter 2017; Smith & Topin 2019).
+    "cosine" and "constant" rise linearly over the first `warmup` of the steps, "one_cycle" along
+    half a cosine from 1/25; "cosine" and "one_cycle" then fall to zero along half a cosine
+    (Loshchilov & Hutter 2017; Smith & Topin 2019).
     """
     rise = warmup * steps
     if step < rise and name == "one_cycle":
@@ -34,7 +35,9 @@ def share(name: str, step: int, steps: int, warmup: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(1.0, steps - rise))))
 
 
-def build_optimizer(parameters: Iterable[Tensor], name: str, **options: Any) -> torch.optim.Optimizer:
+def build_optimizer(
+    parameters: Iterable[Tensor], name: str, **options: Any
+) -> torch.optim.Optimizer:
     """An optimiser of torch by its short name.
 
     Raises:
@@ -45,7 +48,9 @@ def build_optimizer(parameters: Iterable[Tensor], name: str, **options: Any) -> 
     return OPTIMIZERS[name](parameters, **options)
 
 
-def build_schedule(optimizer: torch.optim.Optimizer, name: str, steps: float, warmup: float = 0.0) -> LambdaLR:
+def build_schedule(
+    optimizer: torch.optim.Optimizer, name: str, steps: float, warmup: float = 0.0
+) -> LambdaLR:
     """A learning-rate schedule over a known number of optimiser steps; see `share`.
 
     Raises:
@@ -57,5 +62,7 @@ def build_schedule(optimizer: torch.optim.Optimizer, name: str, steps: float, wa
     if not 0 <= warmup < 1:
         raise ValueError(f"warmup must be a share of the steps in [0, 1), got {warmup}")
     if not 0 < steps < math.inf:
-        raise ValueError(f"A schedule needs to know the number of steps, got {steps}; set trainer.max_steps")
+        raise ValueError(
+            f"A schedule needs to know the number of steps, got {steps}; set trainer.max_steps"
+        )
     return LambdaLR(optimizer, lambda step: share(name, step, int(steps), warmup))

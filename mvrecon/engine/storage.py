@@ -1,7 +1,8 @@
-"""Checkpoint files that survive: put in place whole, with a checksum inside, and the one before kept beside it.
+"""Checkpoint files that survive: put in place whole, with a checksum inside, and the one before
+kept beside it.
 
-A file is what `torch.save` writes, a zip archive, with the SHA-256 of all before it as the archive's comment: other
-programs read it as they would without.
+A file is what `torch.save` writes, a zip archive, with the SHA-256 of all before it as the
+archive's comment: other programs read it as they would without.
 """
 
 import hashlib
@@ -33,7 +34,8 @@ class DamagedCheckpoint(Refused):
 class DurableCheckpoints(CheckpointIO):
     """How Lightning writes, reads and removes checkpoints of a run; see `write` and `read_newest`.
 
-    A checkpoint to go on from may tell Lightning of older ones, to be removed: none outside the run folder is.
+    A checkpoint to go on from may tell Lightning of older ones, to be removed: none outside the run
+    folder is.
 
     Args:
         folder: the run folder.
@@ -42,7 +44,9 @@ class DurableCheckpoints(CheckpointIO):
     def __init__(self, folder: Path):
         self.folder = folder
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
         """Write; see `write`.
 
         Raises:
@@ -50,7 +54,9 @@ class DurableCheckpoints(CheckpointIO):
         """
         write(inside(path, self.folder, "A checkpoint's path"), checkpoint)
 
-    def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None) -> dict[str, Any]:
+    def load_checkpoint(
+        self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None
+    ) -> dict[str, Any]:
         """Read; see `read_newest`. Nothing but plain values and tensors is ever read."""
         return read_newest(Path(path))
 
@@ -72,23 +78,31 @@ def not_finite(checkpoint: Mapping[str, Any]) -> list[str]:
     """The names of the weights, averaged or not, among which is an infinite number or none."""
     states = (checkpoint.get(key) or {} for key in ("state_dict", "current_model_state"))
     weights = (pair for state in states for pair in state.items())
-    return [name for name, value in weights if isinstance(value, Tensor) and not value.isfinite().all()]
+    return [
+        name for name, value in weights if isinstance(value, Tensor) and not value.isfinite().all()
+    ]
 
 
 def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
-    """Put a checkpoint on the disk under its name; the one that was there stays, as `previous(path)`.
+    """Put a checkpoint on the disk under its name; the one that was there stays, as
+    `previous(path)`.
 
     Whatever goes wrong, a full disk or a kill at any moment, one of the two is whole.
 
     Raises:
-        FloatingPointError: weights that are not finite, which must not take a good checkpoint's place.
+        FloatingPointError: weights that are not finite, which must not take a good checkpoint's
+            place.
         OSError: no space, no permission.
     """
     if bad := not_finite(checkpoint):
-        raise FloatingPointError(f"{path} is not written: {len(bad)} weights are not finite, {bad[0]} among them")
+        raise FloatingPointError(
+            f"{path} is not written: {len(bad)} weights are not finite, {bad[0]} among them"
+        )
     buffer = io.BytesIO()
     torch.save(dict(checkpoint), buffer)
-    buffer.seek(-2, io.SEEK_END)  # a zip archive ends with the length of its comment, and the comment
+    buffer.seek(
+        -2, io.SEEK_END
+    )  # a zip archive ends with the length of its comment, and the comment
     buffer.write(struct.pack("<H", COMMENT))
     buffer.write(TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
     with written_whole(path, previous(path)) as part:
@@ -96,7 +110,8 @@ def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """A checkpoint of plain values and tensors, checked; one without a checksum of ours is taken as it is.
+    """A checkpoint of plain values and tensors, checked; one without a checksum of ours is taken as
+    it is.
 
     Raises:
         DamagedCheckpoint: the checksum does not fit, or the file is cut short.
@@ -110,12 +125,17 @@ def read(path: Path) -> dict[str, Any]:
     with blaming(path, "is no checkpoint"):
         bad = not_finite(checkpoint)
     if bad:
-        raise Refused(f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them; expected numbers")
+        raise Refused(
+            f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them; expected "
+            f"numbers"
+        )
     return checkpoint
 
 
 def remove(path: Path) -> None:
-    """Remove a checkpoint and the one before it; then their folder, unless anything else is in it."""
+    """Remove a checkpoint and the one before it; then their folder, unless anything else is in
+    it.
+    """
     for file in (path, previous(path)):
         file.unlink(missing_ok=True)
     with suppress(OSError):
@@ -123,7 +143,8 @@ def remove(path: Path) -> None:
 
 
 def read_newest(path: Path) -> dict[str, Any]:
-    """The checkpoint at `path`, or, with a warning that names both, the one before it where that is damaged.
+    """The checkpoint at `path`, or, with a warning that names both, the one before it where that is
+    damaged.
 
     Raises:
         FileNotFoundError: neither is there.
@@ -136,7 +157,9 @@ def read_newest(path: Path) -> dict[str, Any]:
         if not before.exists():
             raise
         why = error if isinstance(error, DamagedCheckpoint) else f"{path} is missing"
-        warnings.warn(f"{why}; going on from the one before it, {before}", RuntimeWarning, stacklevel=2)
+        warnings.warn(
+            f"{why}; going on from the one before it, {before}", RuntimeWarning, stacklevel=2
+        )
         return read(before)
 
 
@@ -147,7 +170,9 @@ def _verify(path: Path, file: BinaryIO) -> None:
     if tail[-22:].startswith(b"PK\5\6"):  # an archive without a comment
         return
     if not tail.startswith(TAG):
-        raise DamagedCheckpoint(f"{path} is cut short or no checkpoint: {size} bytes, whose end is missing")
+        raise DamagedCheckpoint(
+            f"{path} is cut short or no checkpoint: {size} bytes, whose end is missing"
+        )
     file.seek(0)
     digest, left = hashlib.sha256(), size - COMMENT
     while block := file.read(min(left, 2**20)):

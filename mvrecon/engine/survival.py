@@ -1,4 +1,6 @@
-"""What a training needs to go on after a break as if there had been none, and what it says when it breaks off."""
+"""What a training needs to go on after a break as if there had been none, and what it says when it
+breaks off.
+"""
 
 import random
 from collections.abc import Iterator
@@ -16,7 +18,8 @@ from mvrecon.engine.storage import previous
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint to go on from: after every validation, every epoch without one, and at SIGTERM.
+    """Writes the checkpoint to go on from: after every validation, every epoch without one, and at
+    SIGTERM.
 
     Args:
         path: of the checkpoint; the one before stays beside it.
@@ -39,15 +42,19 @@ class KeepLast(Checkpoint):
             self._save(trainer)
 
     def _save(self, trainer: L.Trainer) -> None:
-        for logger in trainer.loggers:  # or what they hold back is lost, though the training does not come by again
+        for logger in (
+            trainer.loggers
+        ):  # or what they hold back is lost, though the training does not come by again
             logger.save()
         trainer.save_checkpoint(self.path)
 
 
 class AveragedWeights(EMAWeightAveraging):
-    """Lightning's exponential moving average of the weights, which also remembers the last epoch that it took in.
+    """Lightning's exponential moving average of the weights, which also remembers the last epoch
+    that it took in.
 
-    A checkpoint of an epoch's last step is from before that epoch's end, which Lightning does not come back to.
+    A checkpoint of an epoch's last step is from before that epoch's end, which Lightning does not
+    come back to.
     """
 
     def state_dict(self) -> dict[str, Any]:
@@ -69,7 +76,8 @@ class AveragedWeights(EMAWeightAveraging):
 
 
 class RandomNumbers(L.Callback):
-    """Takes the global random numbers of Python, NumPy and torch along in checkpoints: for layers that draw from them.
+    """Takes the global random numbers of Python, NumPy and torch along in checkpoints: for layers
+    that draw from them.
 
     Data, its order and its augmentation do not: they are pure functions of seed, epoch and index.
     """
@@ -85,7 +93,13 @@ class RandomNumbers(L.Callback):
         kind, keys, place, has, cached = np.random.get_state(legacy=True)
         return {
             "python": [version, torch.tensor(words), gauss],
-            "numpy": [kind, torch.tensor(np.asarray(keys, np.int64)), int(place), int(has), float(cached)],
+            "numpy": [
+                kind,
+                torch.tensor(np.asarray(keys, np.int64)),
+                int(place),
+                int(has),
+                float(cached),
+            ],
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         }
@@ -110,7 +124,8 @@ class RandomNumbers(L.Callback):
 
 @contextmanager
 def remembered(last: Path) -> Iterator[None]:
-    """Whatever breaks a training off also tells where its last good checkpoint is; SIGTERM ends with an error too.
+    """Whatever breaks a training off also tells where its last good checkpoint is; SIGTERM ends
+    with an error too.
 
     Raises:
         SystemExit: SIGTERM came. Lightning's own would end the process as if all had gone well.

@@ -1,6 +1,7 @@
 """Boxes of voxels: the part of a volume that has anything in it.
 
-Convention: bounds are in the order of the tensor's axes (z, y, x), the upper ones one behind the last voxel.
+Convention: bounds are in the order of the tensor's axes (z, y, x), the upper ones one behind the
+last voxel.
 """
 
 from collections.abc import Iterable, Sequence
@@ -38,7 +39,9 @@ class Box:
         found = [line.nonzero()[:, 0].tolist() for line in lines]
         if not found[0]:
             return cls((0, 0, 0), (0, 0, 0))
-        return cls(three([places[0] for places in found]), three([places[-1] + 1 for places in found]))
+        return cls(
+            three([places[0] for places in found]), three([places[-1] + 1 for places in found])
+        )
 
     @property
     def shape(self) -> Three:
@@ -58,19 +61,25 @@ class Box:
         return z, y, x
 
     def within(self, outer: "Box") -> tuple[slice, slice, slice]:
-        """What cuts it out of the part of a volume that another box, which holds it, has cut out."""
+        """What cuts it out of the part of a volume that another box, which holds it, has cut
+        out.
+        """
         ends = zip(self.low, self.high, outer.low, strict=True)
         z, y, x = (slice(low - start, high - start) for low, high, start in ends)
         return z, y, x
 
     def margins(self, outer: "Box") -> list[int]:
-        """Voxels between it and another box around it, as `torch.nn.functional.pad` wants them: x first."""
+        """Voxels between it and another box around it, as `torch.nn.functional.pad` wants them: x
+        first.
+        """
         ends = zip(self.low, self.high, outer.low, outer.high, strict=True)
         around = [(low - start, stop - high) for low, high, start, stop in ends]
         return [voxels for pair in reversed(around) for voxels in pair]
 
     def grown(self, voxels: int, shape: Sequence[int]) -> "Box":
-        """With so many voxels more on every side, as far as a volume of `shape` goes; an empty box stays empty."""
+        """With so many voxels more on every side, as far as a volume of `shape` goes; an empty box
+        stays empty.
+        """
         if not self.size:
             return self
         low = [max(0, each - voxels) for each in self.low]
@@ -80,7 +89,9 @@ class Box:
     def aligned(self, multiple: int, shape: Sequence[int]) -> "Box":
         """Grown to bounds that are multiples of a number, or the volume's own."""
         low = [each - each % multiple for each in self.low]
-        high = [min(int(n), each + -each % multiple) for each, n in zip(self.high, shape, strict=True)]
+        high = [
+            min(int(n), each + -each % multiple) for each, n in zip(self.high, shape, strict=True)
+        ]
         return Box(three(low), three(high))
 
     def joined(self, other: "Box") -> "Box":
@@ -92,7 +103,9 @@ class Box:
         return Box(three(low), three(high))
 
 
-def placed(part: Shaped[Tensor, "*b a e i"], box: Box, shape: Sequence[int]) -> Shaped[Tensor, "*b d h w"]:
+def placed(
+    part: Shaped[Tensor, "*b a e i"], box: Box, shape: Sequence[int]
+) -> Shaped[Tensor, "*b d h w"]:
     """The part of a volume of `shape` that lies in a box, with zeros around it."""
     return torch.nn.functional.pad(part, box.margins(Box.whole(shape)))
 

@@ -1,7 +1,8 @@
 """Camera frusta as grids of (depth, row, column), and the warps between a frustum and the world.
 
-A frustum's depth bins are slabs between two planes parallel to the detector. Their centres are equally spaced in z,
-or in the homogeneous factor k = f / z, whose uniform samples lie coarsely far from a central source.
+A frustum's depth bins are slabs between two planes parallel to the detector. Their centres are
+equally spaced in z, or in the homogeneous factor k = f / z, whose uniform samples lie coarsely far
+from a central source.
 
 Convention: frustum tensors are [.. d v u]; frustum indices are (u, v, d), integer at bin centres.
 """
@@ -15,7 +16,9 @@ from torch import Tensor
 Spacing = Literal["z", "k"]
 
 
-def depth_edges(z_range: Float[Tensor, "m 2"], count: int, spacing: Spacing = "z") -> Float[Tensor, "m e"]:
+def depth_edges(
+    z_range: Float[Tensor, "m 2"], count: int, spacing: Spacing = "z"
+) -> Float[Tensor, "m e"]:
     """The count + 1 planes that bound the depth bins of each camera, in mm.
 
     Raises:
@@ -28,12 +31,19 @@ def depth_edges(z_range: Float[Tensor, "m 2"], count: int, spacing: Spacing = "z
     if spacing == "z":
         return near + (far - near) * t
     if (near * far <= 0).any():
-        raise ValueError(f"Depths equally spaced in k = f/z need a range without z = 0, got {z_range.tolist()} mm")
+        raise ValueError(
+            f"Depths equally spaced in k = f/z need a range without z = 0, got {z_range.tolist()} "
+            f"mm"
+        )
     return 1 / (1 / near + (1 / far - 1 / near) * t)
 
 
-def depth_index(z: Float[Tensor, "m *n"], edges: Float[Tensor, "m e"], spacing: Spacing = "z") -> Float[Tensor, "m *n"]:
-    """Depth coordinate of z in mm: -1/2 at the first edge, integer at bin centres (in z, or in k)."""
+def depth_index(
+    z: Float[Tensor, "m *n"], edges: Float[Tensor, "m e"], spacing: Spacing = "z"
+) -> Float[Tensor, "m *n"]:
+    """Depth coordinate of z in mm: -1/2 at the first edge, integer at bin centres (in z, or in
+    k).
+    """
     pad = (len(edges),) + (1,) * (z.ndim - 1)
     near, far = edges[:, 0].reshape(pad), edges[:, -1].reshape(pad)
     count = edges.shape[1] - 1
@@ -52,7 +62,8 @@ def depth_centres(edges: Float[Tensor, "m e"], spacing: Spacing = "z") -> Float[
 
 
 def homography_jacobian(H: Float[Tensor, "*m 4 4"], w: Float[Tensor, "*m"]) -> Float[Tensor, "*m"]:
-    """Volume of frustum coordinates per mm^3 of world, |det H| / w^4, where w is the last row of H times (X, 1).
+    """Volume of frustum coordinates per mm^3 of world, |det H| / w^4, where w is the last row of H
+    times (X, 1).
 
     A density that is to keep its counts when it is warped is divided by it.
     """

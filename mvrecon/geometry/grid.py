@@ -1,7 +1,8 @@
 """Voxel and pixel grids. No other file makes one.
 
-Convention: a volume tensor is [b c d h w] = (z, y, x); points are (x, y, z) in mm. Voxel and pixel indices are
-integer at centres: pixel (0, 0) is centred at (0, 0), so the principal point of W columns is (W - 1) / 2.
+Convention: a volume tensor is [b c d h w] = (z, y, x); points are (x, y, z) in mm. Voxel and pixel
+indices are integer at centres: pixel (0, 0) is centred at (0, 0), so the principal point of W
+columns is (W - 1) / 2.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,8 @@ class Grid:
         affine: maps a voxel index (x, y, z, 1) to world mm, as in NIfTI; float64.
 
     Raises:
-        ValueError: an empty shape, or an affine that is not finite, not 4x4, left-handed or singular.
+        ValueError: an empty shape, or an affine that is not finite, not 4x4, left-handed or
+            singular.
     """
 
     shape: tuple[int, int, int]
@@ -37,7 +39,8 @@ class Grid:
         volume = torch.linalg.det(affine[:3, :3] / affine[:3, :3].norm(dim=0)).item()
         if not volume > 1e-6:
             raise ValueError(
-                f"A grid must be right-handed and not flat, got voxel axes with determinant {volume:.3g}; "
+                f"A grid must be right-handed and not flat, got voxel axes with determinant "
+                f"{volume:.3g}; "
                 "flip the volume along one axis and its affine with it"
             )
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
@@ -58,8 +61,8 @@ class Grid:
             centre: world position of the grid's centre in mm (x, y, z).
 
         Raises:
-            ValueError: a shape that is not three positive sizes, a spacing that is not positive and finite, or a centre
-                that is not finite.
+            ValueError: a shape that is not three positive sizes, a spacing that is not positive and
+                finite, or a centre that is not finite.
         """
         _check_shape(shape)
         steps = torch.as_tensor(spacing, dtype=torch.float64).expand(3).clone()
@@ -101,7 +104,9 @@ class Grid:
     def corners(self) -> Float[Tensor, "8 3"]:
         """World positions of the outer corners of the grid's box, in mm."""
         sizes = torch.tensor(self.shape[::-1], dtype=torch.float64)
-        ends = torch.cartesian_prod(*[torch.tensor([-0.5, n - 0.5], dtype=torch.float64) for n in sizes.tolist()])
+        ends = torch.cartesian_prod(
+            *[torch.tensor([-0.5, n - 0.5], dtype=torch.float64) for n in sizes.tolist()]
+        )
         return self.to_world(ends)
 
     def cropped(self, box: Box) -> "Grid":
@@ -110,9 +115,13 @@ class Grid:
         Raises:
             ValueError: a box that is empty or not inside the grid.
         """
-        inside = all(0 <= low < high <= n for low, high, n in zip(box.low, box.high, self.shape, strict=True))
+        inside = all(
+            0 <= low < high <= n for low, high, n in zip(box.low, box.high, self.shape, strict=True)
+        )
         if not inside:
-            raise ValueError(f"A grid of {self.shape} voxels cannot be cropped to {box.low} .. {box.high}")
+            raise ValueError(
+                f"A grid of {self.shape} voxels cannot be cropped to {box.low} .. {box.high}"
+            )
         affine = self.affine.clone()
         affine[:3, 3] = self.to_world(torch.tensor(box.low[::-1], dtype=torch.float64))
         return Grid(box.shape, affine)
@@ -128,7 +137,9 @@ class Grid:
 
 def _check_shape(shape: Sequence[int]) -> None:
     if len(shape) != 3 or min(shape) < 1:
-        raise ValueError(f"A grid's shape must be three positive sizes (z, y, x), got {tuple(shape)}")
+        raise ValueError(
+            f"A grid's shape must be three positive sizes (z, y, x), got {tuple(shape)}"
+        )
 
 
 def voxel_centres(grid: Grid, dtype: torch.dtype = torch.float64) -> Float[Tensor, "d h w 3"]:
@@ -138,7 +149,11 @@ def voxel_centres(grid: Grid, dtype: torch.dtype = torch.float64) -> Float[Tenso
     return grid.to_world(torch.stack([x, y, z], dim=-1)).to(dtype)
 
 
-def pixel_centres(shape: Sequence[int], dtype: torch.dtype = torch.float64) -> Float[Tensor, "v u 2"]:
-    """Pixel coordinates (u, v) = (column, row) of every pixel's centre of a detector of `shape` (rows, columns)."""
+def pixel_centres(
+    shape: Sequence[int], dtype: torch.dtype = torch.float64
+) -> Float[Tensor, "v u 2"]:
+    """Pixel coordinates (u, v) = (column, row) of every pixel's centre of a detector of `shape`
+    (rows, columns).
+    """
     v, u = torch.meshgrid(*[torch.arange(n, dtype=dtype) for n in shape], indexing="ij")
     return torch.stack([u, v], dim=-1)

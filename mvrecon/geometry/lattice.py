@@ -1,10 +1,13 @@
-"""Where the samples of volumes lie, a world grid's and frusta's alike, and the maps from one lattice into another.
+"""Where the samples of volumes lie, a world grid's and frusta's alike, and the maps from one
+lattice into another.
 
-An index (i, j, k), counted from the volume's centre, is lifted to (i s, j s, k, 1) with s = a + b k. For each lattice
-one choice of (a, b) makes space and lifted index a homography of each other: s = 1 for a world grid, for parallel beams
-with depths equally spaced in z, and for a central frustum with depths equally spaced in f/z; s in proportion to z for a
-central frustum with depths equally spaced in z, and to 1/z for parallel beams with depths equally spaced in f/z. So is
-every map between two lattices (projective coordinates: Hartley & Zisserman, Multiple View Geometry, ch. 2 and 3).
+An index (i, j, k), counted from the volume's centre, is lifted to (i s, j s, k, 1) with s = a + b
+k. For each lattice one choice of (a, b) makes space and lifted index a homography of each other: s
+= 1 for a world grid, for parallel beams with depths equally spaced in z, and for a central frustum
+with depths equally spaced in f/z; s in proportion to z for a central frustum with depths equally
+spaced in z, and to 1/z for parallel beams with depths equally spaced in f/z. So is every map
+between two lattices (projective coordinates: Hartley & Zisserman, Multiple View Geometry, ch. 2 and
+3).
 """
 
 from dataclasses import dataclass
@@ -15,8 +18,9 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 
-#: What turns an index into a place in another lattice: numerators of the three axes, denominator of the first two,
-#: denominator of the third; each a bilinear function (c_i i + c_j j + c) + k (c_ik i + c_jk j + c_k) of the index.
+#: What turns an index into a place in another lattice: numerators of the three axes, denominator of
+#: the first two, denominator of the third; each a bilinear function (c_i i + c_j j + c) + k (c_ik i
+#: + c_jk j + c_k) of the index.
 NUMERATORS, ACROSS, DEPTH = slice(0, 3), 3, 4
 #: Of half a box: a sample so little outside of a face lies on it, but for rounding.
 FACE = 1e-9
@@ -28,8 +32,8 @@ class Lattice:
 
     Args:
         shape: samples along the tensor's axes (k, j, i).
-        matrix: from space, in voxels of one grid about its centre, to lifted indices; denominators are positive on the
-            side of the source that counts.
+        matrix: from space, in voxels of one grid about its centre, to lifted indices; denominators
+            are positive on the side of the source that counts.
         lift: (a, b) of s = a + b k.
     """
 
@@ -53,23 +57,30 @@ def centred_affine(grid: Grid) -> Float[Tensor, "4 4"]:
 
 def grid_lattice(grid: Grid) -> Lattice:
     """The voxels of the grid by which space is measured."""
-    return Lattice(grid.shape, torch.eye(4).to(grid.affine)[None], grid.affine.new_tensor([[1.0, 0.0]]))
+    return Lattice(
+        grid.shape, torch.eye(4).to(grid.affine)[None], grid.affine.new_tensor([[1.0, 0.0]])
+    )
 
 
 def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:
-    """Where each sample of every lattice of `to` lies in every lattice of `of`; rows NUMERATORS, ACROSS and DEPTH.
+    """Where each sample of every lattice of `to` lies in every lattice of `of`; rows NUMERATORS,
+    ACROSS and DEPTH.
 
-    A volume on `of` warped by them is the same field on `to`. All pairs: frusta to one grid [m 1 ..], one grid to
-    frusta [1 m ..], frusta to frusta [m m ..].
+    A volume on `of` warped by them is the same field on `to`. All pairs: frusta to one grid [m 1
+    ..], one grid to frusta [1 m ..], frusta to frusta [m m ..].
     """
     H = of.matrix[:, None] @ torch.linalg.inv(to.matrix)[None]
     return lifted_maps(H, of.lift[:, None], to.lift[None])
 
 
 def lifted_maps(
-    H: Float[Tensor, "*n 4 4"], of: Float[Tensor, "*#n 2"] | None = None, to: Float[Tensor, "*#n 2"] | None = None
+    H: Float[Tensor, "*n 4 4"],
+    of: Float[Tensor, "*#n 2"] | None = None,
+    to: Float[Tensor, "*#n 2"] | None = None,
 ) -> Float[Tensor, "*n 5 2 3"]:
-    """The maps of a homography between lifted indices; without lifts H relates the centred indices themselves."""
+    """The maps of a homography between lifted indices; without lifts H relates the centred indices
+    themselves.
+    """
     plain = H.new_tensor([1.0, 0.0])
     of, to = plain if of is None else of, plain if to is None else to
     across = of[..., :1] * H[..., 3, :] + of[..., 1:] * H[..., 2, :]
@@ -80,15 +91,21 @@ def lifted_maps(
     return torch.stack([fixed, growing], dim=-2)
 
 
-def spread_map(maps: Float[Tensor, "*n r 2 3"], shape: tuple[int, int, int]) -> Float[Tensor, "*n d h w r"]:
+def spread_map(
+    maps: Float[Tensor, "*n r 2 3"], shape: tuple[int, int, int]
+) -> Float[Tensor, "*n d h w r"]:
     """The values of bilinear maps at the centred indices of all samples of a volume of `shape`."""
     planes, j, i = _planes(maps, shape)
     x, y, one = planes[..., None, None, :].unbind(dim=-1)
     return (x * i + y * j[:, None] + one).movedim(-4, -1)
 
 
-def _planes(maps: Tensor, shape: tuple[int, int, int]) -> tuple[Float[Tensor, "*n r d 3"], Tensor, Tensor]:
-    """Bilinear maps on each plane k, where they are x i + y j + one, and the centred indices j and i."""
+def _planes(
+    maps: Tensor, shape: tuple[int, int, int]
+) -> tuple[Float[Tensor, "*n r d 3"], Tensor, Tensor]:
+    """Bilinear maps on each plane k, where they are x i + y j + one, and the centred indices j and
+    i.
+    """
     k, j, i = (torch.arange(n, dtype=maps.dtype, device=maps.device) - (n - 1) / 2 for n in shape)
     return maps[..., 0, None, :] + k[:, None] * maps[..., 1, None, :], j, i
 
@@ -96,7 +113,8 @@ def _planes(maps: Tensor, shape: tuple[int, int, int]) -> tuple[Float[Tensor, "*
 def places(
     maps: Float[Tensor, "*n 5 2 3"], shape: tuple[int, int, int]
 ) -> tuple[Float[Tensor, "*n d h w 3"], Bool[Tensor, "*n d h w"]]:
-    """Centred indices in the source lattice of all samples of an output of `shape`, and which of them count.
+    """Centred indices in the source lattice of all samples of an output of `shape`, and which of
+    them count.
 
     Samples behind the plane of a source do not count; their place means nothing.
     """
@@ -109,14 +127,18 @@ def places(
 def enclosed(
     maps: Float[Tensor, "*n 5 2 3"], source: tuple[int, int, int], shape: tuple[int, int, int]
 ) -> Bool[Tensor, "*n d h w"]:
-    """Which samples of an output of `shape` lie in the source lattice's box, ahead of its source; its faces count.
+    """Which samples of an output of `shape` lie in the source lattice's box, ahead of its source;
+    its faces count.
 
-    Every face is a half-space, which cuts a row of samples at one place: no sample's own place is worked out.
+    Every face is a half-space, which cuts a row of samples at one place: no sample's own place is
+    worked out.
     """
     planes, j, i = _planes(maps, shape)
     half = maps.new_tensor(source[::-1])[:, None, None] / 2 * (1 + FACE)
     top, under = planes[..., NUMERATORS, :, :], planes[..., [ACROSS, ACROSS, DEPTH], :, :] * half
-    x, y, one = torch.cat([under - top, under + top], dim=-3).unbind(dim=-1)  # [*n 6 d], positive within
+    x, y, one = torch.cat([under - top, under + top], dim=-3).unbind(
+        dim=-1
+    )  # [*n 6 d], positive within
     rest = y[..., None] * j + one[..., None]
     x = x[..., None].expand_as(rest)
     cut, never = -rest / x, torch.where(rest > 0, -torch.inf, torch.inf)

@@ -1,4 +1,6 @@
-"""Rigid motions X -> R X + t of the world: rotations from Euler angles, random rotations, inverses, look-at."""
+"""Rigid motions X -> R X + t of the world: rotations from Euler angles, random rotations, inverses,
+look-at.
+"""
 
 import math
 from collections.abc import Sequence
@@ -13,8 +15,9 @@ def euler_rotation(
 ) -> Float[Tensor, "*n 3 3"]:
     """Rotation by three Euler angles in degrees, in float64.
 
-    Convention: R = R_a(first) R_b(second) R_c(third) for axes "abc": intrinsic turns from left to right, equal to
-    extrinsic turns from right to left. The default "zyz" is R_z(phi) R_y(theta) R_z(psi); each turn is right-handed.
+    Convention: R = R_a(first) R_b(second) R_c(third) for axes "abc": intrinsic turns from left to
+    right, equal to extrinsic turns from right to left. The default "zyz" is R_z(phi) R_y(theta)
+    R_z(psi); each turn is right-handed.
 
     Raises:
         ValueError: not three angles, or axes that are not three of x, y, z.
@@ -23,28 +26,39 @@ def euler_rotation(
 
     angles = torch.as_tensor(degrees, dtype=torch.float64)
     if angles.ndim < 1 or angles.shape[-1] != 3:
-        raise ValueError(f"Euler angles must be three degrees [.. 3], got shape {tuple(angles.shape)}")
+        raise ValueError(
+            f"Euler angles must be three degrees [.. 3], got shape {tuple(angles.shape)}"
+        )
     if len(axes) != 3 or not set(axes) <= set("xyz"):
         raise ValueError(f"Euler axes must be three letters of 'xyz', such as 'zyz', got {axes!r}")
     unit = torch.eye(3, dtype=torch.float64)[["xyz".index(a) for a in axes]]
-    first, second, third = axis_angle_to_rotation_matrix(torch.deg2rad(angles)[..., None] * unit).unbind(-3)
+    first, second, third = axis_angle_to_rotation_matrix(
+        torch.deg2rad(angles)[..., None] * unit
+    ).unbind(-3)
     return first @ second @ third
 
 
-def random_rotation(generator: torch.Generator, count: int | None = None) -> Float[Tensor, "*n 3 3"]:
+def random_rotation(
+    generator: torch.Generator, count: int | None = None
+) -> Float[Tensor, "*n 3 3"]:
     """Rotations uniform on SO(3) (Haar measure), in float64: one [3 3], or [count 3 3].
 
-    A 4-D normal vector, made unit length, is a uniform quaternion (Shoemake, Graphics Gems III, 1992).
+    A 4-D normal vector, made unit length, is a uniform quaternion (Shoemake, Graphics Gems III,
+    1992).
     """
     from kornia.geometry.conversions import quaternion_to_rotation_matrix  # slow to import
 
     shape = (4,) if count is None else (count, 4)
-    return quaternion_to_rotation_matrix(torch.randn(shape, generator=generator, dtype=torch.float64))
+    return quaternion_to_rotation_matrix(
+        torch.randn(shape, generator=generator, dtype=torch.float64)
+    )
 
 
 def random_in_ball(generator: torch.Generator, radius: float = 1.0) -> Float[Tensor, "3"]:
     """A point uniform in the ball of a radius about the origin, in float64."""
-    direction = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    direction = torch.nn.functional.normalize(
+        torch.randn(3, generator=generator, dtype=torch.float64), dim=0
+    )
     return direction * radius * torch.rand((), generator=generator, dtype=torch.float64) ** (1 / 3)
 
 
@@ -56,7 +70,9 @@ def inverse(
 
 
 def unit(vectors: Float[Tensor, "*n"], dim: int = -1) -> Float[Tensor, "*n"]:
-    """Vectors made one long; however short they are, where torch leaves those below 1e-12 short. Zero stays zero."""
+    """Vectors made one long; however short they are, where torch leaves those below 1e-12 short.
+    Zero stays zero.
+    """
     return torch.nn.functional.normalize(vectors, dim=dim, eps=torch.finfo(vectors.dtype).tiny)
 
 
@@ -64,12 +80,15 @@ def check_rotation(R: Float[Tensor, "*n 3 3"]) -> None:
     """The door for rotations.
 
     Raises:
-        ValueError: R R^T is further than 1e-5 from 1 (float32's rounding is not), or det R is not +1.
+        ValueError: R R^T is further than 1e-5 from 1 (float32's rounding is not), or det R is not
+            +1.
     """
     off = (R.detach() @ R.detach().mT - torch.eye(3).to(R)).abs().amax()
     if not (off < 1e-5 and (torch.linalg.det(R.detach()) > 0).all()):
         what = "one is left-handed" if off < 1e-5 else f"R R^T is off by {off:.2g}"
-        raise ValueError(f"R must be rotations, with R R^T = 1 and det R = +1, but {what}, got {R.tolist()}")
+        raise ValueError(
+            f"R must be rotations, with R R^T = 1 and det R = +1, but {what}, got {R.tolist()}"
+        )
 
 
 def look_at(
@@ -77,10 +96,12 @@ def look_at(
     target: Float[Tensor, "*n 3"],
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> Float[Tensor, "*n 3 3"]:
-    """World-to-camera rotation of a camera at `source` that looks at `target`, `up` being upwards in its image.
+    """World-to-camera rotation of a camera at `source` that looks at `target`, `up` being upwards
+    in its image.
 
-    Convention: as OpenCV, the rows are the camera's axes in the world: x to the right, y downwards, z forward. Where
-    `up` is the line of sight itself, the world axis most across the line of sight takes its place.
+    Convention: as OpenCV, the rows are the camera's axes in the world: x to the right, y downwards,
+    z forward. Where `up` is the line of sight itself, the world axis most across the line of sight
+    takes its place.
 
     Raises:
         ValueError: the camera is at its target, or one of the three is not finite.
@@ -97,7 +118,9 @@ def look_at(
     if not vertical.isfinite().all():
         raise ValueError(f"A camera's up must be finite, got {up}")
     across = torch.eye(3).to(forward)[forward.abs().argmin(dim=-1)]
-    along = torch.linalg.cross(forward, vertical).norm(dim=-1, keepdim=True) < math.sqrt(torch.finfo(forward.dtype).eps)
+    along = torch.linalg.cross(forward, vertical).norm(dim=-1, keepdim=True) < math.sqrt(
+        torch.finfo(forward.dtype).eps
+    )
     right = torch.linalg.cross(forward, torch.where(along, across, vertical))
     # close to the line of sight `up` leaves `right` few digits: it is squared with the other two
     down = unit(torch.linalg.cross(forward, unit(right)))

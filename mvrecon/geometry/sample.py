@@ -1,7 +1,9 @@
-"""Trilinear sampling. The only caller of `grid_sample`: axis order and corner alignment are settled here.
+"""Trilinear sampling. The only caller of `grid_sample`: axis order and corner alignment are settled
+here.
 
-Convention: coordinates are voxel indices in the order (x, y, z) = (last, middle, first axis of the tensor), integer at
-voxel centres. Outside the outermost centres the values fade to zero over one voxel.
+Convention: coordinates are voxel indices in the order (x, y, z) = (last, middle, first axis of the
+tensor), integer at voxel centres. Outside the outermost centres the values fade to zero over one
+voxel.
 """
 
 from itertools import product
@@ -13,16 +15,21 @@ from torch import Tensor
 
 
 def normalised(index: Float[Tensor, "*n 3"], shape: tuple[int, int, int]) -> Float[Tensor, "*n 3"]:
-    """Voxel indices as `grid_sample` wants them; points that are not finite or far outside land safely outside."""
+    """Voxel indices as `grid_sample` wants them; points that are not finite or far outside land
+    safely outside.
+    """
     sizes = torch.tensor(shape[::-1], dtype=index.dtype, device=index.device)
     scaled = (2 * index + 1) / sizes - 1
     return torch.where(scaled.isfinite(), scaled, 4.0).clamp(-4.0, 4.0)
 
 
-def sample(volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"]) -> Float[Tensor, "b c k v u"]:
+def sample(
+    volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"]
+) -> Float[Tensor, "b c k v u"]:
     """Values of volumes at normalised points (from `normalised`), zero outside.
 
-    Order of accuracy: second in the voxel size. Coordinates stay float32 or wider whatever the volume's dtype.
+    Order of accuracy: second in the voxel size. Coordinates stay float32 or wider whatever the
+    volume's dtype.
     """
     if points.dtype != volume.dtype:
         return sample(volume.to(points.dtype), points).to(volume.dtype)
@@ -31,8 +38,12 @@ def sample(volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"
     return F.grid_sample(volume, points, align_corners=False)
 
 
-def gathered(volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"]) -> Float[Tensor, "b c k v u"]:
-    """What `grid_sample` gives, whose derivative on a GPU adds up in no fixed order; that of `gather` can."""
+def gathered(
+    volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"]
+) -> Float[Tensor, "b c k v u"]:
+    """What `grid_sample` gives, whose derivative on a GPU adds up in no fixed order; that of
+    `gather` can.
+    """
     sizes = torch.tensor(volume.shape[:1:-1], device=points.device)
     places = ((points + 1) * sizes - 1) / 2
     low, flat = places.detach().floor(), volume.flatten(2)
@@ -41,7 +52,9 @@ def gathered(volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 
         at = (low + low.new_tensor(corner)).long()
         held = ((at >= 0) & (at < sizes)).all(dim=-1)
         x, y, z = at.where(held[..., None], 0).unbind(dim=-1)
-        index = ((z * sizes[1] + y) * sizes[0] + x).flatten(1)[:, None].expand(-1, flat.shape[1], -1)
+        index = (
+            ((z * sizes[1] + y) * sizes[0] + x).flatten(1)[:, None].expand(-1, flat.shape[1], -1)
+        )
         along_x, along_y, along_z = (1 - (places - at).abs()).unbind(dim=-1)
         share = along_x * along_y * along_z * held
         found = found + flat.gather(2, index).unflatten(2, held.shape[1:]) * share[:, None]

@@ -19,17 +19,21 @@ def wide(tensor: Tensor) -> Tensor:
 
 
 def forwards(*tensors: Tensor) -> bool:
-    """Whether a derivative forwards is asked for, by `torch.func.jvp`: compiled operators would drop it in silence."""
+    """Whether a derivative forwards is asked for, by `torch.func.jvp`: compiled operators would
+    drop it in silence.
+    """
     return any(unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
-def kernels_for(tensor: Tensor, backend: str, method: str | None = None, *geometry: Tensor) -> tuple[str, ModuleType]:
+def kernels_for(
+    tensor: Tensor, backend: str, method: str | None = None, *geometry: Tensor
+) -> tuple[str, ModuleType]:
     """The back end's name and its functions along rays, for volumes or views [b c ..].
 
     Args:
         tensor: what is to be projected or back-projected.
-        backend: "auto" takes the compiled one of the tensor's device where that can be had, else the reference, which
-            alone has derivatives forwards.
+        backend: "auto" takes the compiled one of the tensor's device where that can be had, else
+            the reference, which alone has derivatives forwards.
         method: of the rays; without it, the name alone tells, and a GPU has none but the reference.
         geometry: what else may carry a derivative.
 
@@ -44,20 +48,27 @@ def kernels_for(tensor: Tensor, backend: str, method: str | None = None, *geomet
     if backend in ("cpu", "cuda") and here != backend:
         memory = "main memory" if backend == "cpu" else "a GPU's memory"
         raise ValueError(
-            f"backend {backend!r} needs tensors in {memory}, got {tensor.device}; use 'auto' or 'reference'"
+            f"backend {backend!r} needs tensors in {memory}, got {tensor.device}; use 'auto' or "
+            f"'reference'"
         )
     if backend == "reference" or not COMPILED:
         return "reference", reference
     if forwards(tensor, *geometry):
         if backend != "auto":
-            raise NotImplementedError(f"backend {backend!r} has no derivatives forwards; use 'auto' or 'reference'")
+            raise NotImplementedError(
+                f"backend {backend!r} has no derivatives forwards; use 'auto' or 'reference'"
+            )
         return "reference", reference
     if here == "cuda":
-        from mvrecon.kernels.rays import selfcheck  # it brings torch's compiler, which takes longer than torch
+        from mvrecon.kernels.rays import (
+            selfcheck,
+        )  # it brings torch's compiler, which takes longer than torch
 
         volumes = tensor.shape[0] * tensor.shape[1]
         why = (
-            selfcheck.reason(tensor.device, method, tensor.dtype, volumes) if method else "only rays have kernels there"
+            selfcheck.reason(tensor.device, method, tensor.dtype, volumes)
+            if method
+            else "only rays have kernels there"
         )
         if why and backend == "cuda":
             raise RuntimeError(f"backend 'cuda' cannot be used on {tensor.device}: {why}")

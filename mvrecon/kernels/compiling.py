@@ -1,4 +1,6 @@
-"""How functions become machine code: at the first call for a type of number, and kept on disk for the next process."""
+"""How functions become machine code: at the first call for a type of number, and kept on disk for
+the next process.
+"""
 
 from collections.abc import Callable
 from hashlib import sha256
@@ -17,13 +19,16 @@ OPTIONS: dict[str, Any] = {"fastmath": FASTMATH, "error_model": "numpy", "_nrt":
 def scalar(function: Callable[..., Any]) -> Any:
     """A function of scalars, compiled into whatever calls it, on the CPU and on CUDA devices."""
     dispatcher: Any = njit(forceinline=True, **OPTIONS)(function)
-    # read by numba-cuda alone: it would take some flags of fast mathematics for all, reciprocals for divisions too
+    # read by numba-cuda alone: it would take some flags of fast mathematics for all, reciprocals
+    # for divisions too
     dispatcher.targetoptions = {"forceinline": True}
     return dispatcher
 
 
 def ordered(function: Callable[..., Any]) -> Any:
-    """A function of scalars whose sums and products are taken as they are written, in no other order."""
+    """A function of scalars whose sums and products are taken as they are written, in no other
+    order.
+    """
     options: dict[str, Any] = {**OPTIONS, "fastmath": FASTMATH - {"reassoc"}}
     return njit(forceinline=True, **options)(function)
 
@@ -43,7 +48,9 @@ def compiled(loop: Callable[..., Any]) -> Any:
         dispatcher: Any = njit(cache=True, **options)(loop)
     except RuntimeError:  # numba finds no folder to write to
         return njit(**options)(loop)
-    if dispatcher is not loop:  # numba may be told to compile nothing, as under its simulator of CUDA
+    if (
+        dispatcher is not loop
+    ):  # numba may be told to compile nothing, as under its simulator of CUDA
         # numba's own stamp sees edits of this file only, not of the functions that the loops call
         dispatcher._cache._cache_file._source_stamp = SOURCES
     return dispatcher

@@ -12,7 +12,10 @@ def face(flat, across):
 @scalar
 def bilinear(face, k, x, y):
     """The value in cell k."""
-    near, far = face[0][k] + x * (face[1][k] - face[0][k]), face[2][k] + x * (face[3][k] - face[2][k])
+    near, far = (
+        face[0][k] + x * (face[1][k] - face[0][k]),
+        face[2][k] + x * (face[3][k] - face[2][k]),
+    )
     return near + y * (far - near)
 
 

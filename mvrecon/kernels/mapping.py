@@ -9,7 +9,9 @@ Mapped = Callable[..., tuple[Tensor, int]]
 
 
 def batched(operator: Callable[..., Tensor]) -> Mapped:
-    """How `torch.func.vmap` maps operator(values, geometry, ..): values join its batch, geometries are looped over."""
+    """How `torch.func.vmap` maps operator(values, geometry, ..): values join its batch, geometries
+    are looped over.
+    """
 
     def mapped(info, in_dims, values, geometry, *rest):
         where, of_geometry = in_dims[:2]
@@ -31,13 +33,17 @@ def looped(operator: Callable[..., Tensor], tensors: int) -> Mapped:
             given.unbind(dim) if dim is not None else [given] * info.batch_size
             for given, dim in zip(inputs[:tensors], in_dims, strict=False)
         ]
-        return torch.stack([operator(*one, *inputs[tensors:]) for one in zip(*each, strict=True)]), 0
+        return torch.stack(
+            [operator(*one, *inputs[tensors:]) for one in zip(*each, strict=True)]
+        ), 0
 
     return mapped
 
 
 def joined(operator: Callable[..., Tensor]) -> Callable[..., tuple[Tensor, None]]:
-    """How `torch.func.vmap` maps what is asked of all volumes at once, for the first of the geometries."""
+    """How `torch.func.vmap` maps what is asked of all volumes at once, for the first of the
+    geometries.
+    """
 
     def mapped(info, in_dims, values, geometry, *rest):
         where, of_geometry = in_dims[:2]

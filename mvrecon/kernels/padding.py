@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-#: Samples of nothing before and behind along every axis: a cell that just misses, and one more for rounding.
+#: Samples of nothing before and behind along every axis: a cell that just misses, and one more for
+#: rounding.
 PAD = (1, 2)
 #: What lies inside the border, along one axis.
 INNER = slice(PAD[0], -PAD[1])
-#: What a thread works in, since compiled loops make no arrays: per position of a row a flat index and three weights;
-#: and what it gathers for itself.
+#: What a thread works in, since compiled loops make no arrays: per position of a row a flat index
+#: and three weights; and what it gathers for itself.
 Room = namedtuple("Room", ["at", "weight", "own"])
 
 
@@ -24,7 +25,9 @@ def steps(shape: Sequence[int]) -> np.ndarray:
     """Flat steps of the padded array along (x, y, ..), as 32-bit integers where they do."""
     sizes = padded_shape(shape)
     kind = np.int64 if math.prod(sizes) >= 2**31 else np.int32
-    return np.array([math.prod(sizes[axis + 1 :]) for axis in reversed(range(len(sizes)))], dtype=kind)
+    return np.array(
+        [math.prod(sizes[axis + 1 :]) for axis in reversed(range(len(sizes)))], dtype=kind
+    )
 
 
 def padded(values: np.ndarray, axes: int) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""One row of an output lattice in a source lattice: where it enters and leaves it, for every kernel driven by voxels.
+"""One row of an output lattice in a source lattice: where it enters and leaves it, for every kernel
+driven by voxels.
 
-Numerators and denominators of a row's places are affine in the position i along it, so that the part of the row inside
-the source's box is an interval, cut out by linear inequalities, and no later loop tests a bound. Scalar, without a
-CPU's own, so that a GPU back end can compile the same source.
+Numerators and denominators of a row's places are affine in the position i along it, so that the
+part of the row inside the source's box is an interval, cut out by linear inequalities, and no later
+loop tests a bound. Scalar, without a CPU's own, so that a GPU back end can compile the same source.
 """
 
 from math import ceil, floor
@@ -15,7 +16,9 @@ LEAST = 1e-200
 
 @scalar
 def affine(line, j, k):
-    """Value and slope along i of a bilinear map [2 3] on the row (j, k), all counted from the lattice's centre."""
+    """Value and slope along i of a bilinear map [2 3] on the row (j, k), all counted from the
+    lattice's centre.
+    """
     slope = line[0, 0] + k * line[1, 0]
     return (line[0, 1] + k * line[1, 1]) * j + (line[0, 2] + k * line[1, 2]), slope
 
@@ -39,7 +42,9 @@ def between(top, under, low, high, part):
 
 @scalar
 def whole(part, half, count):
-    """The first position of a row of `count`, whose centre is at `half`, inside an interval, and the one behind."""
+    """The first position of a row of `count`, whose centre is at `half`, inside an interval, and
+    the one behind.
+    """
     if part[0] > part[1]:
         return 0, 0
     return max(0, int(ceil(part[0] + half))), min(count, int(floor(part[1] + half)) + 1)
@@ -53,5 +58,7 @@ def over(under, i):
 
 @scalar
 def cell(top, inverse, i, border, size):
-    """The padded coordinate of a sample along one axis; held in the border should rounding carry it out."""
+    """The padded coordinate of a sample along one axis; held in the border should rounding carry it
+    out.
+    """
     return min(max((top[0] + i * top[1]) * inverse + border, 0.0), size + 1.0)

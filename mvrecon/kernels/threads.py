@@ -1,6 +1,7 @@
 """A thread pool of torch's size for loops that hold no lock of the interpreter.
 
-numba's own `parallel=True` aborts under concurrent calls, and its OpenMP layer does not survive a fork.
+numba's own `parallel=True` aborts under concurrent calls, and its OpenMP layer does not survive a
+fork.
 """
 
 import os
@@ -19,12 +20,13 @@ _threads: int | None = None  # of the compiled loops, where torch has another nu
 
 @contextmanager
 def in_one_order(wanted: bool = True) -> Iterator[None]:
-    """Leave torch one thread, and these loops as many as it had: every bit is then the same for any number of them.
+    """Leave torch one thread, and these loops as many as it had: every bit is then the same for any
+    number of them.
 
-    The compiled loops add up in one order whatever the threads. torch does not: its convolutions' gradients, 1x1x1
-    convolutions, matrix products, group norms, sums and even SiLU round otherwise on another number of threads (up to
-    1e-5 of the maximum). Whole training steps have to be inside, backward passes too. Costs what torch's own threads
-    save.
+    The compiled loops add up in one order whatever the threads. torch does not: its convolutions'
+    gradients, 1x1x1 convolutions, matrix products, group norms, sums and even SiLU round otherwise
+    on another number of threads (up to 1e-5 of the maximum). Whole training steps have to be
+    inside, backward passes too. Costs what torch's own threads save.
     """
     global _threads
     threads, before = torch.get_num_threads(), _threads
@@ -46,7 +48,9 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
 
 
 def share(work: Callable[[int, int], None], count: int, samples: int, per_thread: int = 1) -> None:
-    """Do work(first, last) for ranges that cover `count` items, on the threads that torch has and `samples` deserve."""
+    """Do work(first, last) for ranges that cover `count` items, on the threads that torch has and
+    `samples` deserve.
+    """
     if not count:
         return
     threads = _threads or torch.get_num_threads()

@@ -1,4 +1,6 @@
-"""What the cross-view model is held against: plain means, a single world U-Net, and methods without training."""
+"""What the cross-view model is held against: plain means, a single world U-Net, and methods without
+training.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,7 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, anything, content_scale, normalised, typical_chord
+from mvrecon.models.consistency import (
+    Consistency,
+    anything,
+    content_scale,
+    normalised,
+    typical_chord,
+)
 from mvrecon.models.door import admitted
 from mvrecon.models.model import CrossView
 from mvrecon.models.output import Reconstruction
@@ -39,13 +47,21 @@ class MeanFusion(CrossView):
         **skip: Any,
     ):
         super().__init__(
-            projector, head, opinion, fusion="mean", refine=0, start=start, consistency=consistency, **skip
+            projector,
+            head,
+            opinion,
+            fusion="mean",
+            refine=0,
+            start=start,
+            consistency=consistency,
+            **skip,
         )
         _refuse_where(self.skip)
 
 
 class BackprojectionUNet(nn.Module):
-    """One 3-D U-Net in the world on the summed back-projection and a few SIRT iterations, then consistency steps.
+    """One 3-D U-Net in the world on the summed back-projection and a few SIRT iterations, then
+    consistency steps.
 
     Args:
         projector: holds the grid and the rig.
@@ -58,7 +74,14 @@ class BackprojectionUNet(nn.Module):
         ValueError: `refine_where`, since no opinions could disagree.
     """
 
-    def __init__(self, projector: Projector, width: int = 18, start: int = 12, consistency: int = 3, **skip: Any):
+    def __init__(
+        self,
+        projector: Projector,
+        width: int = 18,
+        start: int = 12,
+        consistency: int = 3,
+        **skip: Any,
+    ):
         super().__init__()
         self.skip = Skip.of(skip)
         _refuse_where(self.skip)
@@ -80,13 +103,18 @@ class BackprojectionUNet(nn.Module):
 
 def _refuse_where(skip: Skip) -> None:
     if skip.refine_where != "all":
-        raise ValueError(f"refine_where={skip.refine_where!r} needs opinions and their refinement, as in 'cross_view'")
+        raise ValueError(
+            f"refine_where={skip.refine_where!r} needs opinions and their refinement, as in "
+            f"'cross_view'"
+        )
 
 
 class GeometryFree(nn.Module):
-    """A U-Net that is told nothing of the cameras: M views as channels, each repeated along depth in its own frame.
+    """A U-Net that is told nothing of the cameras: M views as channels, each repeated along depth
+    in its own frame.
 
-    It is what `BackprojectionUNet` would be without known geometry; the rig serves only for the views' scale.
+    It is what `BackprojectionUNet` would be without known geometry; the rig serves only for the
+    views' scale.
 
     Args:
         projector: holds the grid and the rig.
@@ -104,7 +132,9 @@ class GeometryFree(nn.Module):
         views = views.contiguous()  # other strides are rounded in another order
         scale = content_scale(views) / self.chord
         depth, *across = self.projector.grid.shape
-        flat = nn.functional.interpolate((views / scale)[:, 0] / self.chord, size=across, mode="bilinear")
+        flat = nn.functional.interpolate(
+            (views / scale)[:, 0] / self.chord, size=across, mode="bilinear"
+        )
         volume = self.net(flat[:, :, None].expand(-1, -1, depth, -1, -1))
         return Reconstruction(volume=volume * scale * anything(views))
 

@@ -10,13 +10,15 @@ from torch import Tensor, nn
 
 from mvrecon.models.voxels import Voxels, convolved, group_norm
 
-#: PyTorch leaves 3x3x3 convolutions of one CPU volume with at most so many (channels x depth x rows) to a kernel that
-#: was measured to be 5 to 12 times slower than the one (oneDNN's) that it takes for two.
+#: PyTorch leaves 3x3x3 convolutions of one CPU volume with at most so many (channels x depth x
+#: rows) to a kernel that was measured to be 5 to 12 times slower than the one (oneDNN's) that it
+#: takes for two.
 ALONE = 20480
 
 
 class ConvBlock(nn.Module):
-    """Two 3x3x3 convolutions, each followed by group normalisation and SiLU, with a residual path around the second.
+    """Two 3x3x3 convolutions, each followed by group normalisation and SiLU, with a residual path
+    around the second.
 
     On some voxels: features are their rows [k c], and all others are taken for zero.
     """
@@ -25,13 +27,19 @@ class ConvBlock(nn.Module):
         super().__init__()
         groups = gcd(groups, outputs)
         self.first = nn.Sequential(
-            nn.Conv3d(inputs, outputs, 3, padding=1, bias=False), nn.GroupNorm(groups, outputs), nn.SiLU()
+            nn.Conv3d(inputs, outputs, 3, padding=1, bias=False),
+            nn.GroupNorm(groups, outputs),
+            nn.SiLU(),
         )
         self.second = nn.Sequential(
-            nn.Conv3d(outputs, outputs, 3, padding=1, bias=False), nn.GroupNorm(groups, outputs), nn.SiLU()
+            nn.Conv3d(outputs, outputs, 3, padding=1, bias=False),
+            nn.GroupNorm(groups, outputs),
+            nn.SiLU(),
         )
 
-    def forward(self, x: Float[Tensor, "n i *d"], on: Voxels | None = None) -> Float[Tensor, "n o *d"]:
+    def forward(
+        self, x: Float[Tensor, "n i *d"], on: Voxels | None = None
+    ) -> Float[Tensor, "n o *d"]:
         x = _step(self.first, x, on)
         return x + _step(self.second, x, on)
 
@@ -46,8 +54,12 @@ def _step(steps: nn.Sequential, x: Tensor, on: Voxels | None) -> Tensor:
     return F.silu(group_norm(x, on.counts, norm.num_groups, (norm.weight, norm.bias), norm.eps))
 
 
-def convolution(x: Float[Tensor, "n i d h w"], weight: Float[Tensor, "o i 3 3 3"]) -> Float[Tensor, "n o d h w"]:
-    """A 3x3x3 convolution without bias, zero beyond the volume; a small volume that is alone goes as two halves."""
+def convolution(
+    x: Float[Tensor, "n i d h w"], weight: Float[Tensor, "o i 3 3 3"]
+) -> Float[Tensor, "n o d h w"]:
+    """A 3x3x3 convolution without bias, zero beyond the volume; a small volume that is alone goes
+    as two halves.
+    """
     n, channels, d, h = x.shape[:4]
     if n > 1 or d < 2 or x.is_cuda or channels * d * h > ALONE:
         return F.conv3d(x, weight, padding=1)

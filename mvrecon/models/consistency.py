@@ -1,4 +1,6 @@
-"""What every network shares with the classical methods: a start from SIRT, a scale, and data-consistency steps."""
+"""What every network shares with the classical methods: a start from SIRT, a scale, and
+data-consistency steps.
+"""
 
 import torch
 from jaxtyping import Float
@@ -12,8 +14,9 @@ from mvrecon.reconstruct.iterative import sirt
 class Consistency(nn.Module):
     """A few learned-length gradient steps towards the data, x + lambda_k C A^T R (y - A x).
 
-    C and R are the inverse column and row sums of A (SIRT, Gregor & Benson 2008), so a step of length one is stable for
-    every rig. The steps' lengths are learned, as in ItNet (Genzel et al. 2022).
+    C and R are the inverse column and row sums of A (SIRT, Gregor & Benson 2008), so a step of
+    length one is stable for every rig. The steps' lengths are learned, as in ItNet (Genzel et al.
+    2022).
 
     Args:
         steps: how many; none leaves the volume as it is.
@@ -32,8 +35,9 @@ class Consistency(nn.Module):
     ) -> Float[Tensor, "b 1 d h w"]:
         """The volume after the steps.
 
-        With `sigma`, the noise of the views in their unit, a sample takes no further step once chi^2 per measurement,
-        the mean of ((y - A x) / sigma)^2, is at most 1. In training every sample takes every step.
+        With `sigma`, the noise of the views in their unit, a sample takes no further step once
+        chi^2 per measurement, the mean of ((y - A x) / sigma)^2, is at most 1. In training every
+        sample takes every step.
         """
         for length in self.lengths:
             wrong = views - region.A(volume)
@@ -50,9 +54,11 @@ class Consistency(nn.Module):
 def normalised(
     region: Region, views: Float[Tensor, "b 1 m v u"], iterations: int
 ) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
-    """The region's views and their classical start, both divided by the content's scale, and that scale.
+    """The region's views and their classical start, both divided by the content's scale, and that
+    scale.
 
-    The start is SIRT with momentum from zero, non-negative, not differentiated. The scale of views of nothing is zero.
+    The start is SIRT with momentum from zero, non-negative, not differentiated. The scale of views
+    of nothing is zero.
     """
     views = region.measured(views)
     with torch.no_grad():
@@ -62,20 +68,24 @@ def normalised(
 
 
 def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:
-    """The value of what is there, sum x^2 / sum |x|: v for any object of one value v, however small.
+    """The value of what is there, sum x^2 / sum |x|: v for any object of one value v, however
+    small.
 
-    Dividing by it makes a network's answer scale with its input: f(a y) = a f(y). One for an empty volume. Relative to
-    the largest value, whose square may be no number of the dtype.
+    Dividing by it makes a network's answer scale with its input: f(a y) = a f(y). One for an empty
+    volume. Relative to the largest value, whose square may be no number of the dtype.
     """
     peak = volume.abs().amax(dim=(1, 2, 3, 4), keepdim=True)
     peak = torch.where(peak > 0, peak, 1.0)
     part = (volume / peak).abs()
-    scale = part.square().sum(dim=(1, 2, 3, 4), keepdim=True) / part.sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
+    scale = part.square().sum(dim=(1, 2, 3, 4), keepdim=True) / part.sum(
+        dim=(1, 2, 3, 4), keepdim=True
+    ).clamp_min(1)
     return torch.where(scale > 0, scale * peak, 1.0)
 
 
 def typical_chord(grid: Grid) -> float:
-    """The length in mm by which a network's views are divided, so that it sees densities and no unit of length.
+    """The length in mm by which a network's views are divided, so that it sees densities and no
+    unit of length.
 
     Of the whole grid, since a crop's would change with the crop.
     """

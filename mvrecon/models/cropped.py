@@ -1,4 +1,6 @@
-"""Frusta over a crop of the grid: some bins of the whole frusta, with all that is known of them taken over."""
+"""Frusta over a crop of the grid: some bins of the whole frusta, with all that is known of them
+taken over.
+"""
 
 import torch
 from jaxtyping import Float, Int
@@ -23,12 +25,22 @@ class CroppedFrusta(Frusta):
         views: which of the rig's cameras these are.
     """
 
-    def __init__(self, whole: Frusta, grid: Grid, cameras: Cameras, box: Box, window: Window, views: Int[Tensor, " k"]):
+    def __init__(
+        self,
+        whole: Frusta,
+        grid: Grid,
+        cameras: Cameras,
+        box: Box,
+        window: Window,
+        views: Int[Tensor, " k"],
+    ):
         nn.Module.__init__(self)
         self.window, self.depth = window, whole.shape[0]
         edges = window.edges(whole.edges[views]).to(cameras.source)
         self._place(grid.cropped(box), window.cameras(cameras), edges, whole.spacing)
-        visible, occupied, step = (part[views] for part in (whole.visible, whole.occupied, whole.step))
+        visible, occupied, step = (
+            part[views] for part in (whole.visible, whole.occupied, whole.step)
+        )
         self._hold(visible[..., *box.slices], window.bins(occupied), window.bins(step))
 
     def part_of(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:

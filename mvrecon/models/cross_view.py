@@ -1,7 +1,8 @@
-"""What the other cameras say: pooled statistics of M volumes in the world, and the same with one camera left out.
+"""What the other cameras say: pooled statistics of M volumes in the world, and the same with one
+camera left out.
 
-Every statistic is a sum over cameras, so it does not depend on their order, costs 2M warps instead of M(M-1), and
-leaving one camera out is a subtraction.
+Every statistic is a sum over cameras, so it does not depend on their order, costs 2M warps instead
+of M(M-1), and leaving one camera out is a subtraction.
 """
 
 import torch

@@ -10,17 +10,25 @@ from mvrecon.projectors.checks import check, check_floating
 
 
 def admitted(views: Tensor, cameras: Cameras, weights: Tensor) -> Float[Tensor, "b 1 m v u"]:
-    """Measured views in the type of a network's weights: whatever theirs is, that of the volume is the network's.
+    """Measured views in the type of a network's weights: whatever theirs is, that of the volume is
+    the network's.
 
     Raises:
-        ValueError: a wrong rank, size or device, more than one channel, no sample, values that are no floating point or
-            not finite; weights of half precision, which the operators have not (`torch.autocast` is for that).
+        ValueError: a wrong rank, size or device, more than one channel, no sample, values that are
+            no floating point or not finite; weights of half precision, which the operators have not
+            (`torch.autocast` is for that).
     """
     if weights.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"Expected a model of float32 or float64, got {weights.dtype}; for less use torch.autocast")
+        raise ValueError(
+            f"Expected a model of float32 or float64, got {weights.dtype}; for less use "
+            f"torch.autocast"
+        )
     check(views, "views [b 1 m v u]", (len(cameras), *cameras.shape), weights.device)
     if views.shape[1] != 1 or not len(views):
-        raise ValueError(f"Expected views [b 1 m v u] of at least one sample and one channel, got {tuple(views.shape)}")
+        raise ValueError(
+            f"Expected views [b 1 m v u] of at least one sample and one channel, got "
+            f"{tuple(views.shape)}"
+        )
     check_floating(views, "views")
     check_finite(views)
     return views.to(weights.dtype)

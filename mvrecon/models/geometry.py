@@ -1,4 +1,5 @@
-"""What depends on the grid and the rig alone: the operator, the cameras' frusta, the weights of SIRT.
+"""What depends on the grid and the rig alone: the operator, the cameras' frusta, the weights of
+SIRT.
 
 It is made once for the grid, and once for every crop of it that a scene needs.
 """
@@ -22,13 +23,15 @@ MULTIPLE = 4
 
 
 class Geometry(nn.Module):
-    """A projector, the fine and the coarse frusta of its cameras, and SIRT's inverse row and column sums.
+    """A projector, the fine and the coarse frusta of its cameras, and SIRT's inverse row and column
+    sums.
 
     Args:
         projector: A.
         weights: (R, C) of A.
         frusta: (fine, coarse), where a model has cameras' opinions.
-        views: which of the rig's cameras the projector has, those that see its grid; all, by default.
+        views: which of the rig's cameras the projector has, those that see its grid; all, by
+            default.
     """
 
     row: Tensor
@@ -77,7 +80,9 @@ def whole_geometry(projector: Projector, binning: int | None = None) -> Geometry
     return Geometry(projector, sirt_weights(projector), frusta)
 
 
-def cropped_geometry(whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | None = None) -> Geometry:
+def cropped_geometry(
+    whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | None = None
+) -> Geometry:
     """The same for the voxels in a box, and the cameras that see any of it.
 
     What is equal to them is taken over, the rest made for them alone.
@@ -85,8 +90,8 @@ def cropped_geometry(whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | 
     Args:
         whole: of the grid.
         box: the voxels.
-        bricks: of the box, those that may hold anything, from `held_bricks`: the frusta have no bins for others. None:
-            all.
+        bricks: of the box, those that may hold anything, from `held_bricks`: the frusta have no
+            bins for others. None: all.
     """
     views = _seeing(whole.projector.cameras, whole.projector.grid.cropped(box)).to(whole.row.device)
     projector = whole.projector.cropped(box, views.tolist())
@@ -94,7 +99,11 @@ def cropped_geometry(whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | 
     if whole.frusta is None:
         return Geometry(projector, weights, views=views)
     fine, coarse = whole.fine, whole.coarse
-    grid, cameras, binning = whole.projector.grid, projector.cameras, fine.shape[1] // coarse.shape[1]
+    grid, cameras, binning = (
+        whole.projector.grid,
+        projector.cameras,
+        fine.shape[1] // coarse.shape[1],
+    )
     binned = cameras.binned(binning)
     window = window_of(brick_corners(projector.grid, bricks), binned, coarse.edges[views], MULTIPLE)
     finer = window.scaled(2, binning)

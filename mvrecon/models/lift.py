@@ -1,7 +1,9 @@
-"""The inverse projection transform: views to frusta of density, and the warps between frusta and the world.
+"""The inverse projection transform: views to frusta of density, and the warps between frusta and
+the world.
 
-In a camera's own frustum projecting is a plain sum: p[v, u] = sum over d of g[d, v, u] * step[v, u], so a lift that
-divides by the step conserves every ray's integral exactly. A warp is one trilinear fetch per bin or voxel.
+In a camera's own frustum projecting is a plain sum: p[v, u] = sum over d of g[d, v, u] * step[v,
+u], so a lift that divides by the step conserves every ray's integral exactly. A warp is one
+trilinear fetch per bin or voxel.
 """
 
 import torch
@@ -46,11 +48,15 @@ class Frusta(Bins, nn.Module):
         held = enclosed(self.world_from_frusta, grid.shape, self.shape).transpose(0, 1)
         visible = enclosed(self.frusta_from_world, self.shape, grid.shape)
         start, end = cameras.rays()
-        per_mm = (end - start).norm(dim=-1) / cameras.distance[:, None, None]  # mm of ray per mm of depth
+        per_mm = (end - start).norm(dim=-1) / cameras.distance[
+            :, None, None
+        ]  # mm of ray per mm of depth
         step = (edges[:, 1:] - edges[:, :-1]).abs()[:, :, None, None] * per_mm[:, None]
         self._hold(visible, held & ahead, step[:, None].float())
 
-    def _place(self, grid: Grid, cameras: Cameras, edges: Float[Tensor, "m e"], spacing: Spacing) -> None:
+    def _place(
+        self, grid: Grid, cameras: Cameras, edges: Float[Tensor, "m e"], spacing: Spacing
+    ) -> None:
         self.grid_shape, self.shape = grid.shape, (edges.shape[1] - 1, *cameras.shape)
         self.spacing: Spacing = spacing
         world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges, spacing)
@@ -64,7 +70,10 @@ class Frusta(Bins, nn.Module):
         self.register_buffer("step", step, persistent=False)
 
     def _apply(self, fn, recurse: bool = True):
-        exact = {name: getattr(self, name) for name in ("edges", "frusta_from_world", "world_from_frusta")}
+        exact = {
+            name: getattr(self, name)
+            for name in ("edges", "frusta_from_world", "world_from_frusta")
+        }
         super()._apply(fn, recurse)  # moves them; their digits stay
         for name, given in exact.items():
             setattr(self, name, given.to(self.step.device))
@@ -76,23 +85,31 @@ class Frusta(Bins, nn.Module):
 
     def ramp(self, like: Tensor) -> Float[Tensor, "*m D 1 1"]:
         """The bins' depth, from -1 to 1."""
-        return torch.linspace(-1, 1, self.shape[0], device=like.device, dtype=like.dtype)[:, None, None]
+        return torch.linspace(-1, 1, self.shape[0], device=like.device, dtype=like.dtype)[
+            :, None, None
+        ]
 
     def to_world(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
         """Each frustum's density at the voxels of the grid; zero where the camera does not see."""
         return warp(frusta, self.frusta_from_world, self.grid_shape)[:, :, 0]
 
     def to_frusta(self, volumes: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m c D v u"]:
-        """World volumes at the bins of the frusta, one volume for each camera (or one for all, m = 1)."""
+        """World volumes at the bins of the frusta, one volume for each camera (or one for all, m =
+        1).
+        """
         if volumes.shape[1] == 1:
             return warp(volumes, self.world_from_frusta, self.shape)[:, 0]
         return warp(volumes, self.world_from_frusta.transpose(0, 1), self.shape)[:, :, 0]
 
     def touched(self, mask: Bool[Tensor, "b 1 d h w"]) -> Bool[Tensor, "b m 1 D v u"]:
-        """Every bin that reads a voxel of the mask, or that one reads: none that holds a part of it is left out."""
+        """Every bin that reads a voxel of the mask, or that one reads: none that holds a part of it
+        is left out.
+        """
         with torch.inference_mode(False), torch.enable_grad():
             volume = mask.to(self.step.dtype, copy=True)[:, None]
             m = len(self.step)
             bins = self.step.new_zeros(len(mask), m, 1, *self.shape, requires_grad=True)
-            (read,) = torch.autograd.grad(self.to_world(bins), bins, volume.expand(-1, m, -1, -1, -1, -1))
+            (read,) = torch.autograd.grad(
+                self.to_world(bins), bins, volume.expand(-1, m, -1, -1, -1, -1)
+            )
         return (self.to_frusta(volume) > TOUCH) | (read > TOUCH)

@@ -1,6 +1,7 @@
 """Steps between the scales of whole volumes: halving, and interpolation on a part of them.
 
-Masks are numbers 0 and 1 in the features' type. Networks that work on a mask's voxels alone: `voxels`.
+Masks are numbers 0 and 1 in the features' type. Networks that work on a mask's voxels alone:
+`voxels`.
 """
 
 from collections.abc import Sequence
@@ -13,8 +14,8 @@ from torch import Tensor
 
 
 class _Halved(torch.autograd.Function):
-    """torch's own derivative of `avg_pool3d` adds up in no fixed order on a GPU; this one, the same to the last bit,
-    adds up nothing."""
+    """torch's own derivative of `avg_pool3d` adds up in no fixed order on a GPU; this one, the same
+    to the last bit, adds up nothing."""
 
     generate_vmap_rule = True
 
@@ -31,13 +32,18 @@ class _Halved(torch.autograd.Function):
         share = gradient / 8
         for axis, size in enumerate(ctx.shape, start=2):
             if size % 2:  # the last mean is of half as many
-                share = torch.cat([share.narrow(axis, 0, size // 2), 2 * share.narrow(axis, size // 2, 1)], dim=axis)
+                share = torch.cat(
+                    [share.narrow(axis, 0, size // 2), 2 * share.narrow(axis, size // 2, 1)],
+                    dim=axis,
+                )
         d, h, w = ctx.shape
         return F.interpolate(share, scale_factor=2.0, mode="nearest")[:, :, :d, :h, :w]
 
 
 def halved(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
-    """Means of 2x2x2 voxels; at odd ends, of as many as there are. Its derivative has the same bits in every run."""
+    """Means of 2x2x2 voxels; at odd ends, of as many as there are. Its derivative has the same bits
+    in every run.
+    """
     return _Halved.apply(x)
 
 
@@ -56,5 +62,8 @@ def upsampled(
         size: of all coarse voxels on the fine lattice; what `onto` has not is cut off.
     """
     d, h, w = onto.shape[2:]
-    values, shares = (F.interpolate(f, size=list(size), mode="trilinear")[:, :, :d, :h, :w] for f in (x * mask, mask))
+    values, shares = (
+        F.interpolate(f, size=list(size), mode="trilinear")[:, :, :d, :h, :w]
+        for f in (x * mask, mask)
+    )
     return values * (onto / torch.where(shares > 0, shares, 1.0))

@@ -1,7 +1,9 @@
-"""The cross-view model: every camera forms an opinion of the volume, the cameras compare, a network weighs them.
+"""The cross-view model: every camera forms an opinion of the volume, the cameras compare, a network
+weighs them.
 
-1 lift, 2 pool what the other cameras say, 3 depth U-Net and head, 4 inverse projection to the world, 5 re-projection
-into all cameras, 6 weighting, then refinement and 7 data consistency. `docs/model.md` walks through the shapes.
+1 lift, 2 pool what the other cameras say, 3 depth U-Net and head, 4 inverse projection to the
+world, 5 re-projection into all cameras, 6 weighting, then refinement and 7 data consistency.
+`docs/model.md` walks through the shapes.
 """
 
 from collections.abc import Mapping
@@ -37,8 +39,8 @@ class CrossView(nn.Module):
         head: the head's name and options.
         opinion: options of `Opinions` (width, features, binning, shared, prior, geometry).
         fusion: "weighted" by a U-Net, or the plain "mean" over the cameras that see a voxel.
-        refine: channels of the U-Net that corrects the fused volume, 0 for none: a weighted mean cannot create what
-            no camera holds.
+        refine: channels of the U-Net that corrects the fused volume, 0 for none: a weighted mean
+            cannot create what no camera holds.
         start: SIRT iterations of the classical start.
         consistency: learned gradient steps towards the data at the end.
         skip: options of `Skip` (support, masked, ...): what is left out; nothing by default.
@@ -76,7 +78,9 @@ class CrossView(nn.Module):
         y, x0, scale = normalised(region, views, self.iterations)
         expected = region.A(x0)
         opinions, features = self.opinions(region, y, x0, y - expected)
-        cross_views = region.A(opinions[:, :, 0])  # every camera's opinion as every camera would have seen it
+        cross_views = region.A(
+            opinions[:, :, 0]
+        )  # every camera's opinion as every camera would have seen it
         logits = torch.zeros_like(opinions)
         if self.weighting is not None:
             seen = self._compare(region, opinions, x0, y - cross_views)
@@ -84,7 +88,9 @@ class CrossView(nn.Module):
         volume, weights = fuse(opinions, logits, region.seen())
         if self.refine is not None:
             volume = volume + self._correction(region, volume, (opinions, features, weights), x0, y)
-        volume = self.consistency(region, volume, y, None if self.skip.sigma is None else self.skip.sigma / scale)
+        volume = self.consistency(
+            region, volume, y, None if self.skip.sigma is None else self.skip.sigma / scale
+        )
         return Reconstruction(
             volume=region.pasted(volume * scale),
             opinions=region.pasted(region.of_all(opinions, x0[:, None]) * scale[:, None]),
@@ -94,19 +100,31 @@ class CrossView(nn.Module):
             support=region.support,
         )
 
-    def _compare(self, region: Region, opinions: Tensor, x0: Tensor, wrong: Tensor) -> Float[Tensor, "b m 5 d h w"]:
-        """What the weighting sees: own opinion, pooled mean and spread, own disagreement with the views, the start."""
+    def _compare(
+        self, region: Region, opinions: Tensor, x0: Tensor, wrong: Tensor
+    ) -> Float[Tensor, "b m 5 d h w"]:
+        """What the weighting sees: own opinion, pooled mean and spread, own disagreement with the
+        views, the start.
+        """
         mean, variance = pooled(opinions, region.geometry.fine.visible)
         with torch.no_grad():  # a hint for the weights; its gradient costs more than it teaches
             wrong = region.back(wrong)[:, :, None]
-        shared = torch.cat([mean, _root(variance), x0[:, None]], dim=2).expand(-1, opinions.shape[1], -1, -1, -1, -1)
+        shared = torch.cat([mean, _root(variance), x0[:, None]], dim=2).expand(
+            -1, opinions.shape[1], -1, -1, -1, -1
+        )
         return torch.cat([opinions, wrong, shared], dim=2)
 
     def _correction(
-        self, region: Region, fused: Tensor, said: tuple[Tensor, Tensor, Tensor], x0: Tensor, y: Tensor
+        self,
+        region: Region,
+        fused: Tensor,
+        said: tuple[Tensor, Tensor, Tensor],
+        x0: Tensor,
+        y: Tensor,
     ) -> Float[Tensor, "b 1 d h w"]:
-        """What the refinement adds where it looks, from the fused volume, its residual, the cameras' mean, spread and
-        features, and the start; `said` are opinions, features and weights."""
+        """What the refinement adds where it looks, from the fused volume, its residual, the
+        cameras' mean, spread and features, and the start; `said` are opinions, features and
+        weights."""
         assert self.refine is not None
         opinions, features, weights = said
         mean, variance = pooled(opinions, region.geometry.fine.visible)
@@ -122,12 +140,16 @@ class CrossView(nn.Module):
 def _of_all(
     region: Region, cross_views: Float[Tensor, "b k k v u"], expected: Float[Tensor, "b 1 k v u"]
 ) -> Float[Tensor, "b m m v u"]:
-    """Cross-views of all cameras: of those that are left out, opinions are the start, and views are of nothing."""
+    """Cross-views of all cameras: of those that are left out, opinions are the start, and views are
+    of nothing.
+    """
     return region.of_all(region.of_all(cross_views, expected).transpose(1, 2)).transpose(1, 2)
 
 
 def disagreement(spread: Float[Tensor, "b 1 d h w"], tolerance: float) -> Bool[Tensor, "b 1 d h w"]:
-    """Bricks of 4 voxels in which the opinions' spread passes a tolerance somewhere, and the bricks around them."""
+    """Bricks of 4 voxels in which the opinions' spread passes a tolerance somewhere, and the bricks
+    around them.
+    """
     with torch.no_grad():
         bricks = (max_pool3d(spread, BRICK, ceil_mode=True) > tolerance).to(spread.dtype)
         near = max_pool3d(bricks, 3, stride=1, padding=1) > 0

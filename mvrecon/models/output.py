@@ -14,7 +14,8 @@ class Reconstruction:
         volume: in the unit of (views / mm).
         opinions: each camera's own volume.
         visible: which voxels each camera's frustum holds.
-        weights: how much each camera counts at each voxel; they sum to one over the cameras that see it.
+        weights: how much each camera counts at each voxel; they sum to one over the cameras that
+            see it.
         cross_views: opinion m projected into camera n, in the unit of the views.
         support: where the volume may differ from zero; none for everywhere.
     """

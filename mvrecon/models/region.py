@@ -1,6 +1,8 @@
-"""Where one batch is worked on: a crop of the grid, and the voxels of each sample that may hold anything.
+"""Where one batch is worked on: a crop of the grid, and the voxels of each sample that may hold
+anything.
 
-Convention: inside a model every volume is the crop's; only what a model returns has the shape of the grid.
+Convention: inside a model every volume is the crop's; only what a model returns has the shape of
+the grid.
 """
 
 from dataclasses import dataclass
@@ -24,7 +26,8 @@ class Region:
     Args:
         geometry: of the crop.
         shape: voxels of the whole grid.
-        cameras: of the whole rig; those that see nothing of the crop are left out, which changes nothing.
+        cameras: of the whole rig; those that see nothing of the crop are left out, which changes
+            nothing.
         weights: SIRT's (R, C); C is zero outside the mask and R is made of rays through it.
         box: the crop; none for the whole grid.
         mask: where the density may differ from zero; none for everywhere.
@@ -46,7 +49,9 @@ class Region:
 
     @cached_property
     def net_mask(self) -> Bool[Tensor, "b 1 d h w"] | None:
-        """The mask of the world's networks; none where one of ones would change nothing, and take longer."""
+        """The mask of the world's networks; none where one of ones would change nothing, and take
+        longer.
+        """
         if not self.seen_by_nets or self.mask is None:
             return None
         plain = self.mask.all() and not any(size % MULTIPLE for size in self.mask.shape[2:])
@@ -61,8 +66,12 @@ class Region:
         """How many cameras see nothing of the crop, and are left out."""
         return self.cameras - len(self.geometry.views)
 
-    def of_all(self, values: Shaped[Tensor, "b k *n"], otherwise: Shaped[Tensor, "b 1 *n"] | None = None) -> Tensor:
-        """Values of the cameras that see the crop among the whole rig's; zero for the others, or as given."""
+    def of_all(
+        self, values: Shaped[Tensor, "b k *n"], otherwise: Shaped[Tensor, "b 1 *n"] | None = None
+    ) -> Tensor:
+        """Values of the cameras that see the crop among the whole rig's; zero for the others, or as
+        given.
+        """
         if not self.culled:
             return values
         size = [len(values), self.cameras, *values.shape[2:]]
@@ -76,7 +85,9 @@ class Region:
     def residual(
         self, volume: Float[Tensor, "b c d h w"], views: Float[Tensor, "b c m v u"]
     ) -> Float[Tensor, "b c d h w"]:
-        """How each voxel should change for the views to be met: C A^T R (y - A x), in the unit of x."""
+        """How each voxel should change for the views to be met: C A^T R (y - A x), in the unit of
+        x.
+        """
         return self.back(views - self.A(volume))
 
     def within(self, volume: Float[Tensor, "b *m c d h w"]) -> Float[Tensor, "b *m c d h w"]:
@@ -98,7 +109,9 @@ class Region:
         touched = fine.touched(self.mask)
         held = adaptive_max_pool3d(touched.flatten(0, 1).to(fine.step.dtype), coarse.shape) > 0
         held = held.unflatten(0, touched.shape[:2])
-        return SomeBins(fine.occupied & touched, fine.step), SomeBins(coarse.occupied & held, coarse.step)
+        return SomeBins(fine.occupied & touched, fine.step), SomeBins(
+            coarse.occupied & held, coarse.step
+        )
 
     def pasted(self, volume: Float[Tensor, "*b d h w"]) -> Float[Tensor, "*b D H W"]:
         """A volume of the crop in zeros of the whole grid."""

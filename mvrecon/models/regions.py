@@ -44,14 +44,20 @@ class Regions(nn.Module):
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Region:
         """The region of views."""
         A, skip = self.whole.projector, self.skip
-        everything = Region(self.whole, A.grid.shape, len(A.cameras), (self.whole.row, self.whole.column))
+        everything = Region(
+            self.whole, A.grid.shape, len(A.cameras), (self.whole.row, self.whole.column)
+        )
         if skip.support == "none":
             return everything
         found = support_from_views(views, A.cameras, A.grid, "hull", skip.noise)
         assert found.mask is not None  # a hull has a mask
         mask = torch.cat([worked_on(one, skip.support) for one in found.mask.split(1)])
         box = Box.around(mask)
-        box = (box if box.size else found.box).grown(skip.margin, A.grid.shape).aligned(MULTIPLE, A.grid.shape)
+        box = (
+            (box if box.size else found.box)
+            .grown(skip.margin, A.grid.shape)
+            .aligned(MULTIPLE, A.grid.shape)
+        )
         mask = mask[..., *box.slices]
         geometry = self.crop(box, held_bricks(mask) if skip.masked else None)
         weights = masked_weights(geometry, mask, views.dtype)
@@ -69,15 +75,20 @@ class Regions(nn.Module):
         return self.crops[key]
 
 
-def masked_weights(geometry: Geometry, mask: Bool[Tensor, "b 1 d h w"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """SIRT's (R, C) of the operator A diag(M), for each sample: R from rays through the mask, C zero outside it."""
+def masked_weights(
+    geometry: Geometry, mask: Bool[Tensor, "b 1 d h w"], dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """SIRT's (R, C) of the operator A diag(M), for each sample: R from rays through the mask, C
+    zero outside it.
+    """
     with torch.no_grad():
         rows = geometry.projector(mask.to(dtype))
     return torch.cat([inverse_sums(own) for own in rows.split(1)]), geometry.column * mask
 
 
 def worked_on(hull: Bool[Tensor, "1 1 d h w"], kind: str) -> Bool[Tensor, "1 1 d h w"]:
-    """A sample's mask: its "hull", that hull's "box", or by "auto" the hull if its box is small, else everything.
+    """A sample's mask: its "hull", that hull's "box", or by "auto" the hull if its box is small,
+    else everything.
 
     A sample is asked alone, so that it does not matter with which others it is in a batch.
     """

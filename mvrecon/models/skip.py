@@ -16,17 +16,20 @@ class Skip:
     """Which work is skipped. All of it is off by default.
 
     Args:
-        support: where the density may differ from zero, told from the views: the visual "hull", its "box", "auto" for
-            the hull of a sample if its box is small and else everything, or "none" to ask for nothing. Work is done on
-            a crop around it, and outside it the density is 0 by definition.
+        support: where the density may differ from zero, told from the views: the visual "hull", its
+            "box", "auto" for the hull of a sample if its box is small and else everything, or
+            "none" to ask for nothing. Work is done on a crop around it, and outside it the density
+            is 0 by definition.
         noise: of the views, as `support_from_views` wants it; none for exact views.
-        halo: voxels around the support's box that the crop holds, at least 1. With `masked` they change nothing: by
-            default there are none then, and else 4.
-        masked: the support belongs to the networks too: features are zero and normalisation does not look outside it.
-        sigma: standard deviation of the views' noise, in their unit; the consistency steps stop where it explains what
-            is left. None: every step.
+        halo: voxels around the support's box that the crop holds, at least 1. With `masked` they
+            change nothing: by default there are none then, and else 4.
+        masked: the support belongs to the networks too: features are zero and normalisation does
+            not look outside it.
+        sigma: standard deviation of the views' noise, in their unit; the consistency steps stop
+            where it explains what is left. None: every step.
         refine_where: "all" of the support, or bricks of "disagreement" between the opinions.
-        tolerance: the opinions' standard deviation, relative to the content's scale, from which on they disagree.
+        tolerance: the opinions' standard deviation, relative to the content's scale, from which on
+            they disagree.
 
     Raises:
         ValueError: an unknown choice, a halo below 1, a sigma or a tolerance that is not positive.
@@ -44,7 +47,9 @@ class Skip:
         known = {"support": KINDS, "refine_where": ("all", "disagreement")}
         for name, choices in known.items():
             if getattr(self, name) not in choices:
-                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
+                raise ValueError(
+                    f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
+                )
         if self.halo is not None and self.halo < 1:
             raise ValueError(f"A crop needs a halo of at least one voxel, got {self.halo}")
         for name in ("sigma", "tolerance"):

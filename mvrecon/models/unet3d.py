@@ -14,12 +14,14 @@ from mvrecon.models.voxels import Voxels, pyramid
 
 
 class UNet3d(nn.Module):
-    """Encoder and decoder over `levels` scales; any spatial size, since an axis of one voxel stays one when halved.
+    """Encoder and decoder over `levels` scales; any spatial size, since an axis of one voxel stays
+    one when halved.
 
-    With a mask the network is another one, of the same weights: after every convolution the features are zero outside
-    the mask (max-pooled on coarser levels), and normalisation, pooling and upsampling look at its voxels alone. What it
-    gives does not depend on the empty space around the mask, if voxels keep their places modulo 2^(levels - 1). A mask
-    of ones gives what no mask gives, up to rounding, for sizes that are multiples of 2^(levels - 1).
+    With a mask the network is another one, of the same weights: after every convolution the
+    features are zero outside the mask (max-pooled on coarser levels), and normalisation, pooling
+    and upsampling look at its voxels alone. What it gives does not depend on the empty space around
+    the mask, if voxels keep their places modulo 2^(levels - 1). A mask of ones gives what no mask
+    gives, up to rounding, for sizes that are multiples of 2^(levels - 1).
 
     Args:
         inputs: channels in.
@@ -29,11 +31,17 @@ class UNet3d(nn.Module):
         zero: start with an output of exactly zero, for a network that corrects something.
     """
 
-    def __init__(self, inputs: int, outputs: int, width: int = 16, levels: int = 3, zero: bool = False):
+    def __init__(
+        self, inputs: int, outputs: int, width: int = 16, levels: int = 3, zero: bool = False
+    ):
         super().__init__()
         widths = [width * 2**level for level in range(levels)]
-        self.down = nn.ModuleList(ConvBlock(a, b) for a, b in zip([inputs, *widths], widths, strict=False))
-        self.reduce = nn.ModuleList(nn.Conv3d(b, a, 1) for a, b in zip(widths, widths[1:], strict=False))
+        self.down = nn.ModuleList(
+            ConvBlock(a, b) for a, b in zip([inputs, *widths], widths, strict=False)
+        )
+        self.reduce = nn.ModuleList(
+            nn.Conv3d(b, a, 1) for a, b in zip(widths, widths[1:], strict=False)
+        )
         self.up = nn.ModuleList(ConvBlock(a, a) for a in widths[:-1])
         self.last = nn.Conv3d(width, outputs, 1, bias=False)
         if zero:
@@ -55,7 +63,9 @@ class UNet3d(nn.Module):
             x = block(x)
         for level in reversed(range(len(self.up))):
             skip = skips[level]
-            x = nn.functional.interpolate(self.reduce[level](x), size=skip.shape[2:], mode="trilinear")
+            x = nn.functional.interpolate(
+                self.reduce[level](x), size=skip.shape[2:], mode="trilinear"
+            )
             x = self.up[level](x + skip)
         return self.last(x)
 

@@ -1,9 +1,11 @@
-"""Features of a mask's voxels alone, and a U-Net's steps on them: nothing outside counts, nothing outside is computed.
+"""Features of a mask's voxels alone, and a U-Net's steps on them: nothing outside counts, nothing
+outside is computed.
 
-Features are rows [k c], one for each voxel. Every step is a gather of rows and dense arithmetic on what it gives; an
-index that is one too large stands for a voxel that is not in the mask, whose features are zero. Normalisation, halving
-and doubling average over the mask alone, so results do not depend on how much empty space lies around it, as long as
-coarse voxels keep their places, and a mask of ones gives the plain steps.
+Features are rows [k c], one for each voxel. Every step is a gather of rows and dense arithmetic on
+what it gives; an index that is one too large stands for a voxel that is not in the mask, whose
+features are zero. Normalisation, halving and doubling average over the mask alone, so results do
+not depend on how much empty space lies around it, as long as coarse voxels keep their places, and a
+mask of ones gives the plain steps.
 """
 
 from collections.abc import Sequence
@@ -15,21 +17,23 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-#: Voxels (z, y, x) of the bricks that convolutions are done in, all as one batch, each with a halo of one voxel.
-#: Measured on one core with 8 to 32 channels (oneDNN, AVX2): 1.1 to 1.3 times the time of dense convolutions per voxel,
-#: and small enough to follow a hull.
+#: Voxels (z, y, x) of the bricks that convolutions are done in, all as one batch, each with a halo
+#: of one voxel. Measured on one core with 8 to 32 channels (oneDNN, AVX2): 1.1 to 1.3 times the
+#: time of dense convolutions per voxel, and small enough to follow a hull.
 BRICK = (4, 4, 8)
 
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """The voxels of n masks, in an order in which those of a sample, and of a brick, follow each other.
+    """The voxels of n masks, in an order in which those of a sample, and of a brick, follow each
+    other.
 
     Args:
         shape: (n, d, h, w).
         counts: voxels of each sample.
         place: [k] where each lies in the flat volumes [n d h w].
-        row: [n d+2 h+2 w+2] the row of each voxel, and of those around the volume; k outside the mask.
+        row: [n d+2 h+2 w+2] the row of each voxel, and of those around the volume; k outside the
+            mask.
         around: [q 6 6 10] the rows of each brick and its halo.
         own: [k] where each voxel lies among those of the bricks.
     """
@@ -49,7 +53,9 @@ class Voxels:
 
     def pick(self, volumes: Float[Tensor, "n c d h w"]) -> Float[Tensor, "k c"]:
         """The voxels' values."""
-        return volumes.permute(0, 2, 3, 4, 1).reshape(-1, volumes.shape[1]).index_select(0, self.place)
+        return (
+            volumes.permute(0, 2, 3, 4, 1).reshape(-1, volumes.shape[1]).index_select(0, self.place)
+        )
 
     def put(self, rows: Float[Tensor, "k c"]) -> Float[Tensor, "n c d h w"]:
         """Volumes with the voxels' values, and zero elsewhere."""
@@ -67,7 +73,9 @@ def voxels_of(mask: Bool[Tensor, "n 1 d h w"]) -> Voxels:
     active = bricks.any(dim=-1).any(dim=-1).any(dim=-1).nonzero()  # [q 4]
     held = bricks[tuple(active.unbind(dim=1))].flatten(1)  # [q 128]
     brick, inner = held.nonzero().unbind(dim=1)
-    index = torch.stack(torch.unravel_index(inner, BRICK), dim=1) + active[brick, 1:] * active.new_tensor(BRICK)
+    index = torch.stack(torch.unravel_index(inner, BRICK), dim=1) + active[
+        brick, 1:
+    ] * active.new_tensor(BRICK)
     sample, (z, y, x) = active[brick, 0], index.unbind(dim=1)
     row = torch.full((n, *[size + 2 for size in padded.shape[1:]]), len(z), device=mask.device)
     row[sample, z + 1, y + 1, x + 1] = torch.arange(len(z), device=mask.device)
@@ -96,7 +104,9 @@ def pyramid(mask: Bool[Tensor, "n 1 d h w"], levels: int) -> list[Voxels]:
     return found
 
 
-def convolved(x: Float[Tensor, "k i"], weight: Float[Tensor, "o i 3 3 3"], on: Voxels) -> Float[Tensor, "k o"]:
+def convolved(
+    x: Float[Tensor, "k i"], weight: Float[Tensor, "o i 3 3 3"], on: Voxels
+) -> Float[Tensor, "k o"]:
     """A 3x3x3 convolution without bias."""
     bricks = _with_none(x).index_select(0, on.around.flatten()).view(*on.around.shape, x.shape[1])
     values = F.conv3d(bricks.permute(0, 4, 1, 2, 3), weight)  # channels last: rows are copied whole
@@ -104,7 +114,11 @@ def convolved(x: Float[Tensor, "k i"], weight: Float[Tensor, "o i 3 3 3"], on: V
 
 
 def group_norm(
-    x: Float[Tensor, "k c"], counts: Sequence[int], groups: int, affine: tuple[Tensor, Tensor], eps: float = 1e-5
+    x: Float[Tensor, "k c"],
+    counts: Sequence[int],
+    groups: int,
+    affine: tuple[Tensor, Tensor],
+    eps: float = 1e-5,
 ) -> Float[Tensor, "k c"]:
     """Group normalisation (Wu & He, ECCV 2018) by the statistics of each sample's voxels.
 
@@ -119,7 +133,9 @@ def group_norm(
     """
 
     def mean(rows: Tensor) -> Tensor:
-        each = rows.sum(dim=0).view(groups, -1).sum(dim=1, keepdim=True) / max(1, rows.numel() // groups)
+        each = rows.sum(dim=0).view(groups, -1).sum(dim=1, keepdim=True) / max(
+            1, rows.numel() // groups
+        )
         return each.expand(-1, rows.shape[1] // groups).reshape(-1)
 
     scale, shift = affine
@@ -141,17 +157,24 @@ def halved(x: Float[Tensor, "k c"], fine: Voxels, coarse: Voxels) -> Float[Tenso
 def doubled(x: Float[Tensor, "l c"], coarse: Voxels, fine: Voxels) -> Float[Tensor, "k c"]:
     """Trilinear interpolation between the coarse voxels that are in the mask."""
     sample, *places = torch.unravel_index(fine.place, fine.shape)
-    first, side = sample, torch.zeros_like(sample)  # of the eight around a voxel; where it lies between them
+    first, side = (
+        sample,
+        torch.zeros_like(sample),
+    )  # of the eight around a voxel; where it lies between them
     for place, size in zip(places, coarse.row.shape[1:], strict=True):
         first, side = first * size + (place + 1) // 2, side * 2 + place % 2
     corners = torch.tensor(list(product((0, 1), repeat=3)), device=x.device)
     steps = corners @ corners.new_tensor(coarse.row.stride()[1:])
     near = coarse.row.flatten().index_select(0, (first[:, None] + steps).flatten()).view(-1, 8)
-    shares = torch.where(corners[:, None] == corners, 0.25, 0.75).prod(dim=-1).to(x)  # an even voxel is nearer to the
+    shares = (
+        torch.where(corners[:, None] == corners, 0.25, 0.75).prod(dim=-1).to(x)
+    )  # an even voxel is nearer to the
     return _means(x, near, shares.index_select(0, side))  # second of two, an odd one to the first
 
 
-def _means(x: Float[Tensor, "k c"], rows: Int[Tensor, "l e"], weights: Float[Tensor, "*l e"]) -> Float[Tensor, "l c"]:
+def _means(
+    x: Float[Tensor, "k c"], rows: Int[Tensor, "l e"], weights: Float[Tensor, "*l e"]
+) -> Float[Tensor, "l c"]:
     """Weighted means over the rows that there are."""
     shares = weights * (rows < len(x))
     shares = shares / shares.sum(dim=1, keepdim=True)

@@ -23,10 +23,11 @@ def fuse(
 
 
 class Weighting(nn.Module):
-    """A U-Net that gives one logit per voxel and camera from the features of that camera, the same for all cameras.
+    """A U-Net that gives one logit per voxel and camera from the features of that camera, the same
+    for all cameras.
 
-    It works at half the grid's resolution: confidence varies more slowly than density, and at full resolution it would
-    cost as much as everything else together.
+    It works at half the grid's resolution: confidence varies more slowly than density, and at full
+    resolution it would cost as much as everything else together.
 
     Args:
         inputs: feature channels of one camera.
@@ -50,8 +51,13 @@ class Weighting(nn.Module):
     def _on(self, features: Tensor, mask: Tensor) -> Float[Tensor, "b m 1 d h w"]:
         m = features.shape[1]
         fine, coarse = pyramid(mask, 2)
-        rows = voxels.halved(fine.pick(features.flatten(1, 2)), fine, coarse)  # of all cameras, side by side
-        each = [part.unflatten(1, (m, -1)).transpose(0, 1).flatten(0, 1) for part in rows.split(coarse.counts)]
+        rows = voxels.halved(
+            fine.pick(features.flatten(1, 2)), fine, coarse
+        )  # of all cameras, side by side
+        each = [
+            part.unflatten(1, (m, -1)).transpose(0, 1).flatten(0, 1)
+            for part in rows.split(coarse.counts)
+        ]
         levels = pyramid(coarse.mask.repeat_interleave(m, dim=0), len(self.net.down))
         logits = self.net.on(levels, torch.cat(each)).split([m * count for count in coarse.counts])
         side_by_side = torch.cat([part.view(m, -1).T for part in logits])

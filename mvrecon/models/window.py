@@ -1,6 +1,8 @@
-"""The part of each camera's frustum that a part of the grid needs: some depths, rows and columns, as many for all.
+"""The part of each camera's frustum that a part of the grid needs: some depths, rows and columns,
+as many for all.
 
-Its bins are bins of the whole frustum, so what is worked out in a window is what would be worked out without it.
+Its bins are bins of the whole frustum, so what is worked out in a window is what would be worked
+out without it.
 """
 
 from collections.abc import Sequence
@@ -16,7 +18,8 @@ from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.frustum import depth_index
 from mvrecon.geometry.grid import Grid
 
-#: Bricks along the longest side of a mask, at most: enough to follow a body, few enough to be projected at once.
+#: Bricks along the longest side of a mask, at most: enough to follow a body, few enough to be
+#: projected at once.
 BRICKS = 16
 
 
@@ -33,7 +36,9 @@ class Window:
     shape: tuple[int, int, int]
 
     def scaled(self, depth: int, pixels: int) -> "Window":
-        """The same part of frusta whose bins are `depth` times as fine in depth, `pixels` times across."""
+        """The same part of frusta whose bins are `depth` times as fine in depth, `pixels` times
+        across.
+        """
         d, v, u = self.shape
         factors = self.first.new_tensor([depth, pixels, pixels])
         return Window(self.first * factors, (d * depth, v * pixels, u * pixels))
@@ -57,23 +62,40 @@ class Window:
 
     def views(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:
         """The part of every view that falls on the cut detectors."""
-        return torch.stack([view[..., v, u] for view, (_, v, u) in zip(views.unbind(2), self._parts(), strict=True)], 2)
+        return torch.stack(
+            [
+                view[..., v, u]
+                for view, (_, v, u) in zip(views.unbind(2), self._parts(), strict=True)
+            ],
+            2,
+        )
 
     def bins(self, values: Shaped[Tensor, "m 1 D v u"]) -> Shaped[Tensor, "m 1 E r s"]:
         """Values of all bins at those that are kept."""
-        return torch.stack([each[:, *part] for each, part in zip(values, self._parts(), strict=True)])
+        return torch.stack(
+            [each[:, *part] for each, part in zip(values, self._parts(), strict=True)]
+        )
 
     def _parts(self) -> list[tuple[slice, slice, slice]]:
-        """What cuts each camera's bins out of all; slices, since an index for each bin takes ten times as long."""
+        """What cuts each camera's bins out of all; slices, since an index for each bin takes ten
+        times as long.
+        """
         first = self.first.tolist()
-        return [Box(three(low), three(a + n for a, n in zip(low, self.shape, strict=True))).slices for low in first]
+        return [
+            Box(three(low), three(a + n for a, n in zip(low, self.shape, strict=True))).slices
+            for low in first
+        ]
 
 
-def window_of(corners: Float[Tensor, "n 3"], cameras: Cameras, edges: Float[Tensor, "m e"], multiple: int) -> Window:
-    """The least window of frusta that holds every bin which the voxels of some boxes read, or are read by.
+def window_of(
+    corners: Float[Tensor, "n 3"], cameras: Cameras, edges: Float[Tensor, "m e"], multiple: int
+) -> Window:
+    """The least window of frusta that holds every bin which the voxels of some boxes read, or are
+    read by.
 
-    Bounds are multiples of a number, so that the coarser levels of a network keep their places; an axis whose size is
-    none is kept whole, and so are the pixels of a camera whose source lies between the planes that bound the boxes.
+    Bounds are multiples of a number, so that the coarser levels of a network keep their places; an
+    axis whose size is none is kept whole, and so are the pixels of a camera whose source lies
+    between the planes that bound the boxes.
 
     Args:
         corners: of the boxes, in world mm.
@@ -82,7 +104,9 @@ def window_of(corners: Float[Tensor, "n 3"], cameras: Cameras, edges: Float[Tens
         multiple: that number.
     """
     seen = cameras.project(corners.to(cameras.source)).cpu()  # [m n 3]
-    place = torch.stack([depth_index(seen[..., 2], edges.cpu()), seen[..., 1], seen[..., 0]], dim=-1)
+    place = torch.stack(
+        [depth_index(seen[..., 2], edges.cpu()), seen[..., 1], seen[..., 0]], dim=-1
+    )
     sizes = torch.tensor([edges.shape[1] - 1, *cameras.shape])
     across = (seen[..., 2].amin(dim=1) * seen[..., 2].amax(dim=1) <= 0) & (not cameras.parallel)
     least, most = place.amin(dim=1), place.amax(dim=1)
@@ -104,7 +128,9 @@ def held_bricks(mask: Bool[Tensor, "b 1 d h w"]) -> Bool[Tensor, "z y x"]:
 
 
 def brick_corners(grid: Grid, bricks: Bool[Tensor, "z y x"] | None = None) -> Float[Tensor, "n 3"]:
-    """World positions in mm of the corners of those bricks of a grid; of its box, where there is none."""
+    """World positions in mm of the corners of those bricks of a grid; of its box, where there is
+    none.
+    """
     if bricks is None or not bricks.any():
         return grid.corners()
     around = pad(bricks.float(), (1, 1, 1, 1, 1, 1))[None]

@@ -15,15 +15,23 @@ def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device)
     if not isinstance(tensor, Tensor):
         raise TypeError(f"Expected {what} as a tensor, got {type(tensor).__name__}")
     if tensor.ndim != 5 or tuple(tensor.shape[2:]) != tuple(sizes):
-        raise ValueError(f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}")
+        raise ValueError(
+            f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}"
+        )
     if tensor.device != device:
-        raise ValueError(f"Expected {what} on {device}, where the projector is, got {tensor.device}")
+        raise ValueError(
+            f"Expected {what} on {device}, where the projector is, got {tensor.device}"
+        )
 
 
 def check_floating(tensor: Tensor, what: str) -> None:
-    """Raise ValueError for integers and masks: they would be rounded to float32 unasked, and have no gradient."""
+    """Raise ValueError for integers and masks: they would be rounded to float32 unasked, and have
+    no gradient.
+    """
     if not tensor.is_floating_point():
-        raise ValueError(f"Expected {what} of floating point, got {tensor.dtype}; convert it, as by .float()")
+        raise ValueError(
+            f"Expected {what} of floating point, got {tensor.dtype}; convert it, as by .float()"
+        )
 
 
 def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:

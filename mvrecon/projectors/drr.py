@@ -10,9 +10,11 @@ from mvrecon.projectors.ray_transform import RayTransform
 
 
 class Drr(RayTransform):
-    """Digitally reconstructed radiographs: integrals along the rays through each camera's point; see `RayTransform`.
+    """Digitally reconstructed radiographs: integrals along the rays through each camera's point;
+    see `RayTransform`.
 
-    Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth volumes, "siddon" one.
+    Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth volumes, "siddon"
+    one.
 
     Args:
         grid: where the voxels lie.
@@ -38,5 +40,7 @@ class Drr(RayTransform):
         support: Bool[Tensor, "d h w"] | None = None,
     ):
         if cameras.parallel:
-            raise ValueError("The projector 'drr' needs central cameras, got a parallel rig; use 'radon'")
+            raise ValueError(
+                "The projector 'drr' needs central cameras, got a parallel rig; use 'radon'"
+            )
         super().__init__(grid, cameras, method, backend, rays_per_pixel, skip, support)

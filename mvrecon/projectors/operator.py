@@ -1,4 +1,6 @@
-"""Linear operators y = A x: the adjoint, weights, stacks, and the parts of an operator that a caller asks for."""
+"""Linear operators y = A x: the adjoint, weights, stacks, and the parts of an operator that a
+caller asks for.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, overload
@@ -16,12 +18,14 @@ Weight = Tensor | Callable[[], Tensor] | None
 
 
 class LinearOperator:
-    """A linear map y = A x from tensors [b c *domain_shape] to tensors [b c *range_shape], with its adjoint.
+    """A linear map y = A x from tensors [b c *domain_shape] to tensors [b c *range_shape], with its
+    adjoint.
 
-    A subclass gives `domain_shape`, `range_shape`, `forward` and `adjoint`; that is all that SIRT, MLEM, likelihoods
-    and models need. The parts of an operator (`subset`, `cropped`, `with_support`) always work: by default the whole
-    operator is computed. An operator that can do a part at the part's cost overrides the method, and names it in
-    `capabilities`, which is what an algorithm asks before it relies on the saving.
+    A subclass gives `domain_shape`, `range_shape`, `forward` and `adjoint`; that is all that SIRT,
+    MLEM, likelihoods and models need. The parts of an operator (`subset`, `cropped`,
+    `with_support`) always work: by default the whole operator is computed. An operator that can do
+    a part at the part's cost overrides the method, and names it in `capabilities`, which is what an
+    algorithm asks before it relies on the saving.
     """
 
     domain_shape: tuple[int, ...]
@@ -47,7 +51,9 @@ class LinearOperator:
 
     @property
     def pose_gradient(self) -> bool:
-        """Whether a gradient by the cameras' pose is asked for: nothing that depends on it may then be kept."""
+        """Whether a gradient by the cameras' pose is asked for: nothing that depends on it may then
+        be kept.
+        """
         return False
 
     @property
@@ -68,11 +74,15 @@ class LinearOperator:
         return Scaled(self, pixels=torch.tensor(float(factor), dtype=torch.float64))
 
     def subset(self, selection: "LinearOperator") -> "LinearOperator":
-        """The chosen entries of A x alone, S A; `selection` is S, from `projectors/selection.py`."""
+        """The chosen entries of A x alone, S A; `selection` is S, from
+        `projectors/selection.py`.
+        """
         return Composed(selection, self)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> "LinearOperator":
-        """A for volumes that are zero outside a box of the grid, and for some of the cameras (None: all)."""
+        """A for volumes that are zero outside a box of the grid, and for some of the cameras (None:
+        all).
+        """
         return Cropped(self, box, views)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> "LinearOperator":
@@ -85,7 +95,9 @@ class LinearOperator:
 
 
 class Projector(LinearOperator):
-    """A linear operator between the volumes [b c d h w] of a grid and the views [b c m v u] of a rig."""
+    """A linear operator between the volumes [b c d h w] of a grid and the views [b c m v u] of a
+    rig.
+    """
 
     grid: Grid
     cameras: Cameras
@@ -118,7 +130,9 @@ class Composed(nn.Module, LinearOperator):
     def __init__(self, A: LinearOperator, B: LinearOperator):
         super().__init__()
         if A.domain_shape != B.range_shape:
-            raise ValueError(f"A B needs A's domain to be B's range, got {A.domain_shape} and {B.range_shape}")
+            raise ValueError(
+                f"A B needs A's domain to be B's range, got {A.domain_shape} and {B.range_shape}"
+            )
         self.A, self.B = A, B
         self.domain_shape, self.range_shape = B.domain_shape, A.range_shape
 
@@ -171,9 +185,10 @@ class Scaled(Wrapped):
 
     Args:
         A: the operator.
-        pixels: factors that broadcast to [*range_shape], or a function that gives them, called at every use: for
-            factors that depend on cameras which want a gradient. None: one.
-        voxels: factors or a mask [*domain_shape]; a mask leaves out what is not finite, too. None: one.
+        pixels: factors that broadcast to [*range_shape], or a function that gives them, called at
+            every use: for factors that depend on cameras which want a gradient. None: one.
+        voxels: factors or a mask [*domain_shape]; a mask leaves out what is not finite, too. None:
+            one.
     """
 
     voxels: Tensor | None
@@ -202,13 +217,21 @@ class Scaled(Wrapped):
     def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
         factors = self.pixels
         # in the wider of the two precisions: a half would round small factors to zero
-        y = y if factors is None else y * factors.to(y.device, torch.promote_types(y.dtype, torch.float32))
+        y = (
+            y
+            if factors is None
+            else y * factors.to(y.device, torch.promote_types(y.dtype, torch.float32))
+        )
         return self._weighted(self.A.adjoint(y))
 
     def _weighted(self, x: Tensor) -> Tensor:
         if self.voxels is None:
             return x
-        return torch.where(self.voxels, x, 0) if self.voxels.dtype == torch.bool else x * self.voxels.to(x)
+        return (
+            torch.where(self.voxels, x, 0)
+            if self.voxels.dtype == torch.bool
+            else x * self.voxels.to(x)
+        )
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
         return Scaled(self.A.subset(selection), self._chosen(selection), self.voxels)
@@ -224,9 +247,17 @@ class Scaled(Wrapped):
     def mirror(self) -> Mirror | None:
         """A's own, where it mirrors the weights into themselves, too."""
         mirror, factors = self.A.mirror(), self.pixels
-        if mirror is None or factors is not None and not _same(mirror.views(self._whole(factors)), factors):
+        if (
+            mirror is None
+            or factors is not None
+            and not _same(mirror.views(self._whole(factors)), factors)
+        ):
             return None
-        return mirror if self.voxels is None or _same(mirror.volume(self.voxels), self.voxels) else None
+        return (
+            mirror
+            if self.voxels is None or _same(mirror.volume(self.voxels), self.voxels)
+            else None
+        )
 
     def _chosen(self, selection: LinearOperator) -> Weight:
         return self._through(lambda w: selection(self._whole(w)[None, None])[0, 0])
@@ -242,7 +273,8 @@ class Scaled(Wrapped):
 
 
 class Cropped(Wrapped):
-    """A for volumes that are zero outside a box, and for some cameras, by way of the whole operator.
+    """A for volumes that are zero outside a box, and for some cameras, by way of the whole
+    operator.
 
     Args:
         A: of the whole grid.

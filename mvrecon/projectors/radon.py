@@ -11,9 +11,10 @@ from mvrecon.projectors.ray_transform import RayTransform
 class Radon(RayTransform):
     """Integrals along parallel rays; see `RayTransform`.
 
-    A grid of one slice under detectors of one row is the 2-D Radon transform. Detector rows along z see a stack of
-    slices: the volume is then read as whole rows along z, several times faster than by rays that are tilted.
-    Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth volumes, "siddon" one.
+    A grid of one slice under detectors of one row is the 2-D Radon transform. Detector rows along z
+    see a stack of slices: the volume is then read as whole rows along z, several times faster than
+    by rays that are tilted. Order of accuracy in the voxel size: "joseph" and "trilinear" two for
+    smooth volumes, "siddon" one.
 
     Args:
         grid: where the voxels lie.
@@ -39,5 +40,7 @@ class Radon(RayTransform):
         support: Bool[Tensor, "d h w"] | None = None,
     ):
         if not cameras.parallel:
-            raise ValueError("The projector 'radon' needs a parallel rig, got central cameras; use 'drr'")
+            raise ValueError(
+                "The projector 'radon' needs a parallel rig, got central cameras; use 'drr'"
+            )
         super().__init__(grid, cameras, method, backend, rays_per_pixel, skip, support)

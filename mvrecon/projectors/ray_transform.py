@@ -1,4 +1,6 @@
-"""The ray transform: integrals of the volumes of one grid along the rays of one rig, and its matched adjoint."""
+"""The ray transform: integrals of the volumes of one grid along the rays of one rig, and its
+matched adjoint.
+"""
 
 import math
 from collections.abc import Sequence
@@ -32,31 +34,37 @@ METHODS = ("joseph", "siddon", "trilinear")
 class RayTransform(nn.Module, Projector):
     """y = A x: the integrals of volumes along the rays of a rig, in (unit of x) * mm.
 
-    Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; twice in volume and views.
-    Half and bfloat16 volumes are read as they are and summed in float32, which views and adjoints are given back in.
-    Geometry stays in float64 whatever the module is cast to. Grid and cameras stay where they were made;
-    `.to(device)` moves the operator. `last_backend` tells which back end did the last call, `skipped` what it left out.
+    Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; twice in
+    volume and views. Half and bfloat16 volumes are read as they are and summed in float32, which
+    views and adjoints are given back in. Geometry stays in float64 whatever the module is cast to.
+    Grid and cameras stay where they were made; `.to(device)` moves the operator. `last_backend`
+    tells which back end did the last call, `skipped` what it left out.
 
     Args:
         grid: where the voxels lie.
         cameras: the rig, or rays given one by one.
-        method: "joseph", second order in the voxel size for smooth volumes, first across sharp edges, with a step where
-            a ray's main axis changes; "siddon", exact for volumes of constant voxels, first order otherwise; or
-            "trilinear", second order in the distance of its samples too, and dearer than "joseph" at no gain. It has as
-            many samples on each ray as voxels fit along the grid's diagonal; "trilinear:300" has 300.
-        backend: "cpu" (compiled), "cuda" (compiled), "reference" (torch, any device and order of derivative), or
-            "auto": the compiled one of the tensors' device where it can be had, else reference.
-        rays_per_pixel: a pixel is the mean over so many rays each way (1: the thin ray at its centre).
-        skip: what `forward` leaves out of a volume: "off", nothing; "box", what lies outside the box of its voxels that
-            are not zero; "brick", its empty bricks of 8 voxels a side, too; "auto", what costs least. The volume is
-            looked at in every call, and the views are the same to the last bit. "verify" also goes without skipping,
-            and raises where a bit differs. Its gradient by the volume stays dense.
-        support: the voxels that may be anything but zero, a mask [d h w]. It is part of the operator, A diag(support),
-            and of its adjoint, diag(support) A^T; what lies outside of it is neither read nor written.
+        method: "joseph", second order in the voxel size for smooth volumes, first across sharp
+            edges, with a step where a ray's main axis changes; "siddon", exact for volumes of
+            constant voxels, first order otherwise; or "trilinear", second order in the distance of
+            its samples too, and dearer than "joseph" at no gain. It has as many samples on each ray
+            as voxels fit along the grid's diagonal; "trilinear:300" has 300.
+        backend: "cpu" (compiled), "cuda" (compiled), "reference" (torch, any device and order of
+            derivative), or "auto": the compiled one of the tensors' device where it can be had,
+            else reference.
+        rays_per_pixel: a pixel is the mean over so many rays each way (1: the thin ray at its
+            centre).
+        skip: what `forward` leaves out of a volume: "off", nothing; "box", what lies outside the
+            box of its voxels that are not zero; "brick", its empty bricks of 8 voxels a side, too;
+            "auto", what costs least. The volume is looked at in every call, and the views are the
+            same to the last bit. "verify" also goes without skipping, and raises where a bit
+            differs. Its gradient by the volume stays dense.
+        support: the voxels that may be anything but zero, a mask [d h w]. It is part of the
+            operator, A diag(support), and of its adjoint, diag(support) A^T; what lies outside of
+            it is neither read nor written.
 
     Raises:
-        ValueError: an unknown method, back end or way to skip, counts below one, a support that does not fit, or grid
-            and cameras on different devices.
+        ValueError: an unknown method, back end or way to skip, counts below one, a support that
+            does not fit, or grid and cameras on different devices.
     """
 
     capabilities = frozenset({"subset", "crop", "support"})
@@ -74,12 +82,17 @@ class RayTransform(nn.Module, Projector):
     ):
         super().__init__()
         known = {"method": METHODS, "backend": backends.BACKENDS, "skip": SKIPS}
-        for what, name in (("method", method.partition(":")[0]), ("backend", backend), ("skip", skip)):
+        for what, name in (
+            ("method", method.partition(":")[0]),
+            ("backend", backend),
+            ("skip", skip),
+        ):
             if name not in known[what]:
                 raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(known[what])}")
         if cameras.source.device != grid.affine.device:
             raise ValueError(
-                f"Grid and cameras must be on one device, got {grid.affine.device} and {cameras.source.device}"
+                f"Grid and cameras must be on one device, got {grid.affine.device} and "
+                f"{cameras.source.device}"
             )
         self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
@@ -94,7 +107,9 @@ class RayTransform(nn.Module, Projector):
         self._last: Tensor | None = None
 
     def __init_subclass__(cls, **options: object) -> None:
-        """A subclass that computes something else has the whole operator's parts alone: right, but nothing is saved."""
+        """A subclass that computes something else has the whole operator's parts alone: right, but
+        nothing is saved.
+        """
         super().__init_subclass__(**options)
         if {"forward", "adjoint"} & vars(cls).keys():
             cls.capabilities = frozenset()
@@ -127,13 +142,16 @@ class RayTransform(nn.Module, Projector):
             return super().cropped(box, views)
         support = None if self.support is None else self.support[box.slices].cpu()
         device = self.cameras.source.device
-        cameras = self.cameras if views is None else self.cameras[torch.tensor(views, device=device)]
+        cameras = (
+            self.cameras if views is None else self.cameras[torch.tensor(views, device=device)]
+        )
         options = (self.method, self.backend, self.rays_per_pixel, self.skip, support)
         return RayTransform(self.grid.cropped(box), cameras, *options).to(self.device)
 
     def mirror(self) -> Mirror | None:
         """A plane that mirrors grid, rig and support into themselves."""
-        # a ray in the face between two voxels is given to one of them by "siddon": not to that one's mirror image
+        # a ray in the face between two voxels is given to one of them by "siddon": not to that
+        # one's mirror image
         known = bool(self.capabilities) and self.method != "siddon"
         if not known or isinstance(self.rays, ExplicitRays):
             return None
@@ -162,7 +180,9 @@ class RayTransform(nn.Module, Projector):
             ValueError: the rays were given one by one, and have no cameras with frusta.
         """
         if isinstance(self.rays, ExplicitRays):
-            raise ValueError("This needs cameras, which the projector has not: it was given explicit rays")
+            raise ValueError(
+                "This needs cameras, which the projector has not: it was given explicit rays"
+            )
         return self.rays
 
     @property
@@ -173,7 +193,9 @@ class RayTransform(nn.Module, Projector):
     def _lines(self) -> Float[Tensor, "m 4 3 k"]:
         if isinstance(self.rays, ExplicitRays):
             if self.rays_per_pixel != 1:
-                raise ValueError(f"Explicit rays are one a pixel, got rays_per_pixel={self.rays_per_pixel}")
+                raise ValueError(
+                    f"Explicit rays are one a pixel, got rays_per_pixel={self.rays_per_pixel}"
+                )
             return lines_of_rays(self.rays, self.grid)
         return lines_of(self.rays.refined(self.rays_per_pixel), self.grid)
 
@@ -185,7 +207,9 @@ class RayTransform(nn.Module, Projector):
 
     @property
     def lines(self) -> Float[Tensor, "m 4 3 k"]:
-        """The rays in voxel space; made anew, with their graph, where the cameras want a gradient."""
+        """The rays in voxel space; made anew, with their graph, where the cameras want a
+        gradient.
+        """
         return self._lines().to(self.fixed_lines.device) if self.poses else self.fixed_lines
 
     @property
@@ -207,7 +231,8 @@ class RayTransform(nn.Module, Projector):
         return views.reshape(*volume.shape[:2], *self.range_shape)
 
     def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
-        """Volumes from views: every value spread along its ray with the weights of `forward`; zeros cost nothing.
+        """Volumes from views: every value spread along its ray with the weights of `forward`; zeros
+        cost nothing.
 
         Raises:
             ValueError: a wrong rank, size, device or dtype.
@@ -221,16 +246,23 @@ class RayTransform(nn.Module, Projector):
         return self.backproject_along(y, self.lines).unflatten(0, views.shape[:2])
 
     def project_along(
-        self, volume: Float[Tensor, "b c d h w"], lines: Float[Tensor, "r 4 3 k"], detector: Sequence[int]
+        self,
+        volume: Float[Tensor, "b c d h w"],
+        lines: Float[Tensor, "r 4 3 k"],
+        detector: Sequence[int],
     ) -> Float[Tensor, "n r v u"]:
-        """Integrals along rays in voxel space, see `kernels/rays/lines.py`; a detector has so many (rows, columns)."""
+        """Integrals along rays in voxel space, see `kernels/rays/lines.py`; a detector has so many
+        (rows, columns).
+        """
         check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(volume, "a volume")
         x, kernels = volume.flatten(0, 1), self._kernels(volume, lines)
         rays = lines, self.window, list(detector), self.kernel
         if kernels is reference:
             self._last = None
-            return kernels.project(wide(x if self.support is None else within(x, self.support)), *rays)
+            return kernels.project(
+                wide(x if self.support is None else within(x, self.support)), *rays
+            )
         if self.support is not None:
             self._last, box = held = self._held
             part = within(x[:, *box.slices], self.support[box.slices])
@@ -254,7 +286,9 @@ class RayTransform(nn.Module, Projector):
         if self.support is None:
             return kernels.backproject(views, lines, self.window, shape, self.kernel)
         if kernels is reference:
-            return within(kernels.backproject(views, lines, self.window, shape, self.kernel), self.support)
+            return within(
+                kernels.backproject(views, lines, self.window, shape, self.kernel), self.support
+            )
         self._last, box = held = self._held
         part = kernels.backproject(views, lines, self.window, list(box.shape), self.kernel, held[0])
         return placed(within(part, self.support[box.slices]), box, self.grid.shape)
@@ -265,7 +299,9 @@ class RayTransform(nn.Module, Projector):
         if self.support is not None and self.skip != "off" and backends.COMPILED:
             mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
             how = self.skip if self.skip in ("box", "brick") else "once"
-            held = Occupancy.decoded(ops.occupied(mask, rays, self.window, self.detector, self.kernel, how))
+            held = Occupancy.decoded(
+                ops.occupied(mask, rays, self.window, self.detector, self.kernel, how)
+            )
         return held.encoded(), held.box
 
     def _kernels(self, tensor: Tensor, lines: Tensor) -> ModuleType:
@@ -274,7 +310,10 @@ class RayTransform(nn.Module, Projector):
         return kernels
 
     def extra_repr(self) -> str:
-        return f"{len(self.rays)} views of {self.rays.shape}, grid {self.grid.shape}, {self.method}, {self.backend}"
+        return (
+            f"{len(self.rays)} views of {self.rays.shape}, grid {self.grid.shape}, "
+            f"{self.method}, {self.backend}"
+        )
 
 
 def _kernel(method: str, grid: Grid) -> str:
@@ -286,5 +325,7 @@ def _kernel(method: str, grid: Grid) -> str:
     if not colon:
         return f"{name}:{math.ceil(math.hypot(*grid.shape))}"
     if not samples.isdecimal() or int(samples) < 1:
-        raise ValueError(f"A ray needs a positive number of samples, as in 'trilinear:300', got {method!r}")
+        raise ValueError(
+            f"A ray needs a positive number of samples, as in 'trilinear:300', got {method!r}"
+        )
     return method

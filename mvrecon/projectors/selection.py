@@ -1,4 +1,6 @@
-"""Chosen cameras or chosen pixels of views, as operators: what picks them, and what puts them back among zeros."""
+"""Chosen cameras or chosen pixels of views, as operators: what picks them, and what puts them back
+among zeros.
+"""
 
 from collections.abc import Sequence
 
@@ -65,7 +67,9 @@ class RaySelection(LinearOperator):
 
 
 def view_subset(A: LinearOperator, views: Sequence[int]) -> LinearOperator:
-    """The part of an operator that makes some cameras' views, volumes [b c d h w] to views [b c k v u]."""
+    """The part of an operator that makes some cameras' views, volumes [b c d h w] to views [b c k v
+    u].
+    """
     return A.subset(ViewSelection(A.range_shape, views))
 
 
@@ -75,11 +79,15 @@ def ray_subset(A: LinearOperator, chosen: Bool[Tensor, "m v u"]) -> LinearOperat
 
 
 def ordered_subsets(count: int, subsets: int) -> list[range]:
-    """The indices of `count` cameras dealt out in turn, so that each ordered subset sees the object from all around.
+    """The indices of `count` cameras dealt out in turn, so that each ordered subset sees the object
+    from all around.
 
     Raises:
         ValueError: fewer than one subset, or more than there are cameras.
     """
     if not 1 <= subsets <= count:
-        raise ValueError(f"Cameras are dealt out to 1 to {count} subsets, one camera each at least, got {subsets}")
+        raise ValueError(
+            f"Cameras are dealt out to 1 to {count} subsets, one camera each at least, got "
+            f"{subsets}"
+        )
     return [range(first, count, subsets) for first in range(subsets)]

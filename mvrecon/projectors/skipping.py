@@ -1,4 +1,6 @@
-"""What an operator leaves out: supports that are part of it, and what it tells of the zeros that it passes by."""
+"""What an operator leaves out: supports that are part of it, and what it tells of the zeros that it
+passes by.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,8 +25,8 @@ class Skipped:
         mode: "off", "box" or "brick".
         box: the voxels that were looked at.
         why: in words.
-        fractions: "voxels", of the volume, in the box; "box" and "brick", of the work on a few rays, that either
-            leaves, where they were counted.
+        fractions: "voxels", of the volume, in the box; "box" and "brick", of the work on a few
+            rays, that either leaves, where they were counted.
     """
 
     mode: str
@@ -36,18 +38,31 @@ class Skipped:
 def told(code: Tensor | None, asked: str, shape: Sequence[int]) -> Skipped:
     """What the code of an occupancy says; none: nothing was left out."""
     if code is None:
-        return Skipped("off", Box.whole(shape), "nothing was asked to be skipped, or the back end skips nothing")
+        return Skipped(
+            "off",
+            Box.whole(shape),
+            "nothing was asked to be skipped, or the back end skips nothing",
+        )
     held = Occupancy.decoded(code)
     whole = held.box == Box.whole(shape)
     mode = "brick" if held.bricks is not None else "off" if whole else "box"
     fractions = {"voxels": held.box.size / math.prod(shape)}
-    fractions |= {name: each for name, each in zip(("box", "brick"), held.shares, strict=True) if each == each}
+    fractions |= {
+        name: each for name, each in zip(("box", "brick"), held.shares, strict=True) if each == each
+    }
     if "brick" in fractions:
-        why = f"on a few rays the box leaves {fractions['box']:.1%} of the work, bricks {fractions['brick']:.1%}"
+        why = (
+            f"on a few rays the box leaves {fractions['box']:.1%} of the work, bricks "
+            f"{fractions['brick']:.1%}"
+        )
     elif asked in ("box", "brick"):
         why = f"{asked!r} was asked for"
     else:
-        why = "it is small work, or the volume is full" if whole else "bricks are full, or too small work to count them"
+        why = (
+            "it is small work, or the volume is full"
+            if whole
+            else "bricks are full, or too small work to count them"
+        )
     return Skipped(mode, held.box, why, fractions)
 
 
@@ -65,7 +80,9 @@ def check_support(support: Tensor | None, grid: Grid) -> Bool[Tensor, "d h w"] |
     return support
 
 
-def within(volumes: Float[Tensor, "n d h w"], support: Bool[Tensor, "d h w"]) -> Float[Tensor, "n d h w"]:
+def within(
+    volumes: Float[Tensor, "n d h w"], support: Bool[Tensor, "d h w"]
+) -> Float[Tensor, "n d h w"]:
     """Volumes with nothing outside a support, whatever stood there."""
     return torch.where(support, volumes, 0)
 
@@ -75,6 +92,7 @@ def verify(views: Tensor, dense: Tensor, skipped: Skipped) -> None:
     same = (views == dense) | (views.isnan() & dense.isnan())
     if not same.all():
         raise RuntimeError(
-            f"skip='verify': {int((~same).sum())} of {same.numel()} pixels differ from those without skipping "
+            f"skip='verify': {int((~same).sum())} of {same.numel()} pixels differ from those "
+            f"without skipping "
             f"({skipped.mode}, {skipped.why})"
         )

@@ -1,4 +1,6 @@
-"""Operators on one volume, stacked: several scanners, or several energies, that see the same object."""
+"""Operators on one volume, stacked: several scanners, or several energies, that see the same
+object.
+"""
 
 from collections.abc import Sequence
 
@@ -10,7 +12,8 @@ from mvrecon.projectors.operator import LinearOperator
 
 
 class Stacked(nn.Module, LinearOperator):
-    """Operators on one domain, one above the other: their views are joined along the axis of the cameras.
+    """Operators on one domain, one above the other: their views are joined along the axis of the
+    cameras.
 
     Raises:
         ValueError: domains or detectors that differ.
@@ -20,7 +23,9 @@ class Stacked(nn.Module, LinearOperator):
         super().__init__()
         shapes = {(A.domain_shape, A.range_shape[1:]) for A in parts}
         if len(shapes) != 1:
-            raise ValueError(f"Stacked operators need one domain and one detector, got {sorted(shapes)}")
+            raise ValueError(
+                f"Stacked operators need one domain and one detector, got {sorted(shapes)}"
+            )
         self.parts = list(parts)
         self.domain_shape = parts[0].domain_shape
         self.range_shape = (sum(A.range_shape[0] for A in parts), *parts[0].range_shape[1:])
@@ -34,4 +39,6 @@ class Stacked(nn.Module, LinearOperator):
 
     def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
         pieces = y.split([A.range_shape[0] for A in self.parts], dim=2)
-        return torch.stack([A.adjoint(p) for A, p in zip(self.parts, pieces, strict=True)]).sum(dim=0)
+        return torch.stack([A.adjoint(p) for A, p in zip(self.parts, pieces, strict=True)]).sum(
+            dim=0
+        )

@@ -1,4 +1,6 @@
-"""Some rays of a ray transform, at a cost that falls with their number: ordered subsets, bins that hold counts."""
+"""Some rays of a ray transform, at a cost that falls with their number: ordered subsets, bins that
+hold counts.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -20,9 +22,10 @@ if TYPE_CHECKING:
 class SomeRays(LinearOperator):
     """Some rows of a ray transform: the chosen entries of A x, and the matched adjoint.
 
-    Differentiable as the transform is, in the cameras' tensors too, and on its device. The values are the whole
-    operator's up to rounding, since sums may be taken in another order: to about 1e-6 of their norm in float32, 1e-12
-    in float64. Fixed rays are kept: 96 bytes for each view's or pixel's, 288 where a pixel has several.
+    Differentiable as the transform is, in the cameras' tensors too, and on its device. The values
+    are the whole operator's up to rounding, since sums may be taken in another order: to about 1e-6
+    of their norm in float32, 1e-12 in float64. Fixed rays are kept: 96 bytes for each view's or
+    pixel's, 288 where a pixel has several.
 
     Args:
         A: the ray transform.
@@ -56,7 +59,9 @@ class SomeRays(LinearOperator):
 
     @property
     def lines(self) -> Float[Tensor, "n 4 3 k"]:
-        """The rays in voxel space; made anew, with their graph, where the cameras want a gradient."""
+        """The rays in voxel space; made anew, with their graph, where the cameras want a
+        gradient.
+        """
         return self._choose(self.A.lines) if self._fixed is None else self._fixed.to(self.device)
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
@@ -104,7 +109,8 @@ class SomePixels(SomeRays):
     def _prepare(self) -> None:
         _, rows, columns = self.selection.domain_shape
         chosen = self.selection.chosen.to(self.device)
-        # column by column: rays in turn mostly differ in z, and meet again the voxels that the cache holds
+        # column by column: rays in turn mostly differ in z, and meet again the voxels that the
+        # cache holds
         view, u, v = chosen.mT.nonzero().unbind(dim=1)
         self.pixels, self.detector = torch.stack([view, v, u]), (1, 1)
         self.order = ((view * rows + v) * columns + u).argsort()
@@ -116,7 +122,9 @@ class SomePixels(SomeRays):
         if lines.shape[3] == 1:
             return lines[(view * rows + v) * columns + u]
         r = self.A.rays_per_pixel
-        across, down, middle = lines[view].unbind(dim=3) if r > 1 else (lines[..., k][view] for k in range(3))
+        across, down, middle = (
+            lines[view].unbind(dim=3) if r > 1 else (lines[..., k][view] for k in range(3))
+        )
         u = r * (u - (columns - 1) / 2).to(lines)[:, None, None]
         v = r * (v - (rows - 1) / 2).to(lines)[:, None, None]
         here = across * u + down * v + middle
@@ -130,7 +138,9 @@ class SomePixels(SomeRays):
 
 
 class SomeViews(SomeRays):
-    """Chosen cameras of a ray transform: volumes [b c d h w] to views [b c k v u], in the selection's order."""
+    """Chosen cameras of a ray transform: volumes [b c d h w] to views [b c k v u], in the
+    selection's order.
+    """
 
     selection: ViewSelection
 

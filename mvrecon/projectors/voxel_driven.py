@@ -1,4 +1,6 @@
-"""Voxel-driven back-projection: every voxel looks up its own image, as filtered back-projection wants it."""
+"""Voxel-driven back-projection: every voxel looks up its own image, as filtered back-projection
+wants it.
+"""
 
 from dataclasses import replace
 from typing import Literal
@@ -25,22 +27,25 @@ def backproject(
     weight: Weight = "none",
     backend: str = "auto",
 ) -> Float[Tensor, "b c d h w"]:
-    """The sum over cameras of each view at the image of every voxel's centre, weighted by distance if asked for.
+    """The sum over cameras of each view at the image of every voxel's centre, weighted by distance
+    if asked for.
 
-    Bilinear in the view; beyond the outermost pixel centres values fade to zero over one pixel. A voxel counts where
-    its ray does: on the right side of the source, and for a segment before the detector. Order of accuracy: second in
-    the pixel size. It is no projector's adjoint; `LinearOperator.T` is. Differentiable in the views by its exact
-    transpose; in the cameras with "reference", which "auto" takes for cameras that want a gradient. Half and bfloat16
-    views are summed, and given back, in float32.
+    Bilinear in the view; beyond the outermost pixel centres values fade to zero over one pixel. A
+    voxel counts where its ray does: on the right side of the source, and for a segment before the
+    detector. Order of accuracy: second in the pixel size. It is no projector's adjoint;
+    `LinearOperator.T` is. Differentiable in the views by its exact transpose; in the cameras with
+    "reference", which "auto" takes for cameras that want a gradient. Half and bfloat16 views are
+    summed, and given back, in float32.
 
     Args:
         views: values on the detectors.
         cameras: the rig.
         grid: the voxels.
-        weight: "none", or "distance" for 1 / w^2 = (SDD / z)^2, with z the voxel's depth from the source along the
-            detector's normal and SDD the source's distance to the detector; 1 for parallel beams. Feldkamp, Davis and
-            Kress, Practical cone-beam algorithm, JOSA A 1, 1984, eq. 28 weigh with d^2 / (d + r . x)^2 = (SID / z)^2,
-            d = SID from the source to the axis of rotation: that is (SID / SDD)^2 times this weight.
+        weight: "none", or "distance" for 1 / w^2 = (SDD / z)^2, with z the voxel's depth from the
+            source along the detector's normal and SDD the source's distance to the detector; 1 for
+            parallel beams. Feldkamp, Davis and Kress, Practical cone-beam algorithm, JOSA A 1,
+            1984, eq. 28 weigh with d^2 / (d + r . x)^2 = (SID / z)^2, d = SID from the source to
+            the axis of rotation: that is (SID / SDD)^2 times this weight.
         backend: "cpu" (compiled), "reference" (torch, any device), or "auto".
 
     Raises:
@@ -51,14 +56,19 @@ def backproject(
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     maps = image_maps(cameras, grid).to(views.device)
     values = wide(views).flatten(0, 1)
-    compiled = kernels_for(views, backend, None, maps)[0] == "cpu" and not (backend == "auto" and maps.requires_grad)
+    compiled = kernels_for(views, backend, None, maps)[0] == "cpu" and not (
+        backend == "auto" and maps.requires_grad
+    )
     kernels = voxel_ops if compiled else voxel_reference
-    volumes = kernels.look(values, maps, list(cameras.limits), weight == "distance", list(grid.shape))
+    volumes = kernels.look(
+        values, maps, list(cameras.limits), weight == "distance", list(grid.shape)
+    )
     return volumes.unflatten(0, views.shape[:2])
 
 
 def image_maps(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 2 3"]:
-    """From centred voxel indices to (u w, v w, w) about the detector's centre and the fraction of the ray, in float64.
+    """From centred voxel indices to (u w, v w, w) about the detector's centre and the fraction of
+    the ray, in float64.
 
     w is positive on the side of the source that counts, and 1 for parallel beams.
     """

@@ -12,9 +12,11 @@ from mvrecon.projectors.selection import ViewSelection
 
 
 def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-    """Inverse row sums R [1 1 *range] and column sums C [1 1 *domain] of A, zero where a ray or voxel is empty.
+    """Inverse row sums R [1 1 *range] and column sums C [1 1 *domain] of A, zero where a ray or
+    voxel is empty.
 
-    A rig that is its own mirror image is projected by half; the numbers are the same up to rounding.
+    A rig that is its own mirror image is projected by half; the numbers are the same up to
+    rounding.
     """
     ones = torch.ones(1, 1, *A.domain_shape, dtype=dtype, device=A.device)
     with torch.no_grad():
@@ -27,7 +29,9 @@ def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> tuple
         half = A.subset(selection)
         rows = share * selection.T(half(ones))
         columns = half.T(selection(share.expand_as(rows)))
-        return inverse_sums(rows + mirror.views(rows)), inverse_sums(columns + mirror.volume(columns))
+        return inverse_sums(rows + mirror.views(rows)), inverse_sums(
+            columns + mirror.volume(columns)
+        )
 
 
 def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -40,7 +44,9 @@ def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 def correction(
     A: LinearOperator, residual: Float[Tensor, "b c m v u"], weights: tuple[Tensor, Tensor]
 ) -> Float[Tensor, "b c d h w"]:
-    """What residual views ask of each voxel, C A^T R r, in the unit of the volume; `weights` are (R, C)."""
+    """What residual views ask of each voxel, C A^T R r, in the unit of the volume; `weights` are
+    (R, C).
+    """
     row, column = weights
     return column * A.T(row * residual)
 
@@ -56,9 +62,9 @@ def sirt(
 ) -> Float[Tensor, "b c d h w"]:
     """Simultaneous iterative reconstruction: x <- x + C A^T R (y - A x), in the unit of the volume.
 
-    Converges to the least-squares solution weighted by R (Gregor & Benson, IEEE Trans. Med. Imaging 27, 2008). With
-    momentum n iterations do the work of about n^2 / 4 (Nesterov's sequence, as in FISTA: Beck & Teboulle, SIAM J.
-    Imaging Sci. 2, 2009, eq. 4.2 and 4.3).
+    Converges to the least-squares solution weighted by R (Gregor & Benson, IEEE Trans. Med. Imaging
+    27, 2008). With momentum n iterations do the work of about n^2 / 4 (Nesterov's sequence, as in
+    FISTA: Beck & Teboulle, SIAM J. Imaging Sci. 2, 2009, eq. 4.2 and 4.3).
 
     Args:
         A: the operator.
@@ -73,7 +79,9 @@ def sirt(
         ValueError: views that are not finite, such as logarithms of no intensity.
     """
     check_finite(views)
-    weights = weights or sirt_weights(A, views.dtype if views.dtype == torch.float64 else torch.float32)
+    weights = weights or sirt_weights(
+        A, views.dtype if views.dtype == torch.float64 else torch.float32
+    )
     x = weights[0].new_zeros(*views.shape[:2], *A.domain_shape) if start is None else start
     ahead, t = x, 1.0
     for _ in range(iterations):

@@ -11,31 +11,37 @@ from mvrecon.projectors.checks import check
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import RaySelection, ViewSelection
 
-#: The share of bins with counts up to which a list of rays costs less than whole views, for all rigs and methods: a ray
-#: of a list takes up to three times as long, and the adjoint leaves out rays of zero in whole views as well.
+#: The share of bins with counts up to which a list of rays costs less than whole views, for all
+#: rigs and methods: a ray of a list takes up to three times as long, and the adjoint leaves out
+#: rays of zero in whole views as well.
 LIST = 0.2
 
 
 class PoissonLikelihood:
-    """The negative log-likelihood of counts under a volume x: sum(ybar - y log ybar) with ybar = A x + r.
+    """The negative log-likelihood of counts under a volume x: sum(ybar - y log ybar) with ybar = A
+    x + r.
 
-    Constants of the counts alone are left out. A bin without counts needs no ray: it has no part in the second sum,
-    and the first is <s, x> + sum(r), with the sensitivity s = A^T 1 made once. That is exact, for this likelihood and
-    no other (list-mode data have the same one: Barrett, White and Parra, JOSA A 14, 1997). Where most bins hold counts
-    whole views are cheaper than lists of rays, and are taken; `why` tells what was chosen, and for what reason.
+    Constants of the counts alone are left out. A bin without counts needs no ray: it has no part in
+    the second sum, and the first is <s, x> + sum(r), with the sensitivity s = A^T 1 made once. That
+    is exact, for this likelihood and no other (list-mode data have the same one: Barrett, White and
+    Parra, JOSA A 14, 1997). Where most bins hold counts whole views are cheaper than lists of rays,
+    and are taken; `why` tells what was chosen, and for what reason.
 
-    Expected counts must be positive wherever counts are. A volume with negative voxels is let through as long as they
-    are. Make it anew when counts, operator or its device change; cameras that want a gradient may move.
+    Expected counts must be positive wherever counts are. A volume with negative voxels is let
+    through as long as they are. Make it anew when counts, operator or its device change; cameras
+    that want a gradient may move.
 
     Args:
         A: the operator, in counts per unit of the volume.
         counts: measured, [b c m v u]; rays are left out where no case of the batch has counts.
-        background: expected counts r of other origin, one number or views that broadcast to the counts.
+        background: expected counts r of other origin, one number or views that broadcast to the
+            counts.
         views: indices of the only views that count; all by default.
         skip_zero_bins: False takes all bins of those views.
 
     Raises:
-        ValueError: a wrong rank, size or device; counts or background that are negative or not finite.
+        ValueError: a wrong rank, size or device; counts or background that are negative or not
+            finite.
     """
 
     def __init__(
@@ -47,24 +53,35 @@ class PoissonLikelihood:
         skip_zero_bins: bool = True,
     ):
         check(counts, "counts [b c m v u]", A.range_shape, A.device)
-        self.A, self.views = A, ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views)
+        self.A, self.views = (
+            A,
+            ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views),
+        )
         measured, added = wide(self.views(counts)), self.views(_spread(background, counts))
         for what, values in (("counts", measured), ("background", added)):
             bad = int((~(values >= 0) | ~values.isfinite()).sum())
             if bad:
-                raise ValueError(f"Expected {what} that are finite and not negative, got {bad} bins that are not")
+                raise ValueError(
+                    f"Expected {what} that are finite and not negative, got {bad} bins that are not"
+                )
         self.selection, self.why = self._choose(measured, skip_zero_bins)
         self.bins = A.subset(self.selection)
-        self.counts, self.background = (self.selection(self.views.T(values)) for values in (measured, added))
+        self.counts, self.background = (
+            self.selection(self.views.T(values)) for values in (measured, added)
+        )
         self._added = added.flatten(1).sum(dim=1, dtype=torch.float64)
         self._sensitivity: dict[torch.dtype, Tensor] = {}
 
-    def _choose(self, measured: Float[Tensor, "b c k v u"], skip: bool) -> tuple[LinearOperator, str]:
+    def _choose(
+        self, measured: Float[Tensor, "b c k v u"], skip: bool
+    ) -> tuple[LinearOperator, str]:
         if not skip:
             return self.views, "all bins: asked for"
         if "subset" not in self.A.capabilities:
             return self.views, f"all bins: {type(self.A).__name__} does not compute rays one by one"
-        chosen = self.views.T((measured != 0).any(dim=0, keepdim=True).any(dim=1, keepdim=True))[0, 0]
+        chosen = self.views.T((measured != 0).any(dim=0, keepdim=True).any(dim=1, keepdim=True))[
+            0, 0
+        ]
         share = int(chosen.sum()) / max(1, measured[:1, :1].numel())
         reason = f"{share:.1%} of the bins hold counts, a list of rays pays up to {LIST:.0%}"
         if share > LIST:
@@ -72,7 +89,9 @@ class PoissonLikelihood:
         return RaySelection(self.A.range_shape, chosen), f"bins with counts: {reason}"
 
     def sensitivity(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
-        """s = A^T 1: the counts that one unit in each voxel brings; made anew where the cameras want a gradient."""
+        """s = A^T 1: the counts that one unit in each voxel brings; made anew where the cameras
+        want a gradient.
+        """
         if self.A.pose_gradient or dtype not in self._sensitivity:
             self._sensitivity[dtype] = self._summed(dtype)
         return self._sensitivity[dtype]
@@ -82,7 +101,8 @@ class PoissonLikelihood:
         own, ones = (torch.ones(1, 1, *s, dtype=dtype, device=self.counts.device) for s in shapes)
         if self.selection is self.views:
             return self.bins.T(own)
-        # a list of rays rounds otherwise than whole views, and MLEM divides what a list explains by this
+        # a list of rays rounds otherwise than whole views, and MLEM divides what a list explains by
+        # this
         rest = ones - self.views(self.selection.T(own))
         return self.bins.T(own) + self.A.subset(self.views).T(rest)
 
@@ -90,20 +110,24 @@ class PoissonLikelihood:
         """ybar, the counts to be expected in the bins that are computed.
 
         Raises:
-            ValueError: a volume of another batch than the counts, or one that allows no counts where there are some.
+            ValueError: a volume of another batch than the counts, or one that allows no counts
+                where there are some.
         """
         self._check(volume)
         expected = self.bins(volume) + self.background
         impossible = int(((self.counts > 0) & ~(expected > 0)).sum())
         if impossible:
             raise ValueError(
-                f"{impossible} bins hold counts where the volume and the background allow none: their likelihood is "
-                "zero. Give a background > 0, a grid or support that reaches these rays, or a volume with values there"
+                f"{impossible} bins hold counts where the volume and the background allow none: "
+                f"their likelihood is "
+                "zero. Give a background > 0, a grid or support that reaches these rays, or a "
+                "volume with values there"
             )
         return expected
 
     def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, " b"]:
-        """The negative log-likelihood of each case, in float64; differentiable in the volume and in the cameras.
+        """The negative log-likelihood of each case, in float64; differentiable in the volume and in
+        the cameras.
 
         Raises:
             ValueError: as `expected`.
@@ -112,7 +136,9 @@ class PoissonLikelihood:
         held = self.counts > 0
         # an unexpected bin without counts has part 0, but would have the derivative 0 / 0
         logs = self.counts * torch.where(held, expected, 1).double().log()
-        total = (self.sensitivity(expected.dtype) * volume).flatten(1).sum(dim=1, dtype=torch.float64)
+        total = (
+            (self.sensitivity(expected.dtype) * volume).flatten(1).sum(dim=1, dtype=torch.float64)
+        )
         return total + self._added - logs.flatten(1).sum(dim=1)
 
     @torch.no_grad()
@@ -127,9 +153,11 @@ class PoissonLikelihood:
 
     @torch.no_grad()
     def explained(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
-        """A^T (y / ybar), for a volume that is nowhere negative; bins with no counts to expect are left out.
+        """A^T (y / ybar), for a volume that is nowhere negative; bins with no counts to expect are
+        left out.
 
-        That changes no multiplicative step: all voxels on the ray of such a bin are zero, and stay so.
+        That changes no multiplicative step: all voxels on the ray of such a bin are zero, and stay
+        so.
         """
         self._check(volume)
         return self.bins.T(_ratio(self.counts, self.bins(volume) + self.background))
@@ -137,7 +165,10 @@ class PoissonLikelihood:
     def _check(self, volume: Tensor) -> None:
         if volume.shape[:2] != self.counts.shape[:2]:
             batch = tuple(self.counts.shape[:2])
-            raise ValueError(f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got {tuple(volume.shape)}")
+            raise ValueError(
+                f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got "
+                f"{tuple(volume.shape)}"
+            )
 
 
 def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
@@ -152,6 +183,7 @@ def _spread(background: float | Tensor, counts: Tensor) -> Tensor:
         return added.expand(counts.shape)
     except RuntimeError as error:
         raise ValueError(
-            f"Expected a background of one number or views that broadcast to {tuple(counts.shape)}, "
+            f"Expected a background of one number or views that broadcast to "
+            f"{tuple(counts.shape)}, "
             f"got {tuple(added.shape)}"
         ) from error

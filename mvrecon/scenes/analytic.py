@@ -1,4 +1,6 @@
-"""Scenes of analytic phantoms: exact views, supersampled truth, and random numbers that depend on the case alone."""
+"""Scenes of analytic phantoms: exact views, supersampled truth, and random numbers that depend on
+the case alone.
+"""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -17,8 +19,8 @@ class AnalyticScene(ABC):
     """Cases of one kind of phantom.
 
     Args:
-        field: radius of the sphere about the grid's centre that holds the object, as a fraction of the grid's
-            shortest edge.
+        field: radius of the sphere about the grid's centre that holds the object, as a fraction of
+            the grid's shortest edge.
         value: the greatest value; all lie between 0 and it.
         unit: of the value.
 
@@ -35,7 +37,10 @@ class AnalyticScene(ABC):
 
     def __post_init__(self) -> None:
         if not 0 < self.field <= 0.5:
-            raise ValueError(f"The field must be a fraction in (0, 0.5] of the grid's shortest edge, got {self.field}")
+            raise ValueError(
+                f"The field must be a fraction in (0, 0.5] of the grid's shortest edge, got "
+                f"{self.field}"
+            )
         if not self.value > 0:
             raise ValueError(f"The greatest value of a scene must be positive, got {self.value}")
 
@@ -50,7 +55,9 @@ class AnalyticScene(ABC):
 
     def radius(self, grid: Grid) -> float:
         """Radius of the field in mm."""
-        return self.field * min(n * step for n, step in zip(grid.shape[::-1], grid.spacing, strict=True))
+        return self.field * min(
+            n * step for n, step in zip(grid.shape[::-1], grid.spacing, strict=True)
+        )
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
         """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`.
@@ -59,8 +66,12 @@ class AnalyticScene(ABC):
             IndexError: the scene has no such case.
         """
         if self.length is not None and not index < self.length:
-            raise IndexError(f"The scene {self.kind!r} has {self.length} case(s), got index {index}")
-        return render(self.phantom(generator(seed, index), grid), grid, cameras, f"{self.kind}-{seed}-{index}")
+            raise IndexError(
+                f"The scene {self.kind!r} has {self.length} case(s), got index {index}"
+            )
+        return render(
+            self.phantom(generator(seed, index), grid), grid, cameras, f"{self.kind}-{seed}-{index}"
+        )
 
 
 def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int = 4) -> Sample:
@@ -69,7 +80,9 @@ def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int =
     views = phantom.integrals(start.detach().cpu(), end.detach().cpu(), cameras.limits)
     volume = voxelise(phantom, grid, factor)
     inside = volume > 0
-    if any((part.values < 0).any() for part in phantom.parts):  # values may cancel inside the object
+    if any(
+        (part.values < 0).any() for part in phantom.parts
+    ):  # values may cancel inside the object
         inside |= voxelise(phantom.support(), grid, factor) > 0
     return Sample(views[None].to(torch.float32), volume[None], inside[None], name)
 
@@ -77,14 +90,17 @@ def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int =
 def generator(seed: int, index: int) -> torch.Generator:
     """The random numbers of one case.
 
-    Torch's CPU generator takes 32 bits of seed: here the murmur3 finaliser, a bijection, of seed * 2^32 / phi + index.
-    No two indices of a series share a stream, nor do any two of the series 0 to 999 below index 10^6.
+    Torch's CPU generator takes 32 bits of seed: here the murmur3 finaliser, a bijection, of seed *
+    2^32 / phi + index. No two indices of a series share a stream, nor do any two of the series 0 to
+    999 below index 10^6.
 
     Raises:
         ValueError: a negative seed or index.
     """
     if seed < 0 or index < 0:
-        raise ValueError(f"A case needs a seed and an index of at least 0, got seed {seed}, index {index}")
+        raise ValueError(
+            f"A case needs a seed and an index of at least 0, got seed {seed}, index {index}"
+        )
     return torch.Generator().manual_seed(mixed(seed, index))
 
 

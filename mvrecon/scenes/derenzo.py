@@ -1,7 +1,8 @@
 """The Derenzo (hot rod) phantom: six sectors of parallel wells, a test of resolution.
 
-The layout is that of the usual insert: in a sector of 60 degrees wells of diameter d stand on a triangular lattice of
-spacing 2 d; row n from the tip has n wells (Derenzo, IEEE Trans. Nucl. Sci. 24 (1977) 544).
+The layout is that of the usual insert: in a sector of 60 degrees wells of diameter d stand on a
+triangular lattice of spacing 2 d; row n from the tip has n wells (Derenzo, IEEE Trans. Nucl. Sci.
+24 (1977) 544).
 """
 
 import math
@@ -22,7 +23,8 @@ SECTORS = 6
 
 
 def sector_wells(diameter: float, radius: float) -> Float[Tensor, "n 2"]:
-    """Centres (x, y) in mm of the wells of the sector about +x, all of them within the phantom's radius.
+    """Centres (x, y) in mm of the wells of the sector about +x, all of them within the phantom's
+    radius.
 
     A sector of at least two rows starts a tenth of the radius away from the phantom's axis.
 
@@ -34,10 +36,17 @@ def sector_wells(diameter: float, radius: float) -> Float[Tensor, "n 2"]:
     if (radius - 2 * offset - diameter) / step < 2:
         offset = 0.0
     rows = math.floor((radius - 2 * offset - diameter) / step)
-    wells = [(offset + step * n, diameter * (2 * i - n + 1)) for n in range(1, rows + 1) for i in range(n)]
+    wells = [
+        (offset + step * n, diameter * (2 * i - n + 1))
+        for n in range(1, rows + 1)
+        for i in range(n)
+    ]
     wells = [(x, y) for x, y in wells if math.hypot(x, y) + diameter / 2 <= radius]
     if not wells:
-        raise ValueError(f"No well of diameter {diameter:g} mm fits into a Derenzo phantom of radius {radius:g} mm")
+        raise ValueError(
+            f"No well of diameter {diameter:g} mm fits into a Derenzo phantom of radius "
+            f"{radius:g} mm"
+        )
     return torch.tensor(wells, dtype=torch.float64)
 
 
@@ -53,22 +62,28 @@ def derenzo(
     """A Derenzo phantom.
 
     Args:
-        well_diameters: of the six sectors in mm, counter-clockwise seen from the phantom's +z, the first about its +x.
+        well_diameters: of the six sectors in mm, counter-clockwise seen from the phantom's +z, the
+            first about its +x.
         radius: of the phantom in mm.
         height: of the wells in mm, from end to end.
         centre: in world mm.
-        euler_degrees: (phi, theta, psi) of R_z(phi) R_y(theta) R_z(psi), from the phantom's axes to the world's.
+        euler_degrees: (phi, theta, psi) of R_z(phi) R_y(theta) R_z(psi), from the phantom's axes to
+            the world's.
         value: in the wells.
-        background: between the wells, as a fraction of `value`; above zero it fills the phantom's cylinder.
+        background: between the wells, as a fraction of `value`; above zero it fills the phantom's
+            cylinder.
 
     Raises:
-        ValueError: sizes that are not positive, not six diameters, wells that do not fit, a background not in [0, 1).
+        ValueError: sizes that are not positive, not six diameters, wells that do not fit, a
+            background not in [0, 1).
     """
     _check(well_diameters, radius, height, background)
     sectors = [sector_wells(d, radius) for d in well_diameters]
     turns = euler_rotation([(60.0 * k, 0.0, 0.0) for k in range(SECTORS)])[:, :2, :2]
     places = torch.cat([xy @ turn.T for xy, turn in zip(sectors, turns, strict=True)])
-    radii = torch.cat([torch.full((len(xy),), d / 2) for xy, d in zip(sectors, well_diameters, strict=True)]).to(places)
+    radii = torch.cat(
+        [torch.full((len(xy),), d / 2) for xy, d in zip(sectors, well_diameters, strict=True)]
+    ).to(places)
     values = torch.full_like(radii, value * (1 - background))
     if background > 0:
         places = torch.cat([places.new_zeros(1, 2), places])
@@ -78,29 +93,42 @@ def derenzo(
     semi_axes = torch.stack([radii, radii, torch.full_like(radii, height / 2)], dim=-1)
     axes = torch.eye(3).expand(len(values), 3, 3)
     upright = Phantom((Solids("cylinder", centres, axes, semi_axes, values),))
-    return upright.moved(euler_rotation(euler_degrees), torch.tensor(list(centre), dtype=torch.float64))
+    return upright.moved(
+        euler_rotation(euler_degrees), torch.tensor(list(centre), dtype=torch.float64)
+    )
 
 
-def _check(well_diameters: Sequence[float], radius: float, height: float, background: float) -> None:
+def _check(
+    well_diameters: Sequence[float], radius: float, height: float, background: float
+) -> None:
     if len(well_diameters) != SECTORS or not all(d > 0 for d in well_diameters):
-        raise ValueError(f"A Derenzo phantom needs {SECTORS} positive well diameters in mm, got {list(well_diameters)}")
+        raise ValueError(
+            f"A Derenzo phantom needs {SECTORS} positive well diameters in mm, got "
+            f"{list(well_diameters)}"
+        )
     if not (radius > 0 and height > 0):
-        raise ValueError(f"A Derenzo phantom needs a positive radius and height in mm, got {radius} and {height}")
+        raise ValueError(
+            f"A Derenzo phantom needs a positive radius and height in mm, got {radius} and {height}"
+        )
     if not 0 <= background < 1:
-        raise ValueError(f"A Derenzo background must be a fraction in [0, 1) of the value, got {background}")
+        raise ValueError(
+            f"A Derenzo background must be a fraction in [0, 1) of the value, got {background}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomDerenzo(AnalyticScene):
-    """Cases of one Derenzo phantom in a random pose, the rotation uniform on SO(3), the place uniform in the field.
+    """Cases of one Derenzo phantom in a random pose, the rotation uniform on SO(3), the place
+    uniform in the field.
 
     Args:
         well_diameters: of the six sectors, in mm.
         radius_mm: of the phantom.
         height_mm: of its wells, from end to end.
         background: between the wells, as a fraction of `value`.
-        fill: least and greatest radius of the ball around the phantom, as fractions of the field's radius; the phantom
-            is scaled to it, so that its wells keep their size in voxels on every grid. None: the sizes are kept in mm.
+        fill: least and greatest radius of the ball around the phantom, as fractions of the field's
+            radius; the phantom is scaled to it, so that its wells keep their size in voxels on
+            every grid. None: the sizes are kept in mm.
 
     Raises:
         ValueError: as `derenzo`; a fill that is not ascending in (0, 1].
@@ -117,8 +145,13 @@ class RandomDerenzo(AnalyticScene):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.fill is not None and not (len(self.fill) == 2 and 0 < self.fill[0] <= self.fill[1] <= 1):
-            raise ValueError(f"A Derenzo scene needs a fill (least, greatest) in (0, 1], or none, got {self.fill}")
+        if self.fill is not None and not (
+            len(self.fill) == 2 and 0 < self.fill[0] <= self.fill[1] <= 1
+        ):
+            raise ValueError(
+                f"A Derenzo scene needs a fill (least, greatest) in (0, 1], or none, got "
+                f"{self.fill}"
+            )
         self._scaled(1.0)
 
     def _scaled(self, scale: float) -> Phantom:
@@ -133,7 +166,9 @@ class RandomDerenzo(AnalyticScene):
     def thinnest(self, grid: Grid) -> float:
         """The least diameter in mm that a well has in any case on `grid`."""
         reach, room = math.hypot(self.radius_mm, self.height_mm / 2), self.radius(grid)
-        return min(self.well_diameters) * (1.0 if self.fill is None else self.fill[0] * room / reach)
+        return min(self.well_diameters) * (
+            1.0 if self.fill is None else self.fill[0] * room / reach
+        )
 
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
         """The phantom in a random pose in the field of `grid`.
@@ -144,5 +179,10 @@ class RandomDerenzo(AnalyticScene):
         reach, room = math.hypot(self.radius_mm, self.height_mm / 2), self.radius(grid)
         scale = 1.0 if self.fill is None else uniform(rng, *self.fill) * room / reach
         if scale * reach > room * (1 + 1e-9):
-            raise ValueError(f"A Derenzo phantom needs a field of radius {reach:g} mm, got {room:g} mm; set `fill`")
-        return self._scaled(scale).moved(random_rotation(rng), grid.centre + random_in_ball(rng, room - scale * reach))
+            raise ValueError(
+                f"A Derenzo phantom needs a field of radius {reach:g} mm, got {room:g} mm; set "
+                f"`fill`"
+            )
+        return self._scaled(scale).moved(
+            random_rotation(rng), grid.centre + random_in_ball(rng, room - scale * reach)
+        )

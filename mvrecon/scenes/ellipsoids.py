@@ -31,14 +31,22 @@ class RandomEllipsoids(AnalyticScene):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.count) != 2 or not 0 <= self.count[0] <= self.count[1]:
-            raise ValueError(f"Ellipsoids need a count (least, greatest) of at least 0, got {tuple(self.count)}")
+            raise ValueError(
+                f"Ellipsoids need a count (least, greatest) of at least 0, got {tuple(self.count)}"
+            )
         if len(self.sizes) != 2 or not 0 < self.sizes[0] <= self.sizes[1]:
-            raise ValueError(f"Ellipsoids need sizes (least, greatest) above 0, got {tuple(self.sizes)}")
+            raise ValueError(
+                f"Ellipsoids need sizes (least, greatest) above 0, got {tuple(self.sizes)}"
+            )
 
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
-        """A random phantom in the field of `grid`; the body comes first, and holds all the others."""
+        """A random phantom in the field of `grid`; the body comes first, and holds all the
+        others.
+        """
         radius = self.radius(grid)
-        body_axes = torch.tensor([uniform(rng, 0.6, 0.95) * radius for _ in range(3)], dtype=torch.float64)
+        body_axes = torch.tensor(
+            [uniform(rng, 0.6, 0.95) * radius for _ in range(3)], dtype=torch.float64
+        )
         body_centre = grid.centre + random_in_ball(rng, radius - body_axes.max().item())
         body_rotation = random_rotation(rng)
         count = int(torch.randint(self.count[0], self.count[1] + 1, (), generator=rng))
@@ -51,14 +59,20 @@ class RandomEllipsoids(AnalyticScene):
             for i in range(3):
                 axes[n, i] = min(room, uniform(rng, *self.sizes) * radius)
         rotations = torch.cat([body_rotation[None], random_rotation(rng, count)])
-        return Phantom((Solids("ellipsoid", places, rotations, axes, self.value * _values(rng, places, axes)),))
+        return Phantom(
+            (Solids("ellipsoid", places, rotations, axes, self.value * _values(rng, places, axes)),)
+        )
 
 
-def _values(rng: torch.Generator, places: Float[Tensor, "n 3"], axes: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Random values, the first positive, whose sums over overlapping ellipsoids stay between 0 and 1.
+def _values(
+    rng: torch.Generator, places: Float[Tensor, "n 3"], axes: Float[Tensor, "n 3"]
+) -> Float[Tensor, " n"]:
+    """Random values, the first positive, whose sums over overlapping ellipsoids stay between 0 and
+    1.
 
-    Of each ellipsoid it is known which earlier ones may overlap it (their bounding spheres do). Its value takes a part
-    of the room that all of those together leave, so the sum is bounded at every point.
+    Of each ellipsoid it is known which earlier ones may overlap it (their bounding spheres do). Its
+    value takes a part of the room that all of those together leave, so the sum is bounded at every
+    point.
     """
     reach = axes.amax(dim=1)
     meet = torch.cdist(places, places) < reach + reach[:, None]

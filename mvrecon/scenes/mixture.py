@@ -10,7 +10,8 @@ from mvrecon.scenes.sample import Rays, Sample, Scene, Thin
 
 
 class Mixture:
-    """Cases of several scenes in turn: case i comes from scene i mod n. A scene that ends starts again.
+    """Cases of several scenes in turn: case i comes from scene i mod n. A scene that ends starts
+    again.
 
     Args:
         scenes: the configuration `{name: ..., **options}` of each scene.
@@ -25,7 +26,9 @@ class Mixture:
         self.scenes: list[Scene] = [SCENES.from_config(scene) for scene in scenes]
         kinds = sorted({(scene.data_range, scene.unit) for scene in self.scenes})
         if len(kinds) > 1:
-            raise ValueError(f"The scenes of a mixture must share their data range and unit, got {kinds}")
+            raise ValueError(
+                f"The scenes of a mixture must share their data range and unit, got {kinds}"
+            )
         ((self.data_range, self.unit),) = kinds
 
     @property

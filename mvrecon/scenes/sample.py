@@ -40,7 +40,9 @@ class Sample:
 
 
 class Scene(Protocol):
-    """A source of cases; each is a pure function of (seed, index), in any order and from any process."""
+    """A source of cases; each is a pure function of (seed, index), in any order and from any
+    process.
+    """
 
     @property
     def data_range(self) -> float:

@@ -10,9 +10,10 @@ from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.scenes.analytic import AnalyticScene
 from mvrecon.scenes.solids import Phantom, Solids
 
-#: Yu, Ye and Wang, "Katsevich-type algorithms for variable radius spiral cone-beam CT", Proc. SPIE 5535 (2004) 550:
-#: the head of Kak and Slaney, Principles of Computerized Tomographic Imaging (1988), table 3.1, in 3-D, with contrasts
-#: that the eye can see. Columns: value, semi-axes a b c, centre x y z, turn about z in degrees; the head is in [-1, 1].
+#: Yu, Ye and Wang, "Katsevich-type algorithms for variable radius spiral cone-beam CT", Proc. SPIE
+#: 5535 (2004) 550: the head of Kak and Slaney, Principles of Computerized Tomographic Imaging
+#: (1988), table 3.1, in 3-D, with contrasts that the eye can see. Columns: value, semi-axes a b c,
+#: centre x y z, turn about z in degrees; the head is in [-1, 1].
 TABLE = (
     (1.0, 0.69, 0.92, 0.9, 0.0, 0.0, 0.0, 0.0),
     (-0.8, 0.6624, 0.874, 0.88, 0.0, 0.0, 0.0, 0.0),
@@ -27,8 +28,11 @@ TABLE = (
 )
 
 
-def shepp_logan(half_edge: float = 1.0, centre: Sequence[float] = (0.0, 0.0, 0.0), value: float = 1.0) -> Phantom:
-    """The 3-D Shepp-Logan phantom in the cube of a half edge in mm about a centre; the skull has the value given.
+def shepp_logan(
+    half_edge: float = 1.0, centre: Sequence[float] = (0.0, 0.0, 0.0), value: float = 1.0
+) -> Phantom:
+    """The 3-D Shepp-Logan phantom in the cube of a half edge in mm about a centre; the skull has
+    the value given.
 
     Raises:
         ValueError: a half edge that is not positive.
@@ -37,12 +41,16 @@ def shepp_logan(half_edge: float = 1.0, centre: Sequence[float] = (0.0, 0.0, 0.0
     turns = torch.nn.functional.pad(table[:, 7:], (0, 2))
     semi_axes, places = table[:, 1:4] * half_edge, table[:, 4:7] * half_edge
     places = places + torch.tensor(list(centre), dtype=torch.float64)
-    return Phantom((Solids("ellipsoid", places, euler_rotation(turns), semi_axes, table[:, 0] * value),))
+    return Phantom(
+        (Solids("ellipsoid", places, euler_rotation(turns), semi_axes, table[:, 0] * value),)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class SheppLogan(AnalyticScene):
-    """One case: the 3-D Shepp-Logan phantom, whose cube [-1, 1] has the field's radius as its half edge."""
+    """One case: the 3-D Shepp-Logan phantom, whose cube [-1, 1] has the field's radius as its half
+    edge.
+    """
 
     field: float = 0.5
     kind = "shepp_logan"

@@ -1,9 +1,11 @@
-"""Solids whose line integrals are known in closed form: ellipsoids, finite elliptic cylinders, boxes.
+"""Solids whose line integrals are known in closed form: ellipsoids, finite elliptic cylinders,
+boxes.
 
-In its own frame, p = diag(1/a) R^T (X - c), every solid is a unit ball in its first k axes times a slab |p| < 1 in each
-of the others: an ellipsoid has k = 3, a cylinder k = 2, a box k = 0. A ray p = o + t q meets the ball between the roots
-of |q|^2 t^2 + 2 (o.q) t + |o|^2 - 1, whose discriminant is written without cancellation as |q|^2 - |o x q|^2, and each
-slab between its two planes. Values of overlapping solids add up.
+In its own frame, p = diag(1/a) R^T (X - c), every solid is a unit ball in its first k axes times a
+slab |p| < 1 in each of the others: an ellipsoid has k = 3, a cylinder k = 2, a box k = 0. A ray p =
+o + t q meets the ball between the roots of |q|^2 t^2 + 2 (o.q) t + |o|^2 - 1, whose discriminant is
+written without cancellation as |q|^2 - |o x q|^2, and each slab between its two planes. Values of
+overlapping solids add up.
 """
 
 from collections.abc import Iterator
@@ -32,8 +34,8 @@ class Solids:
         values: what each solid adds to the points inside it.
 
     Raises:
-        ValueError: an unknown kind, shapes that do not agree, values that are not finite, sizes that are not positive,
-            or matrices that are not rotations.
+        ValueError: an unknown kind, shapes that do not agree, values that are not finite, sizes
+            that are not positive, or matrices that are not rotations.
     """
 
     kind: str
@@ -46,16 +48,25 @@ class Solids:
         if self.kind not in ROUND_AXES:
             raise ValueError(f"Unknown kind of solid {self.kind!r}. Known: {', '.join(ROUND_AXES)}")
         n = len(torch.as_tensor(self.values))
-        for name, shape in (("centres", (n, 3)), ("rotations", (n, 3, 3)), ("semi_axes", (n, 3)), ("values", (n,))):
+        for name, shape in (
+            ("centres", (n, 3)),
+            ("rotations", (n, 3, 3)),
+            ("semi_axes", (n, 3)),
+            ("values", (n,)),
+        ):
             value = torch.as_tensor(getattr(self, name)).to(torch.float64)
             if value.shape != shape or not value.isfinite().all():
-                raise ValueError(f"{n} solids need finite {name} of shape {shape}, got {value.tolist()}")
+                raise ValueError(
+                    f"{n} solids need finite {name} of shape {shape}, got {value.tolist()}"
+                )
             object.__setattr__(self, name, value)
         if not (self.semi_axes > 0).all():
             raise ValueError(f"Solids need positive semi-axes in mm, got {self.semi_axes.tolist()}")
         unit = torch.eye(3, dtype=torch.float64)
         if not torch.allclose(self.rotations.mT @ self.rotations, unit.expand(n, 3, 3), atol=1e-6):
-            raise ValueError(f"Solids need rotations with orthonormal columns, got {self.rotations.tolist()}")
+            raise ValueError(
+                f"Solids need rotations with orthonormal columns, got {self.rotations.tolist()}"
+            )
 
     @property
     def round_axes(self) -> int:
@@ -81,7 +92,9 @@ class Solids:
         q = (A[solid, k:] @ step[ray, :, None])[..., 0]
         enter, leave = _slabs(o, q, enter, leave)
         chord = torch.where(leave > enter, leave - enter, 0.0) * step.norm(dim=-1)[ray]
-        return start.new_zeros(len(start)).index_add(0, ray, chord * self.values.to(start.device)[solid])
+        return start.new_zeros(len(start)).index_add(
+            0, ray, chord * self.values.to(start.device)[solid]
+        )
 
     def sums(self, xyz: Float[Tensor, "r 3"]) -> Float[Tensor, " r"]:
         """Sum of the values of the solids around each point; float64."""
@@ -103,11 +116,15 @@ def contains(p: Float[Tensor, "3 ..."], round_axes: int) -> Bool[Tensor, "..."]:
 def _ball(
     o: Float[Tensor, "k n r"], q: Float[Tensor, "k n r"], extent: tuple[float, float]
 ) -> tuple[Int[Tensor, " h"], Int[Tensor, " h"], Float[Tensor, " h"], Float[Tensor, " h"]]:
-    """Solid and ray of every pair that meets in the round axes, and where in `extent` it enters and leaves the ball."""
+    """Solid and ray of every pair that meets in the round axes, and where in `extent` it enters and
+    leaves the ball.
+    """
     qq = q.square().sum(dim=0)
     crosses = (o[i] * q[j] - o[j] * q[i] for i, j in combinations(range(len(o)), 2))
     disc = sum((-cross.square() for cross in crosses), start=qq)
-    along = qq == 0  # along a cylinder's axis, or a box: the ball is not crossed, but stayed in or missed
+    along = (
+        qq == 0
+    )  # along a cylinder's axis, or a box: the ball is not crossed, but stayed in or missed
     hit = (disc > 0) | (along & (o.square().sum(dim=0) < 1)) if along.any() else disc > 0
     solid, ray = hit.nonzero(as_tuple=True)
     o, q, qq, disc, along = o[:, hit], q[:, hit], qq[hit], disc[hit], along[hit]
@@ -118,11 +135,19 @@ def _ball(
 
 
 def _slabs(
-    o: Float[Tensor, "h s"], q: Float[Tensor, "h s"], enter: Float[Tensor, " h"], leave: Float[Tensor, " h"]
+    o: Float[Tensor, "h s"],
+    q: Float[Tensor, "h s"],
+    enter: Float[Tensor, " h"],
+    leave: Float[Tensor, " h"],
 ) -> tuple[Float[Tensor, " h"], Float[Tensor, " h"]]:
-    """The part between `enter` and `leave` that lies in the slabs |o + t q| < 1 of the other axes."""
+    """The part between `enter` and `leave` that lies in the slabs |o + t q| < 1 of the other
+    axes.
+    """
     for a, b in zip(((-1 - o) / q).unbind(dim=-1), ((1 - o) / q).unbind(dim=-1), strict=True):
-        enter, leave = torch.maximum(enter, torch.minimum(a, b)), torch.minimum(leave, torch.maximum(a, b))
+        enter, leave = (
+            torch.maximum(enter, torch.minimum(a, b)),
+            torch.minimum(leave, torch.maximum(a, b)),
+        )
     return enter, leave
 
 
@@ -137,13 +162,20 @@ class Phantom:
     parts: tuple[Solids, ...]
 
     def integrals(
-        self, start: Float[Tensor, "*n 3"], end: Float[Tensor, "*n 3"], extent: tuple[float, float] = (0.0, 1.0)
+        self,
+        start: Float[Tensor, "*n 3"],
+        end: Float[Tensor, "*n 3"],
+        extent: tuple[float, float] = (0.0, 1.0),
     ) -> Float[Tensor, "*n"]:
-        """Exact line integrals in value * mm over X = start + w (end - start), w in `extent` (which may be infinite).
+        """Exact line integrals in value * mm over X = start + w (end - start), w in `extent` (which
+        may be infinite).
 
-        Computed in float64, returned in the dtype of `start`. A ray that only touches a solid has none of it.
+        Computed in float64, returned in the dtype of `start`. A ray that only touches a solid has
+        none of it.
         """
-        first, last = (x.reshape(-1, 3).to(torch.float64) for x in torch.broadcast_tensors(start, end))
+        first, last = (
+            x.reshape(-1, 3).to(torch.float64) for x in torch.broadcast_tensors(start, end)
+        )
         total = first.new_zeros(len(first))
         for part, rays in self._chunks(len(first)):
             total[rays] += part.integrals(first[rays], last[rays] - first[rays], extent)
@@ -163,7 +195,9 @@ class Phantom:
 
     def support(self) -> "Phantom":
         """The same solids, each of value one: positive wherever there is any of them."""
-        return Phantom(tuple(replace(part, values=torch.ones_like(part.values)) for part in self.parts))
+        return Phantom(
+            tuple(replace(part, values=torch.ones_like(part.values)) for part in self.parts)
+        )
 
     def _chunks(self, count: int) -> Iterator[tuple[Solids, slice]]:
         for part in self.parts:

@@ -1,7 +1,8 @@
-"""The left ventricle of the heart: a shell of muscle about a cavity, what a cardiac SPECT camera images.
+"""The left ventricle of the heart: a shell of muscle about a cavity, what a cardiac SPECT camera
+images.
 
-Both surfaces are ellipsoids about one centre, closed at the base, so that integrals stay exact; the real ventricle ends
-in a plane there.
+Both surfaces are ellipsoids about one centre, closed at the base, so that integrals stay exact; the
+real ventricle ends in a plane there.
 """
 
 from collections.abc import Sequence
@@ -29,26 +30,41 @@ def ventricle(
         semi_axes: of the outer surface in mm; the last is the ventricle's own long axis.
         wall: thickness in mm at the ends of the axes.
         centre: in world mm.
-        euler_degrees: (phi, theta, psi) of R_z(phi) R_y(theta) R_z(psi), from the ventricle's axes to the world's.
+        euler_degrees: (phi, theta, psi) of R_z(phi) R_y(theta) R_z(psi), from the ventricle's axes
+            to the world's.
         value: in the wall.
         blood: in the cavity, as a fraction of `value`.
 
     Raises:
-        ValueError: not three semi-axes above the wall, a wall that is not positive, a blood not in [0, 1).
+        ValueError: not three semi-axes above the wall, a wall that is not positive, a blood not in
+            [0, 1).
     """
     outer = torch.tensor(list(semi_axes), dtype=torch.float64)
     if not (outer.shape == (3,) and outer.isfinite().all() and 0 < wall < outer.min()):
-        raise ValueError(f"A ventricle needs three semi-axes above a positive wall, got {list(semi_axes)} and {wall}")
+        raise ValueError(
+            f"A ventricle needs three semi-axes above a positive wall, got {list(semi_axes)} and "
+            f"{wall}"
+        )
     if not 0 <= blood < 1:
-        raise ValueError(f"A ventricle's blood must be a fraction in [0, 1) of the value, got {blood}")
-    surfaces, values = torch.stack([outer, outer - wall]), outer.new_tensor([value, -value * (1 - blood)])
-    shell = Phantom((Solids("ellipsoid", torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), surfaces, values),))
-    return shell.moved(euler_rotation(euler_degrees), torch.tensor(list(centre), dtype=torch.float64))
+        raise ValueError(
+            f"A ventricle's blood must be a fraction in [0, 1) of the value, got {blood}"
+        )
+    surfaces, values = (
+        torch.stack([outer, outer - wall]),
+        outer.new_tensor([value, -value * (1 - blood)]),
+    )
+    shell = Phantom(
+        (Solids("ellipsoid", torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), surfaces, values),)
+    )
+    return shell.moved(
+        euler_rotation(euler_degrees), torch.tensor(list(centre), dtype=torch.float64)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomVentricle(AnalyticScene):
-    """Cases of one ventricle in its true size, in a random pose: the rotation uniform on SO(3), the place in the field.
+    """Cases of one ventricle in its true size, in a random pose: the rotation uniform on SO(3), the
+    place in the field.
 
     Args:
         semi_axes_mm: of the outer surface.
@@ -81,5 +97,10 @@ class RandomVentricle(AnalyticScene):
         """
         reach, room = max(self.semi_axes_mm), self.radius(grid)
         if reach > room:
-            raise ValueError(f"A ventricle of semi-axis {reach:g} mm needs a field of that radius, got {room:g} mm")
-        return self._upright().moved(random_rotation(rng), grid.centre + random_in_ball(rng, room - reach))
+            raise ValueError(
+                f"A ventricle of semi-axis {reach:g} mm needs a field of that radius, got "
+                f"{room:g} mm"
+            )
+        return self._upright().moved(
+            random_rotation(rng), grid.centre + random_in_ball(rng, room - reach)
+        )

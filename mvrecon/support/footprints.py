@@ -1,7 +1,9 @@
-"""Where bricks of voxels are seen: rectangles of pixels, and sums of views over them in constant time.
+"""Where bricks of voxels are seen: rectangles of pixels, and sums of views over them in constant
+time.
 
-A brick is convex, so where all of it lies on one side of a camera's source its image lies between those of its corners.
-Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH 1984).
+A brick is convex, so where all of it lies on one side of a camera's source its image lies between
+those of its corners. Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH
+1984).
 
 Convention: bounds are half-open: of voxels (z, y, x) as in `Box`, of pixels (u, v) = (column, row).
 """
@@ -35,7 +37,9 @@ class Bricks:
 
     @classmethod
     def at(cls, places: Int[Tensor, "n 3"], edge: int, shape: Sequence[int]) -> "Bricks":
-        """The bricks of that edge in these places (z, y, x) of the lattice of bricks; the grid's end cuts the last."""
+        """The bricks of that edge in these places (z, y, x) of the lattice of bricks; the grid's
+        end cuts the last.
+        """
         low = places * edge
         return cls(low, torch.minimum(low + edge, low.new_tensor(list(shape))))
 
@@ -50,8 +54,8 @@ class Footprints:
     Args:
         low: first column and row (u, v), within the detector.
         high: one behind the last; equal to `low` where the brick is not seen.
-        whole: the camera sees all of the brick: its footprint, grown by a diagonal of a pixel at most, ends within the
-            detector, and it lies in the part of the rays that counts.
+        whole: the camera sees all of the brick: its footprint, grown by a diagonal of a pixel at
+            most, ends within the detector, and it lies in the part of the rays that counts.
     """
 
     low: Int[Tensor, "2 m n"]
@@ -59,30 +63,40 @@ class Footprints:
     whole: Bool[Tensor, "m n"]
 
 
-def footprints(cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5, gaps: float = 0.0) -> Footprints:
+def footprints(
+    cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5, gaps: float = 0.0
+) -> Footprints:
     """The footprints of bricks in all views, in float64.
 
     Args:
         cameras: the rig.
         grid: whose voxels the bricks hold.
         bricks: N of them; all cameras' corners are held at once, 500 bytes a brick and camera.
-        reach: voxels by which interpolation carries a value beyond the faces of its voxel: 0.5 for joseph and trilinear
-            (a voxel from its centre), 0 for siddon.
-        gaps: from 1 on, grow them by what may lie between rays, too: by half a pixel and half of so many diagonals of
-            one. The thin rays of a brick's own footprint may all miss the bit of a body that is in it. With 1, where
-            every point of the body lies in a ball of it as wide as a pixel's diagonal magnified to there (`ray_gap`), a
-            ray of the grown footprint meets that ball; the further it is grown, the more it meets of thinner bodies.
+        reach: voxels by which interpolation carries a value beyond the faces of its voxel: 0.5 for
+            joseph and trilinear (a voxel from its centre), 0 for siddon.
+        gaps: from 1 on, grow them by what may lie between rays, too: by half a pixel and half of so
+            many diagonals of one. The thin rays of a brick's own footprint may all miss the bit of
+            a body that is in it. With 1, where every point of the body lies in a ball of it as wide
+            as a pixel's diagonal magnified to there (`ray_gap`), a ray of the grown footprint meets
+            that ball; the further it is grown, the more it meets of thinner bodies.
     """
     images, w = _images(cameras, grid, bricks, reach)
     margin, slack = _gaps(cameras) if gaps else (w.new_zeros(2, len(w), 1), w.new_zeros(len(w), 1))
     more = max(0.0, gaps - 1) * (margin - 0.5)
     near, far = w.amin(dim=1), w.amax(dim=1)
     first, last = cameras.limits
-    across = (near <= 0) & (far >= 0) & (not cameras.parallel)  # such a brick may have an image anywhere
+    across = (
+        (near <= 0) & (far >= 0) & (not cameras.parallel)
+    )  # such a brick may have an image anywhere
     unseen = (far <= first) | (near >= last)
     low, high = images.amin(dim=2) - margin - ROUNDING, images.amax(dim=2) + margin + ROUNDING
     size = low.new_tensor(cameras.shape[::-1]).reshape(2, 1, 1)
-    whole = ((low > -1) & (high < size)).all(dim=0) & (near >= first + slack) & (far <= last - slack) & ~across
+    whole = (
+        ((low > -1) & (high < size)).all(dim=0)
+        & (near >= first + slack)
+        & (far <= last - slack)
+        & ~across
+    )
     low = torch.where(across, 0, (low - more).ceil()).clamp(min=0).minimum(size)
     high = torch.where(across, size, (high + more).floor() + 1).minimum(size)
     return Footprints(low.long(), torch.where(unseen, low, torch.maximum(low, high)).long(), whole)
@@ -91,7 +105,9 @@ def footprints(cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5,
 def _images(
     cameras: Cameras, grid: Grid, bricks: Bricks, reach: float
 ) -> tuple[Float[Tensor, "2 m 8 n"], Float[Tensor, "m 8 n"]]:
-    """Pixels (u, v) of the corners of bricks grown by `reach`, not finite where w = 0; and their fraction w."""
+    """Pixels (u, v) of the corners of bricks grown by `reach`, not finite where w = 0; and their
+    fraction w.
+    """
     inverse = torch.linalg.inv(cameras.frame.detach())
     turn = inverse @ grid.affine[:3, :3].to(inverse)
     shift = inverse @ (grid.centre.to(inverse) - cameras.source.detach())[..., None]
@@ -99,14 +115,20 @@ def _images(
     centre = grid.centre_index.to(inverse)[:, None] + 0.5
     faces = bricks.low.T.flip(0) - centre - reach, bricks.high.T.flip(0) - centre + reach
     one = torch.ones_like(faces[0][0])
-    corners = [torch.stack([faces[i][0], faces[j][1], faces[k][2], one]) for i, j, k in product((0, 1), repeat=3)]
-    q = (maps.transpose(0, 1).reshape(-1, 4) @ torch.cat(corners, dim=1)).reshape(3, len(maps), 8, -1)
+    corners = [
+        torch.stack([faces[i][0], faces[j][1], faces[k][2], one])
+        for i, j, k in product((0, 1), repeat=3)
+    ]
+    q = (maps.transpose(0, 1).reshape(-1, 4) @ torch.cat(corners, dim=1)).reshape(
+        3, len(maps), 8, -1
+    )
     return (q[:2] if cameras.parallel else q[:2] / q[2]), q[2]
 
 
 def ray_gap(cameras: Cameras, grid: Grid) -> float:
-    """The widest diagonal of a pixel, magnified to where in the grid its rays count, in mm: a ball of that diameter
-    cannot pass between the rays of any view; 0 where no view's rays pass the grid."""
+    """The widest diagonal of a pixel, magnified to where in the grid its rays count, in mm: a ball
+    of that diameter cannot pass between the rays of any view; 0 where no view's rays pass the
+    grid."""
     diagonal = _diagonals(cameras)
     if cameras.parallel:
         return diagonal.amax().item()
@@ -122,19 +144,26 @@ def _diagonals(cameras: Cameras) -> Float[Tensor, " m"]:
 
 
 def _gaps(cameras: Cameras) -> tuple[Float[Tensor, "2 m 1"], Float[Tensor, "m 1"]]:
-    """How far from the image of a point the nearest ray is through any ball that holds it and is a pixel's diagonal
-    wide: (u, v) in pixels; and that diagonal as a fraction of the way from source to detector.
+    """How far from the image of a point the nearest ray is through any ball that holds it and is a
+    pixel's diagonal wide: (u, v) in pixels; and that diagonal as a fraction of the way from source
+    to detector.
 
     The ball's centre is half a diagonal away at most, and half a pixel along each axis from a ray.
     """
     u, v, diagonal = cameras.u.detach(), cameras.v.detach(), _diagonals(cameras)
     area = torch.linalg.cross(u, v).norm(dim=-1)
-    pitch = torch.stack([area / v.norm(dim=-1), area / u.norm(dim=-1)])  # between columns, between rows
-    return 0.5 + (diagonal / (2 * pitch))[..., None], (diagonal / cameras.distance.detach())[:, None]
+    pitch = torch.stack(
+        [area / v.norm(dim=-1), area / u.norm(dim=-1)]
+    )  # between columns, between rows
+    return 0.5 + (diagonal / (2 * pitch))[..., None], (diagonal / cameras.distance.detach())[
+        :, None
+    ]
 
 
 def tables(images: Shaped[Tensor, "*n v u"]) -> Int[Tensor, "*n v1 u1"]:
-    """Summed-area tables of whole numbers: the sum of all pixels above and left of a corner; exact."""
+    """Summed-area tables of whole numbers: the sum of all pixels above and left of a corner;
+    exact.
+    """
     dtype = torch.int32 if images.dtype == torch.bool else torch.int64
     sums = images.cumsum(dim=-1, dtype=dtype).cumsum(dim=-2, dtype=dtype)
     return torch.nn.functional.pad(sums, (1, 0, 1, 0))

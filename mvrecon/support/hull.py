@@ -1,4 +1,6 @@
-"""The visual hull: what may hold something, told from where views are empty (Laurentini, IEEE PAMI 16, 1994)."""
+"""The visual hull: what may hold something, told from where views are empty (Laurentini, IEEE PAMI
+16, 1994).
+"""
 
 from collections.abc import Iterator, Sequence
 
@@ -12,16 +14,20 @@ from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
 from mvrecon.support.footprints import Bricks, footprints, sums, tables
 
-#: Views at a time, of all items of a batch: what some of them saw to be empty is not looked at in the next.
+#: Views at a time, of all items of a batch: what some of them saw to be empty is not looked at in
+#: the next.
 VIEWS = 8
 #: Footprints at a time, which bounds the memory (500 bytes each).
 AT_ONCE = 2**15
-#: Diagonals of a pixel by which footprints are grown: 1 proves bodies absent that are nowhere thinner than that, and
-#: 2 takes in twice the length of what is half as wide, which so covers as much of the detector.
+#: Diagonals of a pixel by which footprints are grown: 1 proves bodies absent that are nowhere
+#: thinner than that, and 2 takes in twice the length of what is half as wide, which so covers as
+#: much of the detector.
 GAPS = 2.0
-#: One view in so many must see a brick to be empty, where bodies may be thinner than rays are apart.
+#: One view in so many must see a brick to be empty, where bodies may be thinner than rays are
+#: apart.
 SHARE = 10
-#: Bricks of so many times the edge are tried first; what is empty of them has only empty ones in it.
+#: Bricks of so many times the edge are tried first; what is empty of them has only empty ones in
+#: it.
 COARSER = 4
 
 
@@ -36,25 +42,31 @@ def visual_hull(
 ) -> Bool[Tensor, "b z y x"]:
     """The bricks that may hold something, of a volume without negative values.
 
-    A brick is empty where at least `witnesses` views that see all of it have no pixel above the threshold in its
-    footprint. What is seen in part only, or not at all, stays. With exact views, threshold 0 and one witness no
-    occupied brick is lost, as long as the object is nowhere thinner than `ray_gap`; else see `thin_witnesses`.
+    A brick is empty where at least `witnesses` views that see all of it have no pixel above the
+    threshold in its footprint. What is seen in part only, or not at all, stays. With exact views,
+    threshold 0 and one witness no occupied brick is lost, as long as the object is nowhere thinner
+    than `ray_gap`; else see `thin_witnesses`.
 
     Args:
         views: line integrals, one a ray, finite.
         cameras: the rig.
-        grid, brick: where the voxels lie, and how many make a brick's edge; the last bricks may be cut.
+        grid, brick: where the voxels lie, and how many make a brick's edge; the last bricks may be
+            cut.
         threshold: pixels up to it count as empty; one for all, or one for each.
         witnesses: how many views must agree.
-        keep_unseen: else those also go that no view sees whole and none has a pixel above the threshold for. The data
-            know nothing of them: with threshold 0, MLEM and SIRT without negative values make them zero themselves.
+        keep_unseen: else those also go that no view sees whole and none has a pixel above the
+            threshold for. The data know nothing of them: with threshold 0, MLEM and SIRT without
+            negative values make them zero themselves.
 
     Raises:
-        ValueError: views of another size than the rig's or not finite, a NaN threshold, an edge or witnesses below one.
+        ValueError: views of another size than the rig's or not finite, a NaN threshold, an edge or
+            witnesses below one.
     """
     check_measured(views, cameras)
     if brick < 1 or witnesses < 1:
-        raise ValueError(f"Need a brick's edge and witnesses of at least 1, got {brick} and {witnesses}")
+        raise ValueError(
+            f"Need a brick's edge and witnesses of at least 1, got {brick} and {witnesses}"
+        )
     cameras, limit = cameras.to(views.device), _limit(threshold, views)
     kept = views.new_ones((len(views), 1, 1, 1), dtype=torch.bool)
     for edge in _edges(brick, grid.shape):
@@ -68,15 +80,19 @@ def visual_hull(
 
 
 def thin_witnesses(views: int) -> int:
-    """How many of a rig's views must agree, so that what is thinner than rays are apart is not lost: a tenth.
+    """How many of a rig's views must agree, so that what is thinner than rays are apart is not
+    lost: a tenth.
 
-    If a view misses such a thing with a probability q, a fixed number of views that all miss it turns up in a rig of
-    enough views; a share of them above q hardly does, and the less, the more views there are.
+    If a view misses such a thing with a probability q, a fixed number of views that all miss it
+    turns up in a rig of enough views; a share of them above q hardly does, and the less, the more
+    views there are.
     """
     return max(1, views // SHARE)
 
 
-def expand(bricks: Bool[Tensor, "b z y x"], brick: int, shape: Sequence[int]) -> Bool[Tensor, "b 1 d h w"]:
+def expand(
+    bricks: Bool[Tensor, "b z y x"], brick: int, shape: Sequence[int]
+) -> Bool[Tensor, "b 1 d h w"]:
     """The voxels of a volume of `shape` that lie in the true bricks."""
     return _repeated(bricks, brick, shape)[:, None]
 
@@ -89,14 +105,20 @@ def check_measured(views: Float[Tensor, "b 1 m v u"], cameras: Cameras) -> None:
     """
     expected = (1, len(cameras), *cameras.shape)
     if views.ndim != 5 or tuple(views.shape[1:]) != expected:
-        raise ValueError(f"Expected views [b 1 m v u] with last sizes {expected}, got {tuple(views.shape)}")
+        raise ValueError(
+            f"Expected views [b 1 m v u] with last sizes {expected}, got {tuple(views.shape)}"
+        )
     check_finite(views)
 
 
-def _limit(threshold: float | Float[Tensor, "b 1 m v u"], views: Float[Tensor, "b 1 m v u"]) -> Tensor:
+def _limit(
+    threshold: float | Float[Tensor, "b 1 m v u"], views: Float[Tensor, "b 1 m v u"]
+) -> Tensor:
     limit = torch.as_tensor(threshold).to(views)
     if limit.isnan().any():
-        raise ValueError(f"Expected a threshold, got {int(limit.isnan().sum())} values that are NaN")
+        raise ValueError(
+            f"Expected a threshold, got {int(limit.isnan().sum())} values that are NaN"
+        )
     return limit.expand_as(views)
 
 
@@ -107,7 +129,9 @@ def _edges(brick: int, shape: Sequence[int]) -> Iterator[int]:
     yield brick
 
 
-def _repeated(kept: Bool[Tensor, "b z y x"], times: int, shape: Sequence[int]) -> Bool[Tensor, "b d h w"]:
+def _repeated(
+    kept: Bool[Tensor, "b z y x"], times: int, shape: Sequence[int]
+) -> Bool[Tensor, "b d h w"]:
     for axis, count in enumerate(shape, start=1):
         kept = kept.repeat_interleave(times, dim=axis).narrow(axis, 0, int(count))
     return kept
@@ -120,17 +144,26 @@ def _witnesses(
     grid: Grid,
     task: tuple[Int[Tensor, "n 3"], int, int],
 ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
-    """How many views see each brick to be empty, counted as far as it takes; and which ones lit no pixel of a view."""
+    """How many views see each brick to be empty, counted as far as it takes; and which ones lit no
+    pixel of a view.
+    """
     places, edge, enough = task
     batch = len(views)
     empty = torch.zeros(batch, len(places), dtype=torch.int32, device=views.device)
-    dark, undecided = torch.ones_like(empty, dtype=torch.bool), torch.arange(len(places), device=views.device)
+    dark, undecided = (
+        torch.ones_like(empty, dtype=torch.bool),
+        torch.arange(len(places), device=views.device),
+    )
     rounds = -(-len(cameras) // max(1, VIEWS // batch))
     for turn in range(rounds):
-        chosen = list(range(turn, len(cameras), rounds))  # far apart on most rigs, so that they differ in what they see
+        chosen = list(
+            range(turn, len(cameras), rounds)
+        )  # far apart on most rigs, so that they differ in what they see
         table = tables(views[:, chosen] > limit[:, chosen])
         for some in undecided.split(max(1, AT_ONCE // (batch * len(chosen)))):
-            prints = footprints(cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), gaps=GAPS)
+            prints = footprints(
+                cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), gaps=GAPS
+            )
             none = sums(table, prints) == 0
             empty[:, some] += (none & prints.whole).sum(dim=1, dtype=torch.int32)
             dark[:, some] &= none.all(dim=1)

@@ -1,10 +1,12 @@
-"""Emptiness told from noisy views: of X-rays by their noise, of counts by a bound that holds with a stated probability.
+"""Emptiness told from noisy views: of X-rays by their noise, of counts by a bound that holds with a
+stated probability.
 
-Counts prove nothing empty: a brick can be shown to hold less than a tolerance. Whatever else is in the scene only adds
-counts, so a brick of activity a, from which a set of pixels is to expect S counts per unit of activity, gives n counts
-or fewer with a probability of at most delta where a S > U(n, delta), the one-sided bound of a Poisson mean (Garwood,
-Biometrika 28, 1936). So a <= U / S, but for that probability. The least of several such bounds holds too, where each
-gets its part of delta and the sets were chosen without a look at the counts.
+Counts prove nothing empty: a brick can be shown to hold less than a tolerance. Whatever else is in
+the scene only adds counts, so a brick of activity a, from which a set of pixels is to expect S
+counts per unit of activity, gives n counts or fewer with a probability of at most delta where a S >
+U(n, delta), the one-sided bound of a Poisson mean (Garwood, Biometrika 28, 1936). So a <= U / S,
+but for that probability. The least of several such bounds holds too, where each gets its part of
+delta and the sets were chosen without a look at the counts.
 """
 
 import math
@@ -31,7 +33,8 @@ class Evidence:
     """What "empty" means where counts were bounded.
 
     Args:
-        tolerance: mean activity of a brick, weighted by its sensitivity, that an empty one is below.
+        tolerance: mean activity of a brick, weighted by its sensitivity, that an empty one is
+            below.
         delta: probability that one or more of a scene's bricks were declared empty and are not.
         tests: bounds per brick, among which delta was shared out.
     """
@@ -44,11 +47,13 @@ class Evidence:
 def noise_threshold(
     views: Float[Tensor, "b 1 m v u"], photons: float, sigmas: float = 4.0
 ) -> Float[Tensor, "b 1 m v u"]:
-    """So many standard deviations of the photon noise of X-ray line integrals, exp(p / 2) / sqrt(photons) each.
+    """So many standard deviations of the photon noise of X-ray line integrals, exp(p / 2) /
+    sqrt(photons) each.
 
-    A `visual_hull` of noisy views takes it as its threshold, with several witnesses. What gives no ray more may then be
-    lost: at 1e5 photons and 4 sigma that is p = 0.013, or 0.6 mm of water. Behind so much matter that the noise grows
-    faster than p the threshold stays as it is, at 2: a ray that hardly a photon passes is no sign of emptiness.
+    A `visual_hull` of noisy views takes it as its threshold, with several witnesses. What gives no
+    ray more may then be lost: at 1e5 photons and 4 sigma that is p = 0.013, or 0.6 mm of water.
+    Behind so much matter that the noise grows faster than p the threshold stays as it is, at 2: a
+    ray that hardly a photon passes is no sign of emptiness.
 
     Args:
         views: p = -ln(I / I0).
@@ -99,30 +104,38 @@ def activity_bound(
     sensitivity: Float[Tensor, "m z y x"],
     delta: float = 1e-3,
 ) -> Float[Tensor, "b z y x"]:
-    """What the activity of every brick is below, all at once with a probability of at least 1 - delta.
+    """What the activity of every brick is below, all at once with a probability of at least 1 -
+    delta.
 
-    The activity bounded is the brick's mean, weighted with the sensitivity of its voxels. It is the least bound of a
-    family of sets of views that does not depend on the data (`view_sets`); infinite where no view has sensitivity.
+    The activity bounded is the brick's mean, weighted with the sensitivity of its voxels. It is the
+    least bound of a family of sets of views that does not depend on the data (`view_sets`);
+    infinite where no view has sensitivity.
 
     Args:
         counts, cameras, grid, brick: as of `bounded_hull`.
-        sensitivity: expected counts of each view from each brick if it is full of one unit of activity, as from
-            `brick_sensitivity`. It must count only pixels of the brick's footprint on the detector (not the tails of a
-            wide point spread), and be a lower bound: with the least transmission that the attenuation may leave.
+        sensitivity: expected counts of each view from each brick if it is full of one unit of
+            activity, as from `brick_sensitivity`. It must count only pixels of the brick's
+            footprint on the detector (not the tails of a wide point spread), and be a lower bound:
+            with the least transmission that the attenuation may leave.
         delta: shared out evenly among all tests of all bricks.
 
     Raises:
-        ValueError: counts of another size than the rig's, or not whole numbers from zero; a sensitivity of another size
-            or negative; a delta not between 0 and 1.
+        ValueError: counts of another size than the rig's, or not whole numbers from zero; a
+            sensitivity of another size or negative; a delta not between 0 and 1.
     """
     check_measured(counts, cameras)
     _check_counts(counts, sensitivity, (len(cameras), *bricks_along(grid.shape, brick)), delta)
     lattice, sets = sensitivity.shape[1:], view_sets(len(cameras)).to(counts.device)
     places = torch.ones(lattice, dtype=torch.bool, device=counts.device).nonzero()
-    share, expected = delta / (len(places) * len(sets)), sensitivity.to(counts.device, torch.float64).flatten(1)
+    share, expected = (
+        delta / (len(places) * len(sets)),
+        sensitivity.to(counts.device, torch.float64).flatten(1),
+    )
     cameras, table = cameras.to(counts.device), tables(counts[:, 0])
     bounds = []
-    for some in torch.arange(len(places), device=counts.device).split(max(1, AT_ONCE // (len(cameras) * len(counts)))):
+    for some in torch.arange(len(places), device=counts.device).split(
+        max(1, AT_ONCE // (len(cameras) * len(counts)))
+    ):
         prints = footprints(cameras, grid, Bricks.at(places[some], brick, grid.shape))
         n, back = (sets @ sums(table, prints).to(torch.float64)).unique(return_inverse=True)
         bound = poisson_bound(n, share)[back] / (sets @ expected[:, some])
@@ -131,28 +144,38 @@ def activity_bound(
 
 
 def view_sets(count: int) -> Float[Tensor, "t m"]:
-    """The sets of views that are tested, as rows of ones: each view, consecutive groups of ten, and all; none twice."""
+    """The sets of views that are tested, as rows of ones: each view, consecutive groups of ten, and
+    all; none twice.
+    """
     single = torch.eye(count, dtype=torch.float64)
     groups = torch.arange(count) // GROUP == torch.arange(-(-count // GROUP))[:, None]
     return torch.cat([single, groups.to(single), torch.ones_like(single[:1])]).unique(dim=0)
 
 
-def brick_sensitivity(backprojected: Float[Tensor, "m d h w"], brick: int) -> Float[Tensor, "m z y x"]:
+def brick_sensitivity(
+    backprojected: Float[Tensor, "m d h w"], brick: int
+) -> Float[Tensor, "m z y x"]:
     """Counts that each view is to expect from every brick full of one unit of activity.
 
     Args:
-        backprojected: the adjoint of views of which only one is ones and the others zeros, for each view; times the
-            counts that a line integral of one gives.
+        backprojected: the adjoint of views of which only one is ones and the others zeros, for each
+            view; times the counts that a line integral of one gives.
         brick: edge of a brick in voxels.
     """
     d, h, w = backprojected.shape[1:]
     padded = torch.nn.functional.pad(backprojected, (0, -w % brick, 0, -h % brick, 0, -d % brick))
-    return padded.unflatten(3, (-1, brick)).unflatten(2, (-1, brick)).unflatten(1, (-1, brick)).sum(dim=(2, 4, 6))
+    return (
+        padded.unflatten(3, (-1, brick))
+        .unflatten(2, (-1, brick))
+        .unflatten(1, (-1, brick))
+        .sum(dim=(2, 4, 6))
+    )
 
 
 def poisson_bound(counts: Float[Tensor, "*n"], delta: float) -> Float[Tensor, "*n"]:
-    """The mean U for which a Poisson variable is n or less with probability delta: half the 1 - delta quantile of
-    chi^2 with 2 n + 2 degrees of freedom; -ln delta for n = 0. Accurate to 1e-9, as torch's incomplete gamma function.
+    """The mean U for which a Poisson variable is n or less with probability delta: half the 1 -
+    delta quantile of chi^2 with 2 n + 2 degrees of freedom; -ln delta for n = 0. Accurate to 1e-9,
+    as torch's incomplete gamma function.
 
     Found by bisection below Chernoff's bound n + t + sqrt(t^2 + 2 n t), t = -ln delta.
     """
@@ -166,14 +189,24 @@ def poisson_bound(counts: Float[Tensor, "*n"], delta: float) -> Float[Tensor, "*
 
 
 def _check_counts(
-    counts: Float[Tensor, "b 1 m v u"], sensitivity: Float[Tensor, "m z y x"], sizes: tuple[int, ...], delta: float
+    counts: Float[Tensor, "b 1 m v u"],
+    sensitivity: Float[Tensor, "m z y x"],
+    sizes: tuple[int, ...],
+    delta: float,
 ) -> None:
     if (counts < 0).any() or (counts != counts.round()).any():
         low, high = counts.aminmax()
-        raise ValueError(f"Expected counts, whole numbers from 0, got values between {low:g} and {high:g}")
+        raise ValueError(
+            f"Expected counts, whole numbers from 0, got values between {low:g} and {high:g}"
+        )
     if tuple(sensitivity.shape) != sizes:
-        raise ValueError(f"Expected a sensitivity [m z y x] of {sizes} bricks, got {tuple(sensitivity.shape)}")
+        raise ValueError(
+            f"Expected a sensitivity [m z y x] of {sizes} bricks, got {tuple(sensitivity.shape)}"
+        )
     if not (sensitivity >= 0).all():
-        raise ValueError(f"A sensitivity must not be negative or NaN, got {int((~(sensitivity >= 0)).sum())} that are")
+        raise ValueError(
+            f"A sensitivity must not be negative or NaN, got {int((~(sensitivity >= 0)).sum())} "
+            f"that are"
+        )
     if not 0 < delta < 1:
         raise ValueError(f"A probability delta must lie between 0 and 1, got {delta}")

@@ -17,7 +17,8 @@ from mvrecon.support.hull import expand, thin_witnesses, visual_hull
 from mvrecon.support.noise import WITNESSES, Evidence, bounded_hull, noise_threshold
 
 KINDS = ("auto", "hull", "box", "none")
-#: Share of the grid from which on a hull's box is not worth the work on it: "auto" then takes all of the grid.
+#: Share of the grid from which on a hull's box is not worth the work on it: "auto" then takes all
+#: of the grid.
 WORTH = 0.7
 
 
@@ -26,12 +27,14 @@ class Support:
     """Where a volume may be other than zero.
 
     Args:
-        box: the least box of voxels that holds it in every item of the batch; never empty, so that a grid can always be
-            cropped to it.
+        box: the least box of voxels that holds it in every item of the batch; never empty, so that
+            a grid can always be cropped to it.
         mask: its voxels on the full grid; none where all of the box counts.
         kind: "hull", "box" or "none", as asked for or as "auto" chose.
-        fraction: of the grid's voxels, those in the mask (the mean over the batch), or else in the box.
-        evidence: with what tolerance and probability the rest is empty; none where the hull is exact, or told by sigma.
+        fraction: of the grid's voxels, those in the mask (the mean over the batch), or else in the
+            box.
+        evidence: with what tolerance and probability the rest is empty; none where the hull is
+            exact, or told by sigma.
     """
 
     box: Box
@@ -52,50 +55,63 @@ def support_from_views(
 ) -> Support:
     """The support of the volumes that views show.
 
-    Views in which nothing is seen leave no brick: the mask is then empty, and the box is the brick at the centre.
+    Views in which nothing is seen leave no brick: the mask is then empty, and the box is the brick
+    at the centre.
 
     Args:
         views: line integrals, or counts.
         cameras, grid: the rig, and where the voxels lie.
-        kind: "none" all of the grid; "hull" the visual hull; "box" all of its box; "auto" the hull where its box holds
-            less than 0.7 of the grid, else all of the grid.
-        noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of `noise_threshold`;
-            {sensitivity, tolerance} of counts, with `delta`, as of `bounded_hull`. Exact views and X-rays also take
-            `witnesses`, the views that must agree: by default `thin_witnesses`, with photons at least 3.
+        kind: "none" all of the grid; "hull" the visual hull; "box" all of its box; "auto" the hull
+            where its box holds less than 0.7 of the grid, else all of the grid.
+        noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of
+            `noise_threshold`; {sensitivity, tolerance} of counts, with `delta`, as of
+            `bounded_hull`. Exact views and X-rays also take
+            `witnesses`, the views that must agree: by default `thin_witnesses`, with photons at
+                least 3.
         brick: edge in voxels; by default `brick_edge`.
-        keep_unseen: as of `visual_hull`; of counts, whether to keep bricks to which no view is sensitive. Without, the
-            support is of what the views show, and not of all that may be there.
+        keep_unseen: as of `visual_hull`; of counts, whether to keep bricks to which no view is
+            sensitive. Without, the support is of what the views show, and not of all that may be
+            there.
 
     Warns:
         UserWarning: voxels are smaller than rays are apart, so that what is no larger can be lost.
 
     Raises:
-        ValueError: an unknown kind or noise, explicit rays with a kind but "none", views of a wrong size or not finite.
+        ValueError: an unknown kind or noise, explicit rays with a kind but "none", views of a wrong
+            size or not finite.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown support {kind!r}. Known: {', '.join(KINDS)}")
     if kind == "none":
         return Support(Box.whole(grid.shape), None, "none", 1.0)
     if isinstance(cameras, ExplicitRays):
-        raise ValueError(f"A support is told from cameras with frusta, got explicit rays and kind {kind!r}; use 'none'")
+        raise ValueError(
+            f"A support is told from cameras with frusta, got explicit rays and kind {kind!r}; "
+            f"use 'none'"
+        )
     brick = brick_edge(grid) if brick is None else brick
     bricks, evidence = _bricks((views, cameras, grid, brick), dict(noise or {}), keep_unseen)
     return _chosen(kind, expand(bricks, brick, grid.shape), _middle(grid, brick), evidence)
 
 
 def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stacklevel: int = 3) -> None:
-    """A UserWarning where a size in mm is below `ray_gap`: such things can pass between rays, and be cut off a hull."""
+    """A UserWarning where a size in mm is below `ray_gap`: such things can pass between rays, and
+    be cut off a hull.
+    """
     gap = ray_gap(cameras, grid)
     if size < gap * (1 - 1e-9):
         warnings.warn(
-            f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), {what} are {size:.3g} mm: what is "
+            f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), {what} are "
+            f"{size:.3g} mm: what is "
             f"thinner than {gap:.3g} mm can pass between them, and be cut off by a visual hull",
             UserWarning,
             stacklevel=stacklevel,
         )
 
 
-def _chosen(kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None) -> Support:
+def _chosen(
+    kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None
+) -> Support:
     whole, box = Box.whole(mask.shape[2:]), Box.around(mask) if mask.any() else middle
     held = box.size / whole.size
     if kind == "box":
@@ -106,10 +122,12 @@ def _chosen(kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: E
 
 
 def brick_edge(grid: Grid) -> int:
-    """Edge of the bricks of a hull: about 32 of them fill the grid's longest axis, and they have 1 to 8 voxels.
+    """Edge of the bricks of a hull: about 32 of them fill the grid's longest axis, and they have 1
+    to 8 voxels.
 
-    A footprint is wider than its brick by more than a pixel on every side, so that bricks finer than a few voxels
-    sharpen a hull little, while their number grows with the third power; and the operators skip by bricks of 8.
+    A footprint is wider than its brick by more than a pixel on every side, so that bricks finer
+    than a few voxels sharpen a hull little, while their number grows with the third power; and the
+    operators skip by bricks of 8.
     """
     return min(8, max(1, max(grid.shape) // 32))
 
@@ -120,22 +138,29 @@ def _middle(grid: Grid, brick: int) -> Box:
 
 
 def _bricks(
-    case: tuple[Float[Tensor, "b 1 m v u"], Cameras, Grid, int], noise: dict[str, Any], keep_unseen: bool
+    case: tuple[Float[Tensor, "b 1 m v u"], Cameras, Grid, int],
+    noise: dict[str, Any],
+    keep_unseen: bool,
 ) -> tuple[Bool[Tensor, "b z y x"], Evidence | None]:
     _, cameras, grid, _ = case
     if "sensitivity" not in noise:
         warn_of_gaps(min(grid.spacing), "voxels", cameras, grid, stacklevel=4)
     enough = thin_witnesses(len(cameras))
     if noise.keys() <= {"witnesses"}:
-        return visual_hull(*case, witnesses=noise.get("witnesses", enough), keep_unseen=keep_unseen), None
+        return visual_hull(
+            *case, witnesses=noise.get("witnesses", enough), keep_unseen=keep_unseen
+        ), None
     if "photons" in noise and noise.keys() <= {"photons", "sigmas", "witnesses"}:
         witnesses = noise.pop("witnesses", max(WITNESSES, enough))
         return visual_hull(*case, noise_threshold(case[0], **noise), witnesses, keep_unseen), None
     if {"sensitivity", "tolerance"} <= noise.keys() <= {"sensitivity", "tolerance", "delta"}:
         bricks, evidence = bounded_hull(*case, **noise)
-        return bricks & ((noise["sensitivity"] > 0).any(dim=0).to(bricks.device) | keep_unseen), evidence
+        return bricks & (
+            (noise["sensitivity"] > 0).any(dim=0).to(bricks.device) | keep_unseen
+        ), evidence
     raise ValueError(
-        "Noise is {witnesses} of exact views, {photons} of X-rays (sigmas, witnesses) or {sensitivity, tolerance} of "
+        "Noise is {witnesses} of exact views, {photons} of X-rays (sigmas, witnesses) or "
+        "{sensitivity, tolerance} of "
         "counts (delta), "
         f"got {sorted(noise)}"
     )

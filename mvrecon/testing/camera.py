@@ -14,13 +14,16 @@ from mvrecon.parts import CAMERAS
 def check_camera(name: str, **options: Any) -> None:
     """Raise AssertionError unless the named camera, built with these options, keeps its promises.
 
-    The same rig each time; right-handed where it looks at the object; pixel centres project to themselves; depth grows
-    along every ray; projecting undoes unprojecting to 1e-9; a rig of M cameras equals M rigs of one.
+    The same rig each time; right-handed where it looks at the object; pixel centres project to
+    themselves; depth grows along every ray; projecting undoes unprojecting to 1e-9; a rig of M
+    cameras equals M rigs of one.
     """
     cameras, again = CAMERAS.build(name, **options), CAMERAS.build(name, **options)
     assert isinstance(cameras, Cameras), f"expected Cameras, got {type(cameras).__name__}"
     for vector in VECTORS:
-        assert torch.equal(getattr(cameras, vector), getattr(again, vector)), f"{vector} differs from call to call"
+        assert torch.equal(getattr(cameras, vector), getattr(again, vector)), (
+            f"{vector} differs from call to call"
+        )
     _check_handedness(cameras)
     _check_pixels(cameras)
     uvz = _somewhere(cameras)
@@ -28,12 +31,20 @@ def check_camera(name: str, **options: Any) -> None:
     for m, camera in enumerate(cameras):
         seen = camera.project(xyz[m])[0]
         error = ((seen - uvz[m]).abs() / (1 + uvz[m].abs())).max()
-        assert error < 1e-9, f"camera {m}: projecting a point that was unprojected misses by {error:.2g}"
-        assert torch.allclose(cameras.project(xyz[m])[m], seen, rtol=1e-12, atol=1e-9), f"camera {m} differs when alone"
+        assert error < 1e-9, (
+            f"camera {m}: projecting a point that was unprojected misses by {error:.2g}"
+        )
+        assert torch.allclose(cameras.project(xyz[m])[m], seen, rtol=1e-12, atol=1e-9), (
+            f"camera {m} differs when alone"
+        )
 
 
 def _check_handedness(cameras: Cameras) -> None:
-    ahead = cameras.source - cameras.origin if cameras.extent == "behind" else cameras.origin - cameras.source
+    ahead = (
+        cameras.source - cameras.origin
+        if cameras.extent == "behind"
+        else cameras.origin - cameras.source
+    )
     handed = (torch.linalg.cross(cameras.u, cameras.v) * ahead).sum(-1)
     assert (handed > 0).all(), f"left-handed cameras: {(handed <= 0).nonzero().flatten().tolist()}"
 
@@ -56,7 +67,9 @@ def _check_pixels(cameras: Cameras) -> None:
 def _somewhere(cameras: Cameras, count: int = 50) -> Float[Tensor, "m n 3"]:
     """Random pixel coordinates and depths on the side of each camera that counts."""
     least, most = (max(min(w, 3.0), -3.0) for w in cameras.limits)
-    t = torch.rand(len(cameras), count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    t = torch.rand(
+        len(cameras), count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     uv = t[..., :2] * t.new_tensor(cameras.shape[::-1]) - 0.5
     w = least + (most - least) * (0.05 + 0.9 * t[..., 2:])
     return torch.cat([uv, w * cameras.distance[:, None, None]], dim=-1)

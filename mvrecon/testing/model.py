@@ -18,11 +18,12 @@ TOLERANCE = 1e-5
 def check_model(name: str, projector: Projector, seed: int = 0, **options: Any) -> None:
     """Raise AssertionError unless the named model keeps its promises for views of this projector.
 
-    A finite volume of the grid's shape and of the views' dtype, the same bits when it is called twice; a multiple of
-    the views gives that multiple of the volume, views of zero a volume of zero; a sample's volume depends neither on
-    the other samples of its batch nor on their order; gradients of the volume reach every parameter; views of another
-    shape, or with a value that is not finite, are refused by a ValueError that speaks of views. All of this with random
-    weights, so that layers that start at zero take part.
+    A finite volume of the grid's shape and of the views' dtype, the same bits when it is called
+    twice; a multiple of the views gives that multiple of the volume, views of zero a volume of
+    zero; a sample's volume depends neither on the other samples of its batch nor on their order;
+    gradients of the volume reach every parameter; views of another shape, or with a value that is
+    not finite, are refused by a ValueError that speaks of views. All of this with random weights,
+    so that layers that start at zero take part.
 
     Args:
         name: of the model.
@@ -43,12 +44,18 @@ def check_model(name: str, projector: Projector, seed: int = 0, **options: Any) 
     _check_gradients(model, views)
 
 
-def _check_volume(model: nn.Module, views: Float[Tensor, "2 1 m v u"], shape: tuple[int, ...]) -> None:
+def _check_volume(
+    model: nn.Module, views: Float[Tensor, "2 1 m v u"], shape: tuple[int, ...]
+) -> None:
     out = model(views)
     assert isinstance(out, Reconstruction), f"expected a Reconstruction, got {type(out).__name__}"
     expected = (2, 1, *shape)
-    assert out.volume.shape == expected, f"the volume is {tuple(out.volume.shape)}, expected {expected}"
-    assert out.volume.dtype == views.dtype, f"the volume of {views.dtype} views is {out.volume.dtype}"
+    assert out.volume.shape == expected, (
+        f"the volume is {tuple(out.volume.shape)}, expected {expected}"
+    )
+    assert out.volume.dtype == views.dtype, (
+        f"the volume of {views.dtype} views is {out.volume.dtype}"
+    )
     assert out.volume.isfinite().all(), "the volume is not finite"
     assert torch.equal(model(views).volume, out.volume), "not the same bits when called twice"
 
@@ -58,23 +65,37 @@ def _check_scale(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
     for factor in (2.0**-10, 2.0**10):
         multiple = model(factor * views).volume
         assert close(multiple / factor, volume, TOLERANCE), f"f({factor} y) is not {factor} f(y)"
-    assert not model(torch.zeros_like(views)).volume.any(), "views of zero do not give a volume of zero"
+    assert not model(torch.zeros_like(views)).volume.any(), (
+        "views of zero do not give a volume of zero"
+    )
 
 
 def _check_batch(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
     volume = model(views).volume
-    assert close(model(views.flip(0)).volume.flip(0), volume, TOLERANCE), "the order of a batch changes its volumes"
-    assert close(model(views[1:]).volume, volume[1:], TOLERANCE), "a volume depends on the others of its batch"
+    assert close(model(views.flip(0)).volume.flip(0), volume, TOLERANCE), (
+        "the order of a batch changes its volumes"
+    )
+    assert close(model(views[1:]).volume, volume[1:], TOLERANCE), (
+        "a volume depends on the others of its batch"
+    )
 
 
 def _check_gradients(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
-    named = {name: each for name, each in model.named_parameters() if each.requires_grad and each.numel()}
+    named = {
+        name: each for name, each in model.named_parameters() if each.requires_grad and each.numel()
+    }
     if named:
         loss = model(views).volume.square().sum()
         gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
-        idle = [name for name, each in zip(named, gradients, strict=True) if each is None or not each.any()]
+        idle = [
+            name
+            for name, each in zip(named, gradients, strict=True)
+            if each is None or not each.any()
+        ]
         assert not idle, f"no gradient reaches {', '.join(idle)}"
-        bad = [name for name, each in zip(named, gradients, strict=True) if not each.isfinite().all()]
+        bad = [
+            name for name, each in zip(named, gradients, strict=True) if not each.isfinite().all()
+        ]
         assert not bad, f"gradients are not finite: {', '.join(bad)}"
 
 
@@ -94,8 +115,12 @@ def _check_refusals(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None
         try:
             model(bad)
         except ValueError as error:
-            assert "views" in str(error).lower(), f"views with {what}: the error does not speak of views: {error}"
+            assert "views" in str(error).lower(), (
+                f"views with {what}: the error does not speak of views: {error}"
+            )
         except Exception as error:
-            raise AssertionError(f"views with {what}: expected a ValueError, got {error!r}") from error
+            raise AssertionError(
+                f"views with {what}: expected a ValueError, got {error!r}"
+            ) from error
         else:
             raise AssertionError(f"views with {what} are not refused")

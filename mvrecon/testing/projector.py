@@ -15,14 +15,17 @@ from mvrecon.projectors.operator import Projector
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
 
 
-def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, gradients: bool = True, **options) -> None:
+def check_projector(
+    name: str, grid: Grid, cameras: Cameras, seed: int = 0, gradients: bool = True, **options
+) -> None:
     """Raise AssertionError unless the named projector keeps its promises on this grid and rig.
 
-    Views and volumes of the right shape and dtype, and finite; A.T the transpose of A in float32 and float64; linear,
-    nothing from nothing; volumes of a batch seen each alone, twice the same to the last bit; moving the object is
-    un-moving the cameras; with a support M it is A diag(M), and diag(M) A^T its transpose; gradients in volume and pose
-    that differences confirm (on a small grid and rig in a generic pose; `gradients=False` leaves them out), that in the
-    volume being the adjoint, and second ones in volume and views.
+    Views and volumes of the right shape and dtype, and finite; A.T the transpose of A in float32
+    and float64; linear, nothing from nothing; volumes of a batch seen each alone, twice the same to
+    the last bit; moving the object is un-moving the cameras; with a support M it is A diag(M), and
+    diag(M) A^T its transpose; gradients in volume and pose that differences confirm (on a small
+    grid and rig in a generic pose; `gradients=False` leaves them out), that in the volume being the
+    adjoint, and second ones in volume and views.
     """
     torch.manual_seed(seed)
     A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)
@@ -32,10 +35,14 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
         expected = (2, 1, len(cameras), *cameras.shape)
         assert views.shape == expected, f"views are {tuple(views.shape)}, expected {expected}"
         assert views.dtype == dtype, f"views of {dtype} volumes are {views.dtype}"
-        assert views.isfinite().all(), f"{int((~views.isfinite()).sum())} views of a finite volume are not finite"
+        assert views.isfinite().all(), (
+            f"{int((~views.isfinite()).sum())} views of a finite volume are not finite"
+        )
         y = torch.randn_like(views)
         volume = A.T(y)
-        assert volume.shape == x.shape, f"the adjoint gives {tuple(volume.shape)}, expected {tuple(x.shape)}"
+        assert volume.shape == x.shape, (
+            f"the adjoint gives {tuple(volume.shape)}, expected {tuple(x.shape)}"
+        )
         assert volume.dtype == dtype, f"the adjoint gives {volume.dtype} for {dtype}"
         assert volume.isfinite().all(), (
             f"the adjoint gives {int((~volume.isfinite()).sum())} values that are not finite"
@@ -46,7 +53,9 @@ def check_projector(name: str, grid: Grid, cameras: Cameras, seed: int = 0, grad
         assert close(A(2 * x - other), 2 * views - A(other), tolerance), f"not linear in {dtype}"
         assert not A(torch.zeros_like(x)).any(), "views of nothing"
         assert torch.equal(A(x), views) and torch.equal(A.T(y), volume), "not the same twice"
-        assert close(A(x[1:]), views[1:], tolerance), "a volume's views depend on the others of its batch"
+        assert close(A(x[1:]), views[1:], tolerance), (
+            "a volume's views depend on the others of its batch"
+        )
     _check_support(A)
     _check_motion(name, grid, cameras, **options)
     if gradients:
@@ -74,7 +83,10 @@ def _check_support(A: Projector) -> None:
 
 def _check_motion(name: str, grid: Grid, cameras: Cameras, **options) -> None:
     """Moving the object shows what un-moving the cameras shows."""
-    R, t = random_rotation(torch.Generator().manual_seed(0)), torch.tensor([30.0, -20.0, 10.0], dtype=torch.float64)
+    R, t = (
+        random_rotation(torch.Generator().manual_seed(0)),
+        torch.tensor([30.0, -20.0, 10.0], dtype=torch.float64),
+    )
     affine = grid.affine.clone()
     affine[:3] = R @ affine[:3]
     affine[:3, 3] += t

@@ -1,4 +1,6 @@
-"""Pictures for review: labelled tiles of planes, views, opinions and weights, with one fixed window of values each."""
+"""Pictures for review: labelled tiles of planes, views, opinions and weights, with one fixed window
+of values each.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -17,7 +19,9 @@ PLANES = ("across z", "across y", "across x")
 
 
 def enlarged(images: Sequence[Image], edge: int = EDGE) -> list[Image]:
-    """Images at one scale, each pixel repeated so often that their longest edge stays within `edge` (at least once)."""
+    """Images at one scale, each pixel repeated so often that their longest edge stays within `edge`
+    (at least once).
+    """
     factor = max(1, edge // max(max(image.shape[:2]) for image in images))
     return [image.repeat(factor, axis=0).repeat(factor, axis=1) for image in images]
 
@@ -39,10 +43,15 @@ def tiled(rows: Sequence[Sequence[Image]]) -> Image:
         ValueError: no image, or rows of different length.
     """
     if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
-        raise ValueError(f"A montage needs rows of equal length, got lengths {[len(row) for row in rows]}")
+        raise ValueError(
+            f"A montage needs rows of equal length, got lengths {[len(row) for row in rows]}"
+        )
     heights = [max(image.shape[0] for image in row) for row in rows]
     widths = [max(image.shape[1] for image in column) for column in zip(*rows, strict=True)]
-    canvas = np.zeros((sum(heights) + GAP * (len(heights) - 1), sum(widths) + GAP * (len(widths) - 1), 3), np.uint8)
+    canvas = np.zeros(
+        (sum(heights) + GAP * (len(heights) - 1), sum(widths) + GAP * (len(widths) - 1), 3),
+        np.uint8,
+    )
     top = 0
     for row, height in zip(rows, heights, strict=True):
         left = 0
@@ -59,14 +68,18 @@ def planes(
     data_range: float,
     spacing: Spacing = CUBES,
 ) -> Image:
-    """Three middle planes (rows) of the truth, of every volume, and of the first volume's error (columns).
+    """Three middle planes (rows) of the truth, of every volume, and of the first volume's error
+    (columns).
 
-    Values from 0 to data_range; the error from -data_range / 2 (blue) to data_range / 2 (red). To scale: `spacing` is
-    the voxel size along (x, y, z), mm.
+    Values from 0 to data_range; the error from -data_range / 2 (blue) to data_range / 2 (red). To
+    scale: `spacing` is the voxel size along (x, y, z), mm.
     """
     error = next(iter(volumes.values())) - truth
     shown = {"truth": truth, **volumes}
-    columns = {name: [grey(p, (0, data_range)) for p in middle_planes(v, spacing)] for name, v in shown.items()}
+    columns = {
+        name: [grey(p, (0, data_range)) for p in middle_planes(v, spacing)]
+        for name, v in shown.items()
+    }
     columns["error"] = [signed(p, data_range / 2) for p in middle_planes(error, spacing)]
     return _captioned(columns, PLANES)
 
@@ -77,9 +90,13 @@ def projections(
     data_range: float,
     spacing: Spacing = CUBES,
 ) -> Image:
-    """Maximum-intensity projections along three axes (rows) of the truth and of every volume (columns), to scale."""
+    """Maximum-intensity projections along three axes (rows) of the truth and of every volume
+    (columns), to scale.
+    """
     shown = {"truth": truth, **volumes}
-    columns = {name: [grey(p, (0, data_range)) for p in brightest(v, spacing)] for name, v in shown.items()}
+    columns = {
+        name: [grey(p, (0, data_range)) for p in brightest(v, spacing)] for name, v in shown.items()
+    }
     return _captioned(columns, ("along z", "along y", "along x"))
 
 
@@ -97,20 +114,26 @@ def views(measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"]) -
 
 
 def radiographs(each: Float[Tensor, "m v u"]) -> list[Image]:
-    """The views of all cameras as they are, bright where a ray met much; values from 0 to the greatest of all."""
+    """The views of all cameras as they are, bright where a ray met much; values from 0 to the
+    greatest of all.
+    """
     top = max(each.amax().item(), torch.finfo(torch.float32).tiny)
     return [grey(view, (0, top)) for view in each]
 
 
 def gallery(each: Float[Tensor, "m v u"], edge: int = 256) -> Image:
     """The views of all cameras in rows of at most four; values from 0 to the greatest."""
-    images = [labelled(image, f"camera {m}") for m, image in enumerate(enlarged(radiographs(each), edge))]
+    images = [
+        labelled(image, f"camera {m}") for m, image in enumerate(enlarged(radiographs(each), edge))
+    ]
     images += [np.zeros_like(images[0])] * (-len(images) % min(4, len(images)))
     return tiled([images[i : i + 4] for i in range(0, len(images), 4)])
 
 
 def opinions(each: Float[Tensor, "m d h w"], data_range: float, spacing: Spacing = CUBES) -> Image:
-    """Three middle planes (rows) of every camera's own volume (columns), to scale; values from 0 to data_range."""
+    """Three middle planes (rows) of every camera's own volume (columns), to scale; values from 0 to
+    data_range.
+    """
     return _per_camera(each, data_range, spacing)
 
 
@@ -123,15 +146,22 @@ def weights(each: Float[Tensor, "m d h w"], spacing: Spacing = CUBES) -> Image:
 
 
 def _per_camera(each: Float[Tensor, "m d h w"], top: float, spacing: Spacing) -> Image:
-    columns = {f"camera {m}": [grey(p, (0, top)) for p in middle_planes(v, spacing)] for m, v in enumerate(each)}
+    columns = {
+        f"camera {m}": [grey(p, (0, top)) for p in middle_planes(v, spacing)]
+        for m, v in enumerate(each)
+    }
     return _captioned(columns, PLANES)
 
 
 def _captioned(columns: Mapping[str, Sequence[Image]], rows: Sequence[str]) -> Image:
-    """Columns of images with their names above and the rows' names on the left, all at one scale."""
+    """Columns of images with their names above and the rows' names on the left, all at one
+    scale.
+    """
     each = iter(enlarged([image for images in columns.values() for image in images]))
     large = {name: [next(each) for _ in images] for name, images in columns.items()}
-    heights = [max(0, image.shape[0] - LABEL) for image in next(iter(large.values()))]  # a flat image has less
+    heights = [
+        max(0, image.shape[0] - LABEL) for image in next(iter(large.values()))
+    ]  # a flat image has less
     names = [np.zeros((height, CAPTION, 3), np.uint8) for height in heights]
     left = [labelled(blank, row) for blank, row in zip(names, rows, strict=True)]
     left[0] = labelled(left[0], "")

@@ -17,7 +17,9 @@ Spacing = tuple[float, float, float]
 CUBES: Spacing = (1.0, 1.0, 1.0)
 
 
-def middle_planes(volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES) -> list[Float[Tensor, "r c"]]:
+def middle_planes(
+    volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES
+) -> list[Float[Tensor, "r c"]]:
     """The three planes through the volume's centre, to scale: across z, across y, across x.
 
     Args:
@@ -28,13 +30,21 @@ def middle_planes(volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES) -> l
     return _to_scale([volume[d], volume[:, h], volume[:, :, w]], spacing)
 
 
-def brightest(volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES) -> list[Float[Tensor, "r c"]]:
-    """Maximum-intensity projections along z, y and x, to scale; arguments as for `middle_planes`."""
+def brightest(
+    volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES
+) -> list[Float[Tensor, "r c"]]:
+    """Maximum-intensity projections along z, y and x, to scale; arguments as for
+    `middle_planes`.
+    """
     return _to_scale([volume.amax(dim=axis) for axis in range(3)], spacing)
 
 
-def _to_scale(planes: Sequence[Float[Tensor, "r c"]], spacing: Spacing) -> list[Float[Tensor, "r c"]]:
-    """Images of planes across z, y and x: square pixels, interpolated where voxels are longer, and +z up."""
+def _to_scale(
+    planes: Sequence[Float[Tensor, "r c"]], spacing: Spacing
+) -> list[Float[Tensor, "r c"]]:
+    """Images of planes across z, y and x: square pixels, interpolated where voxels are longer, and
+    +z up.
+    """
     x, y, z = (step / min(spacing) for step in spacing)
     across_z, across_y, across_x = map(_stretched, planes, ((y, x), (z, x), (z, y)))
     return [across_z, across_y.flip(0), across_x.flip(0)]
@@ -48,7 +58,8 @@ def _stretched(plane: Float[Tensor, "h w"], factors: tuple[float, float]) -> Flo
 
 
 def grey(image: Float[Tensor, "h w"], window: Window) -> Image:
-    """A grey image: black at the window's lower end, white at its upper; values that are not finite are red.
+    """A grey image: black at the window's lower end, white at its upper; values that are not finite
+    are red.
 
     Raises:
         ValueError: a window whose ends are not in order.

@@ -10,18 +10,29 @@ from mvrecon.geometry.rigid import random_rotation
 DETECTOR = {"pixels": [6, 9], "pixel_mm": [2.0, 3.0]}
 OFFSET = {**DETECTOR, "offset_mm": [5.0, -7.0]}
 
-#: Options of each built-in camera but `from_file`; the detectors are oblong, so that a swap of axes shows.
+#: Options of each built-in camera but `from_file`; the detectors are oblong, so that a swap of axes
+#: shows.
 OPTIONS: dict[str, dict[str, Any]] = {
     "circular": {"views": 5, "sid": 400.0, "sdd": 800.0, "detector": OFFSET},
     "arc": {"views": 4, "sid": 400.0, "sdd": 700.0, "detector": OFFSET, "arc_degrees": 120.0},
-    "dome": {"views": 7, "radius": 200.0, "focal": 70.0, "aperture_degrees": 180.0, "detector": OFFSET},
+    "dome": {
+        "views": 7,
+        "radius": 200.0,
+        "focal": 70.0,
+        "aperture_degrees": 180.0,
+        "detector": OFFSET,
+    },
     "parallel": {"views": 5, "detector": OFFSET, "depth_mm": 300.0},
     "dcspect80": {"pixels": [6, 9]},
 }
 
 
-def random_cameras(count: int = 5, seed: int = 0, extent: Extent = "segment", skew: float = 0.1) -> Cameras:
-    """Central cameras in any pose, with oblong pixels, offset detectors, and rows not square to columns."""
+def random_cameras(
+    count: int = 5, seed: int = 0, extent: Extent = "segment", skew: float = 0.1
+) -> Cameras:
+    """Central cameras in any pose, with oblong pixels, offset detectors, and rows not square to
+    columns.
+    """
     rng = torch.Generator().manual_seed(seed)
     axes = random_rotation(rng, count)
     right, down, forward = axes.unbind(dim=-1)

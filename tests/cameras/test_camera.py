@@ -11,7 +11,12 @@ from tests.cameras.rigs import random_cameras, same
 
 def record(**changes):
     """Three cameras at (0, 0, -100) looking along +z, which are right-handed as OpenCV's."""
-    vectors = {"source": [0.0, 0, -100], "origin": [-4.0, -3, 100], "u": [2.0, 0, 0], "v": [0.0, 2, 0]}
+    vectors = {
+        "source": [0.0, 0, -100],
+        "origin": [-4.0, -3, 100],
+        "u": [2.0, 0, 0],
+        "v": [0.0, 2, 0],
+    }
     options = {name: torch.tensor([vector] * 3) for name, vector in vectors.items()}
     return Cameras(**(options | {"shape": (4, 5)} | changes))
 
@@ -36,7 +41,10 @@ def record(**changes):
         ({"u": torch.tensor([[2.0, 0, 0]] * 2 + [[-2.0, 0, 0]])}, "camera 2 is left-handed"),
         ({"v": torch.tensor([[2.0, 0, 0]] * 3)}, "must not be flat, .* camera 0"),
         ({"u": torch.zeros(3, 3)}, "must not be flat"),
-        ({"origin": torch.tensor([[-4.0, -3, 100]] * 2 + [[-4.0, -3, -100]])}, "must not be flat, .* camera 2"),
+        (
+            {"origin": torch.tensor([[-4.0, -3, 100]] * 2 + [[-4.0, -3, -100]])},
+            "must not be flat, .* camera 2",
+        ),
     ],
 )
 def test_bad_records_are_refused(changes, message):
@@ -56,7 +64,9 @@ def test_numbers_keep_their_digits_whatever_holds_them():
 
 
 def test_the_textbook_camera():
-    """At depth 150 of 200, the centre of pixel (u, v) = (4, 0) of a 4 x 5 detector: (4, -3) mm times 150/200."""
+    """At depth 150 of 200, the centre of pixel (u, v) = (4, 0) of a 4 x 5 detector: (4, -3) mm
+    times 150/200.
+    """
     cameras = record()
     assert torch.equal(cameras.distance, torch.full((3,), 200.0, dtype=torch.float64))
     xyz = torch.tensor([4.0 * 0.75, -3.0 * 0.75, 50.0], dtype=torch.float64)
@@ -72,14 +82,24 @@ def test_the_matrix_agrees_with_project(extent):
     ones = torch.ones(11, 1, dtype=torch.float64)
     homogeneous = torch.cat([xyz, ones], dim=-1) @ cameras.matrix.mT
     uvz = cameras.project(xyz)
-    torch.testing.assert_close(homogeneous[..., :2] / homogeneous[..., 2:], uvz[..., :2], rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(homogeneous[..., 2] * cameras.distance[:, None], uvz[..., 2], rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(
+        homogeneous[..., :2] / homogeneous[..., 2:], uvz[..., :2], rtol=1e-10, atol=1e-10
+    )
+    torch.testing.assert_close(
+        homogeneous[..., 2] * cameras.distance[:, None], uvz[..., 2], rtol=1e-10, atol=1e-10
+    )
 
 
 def test_a_detector_mirrored_through_its_pinhole_sees_the_same():
     behind = random_cameras(extent="behind")
     ahead = Cameras(
-        behind.source, 2 * behind.source - behind.origin, -behind.u, -behind.v, behind.shape, False, "ahead"
+        behind.source,
+        2 * behind.source - behind.origin,
+        -behind.u,
+        -behind.v,
+        behind.shape,
+        False,
+        "ahead",
     )
     xyz = 40 * torch.randn(11, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     a, b = ahead.project(xyz), behind.project(xyz)
@@ -98,7 +118,9 @@ def test_points_keep_their_shape_and_dtype():
 def test_projection_is_differentiable_in_points_and_pose():
     cameras = random_cameras(2)
     vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
-    xyz = torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)).requires_grad_()
+    xyz = torch.randn(
+        3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    ).requires_grad_()
 
     def project(xyz, *vectors):
         return Cameras(*vectors, shape=cameras.shape).project(xyz)
@@ -108,7 +130,15 @@ def test_projection_is_differentiable_in_points_and_pose():
 
 def test_choosing_cameras():
     cameras = random_cameras(5)
-    for index in (2, -3, [2], torch.tensor([2]), slice(2, 3), torch.arange(5) == 2, torch.tensor(2)):
+    for index in (
+        2,
+        -3,
+        [2],
+        torch.tensor([2]),
+        slice(2, 3),
+        torch.arange(5) == 2,
+        torch.tensor(2),
+    ):
         one = cameras[index]
         assert len(one) == 1 and torch.equal(one.source[0], cameras.source[2])
     assert torch.equal(cameras[[3, 0]].u, cameras.u[[3, 0]])
@@ -119,7 +149,9 @@ def test_rays_lead_from_the_source_to_the_pixels():
     cameras = random_cameras(3)
     start, end = cameras.rays()
     assert start.shape == end.shape == (3, 7, 9, 3)
-    torch.testing.assert_close(start, cameras.source[:, None, None].expand_as(start), rtol=0, atol=0)
+    torch.testing.assert_close(
+        start, cameras.source[:, None, None].expand_as(start), rtol=0, atol=0
+    )
     expected = cameras.origin + 6 * cameras.v + 8 * cameras.u
     torch.testing.assert_close(end[:, 6, 8], expected, rtol=1e-14, atol=1e-12)
 
@@ -142,7 +174,9 @@ def test_moving_the_rig_moves_what_it_sees():
     R, t = random_rotation(rng), torch.randn(3, generator=rng, dtype=torch.float64)
     xyz = 20 * torch.randn(9, 3, generator=rng, dtype=torch.float64)
     moved = cameras.moved(R, t)
-    torch.testing.assert_close(moved.project(xyz @ R.T + t), cameras.project(xyz), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(
+        moved.project(xyz @ R.T + t), cameras.project(xyz), rtol=1e-9, atol=1e-9
+    )
     assert same(moved.moved(R.T, -R.T @ t), cameras)
     with pytest.raises(ValueError, match="left-handed"):
         cameras.moved(torch.diag(torch.tensor([1.0, 1, -1])), t)
@@ -151,7 +185,9 @@ def test_moving_the_rig_moves_what_it_sees():
 def test_the_depth_range_holds_the_grid_tightly():
     cameras = record()[0]
     grid = Grid.centred((4, 6, 8), (1.0, 2.0, 5.0), centre=(1.0, 2.0, 3.0))
-    torch.testing.assert_close(cameras.depth_range(grid), torch.tensor([[93.0, 113.0]], dtype=torch.float64))
+    torch.testing.assert_close(
+        cameras.depth_range(grid), torch.tensor([[93.0, 113.0]], dtype=torch.float64)
+    )
 
 
 def test_the_limits_are_those_of_the_extent():
@@ -166,4 +202,6 @@ def test_pixel_centres_of_a_parallel_beam_project_to_themselves_at_any_depth():
         uvz = cameras.project((start + w * (end - start))[0])[0]
         torch.testing.assert_close(uvz[..., :2], pixel_centres((4, 5)), rtol=0, atol=1e-12)
         torch.testing.assert_close(uvz[..., 2], torch.full((4, 5), 200 * w, dtype=torch.float64))
-    assert torch.equal(cameras.matrix[:, 2], torch.tensor([[0.0, 0, 0, 1]] * 3, dtype=torch.float64))
+    assert torch.equal(
+        cameras.matrix[:, 2], torch.tensor([[0.0, 0, 0, 1]] * 3, dtype=torch.float64)
+    )

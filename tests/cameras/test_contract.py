@@ -17,7 +17,9 @@ BUILTIN = sorted(["from_file", *OPTIONS])
 
 
 def test_every_built_in_camera_is_tested_here():
-    builtin = [name for name in CAMERAS.names() if CAMERAS.origin(name).startswith("mvrecon.cameras")]
+    builtin = [
+        name for name in CAMERAS.names() if CAMERAS.origin(name).startswith("mvrecon.cameras")
+    ]
     assert builtin == BUILTIN
 
 
@@ -45,7 +47,9 @@ class Coupled(contract.Cameras):
     """Its cameras know of each other: the answer depends on how many there are."""
 
     def project(self, xyz):
-        return super().project(xyz) * (1 if len(self) == 1 else torch.tensor([1, 1, 1 + 1e-6], dtype=torch.float64))
+        return super().project(xyz) * (
+            1 if len(self) == 1 else torch.tensor([1, 1, 1 + 1e-6], dtype=torch.float64)
+        )
 
 
 def of_kind(kind):

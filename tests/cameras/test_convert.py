@@ -12,7 +12,9 @@ CENTRAL = pytest.mark.parametrize("extent", EXTENTS)
 
 
 def points(cameras, count=12, seed=3):
-    """World points on the side of each camera that counts, [m n 3], and their pixel coordinates and depths."""
+    """World points on the side of each camera that counts, [m n 3], and their pixel coordinates and
+    depths.
+    """
     rng = torch.Generator().manual_seed(seed)
     uv = 9 * torch.rand(len(cameras), count, 2, generator=rng, dtype=torch.float64)
     z = 20 + 60 * torch.rand(len(cameras), count, 1, generator=rng, dtype=torch.float64)
@@ -61,7 +63,11 @@ def test_krt_of_a_cone_beam_is_known():
 def test_matrix_round_trip_at_any_positive_scale(extent):
     cameras = random_cameras(extent=extent)
     scale = torch.tensor([1e-3, 1.0, 7.0, 250.0, 1e4], dtype=torch.float64)[:, None, None]
-    assert same(convert.from_matrix(scale * cameras.matrix, cameras.shape, cameras.distance, extent), cameras, 1e-9)
+    assert same(
+        convert.from_matrix(scale * cameras.matrix, cameras.shape, cameras.distance, extent),
+        cameras,
+        1e-9,
+    )
     with pytest.raises(ValueError, match="left-handed"):
         convert.from_matrix(-cameras.matrix, cameras.shape, cameras.distance, extent)
 
@@ -84,7 +90,9 @@ def test_frustum_coordinates_of_parallel_beams_are_pixels_and_depth():
     close(h, torch.cat([uvz, torch.ones_like(uvz[..., :1])], dim=-1))
 
 
-@pytest.mark.parametrize("cameras", [random_cameras(2), random_cameras(2, extent="behind"), parallel(3, DETECTOR)])
+@pytest.mark.parametrize(
+    "cameras", [random_cameras(2), random_cameras(2, extent="behind"), parallel(3, DETECTOR)]
+)
 def test_the_jacobian_is_autograd_s(cameras):
     f = 30.0
     xyz = torch.randn(4, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
@@ -109,7 +117,9 @@ def test_the_jacobian_of_a_straight_camera_is_f_fx_fy_over_z4():
 @CENTRAL
 def test_astra_round_trip(extent):
     cameras = random_cameras(extent=extent)
-    assert same(convert.from_astra(convert.to_astra(cameras), cameras.shape, extent=extent), cameras)
+    assert same(
+        convert.from_astra(convert.to_astra(cameras), cameras.shape, extent=extent), cameras
+    )
 
 
 def test_astra_parallel_round_trip():
@@ -127,7 +137,9 @@ def astra_circular(angle, sid, odd, du, dv):
 
 def test_astra_s_own_circle_is_ours_with_rows_reversed():
     angles = [0.0, 30.0, 200.0]
-    rows = torch.tensor([astra_circular(math.radians(a), 400, 400, 3, 2) for a in angles], dtype=torch.float64)
+    rows = torch.tensor(
+        [astra_circular(math.radians(a), 400, 400, 3, 2) for a in angles], dtype=torch.float64
+    )
     with pytest.raises(ValueError, match="left-handed"):
         convert.from_astra(rows, (6, 9))
     ours = circular(3, 400.0, 800.0, DETECTOR, angles=[a - 90 for a in angles])
@@ -144,10 +156,15 @@ def test_kornia_projects_and_unprojects_as_the_record_does(extent):
     kornia = PinholeCamera(intrinsics, extrinsics, height, width)
     close(kornia.project(xyz), uvz[..., :2])
     for m in range(len(cameras)):  # kornia takes one depth tensor a camera
-        one = PinholeCamera(intrinsics[m : m + 1], extrinsics[m : m + 1], height[m : m + 1], width[m : m + 1])
+        one = PinholeCamera(
+            intrinsics[m : m + 1], extrinsics[m : m + 1], height[m : m + 1], width[m : m + 1]
+        )
         close(one.unproject(uvz[m, :, :2], uvz[m, :, 2:].abs()), xyz[m], 1e-9)
     own = xyz @ extrinsics[:, :3, :3].mT + extrinsics[:, None, :3, 3]
-    close(project_points(own, intrinsics[:, None, :3, :3].expand(-1, xyz.shape[1], -1, -1)), uvz[..., :2])
+    close(
+        project_points(own, intrinsics[:, None, :3, :3].expand(-1, xyz.shape[1], -1, -1)),
+        uvz[..., :2],
+    )
 
 
 @CENTRAL
@@ -155,12 +172,16 @@ def test_kornia_round_trip(extent):
     cameras = random_cameras(extent=extent)
     intrinsics, extrinsics, height, width = convert.to_kornia(cameras)
     assert (height == 7).all() and (width == 9).all()
-    assert same(convert.from_kornia(intrinsics, extrinsics, (7, 9), cameras.distance, extent), cameras)
+    assert same(
+        convert.from_kornia(intrinsics, extrinsics, (7, 9), cameras.distance, extent), cameras
+    )
 
 
 @CENTRAL
 def test_pytorch3d_s_formula_lands_on_the_record_s_pixels(extent):
-    """NDC: +1 is left and top over the shorter side; on the screen, pixel centres are half a pixel from the edges."""
+    """NDC: +1 is left and top over the shorter side; on the screen, pixel centres are half a pixel
+    from the edges.
+    """
     cameras = random_cameras(extent=extent, skew=0.0)
     R, T, focal, centre = convert.to_pytorch3d(cameras)
     xyz, uvz = points(cameras)

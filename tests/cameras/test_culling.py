@@ -14,25 +14,40 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.parts import CAMERAS, PROJECTORS
 from tests.cameras.rigs import random_cameras
 
-KINDS = [("segment", False), ("behind", False), ("ahead", False), ("line", False), ("segment", True), ("line", True)]
+KINDS = [
+    ("segment", False),
+    ("behind", False),
+    ("ahead", False),
+    ("line", False),
+    ("segment", True),
+    ("line", True),
+]
 
 
 def random_rig(seed: int, extent: Extent, parallel: bool) -> Cameras:
     """Five cameras in any pose, with fields of some 30 degrees."""
     thin = random_cameras(5, seed, "behind" if extent == "behind" else "ahead")
     origin = thin.origin - 3 * (4 * thin.u + 3 * thin.v)
-    return replace(thin, origin=origin, u=4 * thin.u, v=4 * thin.v, extent=extent, parallel=parallel)
+    return replace(
+        thin, origin=origin, u=4 * thin.u, v=4 * thin.v, extent=extent, parallel=parallel
+    )
 
 
 def random_grid(seed: int, cameras: Cameras) -> Grid:
-    """Voxels of any size and shape, turned and sheared, in or beside the field of the first camera."""
+    """Voxels of any size and shape, turned and sheared, in or beside the field of the first
+    camera.
+    """
     rng = torch.Generator().manual_seed(1000 + seed)
     affine = torch.eye(4, dtype=torch.float64)
-    shear = torch.eye(3, dtype=torch.float64) + 0.2 * torch.randn(3, 3, generator=rng, dtype=torch.float64).triu(1)
+    shear = torch.eye(3, dtype=torch.float64) + 0.2 * torch.randn(
+        3, 3, generator=rng, dtype=torch.float64
+    ).triu(1)
     size = 1 + 6 * torch.rand(3, generator=rng, dtype=torch.float64)
     affine[:3, :3] = random_rotation(rng) @ shear @ size.diag()
     rows, columns = cameras.shape
-    u, v, w = 2 * torch.rand(3, generator=rng, dtype=torch.float64) - 0.5  # of the detector and of the distance to it
+    u, v, w = (
+        2 * torch.rand(3, generator=rng, dtype=torch.float64) - 0.5
+    )  # of the detector and of the distance to it
     w = -w if cameras.extent == "behind" else w
     place = torch.stack([u * columns, v * rows, w * cameras.distance[0]])
     affine[:3, 3] = cameras[0].unproject(place[None])[0]
@@ -40,7 +55,9 @@ def random_grid(seed: int, cameras: Cameras) -> Grid:
 
 
 def stretches(cameras: Cameras, grid: Grid, across: int = 41):
-    """Where rays all over each detector, its edges among them, enter and leave the box: [m rays 2] fractions w."""
+    """Where rays all over each detector, its edges among them, enter and leave the box: [m rays 2]
+    fractions w.
+    """
     rows, columns = cameras.shape
     v, u = (torch.linspace(-0.5, n - 0.5, across, dtype=torch.float64) for n in (rows, columns))
     uv = torch.cartesian_prod(u, v).expand(len(cameras), -1, 2)
@@ -58,7 +75,9 @@ def stretches(cameras: Cameras, grid: Grid, across: int = 41):
 
 
 @pytest.mark.parametrize(("extent", "parallel"), KINDS)
-def test_a_camera_is_left_out_only_if_no_ray_meets_the_box_and_hardly_one_else_is_kept(extent, parallel):
+def test_a_camera_is_left_out_only_if_no_ray_meets_the_box_and_hardly_one_else_is_kept(
+    extent, parallel
+):
     seen, hit = [], []
     for seed in range(40):
         cameras = random_rig(seed, extent, parallel)
@@ -69,7 +88,9 @@ def test_a_camera_is_left_out_only_if_no_ray_meets_the_box_and_hardly_one_else_i
     seen, hit = torch.cat(seen), torch.cat(hit)
     assert hit.any() and not hit.all()
     assert seen[hit].all()
-    assert (seen & ~hit).sum() <= 0.02 * len(seen)  # the box's corner between two of the rays that were tried
+    assert (seen & ~hit).sum() <= 0.02 * len(
+        seen
+    )  # the box's corner between two of the rays that were tried
 
 
 @pytest.mark.parametrize(("extent", "parallel"), KINDS)
@@ -94,9 +115,20 @@ def test_depths_are_those_of_the_rays_inside_the_box(extent, parallel):
 
 
 def one_camera(**changes) -> Cameras:
-    """At (0, 0, -100), looking along +z at a detector of 20 x 20 mm, 200 mm away: 0.1 mm wide per mm of depth."""
-    vectors = {"source": [0.0, 0, -100], "origin": [-9.5, -9.5, 100], "u": [1.0, 0, 0], "v": [0.0, 1, 0]}
-    return Cameras(**{name: torch.tensor([vector]) for name, vector in vectors.items()}, shape=(20, 20), **changes)
+    """At (0, 0, -100), looking along +z at a detector of 20 x 20 mm, 200 mm away: 0.1 mm wide per
+    mm of depth.
+    """
+    vectors = {
+        "source": [0.0, 0, -100],
+        "origin": [-9.5, -9.5, 100],
+        "u": [1.0, 0, 0],
+        "v": [0.0, 1, 0],
+    }
+    return Cameras(
+        **{name: torch.tensor([vector]) for name, vector in vectors.items()},
+        shape=(20, 20),
+        **changes,
+    )
 
 
 @pytest.mark.parametrize(
@@ -126,7 +158,9 @@ def test_boxes_beside_behind_and_beyond(centre, extent, sees):
 def test_a_camera_that_looks_away_sees_nothing():
     rig = circular(6, 400.0, 800.0, {"pixels": 8, "pixel_mm": 10.0})
     grid = Grid.centred((8, 8, 8), 10.0)
-    back = 2 * rig.source - rig.origin - 7 * rig.u  # the detector behind the source, its columns turned round
+    back = (
+        2 * rig.source - rig.origin - 7 * rig.u
+    )  # the detector behind the source, its columns turned round
     assert views_that_see(rig, grid).all()
     assert not views_that_see(replace(rig, origin=back - 7 * rig.v, v=-rig.v, u=rig.u), grid).any()
 
@@ -144,10 +178,14 @@ def test_a_rig_sees_every_grid_it_was_made_for_and_only_a_part_of_it_sees_a_corn
 
 
 def test_the_margin_is_as_far_as_interpolation_reaches():
-    grid = Grid.centred((4, 4, 4), 4.0, centre=(14.2, 0.0, 0.0))  # from 6.2 mm on, 1.2 mm beside the field's edge
+    grid = Grid.centred(
+        (4, 4, 4), 4.0, centre=(14.2, 0.0, 0.0)
+    )  # from 6.2 mm on, 1.2 mm beside the field's edge
     camera = one_camera()
     assert not views_that_see(camera, grid, margin=0) and views_that_see(camera, grid)
-    assert PROJECTORS.build("drr", grid=grid, cameras=camera, backend="reference")(torch.ones(1, 1, 4, 4, 4)).any()
+    assert PROJECTORS.build("drr", grid=grid, cameras=camera, backend="reference")(
+        torch.ones(1, 1, 4, 4, 4)
+    ).any()
 
 
 @pytest.mark.parametrize("name", ["circular", "parallel"])
@@ -159,16 +197,25 @@ def test_a_view_that_holds_the_whole_box_has_its_whole_depth(name):
         **({"sid": 400.0, "sdd": 800.0} if name == "circular" else {}),
     )
     grid = Grid.centred((9, 8, 7), (10.0, 9.0, 8.0), centre=(3.0, 2.0, 1.0))
-    torch.testing.assert_close(seen_depth_range(cameras, grid), cameras.depth_range(grid), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        seen_depth_range(cameras, grid), cameras.depth_range(grid), rtol=1e-12, atol=0
+    )
 
 
 def test_a_narrow_view_has_the_depth_of_its_field_alone():
-    # a square box of side 80 mm on edge, seen along its diagonal: depth is lost in proportion to the field's width
+    # a square box of side 80 mm on edge, seen along its diagonal: depth is lost in proportion to
+    # the field's width
     grid = Grid.centred((40, 40, 40), 2.0)
-    camera = CAMERAS.build("parallel", views=1, detector={"pixels": [4, 10], "pixel_mm": 2.0}, start_degrees=45.0)
+    camera = CAMERAS.build(
+        "parallel", views=1, detector={"pixels": [4, 10], "pixel_mm": 2.0}, start_degrees=45.0
+    )
     middle, half = 500.0, 80.0 / 2**0.5
-    torch.testing.assert_close(camera.depth_range(grid)[0], torch.tensor([middle - half, middle + half]).double())
-    torch.testing.assert_close(seen_depth_range(camera, grid)[0], torch.tensor([middle - half, middle + half]).double())
+    torch.testing.assert_close(
+        camera.depth_range(grid)[0], torch.tensor([middle - half, middle + half]).double()
+    )
+    torch.testing.assert_close(
+        seen_depth_range(camera, grid)[0], torch.tensor([middle - half, middle + half]).double()
+    )
     aside = camera.moved(torch.eye(3), 30.0 * torch.nn.functional.normalize(camera.u[0], dim=0))
     depth = half - 20.0  # at 30 mm less half of a field of 20 mm
     torch.testing.assert_close(
@@ -178,4 +225,6 @@ def test_a_narrow_view_has_the_depth_of_its_field_alone():
 
 def test_a_blind_view_keeps_the_depths_of_the_box():
     grid = Grid.centred((4, 4, 4), 2.0, centre=(50.0, 0.0, 0.0))
-    torch.testing.assert_close(seen_depth_range(one_camera(), grid), one_camera().depth_range(grid), rtol=0, atol=0)
+    torch.testing.assert_close(
+        seen_depth_range(one_camera(), grid), one_camera().depth_range(grid), rtol=0, atol=0
+    )

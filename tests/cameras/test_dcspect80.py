@@ -21,17 +21,30 @@ def column(name):
 def test_the_table_agrees_with_itself():
     """Positions, distances and angles were transcribed apart, so their agreement proves each."""
     azimuth, elevation = column("azimuth_rad"), column("elevation_rad")
-    unit = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1)
+    unit = torch.stack(
+        [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1
+    )
     pinhole = dcspect80().source
-    torch.testing.assert_close(pinhole / pinhole.norm(dim=-1, keepdim=True), unit, rtol=0, atol=1e-7)
-    torch.testing.assert_close(pinhole.norm(dim=-1), column("b_pinhole_to_heart_mm"), rtol=0, atol=1e-3)
+    torch.testing.assert_close(
+        pinhole / pinhole.norm(dim=-1, keepdim=True), unit, rtol=0, atol=1e-7
+    )
+    torch.testing.assert_close(
+        pinhole.norm(dim=-1), column("b_pinhole_to_heart_mm"), rtol=0, atol=1e-3
+    )
     assert [int(row["module"]) for row in table()] == list(range(80))
     assert all(int(row["module"]) == 20 * int(row["row"]) + int(row["col"]) for row in table())
 
 
 def test_collimator_lengths_obey_the_fit_and_the_mirror_symmetry():
-    length, source = column("collimator_length_mm"), [row["collimator_length_source"] for row in table()]
-    assert {kind: source.count(kind) for kind in set(source)} == {"published": 8, "mirrored": 8, "fitted": 64}
+    length, source = (
+        column("collimator_length_mm"),
+        [row["collimator_length_source"] for row in table()],
+    )
+    assert {kind: source.count(kind) for kind in set(source)} == {
+        "published": 8,
+        "mirrored": 8,
+        "fitted": 64,
+    }
     error = length - (0.3294 * column("b_pinhole_to_heart_mm") - 7.784)
     fitted = torch.tensor([kind == "fitted" for kind in source])
     assert error.abs().max() < 0.13 and error[fitted].abs().max() < 0.01
@@ -46,10 +59,14 @@ def test_pinholes_and_detectors_stand_where_the_table_says():
     torch.testing.assert_close(cameras.source, expected, rtol=0, atol=1e-6)
     torch.testing.assert_close(cameras.distance, column("collimator_length_mm"), rtol=0, atol=1e-9)
     for step, pixels in ((cameras.v, 10), (cameras.u, 20)):
-        torch.testing.assert_close(step.norm(dim=-1) * pixels, torch.full((80,), 50.0, dtype=torch.float64))
+        torch.testing.assert_close(
+            step.norm(dim=-1) * pixels, torch.full((80,), 50.0, dtype=torch.float64)
+        )
     middle = cameras.origin + 9.5 * cameras.u + 4.5 * cameras.v
     along = middle / middle.norm(dim=-1, keepdim=True)
-    torch.testing.assert_close(along, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        along, expected / expected.norm(dim=-1, keepdim=True), rtol=0, atol=1e-12
+    )
 
 
 def test_rows_of_pixels_run_downwards_and_are_square_to_the_axis():
@@ -62,7 +79,9 @@ def test_rows_of_pixels_run_downwards_and_are_square_to_the_axis():
 def test_a_subset_holds_the_modules_of_its_rows_and_columns():
     whole, part = dcspect80(), dcspect80(rows=[2, 1], columns=[0, 19])
     assert same(part, whole[[40, 59, 20, 39]], 0)
-    assert same(dcspect80(rows=[1]), whole[20:40], 0) and same(dcspect80(columns=[3]), whole[3::20], 0)
+    assert same(dcspect80(rows=[1]), whole[20:40], 0) and same(
+        dcspect80(columns=[3]), whole[3::20], 0
+    )
 
 
 @pytest.mark.parametrize(

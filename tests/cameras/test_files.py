@@ -84,13 +84,19 @@ def with_camera(record, **changes):
         (lambda r: changed(r, extent="behind"), "left-handed"),
         (lambda r: changed(r, cameras=[]), r"at least one, got \[\]"),
         (lambda r: changed(r, cameras=[3]), "'source' of camera 0 as three finite mm, got None"),
-        (lambda r: with_camera(r, u=[1.0, 2.0]), r"'u' of camera 0 as three finite mm, got \[1.0, 2.0\]"),
+        (
+            lambda r: with_camera(r, u=[1.0, 2.0]),
+            r"'u' of camera 0 as three finite mm, got \[1.0, 2.0\]",
+        ),
         (lambda r: with_camera(r, v=[1.0, "2", 3.0]), "'v' of camera 0 as three finite mm"),
         (
             lambda r: with_camera(r, origin=[1.0, float("nan"), 3.0]),
             "'origin' of camera 0 as three finite mm, got .*nan",
         ),
-        (lambda r: with_camera(r, source=None), "'source' of camera 0 as three finite mm, got None"),
+        (
+            lambda r: with_camera(r, source=None),
+            "'source' of camera 0 as three finite mm, got None",
+        ),
         (lambda r: with_camera(r, u=[0.0, 0.0, 0.0]), "must not be flat"),
     ],
 )

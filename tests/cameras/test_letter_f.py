@@ -1,5 +1,5 @@
-"""An F, unlike its mirror images, lands where a viewer would see it: upright before a virtual or X-ray detector, turned
-by 180 degrees on a detector behind a pinhole. Depth, too, has its sign."""
+"""An F, unlike its mirror images, lands where a viewer would see it: upright before a virtual or
+X-ray detector, turned by 180 degrees on a detector behind a pinhole. Depth, too, has its sign."""
 
 import pytest
 import torch
@@ -9,12 +9,15 @@ from mvrecon.cameras.rigs import circular
 from mvrecon.parts import CAMERAS
 from tests.cameras.rigs import DETECTOR, OPTIONS
 
-# Key points (right, up) in mm as a viewer reads the letter: foot, head, ends of the long upper and short lower bar.
+# Key points (right, up) in mm as a viewer reads the letter: foot, head, ends of the long upper and
+# short lower bar.
 F = {"foot": (-4.0, -8.0), "head": (-4.0, 8.0), "upper": (6.0, 8.0), "lower": (3.0, 1.0)}
 
 
 def written_for(camera):
-    """The F in the world, facing one camera, upright along its own image's upwards; its key points in order."""
+    """The F in the world, facing one camera, upright along its own image's upwards; its key points
+    in order.
+    """
     right, down = (torch.nn.functional.normalize(x[0], dim=0) for x in (camera.u, camera.v))
     return torch.stack([a * right - b * down for a, b in F.values()])
 
@@ -43,7 +46,12 @@ def test_the_letter_lands_where_a_viewer_sees_it(name, magnification, turned, tm
     for camera in CAMERAS.build(name, **options):
         scale = magnification or (camera.distance / camera.source.norm()).item()
         seen = camera.project(written_for(camera))[0]
-        image = torch.tensor([(a, -b) for a, b in F.values()], dtype=torch.float64) * scale * turned / pitch(camera)
+        image = (
+            torch.tensor([(a, -b) for a, b in F.values()], dtype=torch.float64)
+            * scale
+            * turned
+            / pitch(camera)
+        )
         middle = torch.tensor([4.0, 2.5], dtype=torch.float64)
         torch.testing.assert_close(seen[:, :2], middle + image, rtol=0, atol=1e-9)
         assert (seen[:, 2] * turned > 0).all()
@@ -61,7 +69,9 @@ def test_up_in_the_world_is_up_in_the_image_unless_a_pinhole_turns_it(name, up):
 
 
 def test_the_letter_on_the_wall_x_is_zero_read_from_plus_x_and_mirrored_from_minus_x():
-    """From +x a viewer with z up has +y to the right, so the F's bars point to larger u; from -x to smaller u."""
+    """From +x a viewer with z up has +y to the right, so the F's bars point to larger u; from -x to
+    smaller u.
+    """
     stem, bar = torch.tensor([[0.0, -4, 8], [0, 6, 8]], dtype=torch.float64)
     for name in ("circular", "parallel"):
         options = OPTIONS[name] | {"views": 2, "arc_degrees": 360.0}
@@ -73,7 +83,11 @@ def test_the_letter_on_the_wall_x_is_zero_read_from_plus_x_and_mirrored_from_min
 def test_of_two_points_the_nearer_has_the_smaller_depth_before_it_and_the_larger_behind_a_pinhole():
     near, far = torch.tensor([[50.0, 0, 0], [-50, 0, 0]], dtype=torch.float64)
     front = CAMERAS.build("circular", **OPTIONS["circular"])[0]
-    assert front.project(near)[0, 2] == pytest.approx(350) and front.project(far)[0, 2] == pytest.approx(450)
+    assert front.project(near)[0, 2] == pytest.approx(350) and front.project(far)[
+        0, 2
+    ] == pytest.approx(450)
     top = CAMERAS.build("dome", **(OPTIONS["dome"] | {"views": 1, "aperture_degrees": 1e-3}))
     above, below = torch.tensor([[0.0, 0, 50], [0, 0, -50]], dtype=torch.float64)
-    assert top.project(above)[0, 2] == pytest.approx(-150) and top.project(below)[0, 2] == pytest.approx(-250)
+    assert top.project(above)[0, 2] == pytest.approx(-150) and top.project(below)[
+        0, 2
+    ] == pytest.approx(-250)

@@ -1,4 +1,6 @@
-"""A rig that is its own mirror image sees the mirrored object as its partners do; nothing else counts as symmetric."""
+"""A rig that is its own mirror image sees the mirrored object as its partners do; nothing else
+counts as symmetric.
+"""
 
 from dataclasses import replace
 
@@ -20,7 +22,10 @@ CASES = {
     "dcspect80": (dcspect80(pixels=[4, 5], columns=[0, 7]), -3),
     "one row of dcspect80 and its image": (dcspect80(pixels=[3, 2], rows=[0, 3], columns=[3]), -3),
     "half a circle": (circular(5, 400.0, 800.0, DETECTOR, 180.0, 10.0), -3),
-    "full circle": (circular(6, 400.0, 800.0, DETECTOR), -1),  # across x, where no camera stands alone
+    "full circle": (
+        circular(6, 400.0, 800.0, DETECTOR),
+        -1,
+    ),  # across x, where no camera stands alone
     "full circle, detectors shifted down": (circular(6, 400.0, 800.0, SHIFTED), -1),
     "half a circle, detectors shifted aside": (circular(5, 400.0, 800.0, ASIDE, 180.0), -3),
     "arc about the y axis": (arc(4, 400.0, 700.0, DETECTOR, 120.0, 30.0), -1),
@@ -42,9 +47,13 @@ def test_the_mirrored_object_is_seen_as_the_partners_see_the_object(name):
         assert mirror is not None and mirror.axis == axis
         A = RayTransform(grid, rig, backend="reference")
         x = torch.rand(1, 1, *grid.shape, dtype=torch.float64)
-        torch.testing.assert_close(A(mirror.volume(x)), mirror.views(A(x)), rtol=1e-10, atol=1e-10 * A(x).max().item())
+        torch.testing.assert_close(
+            A(mirror.volume(x)), mirror.views(A(x)), rtol=1e-10, atol=1e-10 * A(x).max().item()
+        )
         y = torch.rand_like(A(x))
-        torch.testing.assert_close(A.T(mirror.views(y)), mirror.volume(A.T(y)), rtol=1e-10, atol=1e-8)
+        torch.testing.assert_close(
+            A.T(mirror.views(y)), mirror.volume(A.T(y)), rtol=1e-10, atol=1e-8
+        )
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -83,9 +92,17 @@ def test_cameras_on_a_circle_lie_in_its_plane_and_pair_across_it():
         (dome(16, 200.0, 70.0, 180.0, DETECTOR), GRID),
         (random_cameras(4), GRID),
         (dcspect80(rows=[0, 1, 2]), GRID),
-        (dcspect80(), Grid.centred((6, 5, 8), 9.0, centre=(0.0, 0.0, 1e-3))),  # not about the rig's plane
+        (
+            dcspect80(),
+            Grid.centred((6, 5, 8), 9.0, centre=(0.0, 0.0, 1e-3)),
+        ),  # not about the rig's plane
         (circular(5, 400.0, 800.0, SHIFTED, 180.0, 10.0), GRID),
-        (circular(5, 400.0, 800.0, DETECTOR, 180.0, 10.0).moved(torch.eye(3), torch.tensor([0.0, 0.0, 1e-3])), GRID),
+        (
+            circular(5, 400.0, 800.0, DETECTOR, 180.0, 10.0).moved(
+                torch.eye(3), torch.tensor([0.0, 0.0, 1e-3])
+            ),
+            GRID,
+        ),
     ],
 )
 def test_what_is_not_symmetric_has_no_mirror(cameras, grid):

@@ -21,7 +21,9 @@ def head(centre=(0.0, 0.0, 0.0), radius=16.0, shape=(20, 30, 30)):
     """HU of a ball of water in air, with a ball of bone off its centre towards (+x, -y, +z)."""
     xyz = voxel_centres(Grid.centred(shape, SPACING[::-1]))
     ball = (xyz - torch.tensor(centre, dtype=xyz.dtype)).norm(dim=-1)
-    bone = (xyz - torch.tensor(centre, dtype=xyz.dtype) - torch.tensor([6.0, -4.0, 3.0])).norm(dim=-1)
+    bone = (xyz - torch.tensor(centre, dtype=xyz.dtype) - torch.tensor([6.0, -4.0, 3.0])).norm(
+        dim=-1
+    )
     hu = torch.where(bone < 5, 1000.0, torch.where(ball < radius, 0.0, -1000.0))
     return hu.numpy().astype(np.int16)
 

@@ -8,10 +8,20 @@ from mvrecon.data.attenuation import BONE, WATER, attenuation, hounsfield
 
 @pytest.mark.parametrize(
     ("hu", "mu"),
-    [(-2048, 0.0), (-1024, 0.0), (-1000, 0.0), (-500, 0.0096), (0, 0.0192), (500, 0.03825), (1000, 0.0573)],
+    [
+        (-2048, 0.0),
+        (-1024, 0.0),
+        (-1000, 0.0),
+        (-500, 0.0096),
+        (0, 0.0192),
+        (500, 0.03825),
+        (1000, 0.0573),
+    ],
 )
 def test_attenuation_at_known_tissues(hu, mu):
-    assert attenuation(torch.tensor(float(hu), dtype=torch.float64)).item() == pytest.approx(mu, abs=1e-12)
+    assert attenuation(torch.tensor(float(hu), dtype=torch.float64)).item() == pytest.approx(
+        mu, abs=1e-12
+    )
 
 
 def test_the_two_lines_meet_at_water_with_their_own_slopes():

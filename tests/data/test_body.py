@@ -46,7 +46,9 @@ def test_the_centre_is_that_of_the_box_in_mm():
     mask = torch.zeros(10, 12, 14, dtype=torch.bool)
     mask[2:5, 3:4, 7:13] = True
     grid = Grid.centred((10, 12, 14), (1.0, 2.0, 3.0), centre=(100.0, 0.0, 0.0))
-    assert torch.allclose(centre(mask, grid), torch.tensor([103.0, -5.0, -4.5], dtype=torch.float64))
+    assert torch.allclose(
+        centre(mask, grid), torch.tensor([103.0, -5.0, -4.5], dtype=torch.float64)
+    )
 
 
 def test_small_and_empty_volumes_pass():

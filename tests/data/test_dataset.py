@@ -36,7 +36,9 @@ def cameras():
 
 
 def same(a, b):
-    return a["name"] == b["name"] and all(torch.equal(a[key], b[key]) for key in ("views", "volume", "inside"))
+    return a["name"] == b["name"] and all(
+        torch.equal(a[key], b[key]) for key in ("views", "volume", "inside")
+    )
 
 
 def test_every_case_is_made_once(grid, cameras):
@@ -69,29 +71,40 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 if __name__ == "__main__":
     start, cache, workers = sys.argv[1], sys.argv[2] == "cache", int(sys.argv[4])
-    cameras = CAMERAS.build("circular", views=2, sid=300.0, sdd=450.0, detector={"pixels": [6, 6], "pixel_mm": 9.0})
+    detector = {"pixels": [6, 6], "pixel_mm": 9.0}
+    cameras = CAMERAS.build("circular", views=2, sid=300.0, sdd=450.0, detector=detector)
     scene = SCENES.build("hdf5", path=sys.argv[3])
     data = SceneDataset(scene, Grid.centred((6, 6, 6), 8.0), cameras, range(4), 1, cache)
     here = list(DataLoader(data, 2))
-    there = DataLoader(data, 2, num_workers=workers, multiprocessing_context=start, persistent_workers=workers > 1)
+    options = {"num_workers": workers, "persistent_workers": workers > 1}
+    there = DataLoader(data, 2, multiprocessing_context=start, **options)
     for _ in range(workers):  # those that stay go through all of it again
         for a, b in zip(here, there, strict=True):
-            assert a["name"] == b["name"] and all(torch.equal(a[k], b[k]) for k in ("views", "volume", "inside"))
+            assert a["name"] == b["name"]
+            assert all(torch.equal(a[k], b[k]) for k in ("views", "volume", "inside"))
 """
 
 
-@pytest.mark.parametrize(("start", "cache", "workers"), [("spawn", "no", 1), ("fork", "cache", 1), ("fork", "no", 2)])
-def test_workers_load_what_the_main_process_loads(volume_file, tmp_path, root, start, cache, workers):
+@pytest.mark.parametrize(
+    ("start", "cache", "workers"), [("spawn", "no", 1), ("fork", "cache", 1), ("fork", "no", 2)]
+)
+def test_workers_load_what_the_main_process_loads(
+    volume_file, tmp_path, root, start, cache, workers
+):
     script = tmp_path / "workers.py"
     script.write_text(WORKERS)
     environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, script, start, cache, volume_file, str(workers)]
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=900, check=False)
+    done = subprocess.run(
+        command, cwd=root, env=environment, capture_output=True, text=True, timeout=900, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
 def test_values_that_are_not_finite_are_refused(grid, cameras):
-    with pytest.raises(ValueError, match="0-5: expected finite volume, got 512 values that are not"):
+    with pytest.raises(
+        ValueError, match="0-5: expected finite volume, got 512 values that are not"
+    ):
         SceneDataset(Counting(bad=5), grid, cameras, [5], 0).prepare()
 
 
@@ -129,7 +142,9 @@ def test_a_resumed_epoch_leaves_out_what_was_seen_and_the_next_is_whole():
     assert list(sampler) == order(3, 2)
 
 
-def test_a_scene_that_draws_from_the_global_random_numbers_is_a_pure_function_and_leaves_them_alone(grid, cameras):
+def test_a_scene_that_draws_from_the_global_random_numbers_is_a_pure_function_and_leaves_them_alone(
+    grid, cameras
+):
     class Forgetful(Counting):
         def sample(self, index, seed, grid, cameras):
             made = super().sample(index, seed, grid, cameras)

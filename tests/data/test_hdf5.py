@@ -77,7 +77,10 @@ def test_while_a_file_is_written_anew_readers_see_the_old_one_whole(tmp_path):
 
 def test_volumes_that_do_not_fit_together_are_refused(tmp_path):
     label = np.zeros((20, 30, 30), np.uint8)
-    for second in (Stored("b", head(shape=(20, 30, 31)), SPACING), Stored("b", head(), SPACING, label)):
+    for second in (
+        Stored("b", head(shape=(20, 30, 31)), SPACING),
+        Stored("b", head(), SPACING, label),
+    ):
         with pytest.raises(ValueError, match="volume 'b' has .* expected .* as the first"):
             write_volumes(tmp_path / "a.h5", [*stored(1), second])
     with pytest.raises(ValueError, match="at least one volume"):
@@ -86,7 +89,9 @@ def test_volumes_that_do_not_fit_together_are_refused(tmp_path):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no\.h5: no such file; expected an mvrecon volume file: HDF5 with"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no\.h5: no such file; expected an mvrecon volume file: HDF5 with"
+    ):
         len(VolumeFile(tmp_path / "no.h5"))
 
 
@@ -105,7 +110,10 @@ SPOILT = {
 def test_a_volume_file_that_is_cut_short_or_none_is_refused(volume_file, name):
     """A volume file that is cut short, empty, or no HDF5 file is refused with its name."""
     volume_file.write_bytes(SPOILT[name](volume_file.read_bytes()))
-    with pytest.raises(ValueError, match=r"heads\.h5: (not an HDF5 file; e|cannot be opened .*cut short\? E)xpected"):
+    with pytest.raises(
+        ValueError,
+        match=r"heads\.h5: (not an HDF5 file; e|cannot be opened .*cut short\? E)xpected",
+    ):
         VolumeFile(volume_file).read(0)
 
 
@@ -113,7 +121,9 @@ def test_a_volume_file_that_is_cut_short_or_none_is_refused(volume_file, name):
 def test_a_flipped_bit_never_changes_a_volume_silently(tmp_path):
     """A flipped bit in a volume's numbers is an error, or the volume is read as it was written."""
     rng, path = Random(0), tmp_path / "a.h5"
-    noise = np.random.default_rng(0).integers(-(2**15), 2**15, (20, 30, 30)).astype("i2")  # packed, it does not shrink
+    noise = (
+        np.random.default_rng(0).integers(-(2**15), 2**15, (20, 30, 30)).astype("i2")
+    )  # packed, it does not shrink
     written = [*stored(1), Stored("noise", noise, SPACING)]
     write_volumes(path, written)
     whole = path.read_bytes()
@@ -124,7 +134,9 @@ def test_a_flipped_bit_never_changes_a_volume_silently(tmp_path):
         raw[place] ^= 1 << rng.randrange(8)
         path.write_bytes(raw)
         try:
-            assert np.array_equal(VolumeFile(path).read(k).ct, written[k].ct), f"volume {k}, byte {place}"
+            assert np.array_equal(VolumeFile(path).read(k).ct, written[k].ct), (
+                f"volume {k}, byte {place}"
+            )
         except ValueError as error:
             assert f"a.h5: volume {k} cannot be read" in str(error)
 

@@ -14,7 +14,9 @@ RANDOM = {"name": "ellipsoids"}
 
 def build(scene=RANDOM, test_scene=None, seed=0, **sizes):
     scenes = {"train": scene, "test": test_scene or scene}
-    return SceneData(scenes, GRID, RIG, {"train": 5, "val": 2, "test": 3, **sizes}, batch_size=2, seed=seed)
+    return SceneData(
+        scenes, GRID, RIG, {"train": 5, "val": 2, "test": 3, **sizes}, batch_size=2, seed=seed
+    )
 
 
 def names(loader):
@@ -38,7 +40,9 @@ def test_random_scenes_come_from_series_of_their_own():
     first, second = parts(build(seed=0)), parts(build(seed=1))
     assert [len(first[key]) for key in ("train", "val", "test")] == [5, 2, 3]
     assert disjoint(first) and disjoint(second)
-    assert first["test"] == second["test"] and first["val"] == second["val"], "all runs are judged on the same cases"
+    assert first["test"] == second["test"] and first["val"] == second["val"], (
+        "all runs are judged on the same cases"
+    )
     assert not set(first["train"]) & {name for part in second.values() for name in part}
 
 
@@ -54,14 +58,23 @@ def test_asking_for_more_test_cases_never_takes_training_cases(volume_file):
     heads = {"name": "hdf5", "path": str(volume_file)}
     trained = set(build(heads, test=0).indices("train"))
     assert not trained & set(build(heads, test=99).indices("test"))
-    same_file = {"name": "hdf5", "path": f"{volume_file.parent}/../{volume_file.parent.name}/heads.h5", "rays": 1}
+    same_file = {
+        "name": "hdf5",
+        "path": f"{volume_file.parent}/../{volume_file.parent.name}/heads.h5",
+        "rays": 1,
+    }
     assert not trained & set(build(heads, same_file, test=99).indices("test"))
 
 
 def test_a_test_file_of_its_own_leaves_all_others_to_training(volume_file, tmp_path):
     other = tmp_path / "other.h5"
     other.write_bytes(volume_file.read_bytes())
-    data = build({"name": "hdf5", "path": str(volume_file)}, {"name": "hdf5", "path": str(other)}, train=99, test=4)
+    data = build(
+        {"name": "hdf5", "path": str(volume_file)},
+        {"name": "hdf5", "path": str(other)},
+        train=99,
+        test=4,
+    )
     assert data.indices("train") == [0, 1, 2, 3, 4] and data.indices("val") == [5, 6]
     assert data.indices("test") == [0, 1, 2, 3]
     data.setup("test")
@@ -79,7 +92,11 @@ def test_the_test_stage_does_not_need_the_training_file(volume_file):
 def test_varied_copies_are_of_training_cases_alone(volume_file):
     data = build({"name": "hdf5", "path": str(volume_file), "vary": True}, train=23)
     train = data.indices("train")
-    assert len(set(train)) == 23 and {i % 7 for i in train} == {1, 2, 3, 4} and train[:4] == [1, 2, 3, 4]
+    assert (
+        len(set(train)) == 23
+        and {i % 7 for i in train} == {1, 2, 3, 4}
+        and train[:4] == [1, 2, 3, 4]
+    )
 
 
 def test_a_file_that_is_too_small_is_refused(volume_file):
@@ -93,7 +110,9 @@ def test_a_file_that_is_too_small_is_refused(volume_file):
 
 
 def test_wrong_settings_are_refused():
-    with pytest.raises(ValueError, match="sizes must give train, val and test; missing or unknown: tset"):
+    with pytest.raises(
+        ValueError, match="sizes must give train, val and test; missing or unknown: tset"
+    ):
         build(tset=3)
     with pytest.raises(ValueError, match="at least 0 .* got sizes .*'val': -1"):
         build(val=-1)

@@ -19,7 +19,8 @@ def blobs(xyz):
     """An asymmetric smooth object: four Gaussian balls, none the mirror image of another."""
     places = torch.tensor([[0, 0, 0], [12, 0, 0], [0, 9, 0], [3, 0, -8]], dtype=torch.float64)
     return (
-        torch.tensor([1.0, 0.8, 0.6, 0.4]) * torch.exp(-((xyz[..., None, :] - places) ** 2).sum(-1) / (2 * 4.0**2))
+        torch.tensor([1.0, 0.8, 0.6, 0.4])
+        * torch.exp(-((xyz[..., None, :] - places) ** 2).sum(-1) / (2 * 4.0**2))
     ).sum(-1)
 
 
@@ -30,7 +31,9 @@ def save(path, affine, scale=1.0, units="mm"):
     values = blobs(torch.from_numpy(xyz[..., :3])).numpy()
     stored = affine.copy()
     stored[:3] /= {"mm": 1, "meter": 1000}[units]
-    image = nibabel.Nifti1Image(np.rint((values - 0.25) / scale).astype(np.int16) if scale != 1 else values, stored)
+    image = nibabel.Nifti1Image(
+        np.rint((values - 0.25) / scale).astype(np.int16) if scale != 1 else values, stored
+    )
     image.header.set_xyzt_units(units)
     if scale != 1:
         image.header.set_slope_inter(scale, 0.25)
@@ -51,7 +54,8 @@ AFFINES = {
     "permuted": np.array([[0, 0, 1.5], [-1.5, 0, 0], [0, 1.5, 0]]),
     "anisotropic": np.diag([1.2, -1.6, 1.4]),
     "oblique": euler_rotation([20.0, -15.0, 10.0], "xyz").numpy() * 1.5,
-    "oblique and mirrored": euler_rotation([10.0, 25.0, -30.0], "xyz").numpy() @ np.diag([-1.5, 1.5, 1.5]),
+    "oblique and mirrored": euler_rotation([10.0, 25.0, -30.0], "xyz").numpy()
+    @ np.diag([-1.5, 1.5, 1.5]),
 }
 
 
@@ -62,7 +66,9 @@ def test_an_object_lands_at_its_world_place(tmp_path, name):
     values, grid = read_nifti(path)
     assert torch.allclose(values.double(), blobs(voxel_centres(grid)), atol=1e-6)
     target = Grid.centred((12, 16, 18), 2.0, centre=(2.0, 1.0, -1.0))
-    expected = blobs(voxel_centres(target.refined(4))).reshape(12, 4, 16, 4, 18, 4).mean(dim=(1, 3, 5))
+    expected = (
+        blobs(voxel_centres(target.refined(4))).reshape(12, 4, 16, 4, 18, 4).mean(dim=(1, 3, 5))
+    )
     assert torch.allclose(resample(values, grid, target).double(), expected, atol=0.03)
 
 
@@ -85,7 +91,9 @@ def test_a_truncated_file_is_an_error(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     save(path, centred(AFFINES["ras"]))
     path.write_bytes(path.read_bytes()[:20_000])
-    with pytest.raises(ValueError, match=r"(?s)a\.nii.*cannot be read .*cut short\? Expected a NIfTI"):
+    with pytest.raises(
+        ValueError, match=r"(?s)a\.nii.*cannot be read .*cut short\? Expected a NIfTI"
+    ):
         read_nifti(path)
 
 

@@ -30,10 +30,14 @@ def flat(y, x, z):
 def add_patient(clone, folder, name, spacing=(4.0, 3.5, 2.5)):
     place = clone / "provided-data" / folder / name
     place.mkdir(parents=True)
-    body = [(flat(y, x, z), 1024) for y in range(50, 70) for x in range(40, 80) for z in range(60, 90)]
+    body = [
+        (flat(y, x, z), 1024) for y in range(50, 70) for x in range(40, 80) for z in range(60, 90)
+    ]
     rows = [*body, (flat(55, 45, 65), 27116), (flat(56, 45, 65), 24)]
     (place / "ct.csv").write_text(",data\n" + "".join(f"{i},{v}.0\n" for i, v in rows))
-    (place / "Brainstem.csv").write_text(",data\n" + "".join(f"{flat(60, 60, z)},\n" for z in (70, 71)))
+    (place / "Brainstem.csv").write_text(
+        ",data\n" + "".join(f"{flat(60, 60, z)},\n" for z in (70, 71))
+    )
     (place / "PTV70.csv").write_text(f",data\n{flat(60, 60, 71)},\n")
     (place / "Larynx.csv").write_text(",data\n")
     np.savetxt(place / "voxel_dimensions.csv", spacing)
@@ -52,11 +56,19 @@ def test_a_clone_becomes_volume_files(openkbp, tmp_path):
     assert first.name == "pt_9" and first.spacing == (2.5, 4.0, 3.5) and file.orientation == "LPI"
     ct = first.ct
     assert ct.shape == (128, 128, 128) and ct.dtype == np.int16
-    assert ct[65, 55, 45] == 3071 and ct[65, 56, 45] == -1000 and ct[89, 69, 79] == 0 and ct[90, 69, 79] == -1024
+    assert (
+        ct[65, 55, 45] == 3071
+        and ct[65, 56, 45] == -1000
+        and ct[89, 69, 79] == 0
+        and ct[90, 69, 79] == -1024
+    )
     assert (ct > -400).sum() == 20 * 40 * 30 - 1
     label = file.file["label"][0]
     assert label[70, 60, 60] == 1 and label[71, 60, 60] == 10 and (label > 0).sum() == 2
-    assert file.file.attrs["labels"].startswith(b"1=Brainstem,2=SpinalCord") and b"MIT" in file.file.attrs["source"]
+    assert (
+        file.file.attrs["labels"].startswith(b"1=Brainstem,2=SpinalCord")
+        and b"MIT" in file.file.attrs["source"]
+    )
     assert Hdf5Volumes(path=str(out / "openkbp_val.h5")).length == 1
 
 

@@ -1,4 +1,6 @@
-"""Scenes from files: what is measured agrees with the truth, and the patient is where it should be."""
+"""Scenes from files: what is measured agrees with the truth, and the patient is where it should
+be.
+"""
 
 import pickle
 
@@ -37,7 +39,9 @@ def test_truth_is_the_block_mean_of_what_is_projected(volume_file, grid, cameras
     name, fine = scene.finely(2, 0, grid)
     assert sample.name == name == "pt_2" and fine.shape == (24, 24, 24)
     assert torch.allclose(sample.volume, F.avg_pool3d(fine[None], 3))
-    A = PROJECTORS.build("drr", grid=grid.refined(3), cameras=split_pixels(cameras, 2), method="siddon")
+    A = PROJECTORS.build(
+        "drr", grid=grid.refined(3), cameras=split_pixels(cameras, 2), method="siddon"
+    )
     assert torch.equal(sample.views, F.avg_pool2d(A(fine[None, None])[0], 2))
     assert sample.views.shape == (1, 3, 10, 12) and sample.views.dtype == torch.float32
     assert sample.volume.shape == sample.inside.shape == (1, 8, 8, 8)
@@ -71,7 +75,9 @@ def test_the_patient_is_centred_in_the_grid_or_left_alone(tmp_path, cameras):
         box = voxel_centres(grid)[inside[0]]
         middle = (box.amin(dim=0) + box.amax(dim=0)) / 2
         assert torch.allclose(middle, torch.tensor(place, dtype=torch.float64), atol=1.6)
-    free = Hdf5Volumes(path=path, crop="none").sample(0, 0, Grid.centred((20, 20, 20), 3.0), cameras)
+    free = Hdf5Volumes(path=path, crop="none").sample(
+        0, 0, Grid.centred((20, 20, 20), 3.0), cameras
+    )
     box = voxel_centres(Grid.centred((20, 20, 20), 3.0))[free.inside[0]]
     middle = (box.amin(dim=0) + box.amax(dim=0)) / 2
     assert torch.allclose(middle, torch.tensor([7.0, -5.0, 4.0], dtype=torch.float64), atol=1.6)
@@ -94,7 +100,9 @@ def test_a_file_in_any_orientation_shows_the_same_patient(tmp_path, letters, gri
         assert torch.allclose(sample.volume, expected.volume, atol=1e-6)
         assert torch.allclose(sample.views, expected.views, atol=1e-4)
     heavy = centroid(expected.volume, grid)
-    assert heavy[0] > 0.1 and heavy[1] < -0.1 and heavy[2] > 0.05  # the bone lies towards (+x, -y, +z)
+    assert (
+        heavy[0] > 0.1 and heavy[1] < -0.1 and heavy[2] > 0.05
+    )  # the bone lies towards (+x, -y, +z)
 
 
 def test_an_orientation_is_three_letters():
@@ -121,23 +129,32 @@ def test_a_nifti_volume_stays_in_world_mm_without_crop(tmp_path, cameras):
     grid = Grid.centred((16, 16, 16), 4.0, centre=(30.0, 0.0, 0.0))
     sample = NiftiVolume(path=str(tmp_path / "head.nii"), crop="none").sample(0, 0, grid, cameras)
     heavy = centroid(sample.volume, grid)
-    assert heavy[0] < 29.9 and heavy[1] < -0.1 and heavy[2] > 0.05  # the file's first axis runs to the left
+    assert (
+        heavy[0] < 29.9 and heavy[1] < -0.1 and heavy[2] > 0.05
+    )  # the file's first axis runs to the left
 
 
 def test_a_case_is_a_pure_function_of_its_index(volume_file, grid, cameras):
     scene, other = Hdf5Volumes(path=str(volume_file)), Hdf5Volumes(path=str(volume_file))
     scene.sample(3, 0, grid, cameras)
-    a, b = scene.sample(1, 0, grid, cameras), pickle.loads(pickle.dumps(other)).sample(1, 5, grid, cameras)
+    a, b = (
+        scene.sample(1, 0, grid, cameras),
+        pickle.loads(pickle.dumps(other)).sample(1, 5, grid, cameras),
+    )
     assert torch.equal(a.volume, b.volume) and torch.equal(a.views, b.views) and a.name == b.name
 
 
 def test_varied_copies_are_pure_differ_and_keep_their_mass_and_views(volume_file, cameras):
     grid = Grid.centred((16, 16, 16), 6.0)  # holds every shift
     scene = Hdf5Volumes(path=str(volume_file), vary=True)
-    plain, first, second, again = (scene.sample(i, s, grid, cameras) for i, s in ((2, 1), (9, 1), (16, 1), (9, 1)))
+    plain, first, second, again = (
+        scene.sample(i, s, grid, cameras) for i, s in ((2, 1), (9, 1), (16, 1), (9, 1))
+    )
     assert torch.equal(first.volume, again.volume) and torch.equal(first.views, again.views)
     assert (plain.name, first.name, second.name) == ("pt_2", "pt_2-1-1", "pt_2-1-2")
-    assert not torch.allclose(plain.volume, first.volume) and not torch.allclose(first.volume, second.volume)
+    assert not torch.allclose(plain.volume, first.volume) and not torch.allclose(
+        first.volume, second.volume
+    )
     assert not torch.equal(first.volume, scene.sample(9, 2, grid, cameras).volume)
     for sample in (first, second):
         assert 0.9**3 - 0.02 < sample.volume.sum() / plain.volume.sum() < 1.1**3 + 0.02
@@ -169,7 +186,11 @@ def test_an_empty_scan_is_an_error(tmp_path, grid, cameras):
     empty = np.full((20, 30, 30), -1000, np.int16)
     with pytest.raises(ValueError, match=r"pt_1 shows no patient: expected values above -400 HU"):
         Hdf5Volumes(path=one(tmp_path, empty)).sample(0, 0, grid, cameras)
-    assert not Hdf5Volumes(path=one(tmp_path, empty), crop="none").sample(0, 0, grid, cameras).views.any()
+    assert (
+        not Hdf5Volumes(path=one(tmp_path, empty), crop="none")
+        .sample(0, 0, grid, cameras)
+        .views.any()
+    )
 
 
 def test_wrong_options_are_refused():

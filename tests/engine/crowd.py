@@ -13,7 +13,9 @@ READERS, REWRITES, RUNS = 8, 12, 4
 
 
 def together(tasks: list[Callable[[], str]], folder: Path) -> list[tuple[int, str]]:
-    """Run tasks in forked processes at the same moment; the exit and the answer, or the error, of each."""
+    """Run tasks in forked processes at the same moment; the exit and the answer, or the error, of
+    each.
+    """
     children, start = [], time.monotonic() + 0.3
     for k, task in enumerate(tasks):
         child = os.fork()
@@ -32,7 +34,9 @@ def together(tasks: list[Callable[[], str]], folder: Path) -> list[tuple[int, st
 
 
 def readers(folder: Path) -> list[tuple[int, str]]:
-    """Eight processes read a volume file anew and anew while another replaces it; each edition is all one number."""
+    """Eight processes read a volume file anew and anew while another replaces it; each edition is
+    all one number.
+    """
     import numpy as np
 
     from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
@@ -57,7 +61,10 @@ def readers(folder: Path) -> list[tuple[int, str]]:
             volumes = [file.read(k) for k in range(len(file))]
             values = {int(v) for volume in volumes for v in np.unique(volume.ct)}
             names = {volume.name for volume in volumes}
-            assert len(values) == 1 and names == {f"{min(values)}-{k}" for k in range(3)}, (values, names)
+            assert len(values) == 1 and names == {f"{min(values)}-{k}" for k in range(3)}, (
+                values,
+                names,
+            )
             seen.append(values.pop())
         assert seen == sorted(seen), seen
         return str(len(seen))
@@ -67,7 +74,9 @@ def readers(folder: Path) -> list[tuple[int, str]]:
 
 
 def training(folder: Path, same: bool) -> list[tuple[int, str]]:
-    """Four runs of a sweep at once: in folders of their own below one folder, or all in the same."""
+    """Four runs of a sweep at once: in folders of their own below one folder, or all in the
+    same.
+    """
     import torch
 
     from mvrecon import train
@@ -110,7 +119,9 @@ def app(name: str, *options: str) -> Callable[[], str]:
 
 
 def apps(folder: Path) -> list[tuple[int, str]]:
-    """Two trainings, two evaluations of the first, and two simulations, each pair at once and in the same second."""
+    """Two trainings, two evaluations of the first, and two simulations, each pair at once and in
+    the same second.
+    """
     import torch
 
     from mvrecon.engine import agreement, evaluation, fit  # noqa: F401  (all imports once, for every process)

@@ -1,8 +1,10 @@
-"""Lives of one training: each forked from a process without threads, broken off in one way, and begun again.
+"""Lives of one training: each forked from a process without threads, broken off in one way, and
+begun again.
 
-`python -m tests.engine.lives PLAN.json` runs a plan's lives and prints, one line of JSON each, how they ended. A plan
-holds `options` (the command line of mvrecon-train) and `runs` (folder -> what befalls each life; a last one follows
-that nothing befalls). `python -m tests.engine.lives COUNT SEED` kills COUNT times at random and compares the weights.
+`python -m tests.engine.lives PLAN.json` runs a plan's lives and prints, one line of JSON each, how
+they ended. A plan holds `options` (the command line of mvrecon-train) and `runs` (folder -> what
+befalls each life; a last one follows that nothing befalls). `python -m tests.engine.lives COUNT
+SEED` kills COUNT times at random and compares the weights.
 """
 
 import errno
@@ -21,7 +23,8 @@ from typing import Any
 from tests.faults.fault_injection import counted, different, raising, signalled
 
 METHOD, STEPS = "geometry_free", 14
-#: A run of a second: five steps an epoch, a checkpoint every three, averaged weights, a falling rate.
+#: A run of a second: five steps an epoch, a checkpoint every three, averaged weights, a falling
+#: rate.
 OPTIONS = (
     "model=geometry_free",
     "callbacks=ema",
@@ -43,16 +46,22 @@ OPTIONS = (
 )
 
 
-def play(folder: Path, runs: dict[str, list[dict[str, Any]]], *options: str) -> dict[str, list[dict[str, Any]]]:
+def play(
+    folder: Path, runs: dict[str, list[dict[str, Any]]], *options: str
+) -> dict[str, list[dict[str, Any]]]:
     """Run lives in a process of their own; how each life of each run ended, with what it said."""
     plan = folder / "plan.json"
     plan.write_text(
-        json.dumps({"options": [*OPTIONS, *options], "runs": {str(folder / k): v for k, v in runs.items()}})
+        json.dumps(
+            {"options": [*OPTIONS, *options], "runs": {str(folder / k): v for k, v in runs.items()}}
+        )
     )
     root = Path(__file__).parents[2]
     command = [sys.executable, "-m", "tests.engine.lives", str(plan)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=root, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     ended: dict[str, list[dict[str, Any]]] = {name: [] for name in runs}
     for line in filter(lambda line: line.startswith('{"run"'), done.stdout.splitlines()):
@@ -88,14 +97,21 @@ def befall(what: str, n: int) -> None:
         "term": (ReconstructionModule, "training_step", signalled(signal.SIGTERM)),
         "term in validation": (ReconstructionModule, "validation_step", signalled(signal.SIGTERM)),
         "no space": (os, "fsync", raising(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))),
-        "no memory": (ReconstructionModule, "training_step", raising(MemoryError("no memory left"))),
+        "no memory": (
+            ReconstructionModule,
+            "training_step",
+            raising(MemoryError("no memory left")),
+        ),
         "no memory to save": (torch, "save", raising(MemoryError("no memory left"))),
         "dead worker": (SceneDataset, "__getitem__", lambda: os._exit(3)),
     }
     if what in places:
         owner, name, happens = places[what]
         return counted(owner, name, n, happens)
-    if what in ("byte", "full"):  # no file may grow beyond n bytes: the kernel kills, or says that it is so
+    if what in (
+        "byte",
+        "full",
+    ):  # no file may grow beyond n bytes: the kernel kills, or says that it is so
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL if what == "byte" else signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         return resource.setrlimit(resource.RLIMIT_FSIZE, (n, n))
@@ -131,17 +147,25 @@ def seen(folder: Path) -> dict[str, Any]:
     last = unfinished(folder, METHOD)
     begun = last.exists() or previous(last).exists()
     parts = [path.name for path in folder.rglob("*.part")]
-    return {"exit": 0, "said": f"step {read_newest(last)['global_step'] if begun else 0}", "parts": parts}
+    return {
+        "exit": 0,
+        "said": f"step {read_newest(last)['global_step'] if begun else 0}",
+        "parts": parts,
+    }
 
 
 def permitted(folder: Path, mode: int) -> None:
-    """Let anyone write anywhere in a run folder, but set the mode of the folder of its last checkpoint."""
+    """Let anyone write anywhere in a run folder, but set the mode of the folder of its last
+    checkpoint.
+    """
     for path in (folder, *folder.rglob("*")):
         path.chmod(0o777 if path.is_dir() else 0o666)
     (folder / "checkpoints" / METHOD).chmod(mode)
 
 
-def live(options: list[str], settings: dict[str, Any], folder: Path, fate: dict[str, Any]) -> dict[str, Any]:
+def live(
+    options: list[str], settings: dict[str, Any], folder: Path, fate: dict[str, Any]
+) -> dict[str, Any]:
     """One life, as `mvrecon-train` (where the fate says "app") or straight away: how it ended."""
     from mvrecon import train
 
@@ -188,13 +212,20 @@ def main(plan: dict[str, Any]) -> None:
     for name, fates in plan["runs"].items():
         for fate in [*fates, {}]:
             began, ended = time.perf_counter(), live(plan["options"], settings, Path(name), fate)
-            life = {"run": Path(name).name, **fate, **ended, "seconds": round(time.perf_counter() - began, 2)}
+            life = {
+                "run": Path(name).name,
+                **fate,
+                **ended,
+                "seconds": round(time.perf_counter() - began, 2),
+            }
             sys.stdout.write(json.dumps(life) + "\n")
             sys.stdout.flush()
 
 
 def deaths(rng: random.Random, count: int) -> list[dict[str, Any]]:
-    """Random kills: at a step, in the optimiser, in a validation, at any moment, and in the writing of a checkpoint."""
+    """Random kills: at a step, in the optimiser, in a validation, at any moment, and in the writing
+    of a checkpoint.
+    """
     choices: dict[str, Any] = {
         "step": lambda: rng.randint(1, 4),
         "stepped": lambda: rng.randint(1, 4),
@@ -208,7 +239,9 @@ def deaths(rng: random.Random, count: int) -> list[dict[str, Any]]:
 
 
 def campaign(count: int, seed: int) -> None:
-    """Kill at random, six times a run, with and without worker processes; tell how many runs ended otherwise."""
+    """Kill at random, six times a run, with and without worker processes; tell how many runs ended
+    otherwise.
+    """
     rng, killed, wrong = random.Random(seed), 0, []
     for workers in (0, 2):
         runs = {f"run{k}": deaths(rng, 6) for k in range(count // 12)} | {"whole": []}
@@ -216,7 +249,11 @@ def campaign(count: int, seed: int) -> None:
             ended = play(Path(folder), runs, f"data.workers={workers}")
             killed += sum(life["exit"] < 0 for lives in ended.values() for life in lives)
             whole = state(Path(folder) / "whole")
-            wrong += [f"{name}, {workers} workers" for name in runs if different(state(Path(folder) / name), whole)]
+            wrong += [
+                f"{name}, {workers} workers"
+                for name in runs
+                if different(state(Path(folder) / name), whole)
+            ]
     sys.stdout.write(json.dumps({"seed": seed, "kills": killed, "runs that differ": wrong}) + "\n")
 
 

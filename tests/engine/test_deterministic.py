@@ -1,4 +1,6 @@
-"""`trainer.deterministic=true`: it trains, to the same bits, and no layer of it is one that a GPU refuses."""
+"""`trainer.deterministic=true`: it trains, to the same bits, and no layer of it is one that a GPU
+refuses.
+"""
 
 import pytest
 import torch
@@ -10,7 +12,8 @@ from mvrecon.engine import checkpoints, fit
 from mvrecon.kernels import backends
 from mvrecon.kernels.threads import in_one_order, share
 
-#: What torch.use_deterministic_algorithms refuses on CUDA (its documentation, torch 2.13), of what a network may hold.
+#: What torch.use_deterministic_algorithms refuses on CUDA (its documentation, torch 2.13), of what
+#: a network may hold.
 REFUSED = {
     "avg_pool3d_backward",
     "_adaptive_avg_pool2d_backward",
@@ -39,7 +42,9 @@ REFUSED = {
 
 
 class Recorded(TorchDispatchMode):
-    """The names of the operations that run; cumsum only of numbers with a point, since a GPU counts in any order."""
+    """The names of the operations that run; cumsum only of numbers with a point, since a GPU counts
+    in any order.
+    """
 
     def __init__(self):
         super().__init__()
@@ -61,7 +66,9 @@ def strict():
 
 @pytest.fixture
 def taken_for_a_gpu(strict, monkeypatch):
-    """A CPU that torch's and our own choices of an algorithm take for a GPU without compiled kernels."""
+    """A CPU that torch's and our own choices of an algorithm take for a GPU without compiled
+    kernels.
+    """
     monkeypatch.setattr(torch.Tensor, "is_cpu", property(lambda _: False))
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda _: True))
     monkeypatch.setattr(backends, "COMPILED", False)
@@ -101,9 +108,14 @@ def test_no_layer_is_refused_on_a_gpu(model, taken_for_a_gpu):
 def test_what_a_gpu_refuses_would_be_seen(taken_for_a_gpu):
     x = torch.rand(1, 1, 4, 4, 4, requires_grad=True)
     with Recorded() as seen:
-        (F.avg_pool3d(x, 2).sum() + F.grid_sample(x, torch.zeros(1, 1, 1, 1, 3), align_corners=False).sum()).backward()
+        (
+            F.avg_pool3d(x, 2).sum()
+            + F.grid_sample(x, torch.zeros(1, 1, 1, 1, 3), align_corners=False).sum()
+        ).backward()
         torch.ones(2).cumsum(0), torch.ones(2, dtype=torch.bool).cumsum(0)
-        F.interpolate(x, scale_factor=2, mode="trilinear").sum().backward()  # torch has another way for it
+        F.interpolate(
+            x, scale_factor=2, mode="trilinear"
+        ).sum().backward()  # torch has another way for it
     assert seen.names & REFUSED == {"avg_pool3d_backward", "grid_sampler_3d_backward", "cumsum"}
 
 
@@ -130,7 +142,9 @@ def threads():
     torch.set_num_threads(before)
 
 
-def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(tmp_path, strict, threads):
+def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
+    tmp_path, strict, threads
+):
     """Those that any training has on one thread."""
     settings = compose("experiment=smoke")
     data = fit.build_data(settings)
@@ -140,12 +154,19 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(tmp_p
         threads(number)
         run = tmp_path / str(len(weights))
         fit.fit(
-            "cross_view", {**settings, "trainer": settings["trainer"] | {"deterministic": deterministic}}, data, run
+            "cross_view",
+            {**settings, "trainer": settings["trainer"] | {"deterministic": deterministic}},
+            data,
+            run,
         )
         assert torch.get_num_threads() == number
-        weights.append(checkpoints.load(checkpoints.finished(run, "cross_view")).module.state_dict())
+        weights.append(
+            checkpoints.load(checkpoints.finished(run, "cross_view")).module.state_dict()
+        )
     assert torch.are_deterministic_algorithms_enabled()
-    assert all(torch.equal(weights[0][name], other[name]) for other in weights[1:] for name in weights[0])
+    assert all(
+        torch.equal(weights[0][name], other[name]) for other in weights[1:] for name in weights[0]
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -160,7 +181,9 @@ def test_volumes_and_gradients_have_the_same_bits_in_one_order(model, threads):
             volume = module.model(views).volume
             volume.square().sum().backward()
         answers.append([volume, *[p.grad for p in module.parameters() if p.grad is not None]])
-    assert all(torch.equal(a, b) for other in answers[1:] for a, b in zip(answers[0], other, strict=True))
+    assert all(
+        torch.equal(a, b) for other in answers[1:] for a, b in zip(answers[0], other, strict=True)
+    )
 
 
 def test_the_compiled_loops_keep_their_threads_in_one_order(threads):

@@ -66,7 +66,11 @@ def test_every_scene_counts_once_whatever_the_batches():
 
 def test_each_scene_is_shown_with_all_reconstructions():
     seen = []
-    scores(lambda scene, volumes: seen.append((scene["name"], sorted(volumes), tuple(scene["views"].shape))))
+    scores(
+        lambda scene, volumes: seen.append(
+            (scene["name"], sorted(volumes), tuple(scene["views"].shape))
+        )
+    )
     assert seen == [([name], ["exact", "low"], (1, 1, 2, 8, 8)) for name in "abc"]
 
 
@@ -85,10 +89,22 @@ def test_the_table_tells_every_method_and_both_moments():
     found = {"name": "trial", "scenes": ["a", "b"], "seen_in_training": []}
     found["methods"] = {"cross_view": row, "sirt": sharp}
     text = shown(found)
-    for piece in ("trial: 2 unseen scenes", "cross_view", "sirt", "12,345", "0.500", "± 0.125", "± 0.12", "inf", "61"):
+    for piece in (
+        "trial: 2 unseen scenes",
+        "cross_view",
+        "sirt",
+        "12,345",
+        "0.500",
+        "± 0.125",
+        "± 0.12",
+        "inf",
+        "61",
+    ):
         assert piece in text, piece
     assert "nan" not in text and "…" not in text
-    assert "1 unseen scene\n" in shown({**found, "scenes": ["a"]}).replace(" \n", "\n").replace("  ", "")
+    assert "1 unseen scene\n" in shown({**found, "scenes": ["a"]}).replace(" \n", "\n").replace(
+        "  ", ""
+    )
 
 
 @pytest.mark.door
@@ -119,7 +135,12 @@ def test_a_saved_case_keeps_axes_and_affine(tmp_path):
     volume[0, 0, 5, 4, 3] = 1.0
     scene = {"views": torch.rand(1, 1, 2, 4, 4), "volume": volume, "name": ["pat/1 a"]}
     case = save_case(tmp_path, scene, {"sirt": volume * 2}, grid, 1.0)
-    assert sorted(p.name for p in case.iterdir()) == ["planes.png", "sirt.nii.gz", "truth.nii.gz", "views.png"]
+    assert sorted(p.name for p in case.iterdir()) == [
+        "planes.png",
+        "sirt.nii.gz",
+        "truth.nii.gz",
+        "views.png",
+    ]
     image = nibabel.load(case / "sirt.nii.gz")
     assert image.shape == (8, 7, 6) and image.get_fdata()[3, 4, 5] == 2
     world = image.affine @ [3, 4, 5, 1]

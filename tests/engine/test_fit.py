@@ -59,9 +59,13 @@ def test_only_the_finished_checkpoint_stays(run):
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["cross_view.ckpt"]
 
 
-def test_training_changes_the_weights_and_equal_seeds_give_equal_weights(run, settings, data, tmp_path):
+def test_training_changes_the_weights_and_equal_seeds_give_equal_weights(
+    run, settings, data, tmp_path
+):
     fit.fit("cross_view", settings, data, tmp_path)
-    first, second = (checkpoints.load(checkpoints.finished(f, "cross_view")).module for f in (run, tmp_path))
+    first, second = (
+        checkpoints.load(checkpoints.finished(f, "cross_view")).module for f in (run, tmp_path)
+    )
     torch.manual_seed(settings["seed"])
     other = copy.deepcopy(settings)
     other["seed"] = 1
@@ -93,7 +97,9 @@ def test_a_broken_run_goes_on_as_if_it_had_not_broken(run, settings, data, tmp_p
     assert before["global_step"] == 2 and after.steps == 3
     assert after.seconds > before["callbacks"]["Clock"]["seconds"] > 0
     unbroken = checkpoints.load(checkpoints.finished(run, "cross_view")).module.state_dict()
-    assert all(torch.equal(value, unbroken[name]) for name, value in after.module.state_dict().items())
+    assert all(
+        torch.equal(value, unbroken[name]) for name, value in after.module.state_dict().items()
+    )
     fit.fit("cross_view", settings, data, tmp_path)
     assert seen[-1] == 2, "a finished method is not trained again"
 
@@ -101,13 +107,19 @@ def test_a_broken_run_goes_on_as_if_it_had_not_broken(run, settings, data, tmp_p
 def test_a_loss_that_is_not_finite_stops_with_a_remedy(settings, data, tmp_path):
     wild = copy.deepcopy(settings)
     wild["optimizer"] |= {"lr": 1e30, "schedule": "constant", "warmup": 0.0}
-    with pytest.raises(FloatingPointError, match=r"cross_view is not finite at step [12]: .*optimizer.lr"):
+    with pytest.raises(
+        FloatingPointError, match=r"cross_view is not finite at step [12]: .*optimizer.lr"
+    ):
         fit.fit("cross_view", wild, data, tmp_path)
     assert not checkpoints.finished(tmp_path, "cross_view").exists()
 
 
 def test_averaged_weights_are_what_a_checkpoint_holds(run, settings, data, tmp_path):
-    averaging = {"_target_": "lightning.pytorch.callbacks.EMAWeightAveraging", "decay": 0.5, "use_buffers": False}
+    averaging = {
+        "_target_": "lightning.pytorch.callbacks.EMAWeightAveraging",
+        "decay": 0.5,
+        "use_buffers": False,
+    }
     fit.fit("cross_view", {**settings, "callbacks": {"ema": averaging}}, data, tmp_path)
     path = checkpoints.finished(tmp_path, "cross_view")
     state, loaded = torch.load(path), checkpoints.load(path).module.state_dict()
@@ -140,7 +152,9 @@ def test_a_run_folder_is_found_from_anything_in_it(tmp_path):
     (tmp_path / "run" / "config.yaml").write_text("name: run\n")
     file = tmp_path / "run" / "checkpoints" / "a.ckpt"
     file.touch()
-    assert {checkpoints.run_folder(p) for p in (file, file.parent, tmp_path / "run")} == {tmp_path / "run"}
+    assert {checkpoints.run_folder(p) for p in (file, file.parent, tmp_path / "run")} == {
+        tmp_path / "run"
+    }
     with pytest.raises(FileNotFoundError, match="No checkpoint or run folder is at .*nowhere"):
         checkpoints.run_folder(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match="with config.yaml"):

@@ -19,7 +19,9 @@ VOLUMES = {
 
 @pytest.mark.door
 def test_a_resumed_run_logs_again_what_came_after_its_checkpoint_once(tmp_path):
-    """The board shows the steps that a resumed run logs again once, with their new values, NaN among them or not."""
+    """The board shows the steps that a resumed run logs again once, with their new values, NaN
+    among them or not.
+    """
     board = Board(str(tmp_path))
     for step in range(6):
         board.experiment.add_scalar("loss", torch.nan if step == 1 else float(step), step)

@@ -1,4 +1,6 @@
-"""What a run does not change is not computed again: no pose gradients, no pictures, no cases, no weights in a step."""
+"""What a run does not change is not computed again: no pose gradients, no pictures, no cases, no
+weights in a step.
+"""
 
 from collections import Counter
 from itertools import groupby
@@ -17,7 +19,11 @@ from mvrecon.train import train
 from mvrecon.viz import montage
 from tests.models.rig import small_rig
 
-FORWARD, ADJOINT, POSES = "mvrecon::project", "mvrecon::backproject", ("mvrecon::lines_vjp", "mvrecon::warp_vjp")
+FORWARD, ADJOINT, POSES = (
+    "mvrecon::project",
+    "mvrecon::backproject",
+    ("mvrecon::lines_vjp", "mvrecon::warp_vjp"),
+)
 PICTURES = ("planes", "projections", "views", "opinions", "weights")
 
 
@@ -38,18 +44,26 @@ def settings():
     return compose("experiment=smoke")
 
 
-def test_a_training_step_projects_as_often_as_the_model_says_and_never_asks_for_poses(settings, tmp_path, monkeypatch):
+def test_a_training_step_projects_as_often_as_the_model_says_and_never_asks_for_poses(
+    settings, tmp_path, monkeypatch
+):
     steps = []
     with Kernels() as kernels:
-        monkeypatch.setattr(ReconstructionModule, "on_train_batch_start", lambda *_: kernels.calls.clear())
-        monkeypatch.setattr(ReconstructionModule, "on_train_batch_end", lambda *_: steps.append(dict(kernels.calls)))
+        monkeypatch.setattr(
+            ReconstructionModule, "on_train_batch_start", lambda *_: kernels.calls.clear()
+        )
+        monkeypatch.setattr(
+            ReconstructionModule, "on_train_batch_end", lambda *_: steps.append(dict(kernels.calls))
+        )
         fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
     start, consistency = settings["model"]["start"], settings["model"]["consistency"]
-    # Ax of: each SIRT iteration of the start; the start's residual; all opinions at once (the cross views); the fused
-    # volume's residual, which the refinement sees; each consistency step. Back: of the last two kinds' adjoints.
+    # Ax of: each SIRT iteration of the start; the start's residual; all opinions at once (the cross
+    # views); the fused volume's residual, which the refinement sees; each consistency step. Back:
+    # of the last two kinds' adjoints.
     forward = start + 1 + 1 + (1 + consistency) + (1 + consistency)
-    # A^T of: each SIRT iteration; the opinions' disagreement (not differentiated); the fused volume's residual; each
-    # consistency step. Back: of the cross views (for the loss), of the fused residual, of each consistency step.
+    # A^T of: each SIRT iteration; the opinions' disagreement (not differentiated); the fused
+    # volume's residual; each consistency step. Back: of the cross views (for the loss), of the
+    # fused residual, of each consistency step.
     adjoint = start + 1 + (1 + consistency) + (1 + 1 + consistency)
     assert len(steps) == settings["trainer"]["max_steps"]
     assert [step[FORWARD] for step in steps] == [forward] * len(steps)
@@ -59,7 +73,10 @@ def test_a_training_step_projects_as_often_as_the_model_says_and_never_asks_for_
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_the_gradient_of_the_poses_is_taken_for_poses_that_want_one(moves, monkeypatch):
-    monkeypatch.setattr("mvrecon.kernels.rays.cpu.lines_vjp", lambda volume, views, lines, *_: torch.zeros_like(lines))
+    monkeypatch.setattr(
+        "mvrecon.kernels.rays.cpu.lines_vjp",
+        lambda volume, views, lines, *_: torch.zeros_like(lines),
+    )
     grid, rig = small_rig()
     rig = Cameras(rig.source.clone().requires_grad_(moves), rig.origin, rig.u, rig.v, rig.shape)
     A = PROJECTORS.build("drr", grid=grid, cameras=rig, backend="cpu")
@@ -69,7 +86,9 @@ def test_the_gradient_of_the_poses_is_taken_for_poses_that_want_one(moves, monke
     assert kernels.calls[POSES[0]] == moves and (rig.source.grad is not None) == moves
 
 
-def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(settings, tmp_path, monkeypatch):
+def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
+    settings, tmp_path, monkeypatch
+):
     happened, built = [], []
 
     def noted(kind, function):
@@ -82,14 +101,29 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
     for name in PICTURES:
         monkeypatch.setattr(montage, name, noted("pictures", getattr(montage, name)))
     for name in ("training_step", "validation_step"):
-        monkeypatch.setattr(ReconstructionModule, name, noted(name, getattr(ReconstructionModule, name)))
+        monkeypatch.setattr(
+            ReconstructionModule, name, noted(name, getattr(ReconstructionModule, name))
+        )
     build = MODELS.build
-    monkeypatch.setattr(callbacks.MODELS, "build", lambda name, **options: built.append(name) or build(name, **options))
-    board = {"_target_": "mvrecon.engine.callbacks.BoardReview", "every": 1, "cases": 2, "baselines": ["sirt"]}
+    monkeypatch.setattr(
+        callbacks.MODELS,
+        "build",
+        lambda name, **options: built.append(name) or build(name, **options),
+    )
+    board = {
+        "_target_": "mvrecon.engine.callbacks.BoardReview",
+        "every": 1,
+        "cases": 2,
+        "baselines": ["sirt"],
+    }
     trainer = {**settings["trainer"], "val_check_interval": 1, "num_sanity_val_steps": 0}
     settings = {**settings, "callbacks": {"board": board}, "trainer": trainer}
     fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
-    assert [kind for kind, _ in groupby(happened)] == ["training_step", "validation_step", "pictures"] * 3
+    assert [kind for kind, _ in groupby(happened)] == [
+        "training_step",
+        "validation_step",
+        "pictures",
+    ] * 3
     assert built.count("sirt") == 1
 
 
@@ -104,7 +138,11 @@ def test_no_case_is_simulated_twice_however_many_methods_see_it(settings, tmp_pa
     trainer = {**settings["trainer"], "max_steps": 4}  # more than an epoch
     other = {"name": "backprojection_unet", "width": 4, "start": 2, "consistency": 0}
     train(
-        {**settings, "compare": {"other": other, "sirt": {"name": "sirt", "iterations": 2}}, "trainer": trainer},
+        {
+            **settings,
+            "compare": {"other": other, "sirt": {"name": "sirt", "iterations": 2}},
+            "trainer": trainer,
+        },
         tmp_path,
     )
     assert set(made.values()) == {1} and len(made) == sum(settings["data"]["sizes"].values())

@@ -12,7 +12,12 @@ from mvrecon.engine.loggers import MetricsFile
 
 
 def test_settings_come_back_plain_and_in_order(tmp_path):
-    settings = {"name": "a", "seed": 3, "grid": {"shape": [1, 2, 3], "spacing": 0.5}, "resume": None}
+    settings = {
+        "name": "a",
+        "seed": 3,
+        "grid": {"shape": [1, 2, 3], "spacing": 0.5},
+        "resume": None,
+    }
     record.start(tmp_path / "run", settings)
     assert record.read_settings(tmp_path / "run") == settings
     assert list(record.read_settings(tmp_path / "run")) == list(settings)
@@ -21,14 +26,22 @@ def test_settings_come_back_plain_and_in_order(tmp_path):
 
 def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    given = {"scene": {"path": "a.h5", "scenes": [{"path": "/b.h5"}, {"path": None}]}, "name": "path"}
+    given = {
+        "scene": {"path": "a.h5", "scenes": [{"path": "/b.h5"}, {"path": None}]},
+        "name": "path",
+    }
     found = record.anchored(given)
-    assert found["scene"] == {"path": str(tmp_path / "a.h5"), "scenes": [{"path": "/b.h5"}, {"path": None}]}
+    assert found["scene"] == {
+        "path": str(tmp_path / "a.h5"),
+        "scenes": [{"path": "/b.h5"}, {"path": None}],
+    }
     assert found["name"] == "path" and record.anchored(found) == found
 
 
 def test_results_are_strict_json_with_versions(tmp_path):
-    record.write_results(tmp_path, {"psnr": math.inf, "values": [math.nan, 1.5], "deep": {"x": -math.inf}})
+    record.write_results(
+        tmp_path, {"psnr": math.inf, "values": [math.nan, 1.5], "deep": {"x": -math.inf}}
+    )
     found = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
     assert found["psnr"] is None and found["values"] == [None, 1.5] and found["deep"] == {"x": None}
     assert found["versions"]["mvrecon"] and found["command"]
@@ -36,7 +49,9 @@ def test_results_are_strict_json_with_versions(tmp_path):
 
 @pytest.mark.door
 def test_the_version_of_torch_tells_its_build(monkeypatch):
-    """A run's versions tell the build of torch, which the metadata of an installed wheel leaves out."""
+    """A run's versions tell the build of torch, which the metadata of an installed wheel leaves
+    out.
+    """
     monkeypatch.setattr(torch, "__version__", "2.13.0+cu130")
     monkeypatch.setattr(record.metadata, "version", lambda name: "2.13.0")
     assert record.versions()["torch"] == "2.13.0+cu130"
@@ -61,5 +76,8 @@ def test_a_second_logger_adds_to_the_table(tmp_path):
         logger.finalize("success")
     with open(tmp_path / "metrics.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["step"], row["loss"], row["psnr"]) for row in rows] == [("1", "0.5", ""), ("2", "0.25", "30.0")]
+    assert [(row["step"], row["loss"], row["psnr"]) for row in rows] == [
+        ("1", "0.5", ""),
+        ("2", "0.25", "30.0"),
+    ]
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]

@@ -1,4 +1,6 @@
-"""A run's folder is its own: its settings, its rig and its data do not change, and no other process writes to it."""
+"""A run's folder is its own: its settings, its rig and its data do not change, and no other process
+writes to it.
+"""
 
 import json
 import os
@@ -27,7 +29,13 @@ from mvrecon.parts import CAMERAS
 from tests.engine.lives import METHOD, OPTIONS
 
 pytestmark = pytest.mark.door
-RIG = {"name": "circular", "views": 3, "sid": 400.0, "sdd": 800.0, "detector": {"pixels": [12, 12], "pixel_mm": 22.0}}
+RIG = {
+    "name": "circular",
+    "views": 3,
+    "sid": 400.0,
+    "sdd": 800.0,
+    "detector": {"pixels": [12, 12], "pixel_mm": 22.0},
+}
 NOON = "2026-01-01_12-00-00"
 
 
@@ -52,7 +60,9 @@ def crowd(kind, folder):
     command = [sys.executable, "-m", "tests.engine.crowd", kind, str(folder)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     root = Path(__file__).parents[2]
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=root, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1]), done.stderr
 
@@ -70,16 +80,25 @@ def run(tmp_path_factory):
     """A finished run with a rig from a file, and its command line."""
     place = tmp_path_factory.mktemp("run")
     options = [option for option in OPTIONS if not option.startswith("camera")]
-    options += ["camera=from_file", f"camera.path={rig_file(place)}", f"hydra.run.dir={place}/run", "seed=3"]
+    options += [
+        "camera=from_file",
+        f"camera.path={rig_file(place)}",
+        f"hydra.run.dir={place}/run",
+        "seed=3",
+    ]
     assert call(mvrecon.train, *options) == 0
     return place / "run", options
 
 
 def test_settings_that_differ_are_named_and_nothing_is_written(run, capsys):
-    """A training into the folder of a run with other settings is refused, and not a byte of the folder changes."""
+    """A training into the folder of a run with other settings is refused, and not a byte of the
+    folder changes.
+    """
     folder, options = run
     before = contents(folder)
-    assert call(mvrecon.train, *options, "seed=9", "optimizer.lr=0.5", "+compare.sirt.name=sirt") == 1
+    assert (
+        call(mvrecon.train, *options, "seed=9", "optimizer.lr=0.5", "+compare.sirt.name=sirt") == 1
+    )
     message = capsys.readouterr().err
     assert (
         "got seed=9, expected 3" in message
@@ -91,7 +110,9 @@ def test_settings_that_differ_are_named_and_nothing_is_written(run, capsys):
 
 
 def test_the_same_settings_go_on_and_tell_so(run, capsys):
-    """A training into its own finished folder says that there is nothing left to train, and has the same figures."""
+    """A training into its own finished folder says that there is nothing left to train, and has the
+    same figures.
+    """
     folder, options = run
     before = json.loads((folder / "results.json").read_text())
     assert call(mvrecon.train, *options) == 0
@@ -125,7 +146,9 @@ def test_work_without_its_settings_is_nobody_s(tmp_path):
     for name in ("checkpoints", "results.json"):
         folder = tmp_path / f"run with {name}"
         (folder / name).mkdir(parents=True)
-        with pytest.raises(FileExistsError, match=rf"holds {name} of another run without its config.yaml"):
+        with pytest.raises(
+            FileExistsError, match=rf"holds {name} of another run without its config.yaml"
+        ):
             run_folder.check(folder, {"seed": 0})
     run_folder.check(tmp_path, {"seed": 0})
 
@@ -157,14 +180,19 @@ def test_a_new_folder_is_never_one_that_is_there(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
 def test_apps_of_the_same_second_have_folders_of_their_own(tmp_path):
-    """Two trainings, two evaluations and two simulations of the same second each keep their own results."""
+    """Two trainings, two evaluations and two simulations of the same second each keep their own
+    results.
+    """
     answers, message = crowd("apps", tmp_path)
     assert [code for code, _ in answers] == [0] * 6, message
     outputs, folders = tmp_path / "outputs", (NOON, f"{NOON}_2")
     for name in ("train", "eval", "simulate"):
         assert sorted(path.name for path in (outputs / name).iterdir()) == [*folders]
     for name in ("train", "simulate"):
-        assert {yaml.safe_load((outputs / name / f / "config.yaml").read_text())["seed"] for f in folders} == {1, 2}
+        assert {
+            yaml.safe_load((outputs / name / f / "config.yaml").read_text())["seed"]
+            for f in folders
+        } == {1, 2}
     tables = {
         name: [json.loads((outputs / name / f / "results.json").read_text()) for f in folders]
         for name in ("train", "eval")
@@ -183,7 +211,9 @@ def test_a_resumed_run_makes_no_other_folder(run, tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
 def test_a_run_that_another_process_resumes_is_refused(run):
-    """A run that another process is at work on cannot be resumed meanwhile, and keeps its results."""
+    """A run that another process is at work on cannot be resumed meanwhile, and keeps its
+    results.
+    """
     folder, _ = run
     before = (folder / "results.json").read_bytes()
     answers, message = crowd("resuming", folder)
@@ -192,12 +222,20 @@ def test_a_run_that_another_process_resumes_is_refused(run):
 
 
 def test_a_run_keeps_its_rig_and_the_digests_of_rig_and_data(run):
-    """The run folder keeps the rig, number for number, and the checkpoint has its digest and the training cases."""
+    """The run folder keeps the rig, number for number, and the checkpoint has its digest and the
+    training cases.
+    """
     folder, options = run
     kept = files.from_file(folder / "rig.json")
-    assert all(torch.equal(getattr(kept, v), getattr(CAMERAS.from_config(RIG), v)) for v in files.VECTORS)
+    assert all(
+        torch.equal(getattr(kept, v), getattr(CAMERAS.from_config(RIG), v)) for v in files.VECTORS
+    )
     trained = checkpoints.load(checkpoints.finished(folder, METHOD))
-    assert trained.digests == json.loads((folder / "digests.json").read_text()) == {"rig": digests.of_rig(kept)}
+    assert (
+        trained.digests
+        == json.loads((folder / "digests.json").read_text())
+        == {"rig": digests.of_rig(kept)}
+    )
     assert trained.cases == [f"ellipsoids-5-{k}" for k in range(10)]
     state = torch.load(checkpoints.finished(folder, METHOD))
     assert state["SceneData"]["cases"] == trained.cases
@@ -205,7 +243,9 @@ def test_a_run_keeps_its_rig_and_the_digests_of_rig_and_data(run):
 
 @pytest.mark.parametrize("kept", ["folder", "checkpoint"])
 def test_a_rig_that_has_changed_is_refused(run, kept, tmp_path, capsys):
-    """A rig file that has changed since is an error of evaluation and of resumption, by folder and by checkpoint."""
+    """A rig file that has changed since is an error of evaluation and of resumption, by folder and
+    by checkpoint.
+    """
     folder, _ = run
     path = Path(record.read_settings(folder)["camera"]["path"])
     expected, whole = digests.of_rig(files.from_file(path)), (folder / "digests.json").read_bytes()
@@ -219,7 +259,9 @@ def test_a_rig_that_has_changed_is_refused(run, kept, tmp_path, capsys):
             (mvrecon.train, [f"resume={folder}"]),
         ):
             assert call(app, *options) == 1
-            assert f"rig: got sha256 {got[:16]}, expected {expected[:16]}" in capsys.readouterr().err
+            assert (
+                f"rig: got sha256 {got[:16]}, expected {expected[:16]}" in capsys.readouterr().err
+            )
     finally:
         rig_file(path.parent)
         (folder / "digests.json").write_bytes(whole)
@@ -227,30 +269,45 @@ def test_a_rig_that_has_changed_is_refused(run, kept, tmp_path, capsys):
 
 
 def test_a_digest_of_a_rig_tells_every_part_of_the_record():
-    """Each part of a camera record changes its digest; a millionth of a micrometre, which a processor may, does not."""
+    """Each part of a camera record changes its digest; a millionth of a micrometre, which a
+    processor may, does not.
+    """
     rig = CAMERAS.from_config(RIG)
     others = [replace(rig, **{name: getattr(rig, name) * (1 + 1e-6)}) for name in files.VECTORS]
-    others += [replace(rig, shape=(12, 13)), replace(rig, extent="ahead"), replace(rig, parallel=True)]
+    others += [
+        replace(rig, shape=(12, 13)),
+        replace(rig, extent="ahead"),
+        replace(rig, parallel=True),
+    ]
     assert len({digests.of_rig(one) for one in (rig, *others)}) == 8
     assert digests.of_rig(replace(rig, source=rig.source + 1e-13)) == digests.of_rig(rig)
 
 
 def test_a_digest_of_a_file_is_told_by_its_contents(tmp_path):
-    """A data file that changes at the same path is refused, and one that is only copied or touched is not."""
+    """A data file that changes at the same path is refused, and one that is only copied or touched
+    is not.
+    """
     path = tmp_path / "a.h5"
     path.write_bytes(b"first")
-    scene = {"name": "mixture", "scenes": [{"name": "hdf5", "path": str(path)}, {"name": "ellipsoids"}]}
+    scene = {
+        "name": "mixture",
+        "scenes": [{"name": "hdf5", "path": str(path)}, {"name": "ellipsoids"}],
+    }
     assert list(digests.files_in(scene)) == [str(path)]
     before = {str(path): digests.of_file(path)}
     os.utime(path, (0, 0))
     digests.compare({str(path): digests.of_file(path)}, before, "run")
     path.write_bytes(b"other")
-    with pytest.raises(Refused, match=r"as run tells: .*a\.h5: got sha256 [0-9a-f]{16}, expected [0-9a-f]{16}"):
+    with pytest.raises(
+        Refused, match=r"as run tells: .*a\.h5: got sha256 [0-9a-f]{16}, expected [0-9a-f]{16}"
+    ):
         digests.compare({str(path): digests.of_file(path)}, before, "run")
 
 
 def test_no_scene_is_called_unseen_where_a_checkpoint_does_not_tell(run):
-    """A checkpoint that does not tell its training cases leaves it open which scenes are unseen; SIRT has seen none."""
+    """A checkpoint that does not tell its training cases leaves it open which scenes are unseen;
+    SIRT has seen none.
+    """
     folder, _ = run
     assert json.loads((folder / "results.json").read_text())["seen_in_training"] == []
     trained, sirt = Trained(None, 1.0, 14, ["p1", "p2"]), Trained(None, 0.0, 0)
@@ -261,11 +318,19 @@ def test_no_scene_is_called_unseen_where_a_checkpoint_does_not_tell(run):
 
 @pytest.fixture(scope="module")
 def patients(tmp_path_factory):
-    """A finished run on a file of seven volumes: p0 is its test case, p1, p2 and p3 those of its training."""
+    """A finished run on a file of seven volumes: p0 is its test case, p1, p2 and p3 those of its
+    training.
+    """
     place = tmp_path_factory.mktemp("patients")
     rng = np.random.default_rng(0)
     write_volumes(place / "ct.h5", (volume(f"p{k}", rng) for k in range(7)))
-    options = [*OPTIONS, "scene=hdf5", f"scene.path={place}/ct.h5", "scene.crop=none", "data.batch_size=1"]
+    options = [
+        *OPTIONS,
+        "scene=hdf5",
+        f"scene.path={place}/ct.h5",
+        "scene.crop=none",
+        "data.batch_size=1",
+    ]
     options += ["data.sizes={train: 3, val: 1, test: 1}", f"hydra.run.dir={place}/run"]
     assert call(mvrecon.train, *options) == 0
     return place
@@ -277,17 +342,30 @@ def volume(name, rng):
 
 
 def test_patients_of_the_training_are_not_called_unseen(patients, tmp_path, capsys):
-    """An evaluation names the patients whose volumes trained the model, and its table does not call them unseen."""
-    sizes = [f"+data.sizes.{part}={size}" for part, size in {"train": 0, "val": 0, "test": 5}.items()]
-    assert call(mvrecon.eval, f"checkpoint={patients}/run", *sizes, f"hydra.run.dir={tmp_path}/eval") == 0
+    """An evaluation names the patients whose volumes trained the model, and its table does not call
+    them unseen.
+    """
+    sizes = [
+        f"+data.sizes.{part}={size}" for part, size in {"train": 0, "val": 0, "test": 5}.items()
+    ]
+    assert (
+        call(mvrecon.eval, f"checkpoint={patients}/run", *sizes, f"hydra.run.dir={tmp_path}/eval")
+        == 0
+    )
     table = json.loads((tmp_path / "eval" / "results.json").read_text())
-    assert table["scenes"] == [f"p{k}" for k in range(5)] and table["seen_in_training"] == ["p1", "p2", "p3"]
+    assert table["scenes"] == [f"p{k}" for k in range(5)] and table["seen_in_training"] == [
+        "p1",
+        "p2",
+        "p3",
+    ]
     printed = capsys.readouterr().out
     assert "5 scenes, 3 of them seen in training" in printed and "unseen" not in printed
 
 
 def test_data_that_have_changed_are_refused(patients, tmp_path, capsys):
-    """A data file that has changed since the training is an error of evaluation and of resumption."""
+    """A data file that has changed since the training is an error of evaluation and of
+    resumption.
+    """
     path = patients / "ct.h5"
     expected, whole = digests.of_file(path), path.read_bytes()
     rng = np.random.default_rng(1)
@@ -305,7 +383,9 @@ def test_data_that_have_changed_are_refused(patients, tmp_path, capsys):
 
 @pytest.mark.parametrize(("projector", "warned"), [("drr", False), ("halved", True)])
 def test_a_projector_that_does_not_make_the_views_is_told(projector, warned, recwarn):
-    """A run whose projector makes something else of the truth than the scene measures says so, once."""
+    """A run whose projector makes something else of the truth than the scene measures says so,
+    once.
+    """
     from mvrecon.parts import PROJECTORS
     from mvrecon.projectors.drr import Drr
 
@@ -319,4 +399,6 @@ def test_a_projector_that_does_not_make_the_views_is_told(projector, warned, rec
     agreement.warn_of_other_views(settings, fit.build_data(settings))
     lines = [str(w.message) for w in recwarn if "add up to" in str(w.message)]
     assert len(lines) == warned
-    assert all("projector=halved" in line and "line integrals (drr, radon)" in line for line in lines)
+    assert all(
+        "projector=halved" in line and "line integrals (drr, radon)" in line for line in lines
+    )

@@ -32,7 +32,11 @@ def test_warm_up_rises_evenly_to_the_top():
 def test_constant_stays_and_one_cycle_peaks_at_the_given_rate():
     assert set(rates("constant", 5)) == {2.0}
     found = rates("one_cycle", 20, warmup=0.5)
-    assert found[0] == pytest.approx(2 / 25) and found[10] == pytest.approx(2.0) and found[15] == pytest.approx(1.0)
+    assert (
+        found[0] == pytest.approx(2 / 25)
+        and found[10] == pytest.approx(2.0)
+        and found[15] == pytest.approx(1.0)
+    )
     assert found[5] == pytest.approx((2 + 2 / 25) / 2) and found[-1] < 0.05
 
 

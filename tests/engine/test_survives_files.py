@@ -20,7 +20,11 @@ SEED = int(os.environ.get("MVRECON_SEED", "0"))
 
 
 def checkpoint(step):
-    return {"global_step": step, "state_dict": {"w": torch.full((64,), float(step))}, "note": [1, (2.0, "x"), None]}
+    return {
+        "global_step": step,
+        "state_dict": {"w": torch.full((64,), float(step))},
+        "note": [1, (2.0, "x"), None],
+    }
 
 
 @pytest.fixture
@@ -54,7 +58,13 @@ def test_other_programs_read_the_file_as_any_checkpoint_of_torch(last):
 def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
     """One flipped bit in a checkpoint leads to the checkpoint before it, and both are named."""
     whole, rng = last.read_bytes(), random.Random(SEED)
-    for place in [0, 21, *rng.sample(range(len(whole) - storage.COMMENT), 60), len(whole) - 1, len(whole) - 20]:
+    for place in [
+        0,
+        21,
+        *rng.sample(range(len(whole) - storage.COMMENT), 60),
+        len(whole) - 1,
+        len(whole) - 20,
+    ]:
         damaged = bytearray(whole)
         damaged[place] ^= 1 << rng.randrange(8)
         last.write_bytes(damaged)
@@ -68,7 +78,9 @@ def test_a_file_cut_short_leads_to_the_one_before(last, kept):
     """A checkpoint that is cut short leads to the one before it."""
     whole = last.read_bytes()
     last.write_bytes(whole[: min(int(kept * len(whole)), len(whole) - 1)])
-    with pytest.warns(RuntimeWarning, match=r"last\.ckpt is (damaged|cut short).*last\.previous\.ckpt"):
+    with pytest.warns(
+        RuntimeWarning, match=r"last\.ckpt is (damaged|cut short).*last\.previous\.ckpt"
+    ):
         assert step(last) == 3
 
 
@@ -99,10 +111,16 @@ def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
 
 
 @pytest.mark.door
-@pytest.mark.parametrize(("owner", "name"), [("os", "fsync"), ("pathlib.Path", "write_bytes"), ("torch", "save")])
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), MemoryError("no memory left")])
+@pytest.mark.parametrize(
+    ("owner", "name"), [("os", "fsync"), ("pathlib.Path", "write_bytes"), ("torch", "save")]
+)
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), MemoryError("no memory left")]
+)
 def test_what_goes_wrong_in_writing_is_told_and_leaves_both(last, monkeypatch, owner, name, error):
-    """A full disk or too little memory while a checkpoint is written is an error, and both older ones stay."""
+    """A full disk or too little memory while a checkpoint is written is an error, and both older
+    ones stay.
+    """
 
     def fail(*_, **__):
         raise error
@@ -120,7 +138,10 @@ def test_weights_that_are_not_finite_take_no_good_ones_place(last):
     """Weights that are not finite never replace good ones on the disk."""
     bad = checkpoint(9)
     bad["state_dict"]["w"][3] = float("nan")
-    with pytest.raises(FloatingPointError, match=r"last\.ckpt is not written: 1 weights are not finite, w among them"):
+    with pytest.raises(
+        FloatingPointError,
+        match=r"last\.ckpt is not written: 1 weights are not finite, w among them",
+    ):
         storage.write(last, bad)
     assert step(last) == 6
 
@@ -161,9 +182,13 @@ def test_global_random_numbers_go_on_where_they_were():
 
 @pytest.mark.door
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a process is forked and killed as on POSIX")
-@pytest.mark.parametrize(("name", "n"), [("fsync", 1), ("fsync", 2), ("replace", 1), ("replace", 2)])
+@pytest.mark.parametrize(
+    ("name", "n"), [("fsync", 1), ("fsync", 2), ("replace", 1), ("replace", 2)]
+)
 def test_a_kill_at_any_flush_or_rename_leaves_a_whole_checkpoint(last, name, n):
-    """A kill at any flush or rename while a checkpoint is written leaves the old or the new one, whole."""
+    """A kill at any flush or rename while a checkpoint is written leaves the old or the new one,
+    whole.
+    """
     child = os.fork()
     if not child:
         try:
@@ -179,7 +204,9 @@ def test_a_kill_at_any_flush_or_rename_leaves_a_whole_checkpoint(last, name, n):
 
 @pytest.mark.door
 def test_a_file_that_may_not_grow_leaves_the_last_checkpoint(last):
-    """A checkpoint that the kernel does not let grow is an error; the last one stays and nothing is left half done."""
+    """A checkpoint that the kernel does not let grow is an error; the last one stays and nothing is
+    left half done.
+    """
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))

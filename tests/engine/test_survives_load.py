@@ -21,7 +21,13 @@ def crowded(root, tmp_path):
         command = [sys.executable, "-m", "tests.engine.crowd", kind, str(tmp_path)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         done = subprocess.run(
-            command, cwd=root, env=environment, capture_output=True, text=True, timeout=900, check=False
+            command,
+            cwd=root,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=900,
+            check=False,
         )
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout.splitlines()[-1])
@@ -42,7 +48,9 @@ def test_runs_of_one_sweep_at_once_each_leave_their_own_results(crowded, tmp_pat
     """Runs of a sweep at once leave their own results in their own folders."""
     answers = crowded("sweep")
     assert [code for code, _ in answers] == [0] * crowd.RUNS, answers
-    assert len({answer.split()[1] for _, answer in answers}) == crowd.RUNS, "four seeds, four results"
+    assert len({answer.split()[1] for _, answer in answers}) == crowd.RUNS, (
+        "four seeds, four results"
+    )
     for k, (_, answer) in enumerate(answers):
         run = tmp_path / "sweep" / str(k)
         found = json.loads((run / "results.json").read_text())

@@ -1,4 +1,6 @@
-"""Files that say what is not so: volume files (HDF5) and NIfTI whose declarations a reader must not believe."""
+"""Files that say what is not so: volume files (HDF5) and NIfTI whose declarations a reader must not
+believe.
+"""
 
 import gzip
 from collections.abc import Callable
@@ -22,7 +24,9 @@ def instead(name: str, **made: Any) -> Change:
 
 
 def linked(kind: str) -> Change:
-    """Puts a way to another file, or to another dataset, in the place of `ct`: virtual, raw, external or soft."""
+    """Puts a way to another file, or to another dataset, in the place of `ct`: virtual, raw,
+    external or soft.
+    """
 
     def change(file: h5py.File) -> None:
         dataset: Any = file["ct"]
@@ -35,7 +39,11 @@ def linked(kind: str) -> Change:
         elif kind == "raw":
             file.create_dataset("ct", shape, "i2", external=[("other.raw", 0, h5py.h5f.UNLIMITED)])
         else:
-            file["ct"] = h5py.ExternalLink("other.h5", "ct") if kind == "external" else h5py.SoftLink("/spacing")
+            file["ct"] = (
+                h5py.ExternalLink("other.h5", "ct")
+                if kind == "external"
+                else h5py.SoftLink("/spacing")
+            )
 
     return change
 
@@ -45,27 +53,57 @@ HUGE = {"shape": (2, 2**14, 2**14, 2**14), "dtype": "i2"}
 #: What is done to a file of two volumes, and what the refusal says.
 DECLARED: dict[str, tuple[Change, str]] = {
     "a huge contiguous shape": (instead("ct", **HUGE), "'/ct' declares"),
-    "a huge chunked shape": (instead("ct", **HUGE, chunks=(1, 64, 64, 64), compression="gzip"), "'/ct' declares"),
-    "more than 2^63 bytes": (
-        instead("ct", shape=(2, 2**20, 2**20, 2**20), dtype="f8", chunks=(1, 8, 8, 8), compression="gzip"),
+    "a huge chunked shape": (
+        instead("ct", **HUGE, chunks=(1, 64, 64, 64), compression="gzip"),
         "'/ct' declares",
     ),
-    "too few bytes": (instead("ct", shape=(2, 256, 256, 256), dtype="i2", chunks=(1, 256, 256, 256)), "'/ct' declares"),
+    "more than 2^63 bytes": (
+        instead(
+            "ct",
+            shape=(2, 2**20, 2**20, 2**20),
+            dtype="f8",
+            chunks=(1, 8, 8, 8),
+            compression="gzip",
+        ),
+        "'/ct' declares",
+    ),
+    "too few bytes": (
+        instead("ct", shape=(2, 256, 256, 256), dtype="i2", chunks=(1, 256, 256, 256)),
+        "'/ct' declares",
+    ),
     "a plugin's filter": (
         instead("ct", shape=(2, 4, 4, 4), dtype="i2", chunks=(1, 4, 4, 4), compression="lzf"),
         "has the filters .*expected gzip",
     ),
     "an object": (instead("ct", shape=(2, 4, 4, 4), dtype=h5py.vlen_dtype("i2")), "ct object"),
     "references": (instead("ct", shape=(2, 4, 4, 4), dtype=h5py.ref_dtype), "ct object"),
-    "a compound": (instead("ct", shape=(2, 4, 4, 4), dtype=np.dtype([("a", "i2")])), "ct .*expected numbers"),
+    "a compound": (
+        instead("ct", shape=(2, 4, 4, 4), dtype=np.dtype([("a", "i2")])),
+        "ct .*expected numbers",
+    ),
     "an empty space": (instead("ct", data=h5py.Empty("i2")), "'/ct' is empty"),
-    "a named type": (lambda f: (f.pop("ct"), f.__setitem__("ct", np.dtype("i2"))), "is a link, a group or stored"),
+    "a named type": (
+        lambda f: (f.pop("ct"), f.__setitem__("ct", np.dtype("i2"))),
+        "is a link, a group or stored",
+    ),
     "infinite spacing": (instead("spacing", data=np.full((2, 3), np.inf)), "expected positive mm"),
     "tiny spacing": (instead("spacing", data=np.full((2, 3), 1e-300)), "expected positive mm"),
-    "many spacings": (instead("spacing", shape=(2**40, 3), dtype="f8", chunks=(8, 3)), "'/spacing' declares"),
-    "attributes of numbers": (lambda f: f.attrs.update(units=np.arange(1000)), "attribute 'units' is int64"),
-    "many attributes": (lambda f: f.attrs.update(axes=["z", "y", "x"]), r"attribute 'axes' is object \(3,\)"),
-    "bytes that are no text": (lambda f: f.attrs.create("axes", b"\xff\xfe\xff", dtype="S3"), "UnicodeDecodeError"),
+    "many spacings": (
+        instead("spacing", shape=(2**40, 3), dtype="f8", chunks=(8, 3)),
+        "'/spacing' declares",
+    ),
+    "attributes of numbers": (
+        lambda f: f.attrs.update(units=np.arange(1000)),
+        "attribute 'units' is int64",
+    ),
+    "many attributes": (
+        lambda f: f.attrs.update(axes=["z", "y", "x"]),
+        r"attribute 'axes' is object \(3,\)",
+    ),
+    "bytes that are no text": (
+        lambda f: f.attrs.create("axes", b"\xff\xfe\xff", dtype="S3"),
+        "UnicodeDecodeError",
+    ),
 }
 
 

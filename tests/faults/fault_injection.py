@@ -1,4 +1,6 @@
-"""Trouble at a chosen moment of this process, and whether what was left is the same to the last bit."""
+"""Trouble at a chosen moment of this process, and whether what was left is the same to the last
+bit.
+"""
 
 import os
 from collections.abc import Callable
@@ -21,7 +23,9 @@ def counted(owner: Any, name: str, n: int, what: Callable[[], object]) -> None:
 
 
 def signalled(number: int) -> Callable[[], None]:
-    """What sends this process a signal; SIGKILL is how the kernel ends it: nothing is caught, nothing flushed."""
+    """What sends this process a signal; SIGKILL is how the kernel ends it: nothing is caught,
+    nothing flushed.
+    """
     return lambda: os.kill(os.getpid(), number)
 
 
@@ -39,6 +43,12 @@ def different(a: Any, b: Any, where: str = "") -> list[str]:
     if isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
         return [place for key in a for place in different(a[key], b[key], f"{where}/{key}")]
     if isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
-        return [place for i, pair in enumerate(zip(a, b, strict=True)) for place in different(*pair, f"{where}/{i}")]
-    same = torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else a == b
+        return [
+            place
+            for i, pair in enumerate(zip(a, b, strict=True))
+            for place in different(*pair, f"{where}/{i}")
+        ]
+    same = (
+        torch.equal(a, b) if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) else a == b
+    )
     return [] if same else [where]

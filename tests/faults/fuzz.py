@@ -1,4 +1,6 @@
-"""Damaged copies of a file, and what a reader makes of them; for tests of any reader, a plugin's included."""
+"""Damaged copies of a file, and what a reader makes of them; for tests of any reader, a plugin's
+included.
+"""
 
 import struct
 import time
@@ -17,11 +19,16 @@ EXTREMES = [
     for size in (1, 2, 4, 8)
     for value in (0, 2 ** (8 * size - 1) - 1, 2 ** (8 * size) - 1)
     for order in ("little", "big")
-] + [struct.pack(kind, value) for kind in ("<f", "<d") for value in (float("nan"), float("inf"), -1e30)]
+] + [
+    struct.pack(kind, value)
+    for kind in ("<f", "<d")
+    for value in (float("nan"), float("inf"), -1e30)
+]
 
 
 def mutations(data: bytes, rng: Random, count: int) -> Iterator[bytes]:
-    """Damaged copies of a file's bytes: cut short, bits flipped, numbers made extreme, blocks lost, moved or added.
+    """Damaged copies of a file's bytes: cut short, bits flipped, numbers made extreme, blocks lost,
+    moved or added.
 
     Args:
         data: the whole file; not empty.
@@ -65,7 +72,9 @@ def _moved(data: bytes, rng: Random) -> bytes:
 
 def _longer(data: bytes, rng: Random) -> bytes:
     place = rng.choice((len(data), _place(data, rng)))
-    added = rng.choice((b"\0", b"\xff", data[:64] or b"\0", rng.randbytes(16))) * rng.choice((1, 64, 4096))
+    added = rng.choice((b"\0", b"\xff", data[:64] or b"\0", rng.randbytes(16))) * rng.choice(
+        (1, 64, 4096)
+    )
     return data[:place] + added + data[place:]
 
 
@@ -82,8 +91,10 @@ class Tally:
         inputs: files given to it.
         read: files that it read, for the damage left them valid.
         seconds: the slowest took, of this process's own time.
-        peak: bytes by which this process's largest size grew, native libraries included; 0 where no one tells.
-        failures: what must not be: another exception, or a message without the file's name; a line each.
+        peak: bytes by which this process's largest size grew, native libraries included; 0 where no
+            one tells.
+        failures: what must not be: another exception, or a message without the file's name; a line
+            each.
     """
 
     inputs: int = 0
@@ -104,7 +115,9 @@ def tally(read: Callable[[Path], object], cases: Iterable[bytes], path: Path) ->
             found.read += 1
         except REFUSALS as error:
             if path.name not in str(error):
-                found.failures.append(f"case {found.inputs}: {type(error).__name__} without the file's name: {error}")
+                found.failures.append(
+                    f"case {found.inputs}: {type(error).__name__} without the file's name: {error}"
+                )
         except Exception as error:  # whatever it is, a reader must not raise it
             found.failures.append(f"case {found.inputs}: {type(error).__name__}: {error}")
         found.seconds = max(found.seconds, time.process_time() - start)

@@ -1,4 +1,6 @@
-"""Fuzz every reader here and write what came of it as JSON: python -m tests.faults.fuzzing SEED COUNT OUT."""
+"""Fuzz every reader here and write what came of it as JSON: python -m tests.faults.fuzzing SEED
+COUNT OUT.
+"""
 
 import faulthandler
 import json
@@ -11,7 +13,8 @@ from random import Random
 from tests.faults.fuzz import mutations, tally
 from tests.faults.samples import samples
 
-#: Bytes that may be added to what the process uses once all is imported; seconds for all cases of a reader.
+#: Bytes that may be added to what the process uses once all is imported; seconds for all cases of a
+#: reader.
 MEMORY, SECONDS = 2 * 2**30, 60
 
 

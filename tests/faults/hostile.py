@@ -1,4 +1,5 @@
-"""What was made to harm: configs, experiments and pickles that would run something if they were believed.
+"""What was made to harm: configs, experiments and pickles that would run something if they were
+believed.
 
 Each would leave a file, the sentinel, behind; where it is not there, nothing ran.
 """
@@ -25,7 +26,9 @@ class Payload:
 
 
 def targets(sentinel: Path) -> dict[str, dict[str, Any]]:
-    """Nodes of a config that would make the sentinel if they were built; one unpickles `payload.ckpt` beside it."""
+    """Nodes of a config that would make the sentinel if they were built; one unpickles
+    `payload.ckpt` beside it.
+    """
     touch = f"touch {sentinel}"
     pickled = sentinel.with_name("payload.ckpt")
     timer = {"_target_": "lightning.pytorch.callbacks.Timer"}
@@ -34,12 +37,30 @@ def targets(sentinel: Path) -> dict[str, dict[str, Any]]:
     return {
         "direct": {"_target_": "os.system", "command": touch},
         "builtin": {"_target_": "builtins.eval", "source": f"open({str(sentinel)!r}, 'w')"},
-        "through a module's import": {"_target_": "lightning.pytorch.trainer.trainer.os.system", "command": touch},
+        "through a module's import": {
+            "_target_": "lightning.pytorch.trainer.trainer.os.system",
+            "command": touch,
+        },
         "through another package": {"_target_": "logging.os.system", "command": touch},
-        "a function that calls": {"_target_": call, "args": touch, "init": {"class_path": "os.system"}},
-        "a function that writes": {"_target_": "mvrecon.engine.record.write", "path": str(sentinel), "text": "x"},
-        "a method that unpickles": {"_target_": load, "checkpoint_path": str(pickled), "weights_only": False},
-        "a class of another kind": {"_target_": "lightning.pytorch.Trainer", "default_root_dir": str(sentinel)},
+        "a function that calls": {
+            "_target_": call,
+            "args": touch,
+            "init": {"class_path": "os.system"},
+        },
+        "a function that writes": {
+            "_target_": "mvrecon.engine.record.write",
+            "path": str(sentinel),
+            "text": "x",
+        },
+        "a method that unpickles": {
+            "_target_": load,
+            "checkpoint_path": str(pickled),
+            "weights_only": False,
+        },
+        "a class of another kind": {
+            "_target_": "lightning.pytorch.Trainer",
+            "default_root_dir": str(sentinel),
+        },
         "nested": {**timer, "duration": {"_target_": "os.system", "command": touch}},
         "nested in a list": {**timer, "duration": [{"_target_": "os.system", "command": touch}]},
         "partial": {**timer, "_partial_": True},
@@ -49,7 +70,9 @@ def targets(sentinel: Path) -> dict[str, dict[str, Any]]:
 
 
 def experiments(sentinel: Path) -> dict[str, str]:
-    """Experiments that tell Hydra itself what to do; each made the sentinel, or opened a way to, before the guard."""
+    """Experiments that tell Hydra itself what to do; each made the sentinel, or opened a way to,
+    before the guard.
+    """
     touch, call = f'"touch {sentinel}"', "lightning.pytorch.cli.instantiate_class"
     evil = f"{{_target_: {call}, args: {touch}, init: {{class_path: os.system}}}}"
     handler = f"{{class: {call}, args: {touch}, init: {{class_path: os.system}}}}"
@@ -65,8 +88,13 @@ def experiments(sentinel: Path) -> dict[str, str]:
 
 
 def experiment(folder: Path, text: str, **files: str) -> list[str]:
-    """An experiment in a folder that was fetched from somewhere; returns the overrides that choose it."""
-    for name, content in {"experiment/evil.yaml": f"# @package _global_\n{text}\n", **files}.items():
+    """An experiment in a folder that was fetched from somewhere; returns the overrides that choose
+    it.
+    """
+    for name, content in {
+        "experiment/evil.yaml": f"# @package _global_\n{text}\n",
+        **files,
+    }.items():
         (folder / name).parent.mkdir(exist_ok=True, parents=True)
         (folder / name).write_text(content)
     return [f"hydra.searchpath=[file://{folder}]", "experiment=evil"]
@@ -89,7 +117,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 def pickles(sentinel: Path) -> dict[str, bytes]:
-    """Pickles of every protocol that would make the sentinel, or take what torch's own list allows."""
+    """Pickles of every protocol that would make the sentinel, or take what torch's own list
+    allows.
+    """
     payload, text = Payload(f"touch {sentinel}"), f"touch {sentinel}".encode()
     found = {f"protocol {k}": pickle.dumps(payload, protocol=k) for k in range(6)}
     return found | {
@@ -113,9 +143,15 @@ def saved(value: Any) -> bytes:
 def with_pickle(archive: bytes, pickle: bytes) -> bytes:
     """A checkpoint with another pickle in it, every checksum right."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(archive)) as old, zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as new:
+    with (
+        zipfile.ZipFile(io.BytesIO(archive)) as old,
+        zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as new,
+    ):
         for member in old.infolist():
-            new.writestr(member.filename, pickle if member.filename.endswith("data.pkl") else old.read(member))
+            new.writestr(
+                member.filename,
+                pickle if member.filename.endswith("data.pkl") else old.read(member),
+            )
     return buffer.getvalue()
 
 

@@ -11,7 +11,10 @@ from mvrecon.registry import GROUP, installed
 
 @contextmanager
 def plugin(
-    folder: Path, points: Mapping[str, str], modules: Mapping[str, str] | None = None, name: str = "stressed"
+    folder: Path,
+    points: Mapping[str, str],
+    modules: Mapping[str, str] | None = None,
+    name: str = "stressed",
 ) -> Iterator[None]:
     """A distribution with entry points for mvrecon, on Python's path meanwhile.
 
@@ -23,7 +26,9 @@ def plugin(
     """
     about = folder / f"{name}-1.0.dist-info"
     about.mkdir(parents=True)
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", encoding="utf-8")
+    (about / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", encoding="utf-8"
+    )
     lines = [f"[{GROUP}]", *(f"{point} = {where}" for point, where in points.items()), ""]
     (about / "entry_points.txt").write_text("\n".join(lines), encoding="utf-8")
     for module, source in (modules or {}).items():

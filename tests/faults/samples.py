@@ -22,7 +22,13 @@ from tests.faults.hostile import pickle_of, saved, with_pickle
 
 Wrap = Callable[[bytes], bytes]
 HU = np.arange(6 * 7 * 8, dtype=np.int16).reshape(6, 7, 8)
-RIG = {"name": "circular", "views": 3, "sid": 300.0, "sdd": 450.0, "detector": {"pixels": [10, 12], "pixel_mm": 9.0}}
+RIG = {
+    "name": "circular",
+    "views": 3,
+    "sid": 300.0,
+    "sdd": 450.0,
+    "detector": {"pixels": [10, 12], "pixel_mm": 9.0},
+}
 #: A method of few weights, as a run keeps its settings.
 METHOD = {
     "geometry": {
@@ -42,7 +48,11 @@ def checkpoint() -> dict[str, Any]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         module = ReconstructionModule(**METHOD)
-    kept = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams), "global_step": 3}
+    kept = {
+        "state_dict": module.state_dict(),
+        "hyper_parameters": dict(module.hparams),
+        "global_step": 3,
+    }
     return {**kept, "callbacks": {"Clock": {"seconds": 1.5}}, "pytorch-lightning_version": "2.6.6"}
 
 
@@ -53,11 +63,16 @@ def read_volumes(path: Path) -> list[Stored]:
 
 
 def samples(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, str]]:
-    """By reader: how it reads, what is damaged, what is put around the damaged bytes, and the file's ending.
+    """By reader: how it reads, what is damaged, what is put around the damaged bytes, and the
+    file's ending.
 
     NIfTI is among them where nibabel is installed.
     """
-    write_volumes(folder / "a.h5", [Stored(f"p{k}", HU + k, (3.0, 2.0, 2.0)) for k in range(3)], orientation="LPI")
+    write_volumes(
+        folder / "a.h5",
+        [Stored(f"p{k}", HU + k, (3.0, 2.0, 2.0)) for k in range(3)],
+        orientation="LPI",
+    )
     save(CAMERAS.from_config(RIG), folder / "a.json")
     hdf5, rig = ((folder / f"a.{suffix}").read_bytes() for suffix in ("h5", "json"))
     archive, whole = saved(checkpoint()), bytes
@@ -79,6 +94,11 @@ def _nifti(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, 
     nifti = (folder / "a.nii").read_bytes()
     return {
         "NIfTI": (read_nifti, nifti, bytes, ".nii"),
-        "NIfTI, then packed": (read_nifti, nifti, partial(gzip.compress, compresslevel=1), ".nii.gz"),
+        "NIfTI, then packed": (
+            read_nifti,
+            nifti,
+            partial(gzip.compress, compresslevel=1),
+            ".nii.gz",
+        ),
         "NIfTI, packed": (read_nifti, gzip.compress(nifti), bytes, ".nii.gz"),
     }

@@ -18,7 +18,9 @@ def test_a_box_holds_what_is_there_and_no_plane_more():
 def test_an_empty_mask_has_an_empty_box_that_does_not_grow():
     box = Box.around(torch.zeros(4, 4, 4, dtype=torch.bool))
     assert box.size == box.grown(2, (4, 4, 4)).size == box.aligned(2, (4, 4, 4)).size == 0
-    assert box.joined(Box.whole((1, 2, 3))) == Box.whole((1, 2, 3)).joined(box) == Box.whole((1, 2, 3))
+    assert (
+        box.joined(Box.whole((1, 2, 3))) == Box.whole((1, 2, 3)).joined(box) == Box.whole((1, 2, 3))
+    )
 
 
 def test_growing_and_aligning_stay_inside_the_volume():
@@ -29,11 +31,16 @@ def test_growing_and_aligning_stay_inside_the_volume():
 
 
 def test_a_cropped_grid_keeps_its_voxels_where_they_are():
-    grid, box = Grid.centred((6, 7, 8), (1.0, 2.0, 3.0), (9.0, -4.0, 1.0)), Box((1, 2, 3), (4, 7, 5))
+    grid, box = (
+        Grid.centred((6, 7, 8), (1.0, 2.0, 3.0), (9.0, -4.0, 1.0)),
+        Box((1, 2, 3), (4, 7, 5)),
+    )
     assert torch.equal(voxel_centres(grid.cropped(box)), voxel_centres(grid)[box.slices])
 
 
-@pytest.mark.parametrize("box", [Box((0, 0, 0), (0, 1, 1)), Box((0, 0, 0), (1, 1, 9)), Box((-1, 0, 0), (1, 1, 1))])
+@pytest.mark.parametrize(
+    "box", [Box((0, 0, 0), (0, 1, 1)), Box((0, 0, 0), (1, 1, 9)), Box((-1, 0, 0), (1, 1, 1))]
+)
 def test_a_grid_is_not_cropped_to_nothing_or_beyond(box):
     with pytest.raises(ValueError, match="cannot be cropped"):
         Grid.centred((6, 7, 8), 1.0).cropped(box)
@@ -44,5 +51,7 @@ def test_a_part_is_put_back_where_it_was_cut_out():
     part = whole[:, *box.slices]
     assert torch.equal(whole[:, *outer.slices][:, *box.within(outer)], part)
     back = placed(part, box, (7, 8, 9))
-    assert torch.equal(back[:, *box.slices], part) and back.sum() == pytest.approx(part.sum().item())
+    assert torch.equal(back[:, *box.slices], part) and back.sum() == pytest.approx(
+        part.sum().item()
+    )
     assert box.margins(outer) == [0, 1, 2, 0, 1, 2]

@@ -11,13 +11,19 @@ def test_voxel_centres_surround_the_grid_centre():
     grid = Grid.centred((4, 6, 8), (1.0, 2.0, 3.0), centre=(10.0, 20.0, 30.0))
     xyz = voxel_centres(grid)
     assert xyz.shape == (4, 6, 8, 3)
-    assert torch.allclose(xyz.mean(dim=(0, 1, 2)), torch.tensor([10.0, 20.0, 30.0], dtype=torch.float64))
-    assert torch.allclose(xyz[1, 2, 3] - xyz[0, 1, 2], torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    assert torch.allclose(
+        xyz.mean(dim=(0, 1, 2)), torch.tensor([10.0, 20.0, 30.0], dtype=torch.float64)
+    )
+    assert torch.allclose(
+        xyz[1, 2, 3] - xyz[0, 1, 2], torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    )
 
 
 def test_index_and_world_are_inverse_on_an_oblique_grid():
     affine = torch.eye(4, dtype=torch.float64)
-    affine[:3, :3] += 0.2 * torch.rand(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    affine[:3, :3] += 0.2 * torch.rand(
+        3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     affine[:3, 3] = torch.tensor([100.0, -50.0, 7.0])
     grid = Grid((3, 4, 5), affine)
     xyz = torch.randn(20, 3, dtype=torch.float64)
@@ -27,7 +33,12 @@ def test_index_and_world_are_inverse_on_an_oblique_grid():
 def test_refined_grid_fills_the_same_box():
     grid = Grid.centred((4, 6, 8), (1.0, 2.0, 3.0))
     assert torch.allclose(grid.refined(3).corners(), grid.corners())
-    coarse = voxel_centres(grid.refined(3)).unflatten(0, (4, 3)).unflatten(2, (6, 3)).unflatten(4, (8, 3))
+    coarse = (
+        voxel_centres(grid.refined(3))
+        .unflatten(0, (4, 3))
+        .unflatten(2, (6, 3))
+        .unflatten(4, (8, 3))
+    )
     assert torch.allclose(coarse.mean(dim=(1, 3, 5)), voxel_centres(grid))
 
 
@@ -40,7 +51,9 @@ def test_spacing_must_be_positive(spacing):
 @pytest.mark.parametrize("shape", [(0, 2, 2), (8, 0, 8), (2, 2), (2, 2, 2, 2)])
 def test_shape_must_be_three_positive_sizes(shape):
     for build in (lambda: Grid(shape, torch.eye(4)), lambda: Grid.centred(shape, 1.0)):
-        with pytest.raises(ValueError, match=rf"three positive sizes \(z, y, x\), got {re.escape(str(shape))}"):
+        with pytest.raises(
+            ValueError, match=rf"three positive sizes \(z, y, x\), got {re.escape(str(shape))}"
+        ):
             build()
 
 
@@ -57,7 +70,9 @@ def test_pixel_zero_is_centred_at_zero():
 def test_sampling_at_voxel_centres_is_exact_and_axes_are_xyz():
     volume = torch.randn(1, 1, 3, 4, 5)
     index = torch.tensor([[[[[4.0, 1.0, 2.0]]]]])  # x = 4, y = 1, z = 2
-    assert sample(volume, normalised(index, (3, 4, 5))).item() == pytest.approx(volume[0, 0, 2, 1, 4].item(), rel=1e-5)
+    assert sample(volume, normalised(index, (3, 4, 5))).item() == pytest.approx(
+        volume[0, 0, 2, 1, 4].item(), rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30])

@@ -40,7 +40,9 @@ def test_euler_rotations_of_a_batch():
     torch.testing.assert_close(R[0, 1] @ EYE[0], EYE[1], atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize(("angles", "axes"), [((1, 2), "zyz"), (5.0, "zyz"), ((1, 2, 3), "zy"), ((1, 2, 3), "abc")])
+@pytest.mark.parametrize(
+    ("angles", "axes"), [((1, 2), "zyz"), (5.0, "zyz"), ((1, 2, 3), "zy"), ((1, 2, 3), "abc")]
+)
 def test_bad_euler_angles_are_refused(angles, axes):
     with pytest.raises(ValueError, match="Euler .* got"):
         euler_rotation(angles, axes)

@@ -30,4 +30,6 @@ def test_gathered_values_at_voxel_centres_are_the_voxels():
     z, y, x = torch.meshgrid(torch.arange(2), torch.arange(3), torch.arange(4), indexing="ij")
     index = torch.stack([x, y, z], dim=-1).double()
     points = (2 * index + 1) / torch.tensor([4, 3, 2]) - 1
-    assert torch.allclose(gathered(volume.double(), points[None]), volume.double(), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        gathered(volume.double(), points[None]), volume.double(), rtol=0, atol=1e-12
+    )

@@ -32,7 +32,9 @@ def ellipsoids(count: int = 7) -> Phantom:
 
 @pytest.fixture(scope="module", params=RIGS)
 def errors(request) -> tuple[str, dict[str, float], dict[str, float]]:
-    """Of each method with 1 and 4 rays a pixel, relative to the pixel averages and to the thin rays."""
+    """Of each method with 1 and 4 rays a pixel, relative to the pixel averages and to the thin
+    rays.
+    """
     rig, solids = RIGS[request.param], ellipsoids()
     x = voxelise(solids, GRID)[None, None].double()
     fine = solids.integrals(*rig.refined(4).rays(), extent=rig.limits)

@@ -1,6 +1,8 @@
-"""The kernels of the CUDA back end against the reference: on a device where there is one, else in numba's simulator.
+"""The kernels of the CUDA back end against the reference: on a device where there is one, else in
+numba's simulator.
 
-The simulator must be chosen before numba is imported, so one test runs this file again in a process of its own.
+The simulator must be chosen before numba is imported, so one test runs this file again in a process
+of its own.
 """
 
 import os
@@ -22,7 +24,9 @@ from tests.projectors.rigs import GRID, PARALLEL, PINHOLES
 
 SIMULATED = os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
 DEVICE = "cuda" if torch.cuda.is_available() and not SIMULATED else "cpu"
-kernels = pytest.mark.skipif(not SIMULATED and DEVICE == "cpu", reason="no CUDA device and no simulator")
+kernels = pytest.mark.skipif(
+    not SIMULATED and DEVICE == "cpu", reason="no CUDA device and no simulator"
+)
 
 whole = Occupancy.whole
 SMALL = Grid.centred((5, 4, 6), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
@@ -39,7 +43,9 @@ CASES = [(kind, method) for kind in RIGS for method in METHODS]
 
 @pytest.fixture(autouse=True)
 def few_threads(monkeypatch):
-    """A thread of the simulator is one of the interpreter, so idle ones cost as much as busy ones."""
+    """A thread of the simulator is one of the interpreter, so idle ones cost as much as busy
+    ones.
+    """
     if SIMULATED:
         monkeypatch.setattr("mvrecon.kernels.rays.cuda.BLOCK", 32)
         monkeypatch.setattr("mvrecon.kernels.rays.cuda_loops.BLOCK", 32)
@@ -55,18 +61,37 @@ def scene(kind: str, dtype: torch.dtype = torch.float64, count: int = 1):
 
 
 def close(one: torch.Tensor, two: torch.Tensor, tolerance: float = 1e-11) -> bool:
-    return two.abs().max() > 0 and torch.allclose(one, two, rtol=0, atol=tolerance * float(two.abs().max()))
+    return two.abs().max() > 0 and torch.allclose(
+        one, two, rtol=0, atol=tolerance * float(two.abs().max())
+    )
 
 
 @pytest.mark.skipif(SIMULATED, reason="is the simulator")
 def test_in_the_simulator():
     pytest.importorskip("numba")
     # numba cannot compile the arrays of its simulator: everything runs as Python
-    environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.getcwd()}
+    environment = os.environ | {
+        "NUMBA_ENABLE_CUDASIM": "1",
+        "NUMBA_DISABLE_JIT": "1",
+        "PYTHONPATH": os.getcwd(),
+    }
     environment.pop("PYTEST_XDIST_WORKER", None)
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", __file__]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+        __file__,
+    ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
-    assert done.returncode == 0 and "passed" in done.stdout, done.stdout[-4000:] + done.stderr[-2000:]
+    assert done.returncode == 0 and "passed" in done.stdout, (
+        done.stdout[-4000:] + done.stderr[-2000:]
+    )
 
 
 @kernels
@@ -92,9 +117,13 @@ def test_backproject(kind, method):
 
 
 @kernels
-@pytest.mark.parametrize(("kind", "method"), [(kind, method) for kind, method in CASES if kind in ("dome", "parallel")])
+@pytest.mark.parametrize(
+    ("kind", "method"), [(kind, method) for kind, method in CASES if kind in ("dome", "parallel")]
+)
 def test_a_part_of_a_volume(kind, method):
-    """What is held of a volume is read and written as the rest of it would be, were it zero or left out."""
+    """What is held of a volume is read and written as the rest of it would be, were it zero or left
+    out.
+    """
     from mvrecon.kernels.rays import cuda
 
     x, y, lines, window, detector = scene(kind)
@@ -134,7 +163,9 @@ def test_lines_vjp(kind, method, monkeypatch):
     x, y, lines, window, detector = scene(kind)
     monkeypatch.setattr(cuda, "THREADS", 16)  # several pixels a thread
     moving = lines.clone().requires_grad_()
-    (expected,) = torch.autograd.grad((reference.project(x, moving, window, detector, method) * y).sum(), moving)
+    (expected,) = torch.autograd.grad(
+        (reference.project(x, moving, window, detector, method) * y).sum(), moving
+    )
     assert close(cuda.lines_vjp(x, y, lines, window, whole(x.shape[1:]), method), expected, 1e-9)
 
 
@@ -153,7 +184,10 @@ def test_several_volumes_share_their_rays(method):
     expected = reference.backproject(y, lines, window, shape, method)
     assert close(cuda.backproject(y, lines, window, whole(shape), method), expected)
     assert close(cuda.scatter(y, lines, window, whole(shape), method), expected)
-    apart = sum(cuda.lines_vjp(x[i : i + 1], y[i : i + 1], lines, window, whole(x.shape[1:]), method) for i in range(6))
+    apart = sum(
+        cuda.lines_vjp(x[i : i + 1], y[i : i + 1], lines, window, whole(x.shape[1:]), method)
+        for i in range(6)
+    )
     assert close(cuda.lines_vjp(x, y, lines, window, whole(x.shape[1:]), method), apart)
 
 
@@ -216,7 +250,9 @@ def test_rays_given_one_by_one(method):
     y = torch.randn(1, len(lines), 1, 1, dtype=torch.float64, device=DEVICE)
     window, shape = list(cameras.limits), list(x.shape[1:])
     views = cuda.project(x, lines, window, whole(x.shape[1:]), [1, 1], method)
-    expected = reference.project(x, lines_of(cameras, grid).to(DEVICE), window, list(cameras.shape), method)
+    expected = reference.project(
+        x, lines_of(cameras, grid).to(DEVICE), window, list(cameras.shape), method
+    )
     assert close(views.flatten(), expected.flatten())
     volume = cuda.backproject(y, lines, window, whole(shape), method)
     assert torch.isclose((views * y).sum(), (x * volume).sum(), rtol=1e-11)
@@ -268,14 +304,20 @@ def test_the_scene_of_the_check_has_rays_of_every_main_axis():
     lines, window, detector, shape = selfcheck.tiny_scene("cpu")
     centre = lines[:, 0, :, 2].abs().argmax(dim=1)
     assert sorted(centre.tolist()) == [0, 1, 2]
-    views = reference.project(torch.ones(1, *shape, dtype=torch.float64), lines, window, detector, "siddon")
+    views = reference.project(
+        torch.ones(1, *shape, dtype=torch.float64), lines, window, detector, "siddon"
+    )
     assert ((views > 0).sum(dim=(2, 3)) > 10).all()
 
 
 def rays_as_views(grid: Grid, cameras: Cameras) -> torch.Tensor:
     """Every ray of a rig as a view of one pixel: maps of the constant alone."""
     rows, columns = cameras.shape
-    v, u = torch.meshgrid(torch.arange(rows) - (rows - 1) / 2, torch.arange(columns) - (columns - 1) / 2, indexing="ij")
+    v, u = torch.meshgrid(
+        torch.arange(rows) - (rows - 1) / 2,
+        torch.arange(columns) - (columns - 1) / 2,
+        indexing="ij",
+    )
     p = torch.stack([u, v, torch.ones_like(u)], dim=-1).double().reshape(-1, 3)
     maps = torch.einsum("mkxc,rc->mrkx", lines_of(cameras, grid), p)
     return maps.flatten(0, 1)[..., None].contiguous().to(DEVICE)

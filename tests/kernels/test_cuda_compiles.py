@@ -1,4 +1,6 @@
-"""Every kernel of the CUDA back end is compiled for a device with none at hand: numba-cuda needs no driver for it."""
+"""Every kernel of the CUDA back end is compiled for a device with none at hand: numba-cuda needs no
+driver for it.
+"""
 
 from types import SimpleNamespace
 
@@ -20,7 +22,9 @@ METHODS = (JOSEPH, SIDDON, TRILINEAR)
 
 
 def compilable() -> bool:
-    if getattr(cuda, "implementation", "") != "NVIDIA":  # numba's own CUDA target knows no min and max of two numbers
+    if (
+        getattr(cuda, "implementation", "") != "NVIDIA"
+    ):  # numba's own CUDA target knows no min and max of two numbers
         return False
     try:
         cuda.compile_ptx(lambda x: None, types.void(float32), cc=HOPPER, device=False)
@@ -50,18 +54,30 @@ def test_project_keeps_all_in_registers(method):
     kernel = cuda_loops.project_kernel(method, 4, np.uint32)
     text = assembly(kernel, float32[::1], LINES, SCENE, float32[:, :, :, ::1])
     assert "ld.local" not in text and "call" not in text
-    assert "div.rn.f64" in text and "rcp" not in text  # a ray on a face stays on it: no division becomes a product
+    assert (
+        "div.rn.f64" in text and "rcp" not in text
+    )  # a ray on a face stays on it: no division becomes a product
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_scatter_adds_atomically(method):
     kernel = cuda_loops.scatter_kernel(method, 1, np.uint64)
     text = assembly(kernel, float32[:, :, :, ::1], LINES, SCENE, float32[::1])
-    assert ("atom.global.add.f32" in text or "red.global.add.f32" in text) and "ld.local" not in text
+    assert (
+        "atom.global.add.f32" in text or "red.global.add.f32" in text
+    ) and "ld.local" not in text
 
 
 def test_gather_needs_no_atomics():
-    arguments = float32[:, ::1], float32[:, ::1], float32[:, :, ::1], int32[:, ::1], SCENE, int64, float32[:, :, :, ::1]
+    arguments = (
+        float32[:, ::1],
+        float32[:, ::1],
+        float32[:, :, ::1],
+        int32[:, ::1],
+        SCENE,
+        int64,
+        float32[:, :, :, ::1],
+    )
     text = assembly(cuda_loops.gather_kernel(4), *arguments)
     assert "atom." not in text and "red." not in text and "ld.local" not in text
     assert assembly(cuda_loops.record_kernel(), LINES, SCENE, int64, *arguments[1:4])
@@ -70,4 +86,6 @@ def test_gather_needs_no_atomics():
 @pytest.mark.parametrize("method", METHODS)
 def test_vary_compiles(method):
     kernel = cuda_loops.vary_kernel(method)
-    assert assembly(kernel, float32[::1], float32[:, :, :, ::1], LINES, SCENE, float64[:, :, :, :, ::1])
+    assert assembly(
+        kernel, float32[::1], float32[:, :, :, ::1], LINES, SCENE, float64[:, :, :, :, ::1]
+    )

@@ -1,4 +1,6 @@
-"""Digits: far sources, far worlds, tiny and huge voxels, single precision, and halves in storage."""
+"""Digits: far sources, far worlds, tiny and huge voxels, single precision, and halves in
+storage.
+"""
 
 from dataclasses import replace
 
@@ -26,7 +28,9 @@ RIGS = {
 def elsewhere(rig, offset: float, voxel: float) -> Case:
     """The same picture in other units and at another place."""
     shift = torch.full((3,), offset, dtype=torch.float64)
-    scaled = replace(rig, **{name: voxel * getattr(rig, name) for name in ("source", "origin", "u", "v")})
+    scaled = replace(
+        rig, **{name: voxel * getattr(rig, name) for name in ("source", "origin", "u", "v")}
+    )
     grid = Grid.centred(SHAPE, [voxel * mm for mm in SPACING], shift.tolist())
     return Case(grid, scaled.moved(torch.eye(3), shift))
 
@@ -58,7 +62,9 @@ def test_halves_are_stored_and_summed_in_float32(kind, option, dtype, monkeypatc
     single = x.detach().float().requires_grad_()
     views, expected = A(x), A(single)
     assert views.dtype == torch.float32 and torch.equal(views, expected)
-    one, two = (torch.autograd.grad(y.square().sum(), v)[0] for y, v in ((views, x), (expected, single)))
+    one, two = (
+        torch.autograd.grad(y.square().sum(), v)[0] for y, v in ((views, x), (expected, single))
+    )
     assert one.dtype == dtype and torch.equal(one, two.to(dtype))
     back = A.T(views.detach().to(dtype))
     assert back.dtype == torch.float32 and torch.equal(back, A.T(views.detach().to(dtype).float()))

@@ -17,28 +17,40 @@ DETECTOR = {"pixels": [24, 24], "pixel_mm": 2.6}
 def phantom(kind: str, *semi_axes: float, rotated: bool = True) -> Phantom:
     """One solid of value one, turned at random."""
     torch.manual_seed(5)
-    R = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0] if rotated else torch.eye(3, dtype=torch.float64)
+    R = (
+        torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+        if rotated
+        else torch.eye(3, dtype=torch.float64)
+    )
     R = R * torch.linalg.det(R)
-    solid = Solids(kind, torch.tensor([[1.0, -2.0, 0.5]]), R[None], torch.tensor([semi_axes]), torch.ones(1))
+    solid = Solids(
+        kind, torch.tensor([[1.0, -2.0, 0.5]]), R[None], torch.tensor([semi_axes]), torch.ones(1)
+    )
     return Phantom((solid,))
 
 
 def box(grid: Grid) -> Phantom:
     """The grid's own box, of value one."""
-    half = torch.tensor([n * mm / 2 for n, mm in zip(grid.shape[::-1], grid.spacing, strict=True)], dtype=torch.float64)
+    half = torch.tensor(
+        [n * mm / 2 for n, mm in zip(grid.shape[::-1], grid.spacing, strict=True)],
+        dtype=torch.float64,
+    )
     eye = torch.eye(3, dtype=torch.float64)[None]
     return Phantom((Solids("box", grid.centre[None], eye, half[None], torch.ones(1)),))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
-    "rig", [circular(7, 50.0, 90.0, DETECTOR, start_degrees=3.0), dome(7, 40.0, 20.0, 150.0, DETECTOR)]
+    "rig",
+    [circular(7, 50.0, 90.0, DETECTOR, start_degrees=3.0), dome(7, 40.0, 20.0, 150.0, DETECTOR)],
 )
 def test_a_box_of_ones_gives_the_chords(rig, backend):
     grid = Grid.centred((9, 10, 11), (1.5, 2.0, 1.0))
     expected = box(grid).integrals(*rig.rays(), extent=rig.limits)
     ones = torch.ones(1, 1, *grid.shape, dtype=torch.float64)
-    views = PROJECTORS.build("drr", grid=grid, cameras=rig, method="siddon", backend=backend)(ones)[0, 0]
+    views = PROJECTORS.build("drr", grid=grid, cameras=rig, method="siddon", backend=backend)(ones)[
+        0, 0
+    ]
     assert torch.allclose(views, expected, rtol=0, atol=1e-11)
 
 
@@ -50,7 +62,9 @@ def test_both_methods_are_exact_from_face_to_face(method, backend):
     rig = dome(5, 40.0, 20.0, 50.0, {"pixels": [9, 9], "pixel_mm": 0.5})
     expected = box(grid).integrals(*rig.rays(), extent=rig.limits)
     ones = torch.ones(1, 1, *grid.shape, dtype=torch.float64)
-    views = PROJECTORS.build("drr", grid=grid, cameras=rig, method=method, backend=backend)(ones)[0, 0]
+    views = PROJECTORS.build("drr", grid=grid, cameras=rig, method=method, backend=backend)(ones)[
+        0, 0
+    ]
     assert (expected >= 6).all() and torch.allclose(views, expected, rtol=0, atol=1e-11)
 
 
@@ -58,12 +72,16 @@ def test_both_methods_are_exact_from_face_to_face(method, backend):
 def test_rays_that_miss_give_exactly_nothing(method):
     grid = Grid.centred((6, 6, 6), 1.0)
     rig = circular(5, 50.0, 90.0, {"pixels": [20, 20], "pixel_mm": 4.0})
-    views = PROJECTORS.build("drr", grid=grid, cameras=rig, method=method)(torch.rand(1, 1, 6, 6, 6))[0, 0]
+    views = PROJECTORS.build("drr", grid=grid, cameras=rig, method=method)(
+        torch.rand(1, 1, 6, 6, 6)
+    )[0, 0]
     grown = Grid.centred((8, 8, 8), 1.0) if method != "siddon" else grid
     misses = box(grown).integrals(*rig.rays(), extent=rig.limits) == 0
     assert misses.any() and not misses.all() and not views[misses].any()
     behind = Cameras(rig.source, rig.origin, rig.u, -rig.v, rig.shape, extent="behind")
-    assert not PROJECTORS.build("drr", grid=grid, cameras=behind, method=method)(torch.rand(1, 1, 6, 6, 6)).any()
+    assert not PROJECTORS.build("drr", grid=grid, cameras=behind, method=method)(
+        torch.rand(1, 1, 6, 6, 6)
+    ).any()
 
 
 def error(method: str, values, expected: torch.Tensor, n: int, name: str, rig: Cameras) -> float:
@@ -73,13 +91,18 @@ def error(method: str, values, expected: torch.Tensor, n: int, name: str, rig: C
     return ((views - expected).norm() / expected.norm()).item()
 
 
-@pytest.mark.parametrize(("method", "order"), [("joseph", 0.9), ("siddon", 0.7), ("trilinear", 0.9)])
+@pytest.mark.parametrize(
+    ("method", "order"), [("joseph", 0.9), ("siddon", 0.7), ("trilinear", 0.9)]
+)
 def test_ellipsoids_converge_at_first_order(method, order):
     """Across a sharp edge the voxels themselves are first-order truth."""
     rig = circular(3, 100.0, 160.0, DETECTOR, start_degrees=17.0)
     solid = phantom("ellipsoid", 14.0, 17.0, 11.0)
     expected = solid.integrals(*rig.rays(), extent=rig.limits)
-    errors = [error(method, lambda grid: voxelise(solid, grid), expected, n, "drr", rig) for n in (16, 32, 64)]
+    errors = [
+        error(method, lambda grid: voxelise(solid, grid), expected, n, "drr", rig)
+        for n in (16, 32, 64)
+    ]
     slope = torch.tensor(errors[0] / errors[2]).log2().item() / 2
     assert slope > order and errors[2] < 0.03, f"errors {errors}"
 
@@ -116,7 +139,11 @@ def test_a_slice_is_the_radon_transform(backend):
     grid = Grid.centred((1, n, n), (48.0 / n, 48.0 / n, 1.0))
     rig = parallel(5, {"pixels": [1, 40], "pixel_mm": [1.0, 1.1]}, 100.0, start_degrees=10.0)
     solid = Solids(
-        "cylinder", torch.zeros(1, 3), torch.eye(3)[None].double(), torch.tensor([[radius, radius, 1.0]]), torch.ones(1)
+        "cylinder",
+        torch.zeros(1, 3),
+        torch.eye(3)[None].double(),
+        torch.tensor([[radius, radius, 1.0]]),
+        torch.ones(1),
     )
     disc = voxelise(Phantom((solid,)), grid)
     u = (torch.arange(40, dtype=torch.float64) - 19.5) * 1.1

@@ -23,10 +23,15 @@ def test_the_derivative_by_volume_and_views_is_the_operator(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_the_derivative_by_the_pose_is_that_of_differences(method):
     case = DIFFERENTIABLE["cone"]
-    x, way = noise(case)[0], torch.randn(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    x, way = (
+        noise(case)[0],
+        torch.randn(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)),
+    )
 
     def views(source):
-        return replace(case, rays=replace(case.rays, source=source)).build(method=method, backend="auto")(x)
+        return replace(case, rays=replace(case.rays, source=source)).build(
+            method=method, backend="auto"
+        )(x)
 
     slope = torch.func.jvp(views, (case.rays.source,), (way,))[1]
     more, less = (views(case.rays.source + step * way) for step in (1e-5, -1e-5))
@@ -48,5 +53,9 @@ def test_voxel_driven_backprojection_and_warps_refuse():
 
 
 def test_a_compiled_back_end_that_was_asked_for_refuses():
-    with pytest.raises(NotImplementedError, match="'cpu' has no derivatives forwards; use 'auto' or 'reference'"):
-        torch.func.jvp(DIFFERENTIABLE["cone"].build(backend="cpu"), *[noise(DIFFERENTIABLE["cone"])[:1]] * 2)
+    with pytest.raises(
+        NotImplementedError, match="'cpu' has no derivatives forwards; use 'auto' or 'reference'"
+    ):
+        torch.func.jvp(
+            DIFFERENTIABLE["cone"].build(backend="cpu"), *[noise(DIFFERENTIABLE["cone"])[:1]] * 2
+        )

@@ -1,4 +1,6 @@
-"""The voxel-driven adjoint is the transpose of the ray-driven projection, to rounding, for every kind of camera."""
+"""The voxel-driven adjoint is the transpose of the ray-driven projection, to rounding, for every
+kind of camera.
+"""
 
 from dataclasses import replace
 
@@ -18,8 +20,12 @@ from tests.projectors.rigs import AXIAL, CONE, GRID, INSIDE, PARALLEL, PINHOLES
 
 BODY = Grid.centred((9, 8, 10), 22.0)
 #: A source in the volume, its detector so wide that voxels lie on both sides of the source.
-WIDE = circular(2, 40.0, 70.0, {"pixels": [6, 5], "pixel_mm": 25.0}).moved(torch.eye(3), GRID.centre)
-WIDE = replace(WIDE, source=GRID.centre + torch.tensor([0.9, -0.7, 0.6]) + 0.02 * (WIDE.source - GRID.centre))
+WIDE = circular(2, 40.0, 70.0, {"pixels": [6, 5], "pixel_mm": 25.0}).moved(
+    torch.eye(3), GRID.centre
+)
+WIDE = replace(
+    WIDE, source=GRID.centre + torch.tensor([0.9, -0.7, 0.6]) + 0.02 * (WIDE.source - GRID.centre)
+)
 RIGS = {
     "cone": (GRID, CONE),
     "dome": (GRID, PINHOLES),
@@ -84,7 +90,9 @@ def test_the_rigs_have_views_of_several_main_axes(kind):
     """What the test above is for: without such views it would say nothing of them."""
     grid, cameras = RIGS[kind]
     views = torch.ones(1, len(cameras), *cameras.shape, dtype=torch.float64)
-    axes = gathered(views, lines_of(cameras, grid), list(cameras.limits), grid.shape)[1][7].reshape(len(cameras), -1)
+    axes = gathered(views, lines_of(cameras, grid), list(cameras.limits), grid.shape)[1][7].reshape(
+        len(cameras), -1
+    )
     assert any(len(set(row[row >= 0])) > 1 for row in axes)
 
 

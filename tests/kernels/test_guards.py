@@ -1,4 +1,6 @@
-"""What the loops cost: time against the oracle's and each other's, memory, and volumes of more than 2^31 voxels."""
+"""What the loops cost: time against the oracle's and each other's, memory, and volumes of more than
+2^31 voxels.
+"""
 
 import sys
 from dataclasses import replace
@@ -21,7 +23,9 @@ TIMED = Case(Grid.centred((48, 48, 48), 1.0), circular(8, 100.0, 150.0, PIXELS, 
 
 
 def ratio(slow, fast, least: float) -> float:
-    """Least time of one call over the other's on one thread, in turns; anew where another process disturbed it."""
+    """Least time of one call over the other's on one thread, in turns; anew where another process
+    disturbed it.
+    """
     with threads(1):
         for _ in range(4):
             taken = [(once(slow, "cpu")[1], once(fast, "cpu")[1]) for _ in range(5)]
@@ -52,14 +56,18 @@ def test_upright_columns_are_faster_than_rays(monkeypatch):
 
 
 MEMORY = {
-    "circular": circular(3, 400.0, 600.0, {"pixels": [100, 40], "pixel_mm": 3.0}, start_degrees=3.0),
+    "circular": circular(
+        3, 400.0, 600.0, {"pixels": [100, 40], "pixel_mm": 3.0}, start_degrees=3.0
+    ),
     "dome": dome(3, 400.0, 600.0, 150.0, {"pixels": [40, 40], "pixel_mm": 6.0}, extent="ahead"),
     "parallel": parallel(3, {"pixels": [100, 40], "pixel_mm": 3.0}, 600.0, start_degrees=3.0),
 }
 
 
 def least(call):
-    """What a call returns, and the least of the MB that it needed twice: what else the process does only adds."""
+    """What a call returns, and the least of the MB that it needed twice: what else the process does
+    only adds.
+    """
     (found, once), (_, again) = (with_memory(call, "cpu") for _ in range(2))
     return found, min(once, again)
 
@@ -73,7 +81,9 @@ def test_little_memory_is_taken_beyond_input_and_output(kind, dtype, n):
     for method in ("joseph", "siddon"):
         A, warm = case.build(method=method), small.build(method=method)
         little = torch.rand(1, 16, 16, 16).to(dtype)
-        ops.lines_vjp(little, warm(little[None])[0], warm.lines, warm.window, warm.kernel)  # compiles
+        ops.lines_vjp(
+            little, warm(little[None])[0], warm.lines, warm.window, warm.kernel
+        )  # compiles
         x = torch.rand(1, 1, n, n, n).to(dtype)
         views, forward = least(lambda A=A, x=x: A(x))
         assert forward < views.nbytes / 2**20 + 64
@@ -116,7 +126,9 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
 def test_more_than_2_to_the_31_voxels(method, tmp_path):
     """One ray along the last row of a volume of 8 GB that is a file of nothing but holes."""
     grid = Grid.centred((7000, 7200, 40), 1.0)
-    rig = parallel(1, {"pixels": [1, 1], "pixel_mm": 1.0}, 60.0).moved(torch.eye(3), torch.tensor([0, 3599.5, 3499.5]))
+    rig = parallel(1, {"pixels": [1, 1], "pixel_mm": 1.0}, 60.0).moved(
+        torch.eye(3), torch.tensor([0, 3599.5, 3499.5])
+    )
     A = Case(grid, rig).build()
     held = plan.rig_of(A.lines, A.window, Occupancy.whole(grid.shape), [1, 1], method)
     file = np.memmap(tmp_path / "holes", np.float32, "w+", shape=(1, 7203, 43, 7003, 1))
@@ -129,7 +141,9 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
     project_rows(volume, held, room_of(held, volume), (*reads, (True, False, False)), views, 0, 1)
     assert views.item() == pytest.approx(row.sum(), rel=1e-5)
     row[:] = 0
-    backproject_slabs(volume, held, room_of(held, volume), (*reads, 0), np.full_like(views, 2), 0, 40)
+    backproject_slabs(
+        volume, held, room_of(held, volume), (*reads, 0), np.full_like(views, 2), 0, 40
+    )
     assert np.allclose(row, 2, rtol=1e-5)
 
 
@@ -140,8 +154,13 @@ def test_gradients_cross_the_threads(dtype, monkeypatch):
     with threads(3):
         rig = circular(3, 40.0, 70.0, {"pixels": [9, 10], "pixel_mm": 2.0}, start_degrees=13)
         source = rig.source.clone().requires_grad_()
-        A = PROJECTORS.build("drr", grid=Grid.centred((9, 10, 11), 1.0), cameras=replace(rig, source=source))
+        A = PROJECTORS.build(
+            "drr", grid=Grid.centred((9, 10, 11), 1.0), cameras=replace(rig, source=source)
+        )
         x = torch.rand(1, 1, 9, 10, 11).to(dtype).requires_grad_()
         views = A(x)
         by_x, by_source = torch.autograd.grad(views.sum(), (x, source))
-        assert torch.equal(by_x, A.T(torch.ones_like(views)).detach().to(dtype)) and by_source.abs().max() > 0
+        assert (
+            torch.equal(by_x, A.T(torch.ones_like(views)).detach().to(dtype))
+            and by_source.abs().max() > 0
+        )

@@ -25,7 +25,9 @@ def test_far_sources_and_far_worlds_lose_no_digits(offset, sid, backend):
     rig = circular(6, sid, sid + 30, DETECTOR, start_degrees=7.0).moved(torch.eye(3), shift)
     x = torch.rand(1, 1, *GRID.shape, dtype=torch.float64)
     A = PROJECTORS.build("drr", grid=Grid(GRID.shape, affine), cameras=rig, backend=backend)
-    exact = PROJECTORS.build("drr", grid=GRID, cameras=rig.moved(torch.eye(3), -shift), backend="reference")(x)
+    exact = PROJECTORS.build(
+        "drr", grid=GRID, cameras=rig.moved(torch.eye(3), -shift), backend="reference"
+    )(x)
     assert (A(x) - exact).norm() < 1e-9 * exact.norm()
     assert (A(x.float()) - exact).norm() < 2e-6 * exact.norm()
 
@@ -35,14 +37,18 @@ def test_scale_changes_nothing_but_the_unit():
     rig = circular(3, 60.0, 90.0, DETECTOR, start_degrees=7.0)
     y = PROJECTORS.build("drr", grid=GRID, cameras=rig)(x)
     for factor in (1e-6, 1e6):
-        scaled = replace(rig, **{each: factor * getattr(rig, each) for each in ("source", "origin", "u", "v")})
+        scaled = replace(
+            rig, **{each: factor * getattr(rig, each) for each in ("source", "origin", "u", "v")}
+        )
         affine = torch.diag(torch.tensor([factor] * 3 + [1.0], dtype=torch.float64)) @ GRID.affine
         views = PROJECTORS.build("drr", grid=Grid(GRID.shape, affine), cameras=scaled)(x)
         assert torch.allclose(views / factor, y, rtol=1e-9, atol=1e-9)
 
 
 def test_the_disk_cache_knows_every_source_file():
-    """An edit of the ray arithmetic must not leave old machine code in use; numba alone looks at the loops' file."""
+    """An edit of the ray arithmetic must not leave old machine code in use; numba alone looks at
+    the loops' file.
+    """
     from mvrecon.kernels import compiling
     from mvrecon.kernels.rays import loops
 

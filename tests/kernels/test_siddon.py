@@ -12,8 +12,12 @@ from tests.projectors.cases import CASES, gap, noise
 from tests.projectors.rigs import GRID, RIGS
 
 
-def slow_sum(volume: torch.Tensor, grid: Grid, start: torch.Tensor, end: torch.Tensor, limits) -> float:
-    """The integral along one ray: every crossing with every plane, sorted; each piece in the voxel of its middle."""
+def slow_sum(
+    volume: torch.Tensor, grid: Grid, start: torch.Tensor, end: torch.Tensor, limits
+) -> float:
+    """The integral along one ray: every crossing with every plane, sorted; each piece in the voxel
+    of its middle.
+    """
     a, b = grid.to_index(start).tolist(), grid.to_index(end).tolist()
     step = [q - p for p, q in zip(a, b, strict=True)]
     sizes = grid.shape[::-1]
@@ -32,11 +36,15 @@ def slow_sum(volume: torch.Tensor, grid: Grid, start: torch.Tensor, end: torch.T
 def test_it_equals_the_slow_exact_sum(name, kind, rig, backend):
     torch.manual_seed(0)
     x = torch.randn(1, 1, *GRID.shape, dtype=torch.float64)
-    views = PROJECTORS.build(name, grid=GRID, cameras=rig, method="siddon", backend=backend)(x)[0, 0]
+    views = PROJECTORS.build(name, grid=GRID, cameras=rig, method="siddon", backend=backend)(x)[
+        0, 0
+    ]
     start, end = (points.flatten(0, 2) for points in rig.rays())
     expected = [slow_sum(x[0, 0], GRID, a, b, rig.limits) for a, b in zip(start, end, strict=True)]
     assert views.abs().max() > 1
-    assert torch.allclose(views.flatten(), torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        views.flatten(), torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("kind", [kind for kind in CASES if kind != "axial"])
@@ -46,7 +54,8 @@ def test_it_equals_the_slow_exact_sum_in_single_precision(kind):
     rays = zip(*(points.flatten(0, 2) for points in case.rays.rays()), strict=True)
     sums = [slow_sum(x[0, 0], case.grid, start, end, case.rays.limits) for start, end in rays]
     expected, A = torch.tensor(sums, dtype=torch.float64), case.build(method="siddon")
-    # neighbours here differ by as much as they are; where a ray passes between them is known to single precision
+    # neighbours here differ by as much as they are; where a ray passes between them is known to
+    # single precision
     assert gap(A(x).flatten(), expected) < 1e-12 and gap(A(x.float()).flatten(), expected) < 2e-6
 
 
@@ -56,8 +65,12 @@ def test_two_boxes_that_touch_share_no_ray(backend):
     both = Grid.centred((4, 4, 4), 1.0)
     source = torch.tensor([[-9.0, -1.0, -1.0]], dtype=torch.float64)
     u, v = torch.tensor([[0.0, -0.5, 0.0]]), torch.tensor([[0.0, 0.0, -0.5]])
-    rig = Cameras(source, source + torch.tensor([[18.0, 0, 0]]) - 4 * (u + v), u, v, (9, 9), parallel=True)
-    rig = Cameras(rig.origin - torch.tensor([[18.0, 0, 0]]), rig.origin, u, v, (9, 9), parallel=True)
+    rig = Cameras(
+        source, source + torch.tensor([[18.0, 0, 0]]) - 4 * (u + v), u, v, (9, 9), parallel=True
+    )
+    rig = Cameras(
+        rig.origin - torch.tensor([[18.0, 0, 0]]), rig.origin, u, v, (9, 9), parallel=True
+    )
     x = torch.randn(1, 1, 4, 4, 4, dtype=torch.float64)
     total = PROJECTORS.build("radon", grid=both, cameras=rig, method="siddon", backend=backend)(x)
     halves = 0

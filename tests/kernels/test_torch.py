@@ -13,11 +13,18 @@ def fresh_graphs():
     torch.compiler.reset()
 
 
-CHECKS = ("test_schema", "test_autograd_registration", "test_faketensor", "test_aot_dispatch_static")
+CHECKS = (
+    "test_schema",
+    "test_autograd_registration",
+    "test_faketensor",
+    "test_aot_dispatch_static",
+)
 
 
 def arguments(kind: str, option: str, dtype: torch.dtype):
-    """Volume, views, rays, window, detector, shape and method of a case, as the operators take them."""
+    """Volume, views, rays, window, detector, shape and method of a case, as the operators take
+    them.
+    """
     case = DIFFERENTIABLE[kind]
     A = case.build(**OPTIONS[option])
     x, y = (each[:, 0].to(dtype) for each in noise(case))
@@ -52,8 +59,12 @@ def test_a_compiled_graph_holds_the_operators_whole(kind, option):
 
     compiled = torch.compile(step, fullgraph=True, backend="aot_eager")
     assert torch.allclose(compiled(x), step(x))
-    expected, found = (torch.autograd.grad(run(x).log().square().sum(), x)[0] for run in (step, compiled))
-    assert expected.norm() > 1 and torch.allclose(found, expected, rtol=1e-4, atol=1e-5 * expected.abs().max())
+    expected, found = (
+        torch.autograd.grad(run(x).log().square().sum(), x)[0] for run in (step, compiled)
+    )
+    assert expected.norm() > 1 and torch.allclose(
+        found, expected, rtol=1e-4, atol=1e-5 * expected.abs().max()
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -101,7 +112,9 @@ def test_vmap_over_rays_equals_a_loop(kind, option):
         many = torch.stack([values, 2 * values, -values])
         loop = torch.stack([act(*each) for each in zip(many, several.unbind(1), strict=True)])
         assert torch.equal(torch.func.vmap(act, in_dims=(0, 1))(many, several), loop), name
-    mapped = torch.func.vmap(lambda y: ops.lines_vjp(x, y, lines, window, method))(torch.stack([y, 3 * y]))
+    mapped = torch.func.vmap(lambda y: ops.lines_vjp(x, y, lines, window, method))(
+        torch.stack([y, 3 * y])
+    )
     assert torch.allclose(mapped[1], 3 * mapped[0])
 
 
@@ -110,5 +123,8 @@ def test_derivatives_pass_through_a_map():
     A = case.build()
     x, _ = noise(case)
     x.requires_grad_()
-    mapped, whole = (torch.autograd.grad(views.cos().sum(), x)[0] for views in (torch.func.vmap(A)(x[:, None]), A(x)))
+    mapped, whole = (
+        torch.autograd.grad(views.cos().sum(), x)[0]
+        for views in (torch.func.vmap(A)(x[:, None]), A(x))
+    )
     assert torch.allclose(mapped, whole)

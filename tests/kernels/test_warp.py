@@ -1,4 +1,6 @@
-"""The warps against grid_sample at places found by projecting points, and what must hold of any linear resampling."""
+"""The warps against grid_sample at places found by projecting points, and what must hold of any
+linear resampling.
+"""
 
 from dataclasses import replace
 
@@ -33,10 +35,14 @@ def edges_of(grid: Grid, cameras: Cameras, spacing: Spacing) -> torch.Tensor:
 
 
 def lattices(grid: Grid, cameras: Cameras, spacing: Spacing) -> tuple[Lattice, Lattice]:
-    return frusta_lattice(cameras, grid, edges_of(grid, cameras, spacing), spacing), grid_lattice(grid)
+    return frusta_lattice(cameras, grid, edges_of(grid, cameras, spacing), spacing), grid_lattice(
+        grid
+    )
 
 
-def index_in_frusta(cameras: Cameras, edges: torch.Tensor, spacing: Spacing, xyz: torch.Tensor) -> torch.Tensor:
+def index_in_frusta(
+    cameras: Cameras, edges: torch.Tensor, spacing: Spacing, xyz: torch.Tensor
+) -> torch.Tensor:
     uvz = cameras.project(xyz)
     return torch.cat([uvz[..., :2], depth_index(uvz[..., 2], edges, spacing)[..., None]], dim=-1)
 
@@ -44,7 +50,9 @@ def index_in_frusta(cameras: Cameras, edges: torch.Tensor, spacing: Spacing, xyz
 def bin_centres(cameras: Cameras, edges: torch.Tensor, spacing: Spacing) -> torch.Tensor:
     z = depth_centres(edges, spacing)
     uv = pixel_centres(cameras.shape)[None, None].expand(len(cameras), z.shape[1], -1, -1, -1)
-    return cameras.unproject(torch.cat([uv, z[:, :, None, None, None].expand(*uv.shape[:-1], 1)], dim=-1))
+    return cameras.unproject(
+        torch.cat([uv, z[:, :, None, None, None].expand(*uv.shape[:-1], 1)], dim=-1)
+    )
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -58,15 +66,22 @@ def test_warps_sample_where_projection_says(kind, spacing, backend):
     x = torch.randn(2, m, 3, *frusta.shape, dtype=torch.float64)
     points = normalised(index_in_frusta(cameras, edges, spacing, voxel_centres(grid)), frusta.shape)
     expected = torch.stack([sample(each, points) for each in x])[:, :, None]
-    assert torch.allclose(warp(x, lattice_maps(frusta, world), grid.shape, backend), expected, atol=1e-9)
+    assert torch.allclose(
+        warp(x, lattice_maps(frusta, world), grid.shape, backend), expected, atol=1e-9
+    )
     y = torch.randn(2, 1, 3, *grid.shape, dtype=torch.float64)
     points = normalised(grid.to_index(bins), grid.shape)
     expected = torch.stack([sample(each.expand(m, -1, -1, -1, -1), points) for each in y])[:, None]
-    assert torch.allclose(warp(y, lattice_maps(world, frusta), frusta.shape, backend), expected, atol=1e-9)
+    assert torch.allclose(
+        warp(y, lattice_maps(world, frusta), frusta.shape, backend), expected, atol=1e-9
+    )
     # pair (s, k): frustum s at the bins of frustum k
     places = index_in_frusta(cameras, edges, spacing, bins)
     expected = torch.stack(
-        [sample(x[:, 1], normalised(places[1, k], frusta.shape).expand(2, -1, -1, -1, -1)) for k in range(m)]
+        [
+            sample(x[:, 1], normalised(places[1, k], frusta.shape).expand(2, -1, -1, -1, -1))
+            for k in range(m)
+        ]
     )
     pairs = warp(x, lattice_maps(frusta, frusta), frusta.shape, backend)
     assert torch.allclose(pairs[:, 1], expected.transpose(0, 1), atol=1e-7)
@@ -107,7 +122,10 @@ def test_gradients_by_values_and_by_homography():
     y = torch.randn(1, 2, 2, 2, *OTHER, dtype=torch.float64, requires_grad=True)
     back = torch.ops.mvrecon.warp_back
     assert torch.autograd.gradcheck(lambda y, H: back(y, lifted_maps(H), list(SMALL)), (y, H))
-    by_H = [torch.autograd.grad(warp(x, lifted_maps(H), OTHER, b).square().sum(), H)[0] for b in ("cpu", "reference")]
+    by_H = [
+        torch.autograd.grad(warp(x, lifted_maps(H), OTHER, b).square().sum(), H)[0]
+        for b in ("cpu", "reference")
+    ]
     assert torch.allclose(*by_H) and by_H[0].abs().max() > 0.1
 
 
@@ -120,7 +138,9 @@ def test_gradients_by_the_lift_reach_the_cameras(kind):
     for backend in ("cpu", "reference"):
         rig = replace(cameras, source=cameras.source.clone().requires_grad_())
         maps = lattice_maps(frusta_lattice(rig, grid, edges), grid_lattice(grid))
-        results.append(torch.autograd.grad(warp(x, maps, grid.shape, backend).square().sum(), rig.source)[0])
+        results.append(
+            torch.autograd.grad(warp(x, maps, grid.shape, backend).square().sum(), rig.source)[0]
+        )
     assert torch.allclose(*results) and results[0].abs().max() > 1e-3
 
 
@@ -129,7 +149,9 @@ def test_second_derivatives_in_values_are_exact_and_in_maps_refused():
     x = torch.randn(1, 2, 1, *SMALL, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradgradcheck(lambda x: warp(x, maps, OTHER, "cpu").square(), (x,))
     maps.requires_grad_()
-    (by_maps,) = torch.autograd.grad(warp(x, maps, OTHER, "cpu").square().sum(), maps, create_graph=True)
+    (by_maps,) = torch.autograd.grad(
+        warp(x, maps, OTHER, "cpu").square().sum(), maps, create_graph=True
+    )
     with pytest.raises(NotImplementedError, match="reference"):
         by_maps.sum().backward()
 
@@ -137,7 +159,9 @@ def test_second_derivatives_in_values_are_exact_and_in_maps_refused():
 def test_only_what_is_asked_for_is_differentiated(monkeypatch):
     from mvrecon.kernels.warps import cpu as warp_cpu
 
-    monkeypatch.setattr(warp_cpu, "warp_vjp", lambda *_: pytest.fail("no gradient in the maps was asked for"))
+    monkeypatch.setattr(
+        warp_cpu, "warp_vjp", lambda *_: pytest.fail("no gradient in the maps was asked for")
+    )
     x = torch.randn(1, 2, 1, *SMALL, requires_grad=True)
     warp(x, lifted_maps(generic()), OTHER, "cpu").sum().backward()
     assert x.grad is not None
@@ -150,7 +174,9 @@ def test_torch_accepts_the_operators():
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(warp_ops.warp, (x, maps, OTHER), test_utils=checks)
     torch.library.opcheck(warp_ops.warp_back, (y, maps, list(SMALL)), test_utils=checks)
-    torch.library.opcheck(warp_ops.warp_vjp, (x.detach(), y.detach(), maps.detach()), test_utils=checks)
+    torch.library.opcheck(
+        warp_ops.warp_vjp, (x.detach(), y.detach(), maps.detach()), test_utils=checks
+    )
 
 
 def test_vmap_over_values_and_over_maps_equals_a_loop():
@@ -162,14 +188,20 @@ def test_vmap_over_values_and_over_maps_equals_a_loop():
     assert torch.equal(both[1], warp(x[1], maps[1], OTHER, "cpu"))
 
     x.requires_grad_()
-    one = torch.autograd.grad(torch.func.vmap(lambda x: warp(x, maps[0], OTHER, "cpu"))(x).square().sum(), x)[0]
-    assert torch.allclose(one, torch.autograd.grad(warp(x.flatten(0, 1), maps[0], OTHER).square().sum(), x)[0])
+    one = torch.autograd.grad(
+        torch.func.vmap(lambda x: warp(x, maps[0], OTHER, "cpu"))(x).square().sum(), x
+    )[0]
+    assert torch.allclose(
+        one, torch.autograd.grad(warp(x.flatten(0, 1), maps[0], OTHER).square().sum(), x)[0]
+    )
 
 
 def test_a_compiled_graph_holds_the_warp_whole():
     maps = lifted_maps(generic())
     x = torch.randn(1, 2, 1, *SMALL, requires_grad=True)
-    compiled = torch.compile(lambda x: warp(2 * x, maps, OTHER).sin(), fullgraph=True, backend="aot_eager")
+    compiled = torch.compile(
+        lambda x: warp(2 * x, maps, OTHER).sin(), fullgraph=True, backend="aot_eager"
+    )
     expected = torch.autograd.grad(warp(2 * x, maps, OTHER).sin().sum(), x)[0]
     assert torch.allclose(torch.autograd.grad(compiled(x).sum(), x)[0], expected)
 
@@ -183,7 +215,12 @@ def test_threads_change_no_bit(threads, monkeypatch):
     results = []
     for count in (1, 2, 3, 5):
         threads(count)
-        results.append((warp_ops.warp(x, maps, list(frusta.shape)), warp_ops.warp_back(y, maps, list(GRID.shape))))
+        results.append(
+            (
+                warp_ops.warp(x, maps, list(frusta.shape)),
+                warp_ops.warp_back(y, maps, list(GRID.shape)),
+            )
+        )
         results[-1] += (warp_ops.warp_vjp(x, y, maps),)
     for others in results[1:]:
         assert all(torch.equal(one, other) for one, other in zip(results[0], others, strict=True))
@@ -193,10 +230,15 @@ def test_threads_change_no_bit(threads, monkeypatch):
 @pytest.mark.parametrize("sid", [200.0, 1e6])
 @pytest.mark.parametrize(("offset", "voxel"), [(0.0, 1.0), (1e5, 1.0), (0.0, 1e-6), (0.0, 1e6)])
 def test_far_sources_far_worlds_and_scales_lose_no_digits(spacing, sid, offset, voxel):
-    """The same picture in other units and at another place; a beam from afar is nearly a parallel one."""
+    """The same picture in other units and at another place; a beam from afar is nearly a parallel
+    one.
+    """
     torch.manual_seed(0)
     detector = {"pixels": [20, 21], "pixel_mm": 1.3 * (1 + 30 / sid)}
-    grid, cameras = Grid.centred((18, 20, 22), (1.0, 1.1, 0.9)), circular(3, sid, sid + 30, detector, start_degrees=7.0)
+    grid, cameras = (
+        Grid.centred((18, 20, 22), (1.0, 1.1, 0.9)),
+        circular(3, sid, sid + 30, detector, start_degrees=7.0),
+    )
     shift = torch.full((3,), offset, dtype=torch.float64)
     other = {each: voxel * getattr(cameras, each) for each in ("source", "origin", "u", "v")}
     affine = grid.affine.clone()
@@ -207,7 +249,9 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(spacing, sid, offset, 
     far_frusta, far_world = lattices(Grid(grid.shape, affine), moved, spacing)
     x = torch.rand(1, 3, 1, *frusta.shape, dtype=torch.float64)
     y = torch.rand(1, 1, 1, *grid.shape, dtype=torch.float64)
-    places = index_in_frusta(cameras, edges_of(grid, cameras, spacing), spacing, voxel_centres(grid))
+    places = index_in_frusta(
+        cameras, edges_of(grid, cameras, spacing), spacing, voxel_centres(grid)
+    )
     exact = sample(x[0], normalised(places, frusta.shape))[None, :, None]
     for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 2e-6)):
         got = warp(x.to(dtype), lattice_maps(far_frusta, far_world), grid.shape, "cpu")
@@ -221,7 +265,10 @@ def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
     from mvrecon.kernels import padding
     from mvrecon.kernels.warps import cpu as warp_cpu
 
-    assert padding.steps((2**10, 2**11, 2**10)).dtype == "int64" and padding.steps(SMALL).dtype == "int32"
+    assert (
+        padding.steps((2**10, 2**11, 2**10)).dtype == "int64"
+        and padding.steps(SMALL).dtype == "int32"
+    )
     maps = lifted_maps(generic())
     x, y = torch.randn(1, 2, 1, *SMALL), torch.randn(1, 2, 2, 1, *OTHER)
     narrow = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_back(y, maps, SMALL)
@@ -233,7 +280,9 @@ def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
 def test_a_constant_stays_constant_inside_and_nothing_is_seen_outside():
     frusta, world = lattices(GRID, CONE, "z")
     maps = lattice_maps(world, frusta)
-    seen = warp(torch.ones(1, 1, 1, *GRID.shape, dtype=torch.float64), maps, frusta.shape, "cpu")[0, 0, :, 0]
+    seen = warp(torch.ones(1, 1, 1, *GRID.shape, dtype=torch.float64), maps, frusta.shape, "cpu")[
+        0, 0, :, 0
+    ]
     index = GRID.to_index(bin_centres(CONE, edges_of(GRID, CONE, "z"), "z"))
     sizes = torch.tensor(GRID.shape[::-1])
     inner = ((index > 0) & (index < sizes - 1)).all(dim=-1)
@@ -250,7 +299,9 @@ def test_the_identity_changes_no_bit():
 
 
 def test_what_lies_behind_a_source_is_not_seen():
-    """A source inside the grid: its frustum in k reaches away from it, and no voxel behind it gets a value."""
+    """A source inside the grid: its frustum in k reaches away from it, and no voxel behind it gets
+    a value.
+    """
     rig = replace(CONE, source=GRID.centre + 0.02 * (CONE.source - GRID.centre))[:1]
     distance = rig.distance[:, None]
     edges = depth_edges(distance * torch.tensor([[0.002, 0.4]], dtype=torch.float64), DEPTH, "k")
@@ -263,7 +314,9 @@ def test_what_lies_behind_a_source_is_not_seen():
 
 
 def test_a_linear_ramp_goes_through_the_world_and_back_exactly():
-    """Depth in z is a linear field, which trilinear sampling keeps; so it comes back to the frustum's inside."""
+    """Depth in z is a linear field, which trilinear sampling keeps; so it comes back to the
+    frustum's inside.
+    """
     grid = Grid.centred((20, 20, 20), 1.0)
     rig = circular(2, 60.0, 90.0, {"pixels": [40, 40], "pixel_mm": 0.6}, start_degrees=11.0)
     edges = depth_edges(rig.depth_range(grid), 24)
@@ -273,7 +326,12 @@ def test_a_linear_ramp_goes_through_the_world_and_back_exactly():
     back = warp(there, lattice_maps(world, frusta).transpose(0, 1), frusta.shape, "cpu")[0, :, 0, 0]
     index = grid.to_index(bin_centres(rig, edges, "z"))
     whole = warp(torch.ones_like(ramp), lattice_maps(frusta, world), grid.shape, "cpu")[:, :, 0]
-    seen = warp((whole > 1 - 1e-9).double(), lattice_maps(world, frusta).transpose(0, 1), frusta.shape, "cpu")
+    seen = warp(
+        (whole > 1 - 1e-9).double(),
+        lattice_maps(world, frusta).transpose(0, 1),
+        frusta.shape,
+        "cpu",
+    )
     inner = ((index > 0) & (index < 19)).all(dim=-1) & (seen[0, :, 0, 0] > 1 - 1e-9)
     assert inner.sum() > 1000
     assert torch.allclose(back[inner], ramp[0, :, 0][inner], atol=1e-9)

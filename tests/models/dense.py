@@ -1,4 +1,6 @@
-"""A masked network by its definition: whole volumes, set to zero outside the mask after every step."""
+"""A masked network by its definition: whole volumes, set to zero outside the mask after every
+step.
+"""
 
 import torch
 import torch.nn.functional as F
@@ -24,8 +26,12 @@ def normalised(x: Tensor, mask: Tensor, norm: torch.nn.GroupNorm) -> Tensor:
         for group in x[n].split(size):
             held = group[:, inside]
             spread = held.var(unbiased=False) if held.numel() else held.sum()
-            groups.append((group - (held.mean() if held.numel() else 0)) / (spread + norm.eps).sqrt())
-        affine = torch.cat(groups) * norm.weight[:, None, None, None] + norm.bias[:, None, None, None]
+            groups.append(
+                (group - (held.mean() if held.numel() else 0)) / (spread + norm.eps).sqrt()
+            )
+        affine = (
+            torch.cat(groups) * norm.weight[:, None, None, None] + norm.bias[:, None, None, None]
+        )
         samples.append(affine * mask[n])
     return torch.stack(samples)
 

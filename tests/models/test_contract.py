@@ -11,7 +11,9 @@ from tests.models.rig import small_projector
 from tests.models.test_model import OPTIONS
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS.names() if MODELS.origin(name).startswith("mvrecon.")])
+@pytest.mark.parametrize(
+    "name", [name for name in MODELS.names() if MODELS.origin(name).startswith("mvrecon.")]
+)
 def test_built_in_models_keep_the_contract(name):
     check_model(name, small_projector(), **OPTIONS.get(name, {}))
 
@@ -54,7 +56,10 @@ BROKEN = {
     "random": (lambda x: x * torch.rand(1), "same bits"),
     "square": (lambda x: x**2, r"f\(.* y\) is not .* f\(y\)"),
     "offset": (lambda x: x + (x.abs().sum() == 0), "views of zero"),
-    "order": (lambda x: x * torch.arange(1, 1 + len(x)).reshape(-1, 1, 1, 1, 1), "order of a batch"),
+    "order": (
+        lambda x: x * torch.arange(1, 1 + len(x)).reshape(-1, 1, 1, 1, 1),
+        "order of a batch",
+    ),
     "mean": (lambda x: x + x.mean(dim=0), "others of its batch"),
     "detached": (lambda x: x.detach().requires_grad_(), "no gradient reaches weight"),
 }
@@ -63,14 +68,17 @@ BROKEN = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_model_that_breaks_its_contract_is_caught(name, monkeypatch):
     change, message = BROKEN[name]
-    monkeypatch.setattr(Sound, "volume", lambda self, views: change(self.weight * self.projector.T(views)))
+    monkeypatch.setattr(
+        Sound, "volume", lambda self, views: change(self.weight * self.projector.T(views))
+    )
     monkeypatch.setitem(MODELS._parts, "broken", Sound)
     with pytest.raises(AssertionError, match=message):
         check_model("broken", small_projector())
 
 
 @pytest.mark.parametrize(
-    ("part", "message"), [(Idle, "no gradient reaches spare"), (Lenient, "views with NaN are not refused")]
+    ("part", "message"),
+    [(Idle, "no gradient reaches spare"), (Lenient, "views with NaN are not refused")],
 )
 def test_an_idle_parameter_and_bad_views_let_in_are_caught(part, message, monkeypatch):
     monkeypatch.setitem(MODELS._parts, "sound", Sound)

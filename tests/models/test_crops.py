@@ -51,7 +51,9 @@ def test_the_windows_of_a_crop_hold_all_that_its_inner_voxels_read(rig):
     grid, cameras = small_rig(size=24, pixels=36)
     detector = {"pixels": [36, 36], "pixel_mm": 1.0}
     if rig == "dome":
-        cameras = CAMERAS.build("dome", views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector)
+        cameras = CAMERAS.build(
+            "dome", views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector
+        )
     if rig == "parallel":
         cameras = CAMERAS.build("parallel", views=3, detector=detector)
     A = RayTransform(grid, cameras)
@@ -66,7 +68,9 @@ def test_the_windows_of_a_crop_hold_all_that_its_inner_voxels_read(rig):
         z, v, u = index[0][:, :, None, None], index[1][:, None, :, None], index[2][:, None, None, :]
         m = torch.arange(len(cameras))[:, None, None, None]
         cut = values[0, m, 0, z, v, u][None, :, None]
-        assert _close(part.to_world(cut)[inner], full.to_world(values)[..., *box.slices][inner], 1e-5)
+        assert _close(
+            part.to_world(cut)[inner], full.to_world(values)[..., *box.slices][inner], 1e-5
+        )
         touched = full.touched(mask)[0, m, 0, z, v, u][None, :, None]
         assert torch.equal(part.touched(mask[..., *box.slices]), touched)
         assert touched.sum() == full.touched(mask).sum(), "touched bins were cut off"
@@ -76,7 +80,9 @@ def test_the_windows_of_a_crop_hold_all_that_its_inner_voxels_read(rig):
 
 
 def test_touched_bins_are_those_that_hold_part_of_the_mask_and_no_others(projector):
-    """A mask in frusta and back again loses no voxel of what was there, and is zero a bin and a voxel away from it."""
+    """A mask in frusta and back again loses no voxel of what was there, and is zero a bin and a
+    voxel away from it.
+    """
     fine = whole_geometry(projector, 3).fine
     mask = torch.zeros(1, 1, 24, 24, 24, dtype=torch.bool)
     mask[..., 11, 12, 13] = True
@@ -93,7 +99,10 @@ def helix() -> tuple[Grid, Cameras]:
     grid = Grid.centred((40, 16, 16), 1.0)
     detector = {"pixels": [12, 24], "pixel_mm": 2.4}
     turns = [circular(1, 60.0, 100.0, detector, start_degrees=50.0 * k) for k in range(8)]
-    lifted = [rig.moved(torch.eye(3), torch.tensor([0.0, 0.0, 4.5 * k - 15.75])) for k, rig in enumerate(turns)]
+    lifted = [
+        rig.moved(torch.eye(3), torch.tensor([0.0, 0.0, 4.5 * k - 15.75]))
+        for k, rig in enumerate(turns)
+    ]
     vectors = {name: torch.cat([getattr(rig, name) for rig in lifted]) for name in VECTORS}
     return grid, replace(lifted[0], **vectors)
 
@@ -103,7 +112,15 @@ def helical_model(shared: bool = True):
     grid, cameras = helix()
     projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
     opinion = {"width": 4, "features": 2, "binning": 3, "shared": shared}
-    model = CrossView(projector, {"name": "softmax_depth"}, opinion, refine=4, start=3, consistency=1, support="hull")
+    model = CrossView(
+        projector,
+        {"name": "softmax_depth"},
+        opinion,
+        refine=4,
+        start=3,
+        consistency=1,
+        support="hull",
+    )
     for parameter in model.parameters():  # the last layers start from zero, and would hide the rest
         torch.nn.init.normal_(parameter, std=0.1)
     volume = torch.zeros(1, 1, *grid.shape)
@@ -120,17 +137,25 @@ def test_cameras_that_see_nothing_of_the_crop_are_left_out_and_change_nothing(sh
         model.zero_grad()
         region, out = model.regions(views), model(views)
         ReconstructionLoss(1.0)(out, batch)["total"].backward()
-        return region, out, [torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in model.parameters()]
+        return (
+            region,
+            out,
+            [torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in model.parameters()],
+        )
 
     region, out, gradients = done()
     assert region.culled >= 3 and len(region.A.cameras) == 8 - region.culled
     model.regions.crops.clear()
-    monkeypatch.setattr(geometry, "views_that_see", lambda cameras, grid: torch.ones(len(cameras)).bool())
+    monkeypatch.setattr(
+        geometry, "views_that_see", lambda cameras, grid: torch.ones(len(cameras)).bool()
+    )
     dense, expected, others = done()
     assert dense.culled == 0
     for name in ("volume", "opinions", "weights", "cross_views"):
         assert _close(getattr(out, name), getattr(expected, name), 1e-5), name
-    assert all(torch.allclose(a, b, rtol=1e-3, atol=1e-6) for a, b in zip(gradients, others, strict=True))
+    assert all(
+        torch.allclose(a, b, rtol=1e-3, atol=1e-6) for a, b in zip(gradients, others, strict=True)
+    )
     assert any(g.any() for g in gradients)
 
 
@@ -139,8 +164,12 @@ def test_frusta_end_at_the_mask_and_nothing_changes(monkeypatch):
     """A wall across the diagonal of its box, seen along itself."""
     torch.manual_seed(0)
     grid, detector = Grid.centred((32, 32, 32), 1.0), {"pixels": [48, 48], "pixel_mm": 1.0}
-    A = PROJECTORS.build("drr", grid=grid, cameras=circular(2, 90.0, 120.0, detector, angles=[40.0, 50.0]))
-    model = CrossView(A, {"name": "softmax_depth"}, {"width": 4}, refine=4, start=3, consistency=1, support="hull")
+    A = PROJECTORS.build(
+        "drr", grid=grid, cameras=circular(2, 90.0, 120.0, detector, angles=[40.0, 50.0])
+    )
+    model = CrossView(
+        A, {"name": "softmax_depth"}, {"width": 4}, refine=4, start=3, consistency=1, support="hull"
+    )
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     y, x = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="ij")

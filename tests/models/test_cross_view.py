@@ -37,7 +37,9 @@ def test_fusion_is_a_convex_sum_over_the_cameras_that_see():
     low = torch.where(visible, volumes, torch.inf).amin(dim=1)
     high = torch.where(visible, volumes, -torch.inf).amax(dim=1)
     inside = seen.expand_as(fused)
-    assert (fused[inside] >= low[inside] - 1e-3).all() and (fused[inside] <= high[inside] + 1e-3).all()
+    assert (fused[inside] >= low[inside] - 1e-3).all() and (
+        fused[inside] <= high[inside] + 1e-3
+    ).all()
 
 
 def test_fusion_with_zero_logits_is_the_mean():

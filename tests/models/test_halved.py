@@ -17,7 +17,9 @@ def test_values_and_derivative_have_the_bits_of_torch(shape, dtype):
     expected, found = F.avg_pool3d(x, 2, ceil_mode=True), halved(x)
     onto = torch.randn_like(found)
     assert torch.equal(found, expected)
-    assert torch.equal(torch.autograd.grad(found, x, onto)[0], torch.autograd.grad(expected, x, onto)[0])
+    assert torch.equal(
+        torch.autograd.grad(found, x, onto)[0], torch.autograd.grad(expected, x, onto)[0]
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -38,11 +38,15 @@ def test_lift_conserves_every_ray_integral(spacing):
 def test_frustum_chord_is_the_length_of_the_ray_in_the_box():
     grid, cameras = small_rig(views=1, size=12, pixels=13)
     chord = Frusta(grid, cameras, 240).chord[0, 0, 0]
-    assert chord[6, 6].item() == pytest.approx(24.0, rel=1e-3)  # the central ray crosses 12 voxels of 2 mm
+    assert chord[6, 6].item() == pytest.approx(
+        24.0, rel=1e-3
+    )  # the central ray crosses 12 voxels of 2 mm
 
 
 def test_warp_of_a_linear_field_is_exact_where_seen():
-    """Trilinear sampling reproduces a linear function of position; here of the position in the frustum."""
+    """Trilinear sampling reproduces a linear function of position; here of the position in the
+    frustum.
+    """
     grid, cameras = small_rig()
     frusta = Frusta(grid, cameras, 12)
     depth, v, u = frusta.shape
@@ -72,7 +76,12 @@ def test_world_to_frustum_to_world_converges_to_second_order():
 def test_pinholes_behind_their_detectors_lift_like_any_other():
     grid, _ = small_rig()
     cameras = CAMERAS.build(
-        "dome", views=3, radius=100.0, focal=40.0, aperture_degrees=60.0, detector={"pixels": [9, 9], "pixel_mm": 2.0}
+        "dome",
+        views=3,
+        radius=100.0,
+        focal=40.0,
+        aperture_degrees=60.0,
+        detector={"pixels": [9, 9], "pixel_mm": 2.0},
     )
     frusta = Frusta(grid, cameras, 8)
     views = torch.rand(1, 1, 3, 9, 9) * (frusta.chord.reshape(1, 1, 3, 9, 9) > 0)
@@ -92,7 +101,9 @@ def test_warps_compile_into_one_graph():
     grid, cameras = small_rig()
     frusta = Frusta(grid, cameras, 12)
     volumes = torch.rand(1, 1, 2, *grid.shape)
-    compiled = torch.compile(lambda x: frusta.to_world(frusta.to_frusta(x)), fullgraph=True, backend="aot_eager")
+    compiled = torch.compile(
+        lambda x: frusta.to_world(frusta.to_frusta(x)), fullgraph=True, backend="aot_eager"
+    )
     assert torch.equal(compiled(volumes), frusta.to_world(frusta.to_frusta(volumes)))
 
 
@@ -108,6 +119,10 @@ def test_nothing_behind_a_source_inside_the_grid_is_occupied_or_visible():
     inner = replace(cameras, source=0.05 * cameras.source)
     frusta = Frusta(grid, inner, 12)
     z = depth_centres(depth_edges(inner.depth_range(grid), 12))[0]
-    assert (z < 0).any() and (depth_edges(seen_depth_range(inner, grid), 12) >= 0).all() and frusta.occupied.any()
+    assert (
+        (z < 0).any()
+        and (depth_edges(seen_depth_range(inner, grid), 12) >= 0).all()
+        and frusta.occupied.any()
+    )
     behind = inner.project(voxel_centres(grid))[0, ..., 2] < 0
     assert behind.any() and frusta.visible.any() and not frusta.visible[0, 0][behind].any()

@@ -1,4 +1,6 @@
-"""A masked network does not depend on the empty space around its mask, and is what its definition says."""
+"""A masked network does not depend on the empty space around its mask, and is what its definition
+says.
+"""
 
 from functools import partial
 
@@ -43,7 +45,9 @@ def test_empty_space_around_the_mask_changes_nothing(dtype):
         larger = net(F.pad(x, wide, value=7.0), F.pad(mask, wide))
         inner = larger[:, :, *(slice(before, before + n) for n in mask.shape[2:])]
         assert _close(inner, alone, TOLERANCE[dtype])
-        assert not (alone * ~mask).any() and torch.count_nonzero(larger) == torch.count_nonzero(inner)
+        assert not (alone * ~mask).any() and torch.count_nonzero(larger) == torch.count_nonzero(
+            inner
+        )
 
 
 def test_a_shift_that_moves_coarse_voxels_does_change_it():
@@ -88,14 +92,20 @@ def test_a_sample_with_no_voxel_is_zero_and_leaves_the_other_alone():
     assert not net(x, torch.zeros_like(mask)).any()
 
 
-@pytest.mark.parametrize("shape", [(1, 3, 9, 5, 6), (1, 3, 2, 4, 4), (1, 3, 1, 4, 4), (2, 3, 6, 6, 6)])
+@pytest.mark.parametrize(
+    "shape", [(1, 3, 9, 5, 6), (1, 3, 2, 4, 4), (1, 3, 1, 4, 4), (2, 3, 6, 6, 6)]
+)
 def test_a_small_volume_alone_is_convolved_as_any_other(shape):
     torch.manual_seed(0)
-    x, weight = torch.randn(shape, dtype=torch.float64, requires_grad=True), torch.randn(4, 3, 3, 3, 3).double()
+    x, weight = (
+        torch.randn(shape, dtype=torch.float64, requires_grad=True),
+        torch.randn(4, 3, 3, 3, 3).double(),
+    )
     assert shape[1] * shape[2] * shape[3] <= ALONE
     assert torch.allclose(convolution(x, weight), F.conv3d(x, weight, padding=1), atol=1e-12)
     (found,), (dense,) = (
-        torch.autograd.grad(f.square().sum(), x) for f in (convolution(x, weight), F.conv3d(x, weight, padding=1))
+        torch.autograd.grad(f.square().sum(), x)
+        for f in (convolution(x, weight), F.conv3d(x, weight, padding=1))
     )
     assert torch.allclose(found, dense, atol=1e-10)
 

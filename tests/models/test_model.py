@@ -41,7 +41,9 @@ def test_opinions_reproduce_their_own_views():
     _, views = _blob_views(projector)
     seen: list[torch.Tensor] = []
     model.opinions.head.register_forward_hook(lambda _module, _given, density: seen.append(density))
-    model.opinions(model.regions(views), views, torch.rand(2, 1, 12, 12, 12), torch.zeros_like(views))
+    model.opinions(
+        model.regions(views), views, torch.rand(2, 1, 12, 12, 12), torch.zeros_like(views)
+    )
     fine = model.regions.whole.fine
     sees = fine.chord.reshape(1, 1, 4, 12, 12) > 0
     assert _close(fine.integrate(seen[0]), views * sees, 1e-5)
@@ -137,8 +139,8 @@ def test_cameras_may_be_few():
     assert model(_blob_views(projector)[1]).volume.isfinite().all()
 
 
-#: Of models with random weights, from before they could skip anything: the sum and mean square of the volume, two of
-#: its voxels, and the loss.
+#: Of models with random weights, from before they could skip anything: the sum and mean square of
+#: the volume, two of its voxels, and the loss.
 BEFORE = {
     "cross_view": (127.037872, 0.022079, 0.491416, 0.457261, 0.013639),
     "mean_fusion": (125.413834, 0.014192, 0.461284, 0.177629, 0.00994),
@@ -151,7 +153,9 @@ def test_models_that_skip_nothing_answer_as_they_did(name):
     projector = small_projector()
     model = _build(name, projector)
     _stir(model)
-    if name != "backprojection_unet":  # these weights are from when the depth network saw views in mm
+    if (
+        name != "backprojection_unet"
+    ):  # these weights are from when the depth network saw views in mm
         model.opinions.pixels.weight.data *= model.opinions.unit
     volume, views = _blob_views(projector)
     out = model(views)

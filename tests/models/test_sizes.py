@@ -1,4 +1,6 @@
-"""Grids, detectors and types that are out of the ordinary: each is computed, or refused at the door."""
+"""Grids, detectors and types that are out of the ordinary: each is computed, or refused at the
+door.
+"""
 
 import pytest
 import torch
@@ -13,7 +15,12 @@ from tests.models.test_model import HEAD
 NAMES = tuple(MODELS.names())
 SKIPS = ({}, {"support": "hull"}, {"support": "hull", "masked": False})
 #: A model and what it may leave out.
-WAYS = [(name, skip) for name in NAMES for skip in SKIPS if not skip or name in ("cross_view", "backprojection_unet")]
+WAYS = [
+    (name, skip)
+    for name in NAMES
+    for skip in SKIPS
+    if not skip or name in ("cross_view", "backprojection_unet")
+]
 NETWORKS = ("cross_view", "mean_fusion", "backprojection_unet", "geometry_free")
 
 
@@ -35,7 +42,9 @@ def _stirred(name: str, projector: Projector, **options) -> torch.nn.Module:
 
 
 def _learns(model: torch.nn.Module, views: torch.Tensor, shape: tuple[int, ...]) -> None:
-    """The volume has the grid's shape, all of it and of the gradients is finite, and not all is zero."""
+    """The volume has the grid's shape, all of it and of the gradients is finite, and not all is
+    zero.
+    """
     volume = model(views).volume
     assert volume.shape == (1, 1, *shape) and volume.isfinite().all() and volume.any()
     if any(parameter.numel() for parameter in model.parameters()):
@@ -43,7 +52,9 @@ def _learns(model: torch.nn.Module, views: torch.Tensor, shape: tuple[int, ...])
     assert all(p.grad.isfinite().all() for p in model.parameters() if p.grad is not None)
 
 
-@pytest.mark.parametrize("shape", [(1, 16, 16), (16, 16, 1), (2, 2, 2), (5, 5, 5), (3, 1, 7), (1, 1, 1)])
+@pytest.mark.parametrize(
+    "shape", [(1, 16, 16), (16, 16, 1), (2, 2, 2), (5, 5, 5), (3, 1, 7), (1, 1, 1)]
+)
 @pytest.mark.parametrize(("name", "skip"), WAYS)
 def test_every_model_takes_any_grid(name, skip, shape):
     projector = _projector(shape)
@@ -55,19 +66,31 @@ def test_every_model_takes_detectors_of_a_few_pixels(name, skip):
     for pixels in (1, 3):
         projector = _projector(pixels=pixels)
         binned = {"opinion": {"binning": pixels}} if name in ("cross_view", "mean_fusion") else {}
-        _learns(_stirred(name, projector, **skip, **binned), projector(torch.rand(1, 1, 12, 12, 12)), (12, 12, 12))
+        _learns(
+            _stirred(name, projector, **skip, **binned),
+            projector(torch.rand(1, 1, 12, 12, 12)),
+            (12, 12, 12),
+        )
 
 
 def test_a_group_of_one_voxel_is_normalised_to_its_shift():
     projector = _projector((1, 1, 1))
-    _learns(_stirred("backprojection_unet", projector, width=4), projector(torch.ones(1, 1, 1, 1, 1)), (1, 1, 1))
+    _learns(
+        _stirred("backprojection_unet", projector, width=4),
+        projector(torch.ones(1, 1, 1, 1, 1)),
+        (1, 1, 1),
+    )
 
 
 @pytest.mark.parametrize("shape", [(1, 4, 3), (1, 1, 1), (5, 2, 1)])
 def test_halving_leaves_an_axis_of_one_voxel(shape):
     x = torch.rand(2, 3, *shape, dtype=torch.float64, requires_grad=True)
-    mean = torch.stack([part.mean(dim=(2, 3, 4)) for part in x[:, :, :2, :2, :2].split(2, dim=2)])[0]
-    assert torch.allclose(halved(x)[:, :, 0, 0, 0], mean) and halved(x).shape[2:] == tuple(-(-n // 2) for n in shape)
+    mean = torch.stack([part.mean(dim=(2, 3, 4)) for part in x[:, :, :2, :2, :2].split(2, dim=2)])[
+        0
+    ]
+    assert torch.allclose(halved(x)[:, :, 0, 0, 0], mean) and halved(x).shape[2:] == tuple(
+        -(-n // 2) for n in shape
+    )
     assert torch.autograd.gradcheck(halved, [x])
 
 

@@ -13,7 +13,13 @@ from mvrecon.support.support import Support
 
 HEAD = {"name": "softmax_depth"}
 MODEL_OPTIONS = {
-    "cross_view": {"head": HEAD, "opinion": {"width": 4}, "refine": 4, "start": 3, "consistency": 1},
+    "cross_view": {
+        "head": HEAD,
+        "opinion": {"width": 4},
+        "refine": 4,
+        "start": 3,
+        "consistency": 1,
+    },
     "mean_fusion": {"head": HEAD, "opinion": {"width": 4}, "start": 3, "consistency": 1},
     "backprojection_unet": {"width": 4, "start": 3, "consistency": 1},
 }
@@ -31,7 +37,9 @@ def scenes(projector):
     return volume, projector(volume), max_pool3d((volume > 0).float(), 3, stride=1, padding=1) > 0
 
 
-def _build(name: str, projector: torch.nn.Module, dtype: torch.dtype = torch.float32, **options) -> torch.nn.Module:
+def _build(
+    name: str, projector: torch.nn.Module, dtype: torch.dtype = torch.float32, **options
+) -> torch.nn.Module:
     torch.manual_seed(0)
     model = MODELS.build(name, projector, **{**MODEL_OPTIONS[name], **options}).to(dtype)
     torch.manual_seed(2)
@@ -63,7 +71,9 @@ def test_the_crop_does_not_matter_to_a_masked_model(name, dtype, projector, scen
     for other in found[1:]:
         for field in FIELDS:
             one, two = getattr(found[0], field), getattr(other, field)
-            assert (one is None and two is None) or _close(two, one, 1e-5 if dtype == torch.float32 else 1e-10)
+            assert (one is None and two is None) or _close(
+                two, one, 1e-5 if dtype == torch.float32 else 1e-10
+            )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -80,7 +90,9 @@ def test_a_sample_does_not_depend_on_the_others_of_its_batch(name, projector, sc
 
 @pytest.mark.parametrize("masked", [True, False])
 @torch.no_grad()
-def test_everything_returned_has_the_grid_and_is_zero_outside(masked, projector, scenes, monkeypatch):
+def test_everything_returned_has_the_grid_and_is_zero_outside(
+    masked, projector, scenes, monkeypatch
+):
     volume, views, mask = scenes
     _with_mask(monkeypatch, mask)
     out = _build("cross_view", projector, support="hull", masked=masked)(views)
@@ -136,9 +148,14 @@ def test_weights_are_the_same_with_and_without(name, projector):
 def test_a_support_of_everything_is_no_support_in_the_world(projector, scenes, monkeypatch):
     _, views, mask = scenes
     _with_mask(monkeypatch, torch.ones_like(mask))
-    models = [_build("backprojection_unet", projector, torch.float64, support=kind) for kind in ("hull", "none")]
+    models = [
+        _build("backprojection_unet", projector, torch.float64, support=kind)
+        for kind in ("hull", "none")
+    ]
     on, off = (model(views.double()) for model in models)
-    assert off.support is None and _close(on.volume, off.volume, 1e-6)  # as exact as R, which is kept in float32
+    assert off.support is None and _close(
+        on.volume, off.volume, 1e-6
+    )  # as exact as R, which is kept in float32
 
 
 def test_auto_takes_everything_where_the_hull_holds_most_of_it():
@@ -146,10 +163,14 @@ def test_auto_takes_everything_where_the_hull_holds_most_of_it():
     hull[..., 1:7, :, 0] = hull[..., 1, :, 9] = True
     assert torch.equal(regions.worked_on(hull, "auto"), hull)
     hull[..., 8, 5, 5] = True  # now its box holds 0.8 of the voxels
-    assert regions.worked_on(hull, "auto").all() and torch.equal(regions.worked_on(hull, "hull"), hull)
+    assert regions.worked_on(hull, "auto").all() and torch.equal(
+        regions.worked_on(hull, "hull"), hull
+    )
 
 
-def test_every_parameter_learns_on_a_support_met_first_in_evaluation(projector, scenes, monkeypatch):
+def test_every_parameter_learns_on_a_support_met_first_in_evaluation(
+    projector, scenes, monkeypatch
+):
     volume, views, mask = scenes
     _with_mask(monkeypatch, mask)
     model = _build("cross_view", projector, support="hull")
@@ -183,7 +204,9 @@ def test_refinement_where_opinions_disagree(support, projector, scenes, monkeypa
     plain = _build("cross_view", projector, refine=0, **options)
     volumes = {}
     for tolerance in (1e-9, MIDDLE[support], 1e9):
-        model = _build("cross_view", projector, refine_where="disagreement", tolerance=tolerance, **options)
+        model = _build(
+            "cross_view", projector, refine_where="disagreement", tolerance=tolerance, **options
+        )
         plain.load_state_dict(model.state_dict(), strict=False)
         volumes[tolerance] = model(views).volume
     unrefined = plain(views).volume
@@ -201,7 +224,10 @@ def test_steps_stop_for_each_sample_where_noise_explains_what_is_left(projector,
     sigma = 0.01 * views.square().mean().sqrt().expand(2, 1, 1, 1, 1)
     after = model.consistency(region, start, views, sigma)
     assert torch.equal(after[0], start[0]) and not torch.equal(after[1], start[1])
-    assert torch.equal(model.consistency(region, start, views, sigma / 1e6), model.consistency(region, start, views))
+    assert torch.equal(
+        model.consistency(region, start, views, sigma / 1e6),
+        model.consistency(region, start, views),
+    )
     always = model.train().consistency(region, start, views, sigma)
     assert torch.equal(always, model.consistency(region, start, views))
 

@@ -8,12 +8,19 @@ from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from tests.models.test_sizes import SKIPS, _stirred
 
-WAYS = [(name, skip) for name in MODELS.names() for skip in SKIPS[:2] if not skip or name == "cross_view"]
+WAYS = [
+    (name, skip)
+    for name in MODELS.names()
+    for skip in SKIPS[:2]
+    if not skip or name == "cross_view"
+]
 
 
 @torch.no_grad()
 def _answer(name: str, mm: float, dtype: torch.dtype, skip: dict) -> Reconstruction:
-    """Of a scene whose every length is so many times as great, and its attenuation as many times smaller."""
+    """Of a scene whose every length is so many times as great, and its attenuation as many times
+    smaller.
+    """
     grid = Grid.centred((12, 12, 12), 2.0 * mm, centre=(mm, 0.0, 0.0))
     detector = {"pixels": [12, 12], "pixel_mm": 5.0 * mm}
     cameras = CAMERAS.build("circular", views=4, sid=100.0 * mm, sdd=200.0 * mm, detector=detector)
@@ -21,14 +28,18 @@ def _answer(name: str, mm: float, dtype: torch.dtype, skip: dict) -> Reconstruct
     torch.manual_seed(0)
     model = _stirred(name, projector, **skip).to(dtype).eval()
     volume = torch.zeros(1, 1, 12, 12, 12, dtype=dtype)
-    volume[..., 3:9, 4:8, 3:8] = torch.rand(6, 4, 5, generator=torch.Generator().manual_seed(1), dtype=dtype)
+    volume[..., 3:9, 4:8, 3:8] = torch.rand(
+        6, 4, 5, generator=torch.Generator().manual_seed(1), dtype=dtype
+    )
     return model(projector(volume / mm))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("name", "skip"), WAYS)
 def test_the_unit_of_length_does_not_matter(name, skip, dtype):
-    """To rounding, also that of SIRT's sums, which are float32; where no number is rounded, to the bit."""
+    """To rounding, also that of SIRT's sums, which are float32; where no number is rounded, to the
+    bit.
+    """
     expected = _answer(name, 1.0, dtype, skip).volume
     assert expected.any()
     for mm in (10.0, 1e-3):

@@ -1,4 +1,6 @@
-"""Cases for the operators of rays: every kind of rig, those whose columns stand upright over the volume apart."""
+"""Cases for the operators of rays: every kind of rig, those whose columns stand upright over the
+volume apart.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -14,8 +16,12 @@ from mvrecon.projectors.ray_transform import RayTransform
 from tests.projectors.rigs import AXIAL, GRID, INSIDE
 
 METHODS = ("joseph", "siddon", "trilinear")
-#: Each with the options that a projector takes; 5 samples miss most voxels, which no test here minds.
-OPTIONS = {**{method: {"method": method} for method in METHODS}, "samples": {"method": "trilinear:5"}}
+#: Each with the options that a projector takes; 5 samples miss most voxels, which no test here
+#: minds.
+OPTIONS = {
+    **{method: {"method": method} for method in METHODS},
+    "samples": {"method": "trilinear:5"},
+}
 
 
 @dataclass(frozen=True)
@@ -38,10 +44,13 @@ class Case:
 
     def moved(self, *vectors: torch.Tensor) -> "Case":
         """The same with other tensors for the rays."""
-        return replace(self, rays=replace(self.rays, **dict(zip(self.vectors, vectors, strict=True))))
+        return replace(
+            self, rays=replace(self.rays, **dict(zip(self.vectors, vectors, strict=True)))
+        )
 
 
-#: More slices than the least that is worth the loops for upright columns; no two sizes or spacings alike.
+#: More slices than the least that is worth the loops for upright columns; no two sizes or spacings
+#: alike.
 TALL = Grid.centred((11, 7, 9), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
 #: Rows of a pitch that is not the slices', at places between them, that end inside the volume.
 WITHIN = {"pixels": [8, 5], "pixel_mm": [0.83, 1.9], "offset_mm": [0.37, -0.3]}
@@ -75,12 +84,20 @@ TILTED = parallel(3, WITHIN, 60.0, start_degrees=11.0).moved(TURNED, GRID.centre
 
 CASES = {
     "cone": Case(TALL, about(TALL, circular(5, 40.0, 70.0, WITHIN, start_degrees=13.0)), True),
-    "cone beyond": Case(TALL, about(TALL, circular(5, 40.0, 70.0, BEYOND, start_degrees=29.0)), True),
-    "skewed cone": Case(TALL, about(TALL, skewed(circular(3, 40.0, 70.0, BEYOND, start_degrees=13.0))), True),
+    "cone beyond": Case(
+        TALL, about(TALL, circular(5, 40.0, 70.0, BEYOND, start_degrees=29.0)), True
+    ),
+    "skewed cone": Case(
+        TALL, about(TALL, skewed(circular(3, 40.0, 70.0, BEYOND, start_degrees=13.0))), True
+    ),
     "stack": Case(TALL, about(TALL, parallel(4, WITHIN, 60.0, start_degrees=11.0)), True),
     "stack beyond": Case(TALL, about(TALL, parallel(4, BEYOND, 60.0, start_degrees=11.0)), True),
-    "skewed stack": Case(TALL, about(TALL, skewed(parallel(3, BEYOND, 60.0, start_degrees=17.0))), True),
-    "endless stack": Case(TALL, about(TALL, replace(parallel(3, WITHIN, 60.0), extent="line")), True),
+    "skewed stack": Case(
+        TALL, about(TALL, skewed(parallel(3, BEYOND, 60.0, start_degrees=17.0))), True
+    ),
+    "endless stack": Case(
+        TALL, about(TALL, replace(parallel(3, WITHIN, 60.0), extent="line")), True
+    ),
     "cut stack": Case(TALL, about(TALL, parallel(3, WITHIN, 3.3, start_degrees=19.0)), True),
     "arc": Case(GRID, about(GRID, arc(3, 40.0, 70.0, WITHIN, 100.0, 5.0))),
     "dome": Case(GRID, about(GRID, dome(4, 30.0, 20.0, 120.0, WITHIN))),
@@ -104,11 +121,15 @@ DIFFERENTIABLE = {
 }
 
 
-def noise(case: Case, dtype: torch.dtype = torch.float64, channels: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+def noise(
+    case: Case, dtype: torch.dtype = torch.float64, channels: int = 1
+) -> tuple[torch.Tensor, torch.Tensor]:
     """A volume and views of noise."""
     rng = torch.Generator().manual_seed(0)
     x = torch.randn(2, channels, *case.grid.shape, generator=rng, dtype=torch.float64)
-    y = torch.randn(2, channels, len(case.rays), *case.rays.shape, generator=rng, dtype=torch.float64)
+    y = torch.randn(
+        2, channels, len(case.rays), *case.rays.shape, generator=rng, dtype=torch.float64
+    )
     return x.to(dtype), y.to(dtype)
 
 

@@ -14,7 +14,9 @@ CONE = circular(4, 40.0, 70.0, DETECTOR, start_degrees=13.0).moved(torch.eye(3),
 PINHOLES = dome(4, 30.0, 20.0, 120.0, DETECTOR, target=GRID.centre.tolist())
 PARALLEL = parallel(4, DETECTOR, 60.0, start_degrees=11.0).moved(torch.eye(3), GRID.centre)
 #: Sources in the box, none on a voxel's face.
-INSIDE = replace(CONE, source=GRID.centre + torch.tensor([0.9, -0.7, 0.6]) + 0.02 * (CONE.source - GRID.centre))
+INSIDE = replace(
+    CONE, source=GRID.centre + torch.tensor([0.9, -0.7, 0.6]) + 0.02 * (CONE.source - GRID.centre)
+)
 #: Central rays along the grid's axes, through the centres of voxels.
 AXIAL = circular(4, 40.0, 70.0, {"pixels": [5, 5], "pixel_mm": 2.0}).moved(
     torch.eye(3), GRID.centre + torch.tensor([0.0, 0.6, 0.0])

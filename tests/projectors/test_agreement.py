@@ -10,7 +10,8 @@ from mvrecon.kernels.rays import plan, upright
 from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.projectors.cases import CASES, OPTIONS, UPRIGHT, Case, gap, noise
 
-#: Relative errors in float32. Siddon: where a ray passes from cell to cell under a small slope is known to few digits.
+#: Relative errors in float32. Siddon: where a ray passes from cell to cell under a small slope is
+#: known to few digits.
 SINGLE = {option: 5e-6 if option == "siddon" else 2e-6 for option in OPTIONS}
 
 
@@ -32,7 +33,9 @@ def test_the_cases_stand_upright_where_they_say_so():
 def test_the_loops_equal_the_oracle(kind, option):
     case: Case = CASES[kind]
     x, y = noise(case)
-    oracle, compiled = (case.build(backend=backend, **OPTIONS[option]) for backend in ("reference", "cpu"))
+    oracle, compiled = (
+        case.build(backend=backend, **OPTIONS[option]) for backend in ("reference", "cpu")
+    )
     views, volume = oracle(x), oracle.T(y)
     assert compiled.last_backend is None and views.abs().max() > 1 and volume.abs().max() > 1
     assert gap(compiled(x), views) < 1e-12 and gap(compiled.T(y), volume) < 1e-12
@@ -108,13 +111,17 @@ def test_threads_change_no_bit(kind, option, monkeypatch, threads):
 
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", ["cone", "stack", "dome"])
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 6), (9, 1, 6), (9, 5, 1), (1, 1, 6), (1, 5, 1), (9, 1, 1)])
+@pytest.mark.parametrize(
+    "shape", [(1, 1, 1), (1, 5, 6), (9, 1, 6), (9, 5, 1), (1, 1, 6), (1, 5, 1), (9, 1, 1)]
+)
 def test_axes_of_one_voxel(shape, kind, option):
     case = CASES[kind]
     grid = type(case.grid).centred(shape, case.grid.spacing, case.grid.centre.tolist())
     case = Case(grid, case.rays)
     x, y = noise(case)
-    oracle, compiled = (case.build(backend=backend, **OPTIONS[option]) for backend in ("reference", "cpu"))
+    oracle, compiled = (
+        case.build(backend=backend, **OPTIONS[option]) for backend in ("reference", "cpu")
+    )
     # so few samples may all miss a single voxel
     if option != "samples":
         assert oracle(x).abs().max() > 0.1

@@ -15,6 +15,8 @@ def test_what_another_thread_found_about_its_volume_is_not_read(monkeypatch):
     expected = A(x)
     A(x.flip(2, 3, 4))
     elsewhere = A._last
-    monkeypatch.setattr(RayTransform, "_last", property(lambda _: elsewhere, lambda *_: None), raising=False)
+    monkeypatch.setattr(
+        RayTransform, "_last", property(lambda _: elsewhere, lambda *_: None), raising=False
+    )
     assert A.skipped.box != Box.around(x[0, 0] != 0)
     assert torch.equal(A(x), expected)

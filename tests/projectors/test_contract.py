@@ -18,7 +18,8 @@ BACKENDS = ("reference", "cpu")
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("name", "kind", "rig"), RIGS, ids=[kind for _, kind, _ in RIGS])
 def test_a_projector_keeps_the_contract(name, kind, rig, method, backend):
-    # derivatives along an axis-aligned view stand on the kinks between voxels, where differences mean nothing
+    # derivatives along an axis-aligned view stand on the kinks between voxels, where differences
+    # mean nothing
     check_projector(name, GRID, rig, gradients=False, method=method, backend=backend)
 
 
@@ -35,7 +36,9 @@ def test_differences_confirm_its_gradients(kind, method, backend):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("name", "kind", "rig"), RIGS, ids=[kind for _, kind, _ in RIGS])
 def test_both_back_ends_agree(name, kind, rig, method, dtype):
-    oracle, compiled = (PROJECTORS.build(name, grid=GRID, cameras=rig, method=method, backend=b) for b in BACKENDS)
+    oracle, compiled = (
+        PROJECTORS.build(name, grid=GRID, cameras=rig, method=method, backend=b) for b in BACKENDS
+    )
     x = torch.rand(2, 2, *GRID.shape, dtype=dtype)
     y = oracle(x)
     # in float32 a crossing under a small slope is known to fewer digits than the slope
@@ -56,7 +59,9 @@ def test_pose_gradients_agree(kind, method):
     )
     changes = []
     for backend in BACKENDS:
-        vectors = [getattr(rig, each).clone().requires_grad_() for each in ("source", "origin", "u", "v")]
+        vectors = [
+            getattr(rig, each).clone().requires_grad_() for each in ("source", "origin", "u", "v")
+        ]
         moving = replace(rig, **dict(zip(("source", "origin", "u", "v"), vectors, strict=True)))
         A = PROJECTORS.build(name, grid=GRID, cameras=moving, method=method, backend=backend)
         changes.append(torch.autograd.grad((A(x) * y).sum(), vectors))

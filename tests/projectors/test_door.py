@@ -18,7 +18,9 @@ def A():
 
 @pytest.mark.parametrize("shape", [(5, 6, 7), (1, 5, 6, 7), (1, 1, 7, 6, 5)])
 def test_a_volume_of_the_wrong_shape_is_refused(A, shape):
-    with pytest.raises(ValueError, match=rf"volume \[b c d h w\].*\(5, 6, 7\), got {re.escape(str(shape))}"):
+    with pytest.raises(
+        ValueError, match=rf"volume \[b c d h w\].*\(5, 6, 7\), got {re.escape(str(shape))}"
+    ):
         A(torch.zeros(shape))
 
 
@@ -36,7 +38,11 @@ def test_a_support_of_another_grid_is_refused(A):
 
 @pytest.mark.parametrize("dtype", [torch.int16, torch.bool, torch.complex64])
 def test_what_would_be_rounded_or_cut_is_refused(A, dtype):
-    for act, shape in ((A, GRID.shape), (A.T, (4, 5, 6)), (view_subset(A, [0, 1, 2, 3]).T, (4, 5, 6))):
+    for act, shape in (
+        (A, GRID.shape),
+        (A.T, (4, 5, 6)),
+        (view_subset(A, [0, 1, 2, 3]).T, (4, 5, 6)),
+    ):
         with pytest.raises(ValueError, match=rf"Expected .*floating point, got {dtype}"):
             act(torch.ones(1, 1, *shape, dtype=dtype))
 

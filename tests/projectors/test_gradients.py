@@ -1,4 +1,6 @@
-"""Derivatives: confirmed by differences, equal to the oracle's, and computed only where they are asked for."""
+"""Derivatives: confirmed by differences, equal to the oracle's, and computed only where they are
+asked for.
+"""
 
 import pytest
 import torch
@@ -17,8 +19,12 @@ def test_differences_confirm_the_derivatives(kind, option):
     """Also where a ray's own end lies inside the volume: at a source in it, or before a plane."""
     case, options = DIFFERENTIABLE[kind], OPTIONS[option]
     x, y = (each[:1].requires_grad_() for each in noise(case))
-    assert torch.autograd.gradcheck(lambda x, *v: case.moved(*v).build(**options)(x), (x, *leaves(case)), atol=1e-5)
-    assert torch.autograd.gradcheck(lambda y, *v: case.moved(*v).build(**options).T(y), (y, *leaves(case)), atol=1e-5)
+    assert torch.autograd.gradcheck(
+        lambda x, *v: case.moved(*v).build(**options)(x), (x, *leaves(case)), atol=1e-5
+    )
+    assert torch.autograd.gradcheck(
+        lambda y, *v: case.moved(*v).build(**options).T(y), (y, *leaves(case)), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("option", OPTIONS)
@@ -26,7 +32,9 @@ def test_differences_confirm_the_derivatives(kind, option):
 def test_second_derivatives_in_volume_and_views(kind, option):
     A = DIFFERENTIABLE[kind].build(**OPTIONS[option])
     x, y = (each[:1].requires_grad_() for each in noise(DIFFERENTIABLE[kind]))
-    assert torch.autograd.gradgradcheck(lambda x, y: (A(x).square() * y).sum() + A.T(y).pow(3).sum(), (x, y))
+    assert torch.autograd.gradgradcheck(
+        lambda x, y: (A(x).square() * y).sum() + A.T(y).pow(3).sum(), (x, y)
+    )
 
 
 def changes(case: Case, backend: str, options: dict) -> list[torch.Tensor]:
@@ -83,14 +91,22 @@ def calls(monkeypatch):
 
 @pytest.mark.parametrize(
     ("of_values", "of_rays", "expected"),
-    [(True, False, ["back"]), (False, True, ["vjp"]), (True, True, ["back", "vjp"]), (False, False, [])],
+    [
+        (True, False, ["back"]),
+        (False, True, ["vjp"]),
+        (True, True, ["back", "vjp"]),
+        (False, False, []),
+    ],
 )
 def test_only_what_is_asked_for_is_computed(of_values, of_rays, expected, calls):
     case = DIFFERENTIABLE["cone"]
     x, y = (each.requires_grad_(of_values) for each in noise(case))
     vectors = leaves(case) if of_rays else list(case.vectors.values())
     A = case.moved(*vectors).build()
-    for result, forward, back in ((A(x), "project", "backproject"), (A.T(y), "backproject", "project")):
+    for result, forward, back in (
+        (A(x), "project", "backproject"),
+        (A.T(y), "backproject", "project"),
+    ):
         assert result.requires_grad == bool(expected)
         calls.clear()
         if expected:
@@ -102,11 +118,16 @@ def test_only_what_is_asked_for_is_computed(of_values, of_rays, expected, calls)
 def test_a_second_derivative_in_the_pose_says_where_it_is(method):
     case = DIFFERENTIABLE["cone"]
     x, y = (each[:1] for each in noise(case))
-    for backend, by in (("cpu", pytest.raises(NotImplementedError, match="reference")), ("reference", None)):
+    for backend, by in (
+        ("cpu", pytest.raises(NotImplementedError, match="reference")),
+        ("reference", None),
+    ):
         for act, values in (("forward", x), ("adjoint", y)):
             vectors = leaves(case)
             A = case.moved(*vectors).build(backend=backend, method=method)
-            (change,) = torch.autograd.grad(getattr(A, act)(values).square().sum(), vectors[0], create_graph=True)
+            (change,) = torch.autograd.grad(
+                getattr(A, act)(values).square().sum(), vectors[0], create_graph=True
+            )
             if by is None:
                 assert torch.autograd.grad(change.sum(), vectors[0])[0].isfinite().all()
                 continue

@@ -35,7 +35,10 @@ def test_memory_layout_changes_no_bit(kind, option):
     A = case.build(**OPTIONS[option])
     for act, values in zip((A, A.T), noise(case, torch.float32, channels=3), strict=True):
         expected = act(values)
-        for swapped in (values.transpose(0, 1).contiguous().transpose(0, 1), values.mT.contiguous().mT):
+        for swapped in (
+            values.transpose(0, 1).contiguous().transpose(0, 1),
+            values.mT.contiguous().mT,
+        ):
             assert not swapped.is_contiguous() and torch.equal(act(swapped), expected)
         flipped = values.movedim((2, 3), (3, 2)).contiguous().movedim((2, 3), (3, 2))
         assert torch.equal(act(flipped), expected)
@@ -51,7 +54,9 @@ def test_each_volume_is_seen_alone(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
     for act, values in zip((A, A.T), noise(case, torch.float32, channels=2), strict=True):
-        assert gap(act(values)[1:, 1:], act(values[1:, 1:])) < (1e-5 if option == "siddon" else 1e-6)
+        assert gap(act(values)[1:, 1:], act(values[1:, 1:])) < (
+            1e-5 if option == "siddon" else 1e-6
+        )
         assert torch.equal(act(values), act(values)), "twice the same"
 
 

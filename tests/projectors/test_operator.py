@@ -1,4 +1,6 @@
-"""Linear operators made of others: adjoints, products, weights, stacks and parts, against the plain definitions."""
+"""Linear operators made of others: adjoints, products, weights, stacks and parts, against the plain
+definitions.
+"""
 
 import pytest
 import torch

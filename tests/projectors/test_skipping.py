@@ -1,4 +1,6 @@
-"""Leaving out what is zero changes no bit; a support is part of the operator; what pays is chosen by counting."""
+"""Leaving out what is zero changes no bit; a support is part of the operator; what pays is chosen
+by counting.
+"""
 
 from dataclasses import replace
 
@@ -36,7 +38,10 @@ CASES = {
     "dome": Case(GRID, about(dome(5, 45.0, 30.0, 120.0, DETECTOR))),
     "beams": Case(GRID, parallel(3, DETECTOR, 90.0, start_degrees=11.0).moved(TURNED, GRID.centre)),
     "along rows": Case(GRID, about(ALONG)),
-    "inside": Case(GRID, about(circular(3, 9.0, 40.0, DETECTOR, start_degrees=13.0).moved(TURNED, torch.ones(3)))),
+    "inside": Case(
+        GRID,
+        about(circular(3, 9.0, 40.0, DETECTOR, start_degrees=13.0).moved(TURNED, torch.ones(3))),
+    ),
     "dcspect80": Case(Grid.centred((19, 26, 33), (9.0, 8.0, 7.0)), dcspect80()[::13].binned(6)),
     "explicit": Case(GRID, curved(9, 7)),
 }
@@ -52,7 +57,14 @@ def volumes(kind: str, dtype: torch.dtype = torch.float32, count: int = 1) -> to
     if kind == "blob":
         mask[5:9, 11:20, 8:14] = True
     elif kind == "corners":  # a voxel in each corner and on an edge of a brick
-        for z, y, x in [(8, 8, 8), (15, 15, 15), (8, 15, 23), (12, 16, 24), (7, 7, 31), (16, 8, 12)]:
+        for z, y, x in [
+            (8, 8, 8),
+            (15, 15, 15),
+            (8, 15, 23),
+            (12, 16, 24),
+            (7, 7, 31),
+            (16, 8, 12),
+        ]:
             mask[z, y, x] = True
     elif kind == "checkerboard":
         z, y, x = torch.meshgrid(*[torch.arange(n) // EDGE for n in GRID.shape], indexing="ij")
@@ -79,7 +91,11 @@ def test_skipping_zeros_changes_no_bit(kind, method):
             assert operators["off"].skipped.mode == "off"
             for skip in WAYS:
                 assert torch.equal(operators[skip](x), dense), (shape, dtype, count, skip)
-            assert bool(dense.any()) or shape not in ("blob", "checkerboard", "full") or method == "trilinear:7"
+            assert (
+                bool(dense.any())
+                or shape not in ("blob", "checkerboard", "full")
+                or method == "trilinear:7"
+            )
 
 
 @pytest.mark.parametrize("kind", ["cone", "dome"])
@@ -87,7 +103,9 @@ def test_random_rays_agree_to_the_last_bit(kind):
     """Ten thousand and more rays in random poses of the grid."""
     rng = torch.Generator().manual_seed(11)
     for _ in range(6):
-        rig = CASES[kind].rays.moved(random_rotation(rng) if kind == "dome" else torch.eye(3), torch.rand(3) - 0.5)
+        rig = CASES[kind].rays.moved(
+            random_rotation(rng) if kind == "dome" else torch.eye(3), torch.rand(3) - 0.5
+        )
         case = Case(GRID, rig.refined(2))
         for shape in ("blob", "checkerboard"):
             x = volumes(shape)
@@ -193,7 +211,10 @@ def test_the_gradient_by_the_geometry_is_the_dense_one(kind, method):
     ("options", "message"),
     [
         ({"skip": "boxes"}, "Unknown skip 'boxes'. Known: auto, off, box, brick, verify"),
-        ({"support": torch.ones(3, 3, 3, dtype=torch.bool)}, r"shape \(19, 26, 33\), got bool of \(3, 3, 3\)"),
+        (
+            {"support": torch.ones(3, 3, 3, dtype=torch.bool)},
+            r"shape \(19, 26, 33\), got bool of \(3, 3, 3\)",
+        ),
         ({"support": torch.ones(19, 26, 33)}, r"mask of bool .* got float32 of \(19, 26, 33\)"),
     ],
 )
@@ -220,23 +241,36 @@ def test_bricks_hold_what_is_there_and_what_is_just_behind():
     box = Box.around(x[0] != 0)
     found = bricks_of(x.numpy(), box)
     for k, j, i in torch.cartesian_prod(*[torch.arange(n) for n in found.shape]).tolist():
-        part = x[0, k * EDGE : k * EDGE + EDGE + 1, j * EDGE : j * EDGE + EDGE + 1, i * EDGE : i * EDGE + EDGE + 1]
+        part = x[
+            0,
+            k * EDGE : k * EDGE + EDGE + 1,
+            j * EDGE : j * EDGE + EDGE + 1,
+            i * EDGE : i * EDGE + EDGE + 1,
+        ]
         assert bool(found[k, j, i]) == bool(part.any())
 
 
 def test_the_choice_is_told_and_follows_the_scene():
-    """A full volume: nothing to skip. A small object: its box. Two small ones in far corners: bricks."""
+    """A full volume: nothing to skip. A small object: its box. Two small ones in far corners:
+    bricks.
+    """
     grid = Grid.centred((64, 64, 64), 1.0)
     A = Case(grid, dome(4, 120.0, 60.0, 120.0, {"pixels": [96, 96], "pixel_mm": 0.45})).build()
     x = torch.rand(1, 1, 64, 64, 64) + 0.1
     A(x)
-    assert (A.skipped.mode, A.skipped.box) == ("off", Box.whole((64, 64, 64))) and "full" in A.skipped.why
+    assert (A.skipped.mode, A.skipped.box) == (
+        "off",
+        Box.whole((64, 64, 64)),
+    ) and "full" in A.skipped.why
     A(torch.nn.functional.pad(x[..., 20:40, 20:40, 20:40], (20, 24) * 3))
     assert (A.skipped.mode, A.skipped.box) == ("box", Box((20,) * 3, (40,) * 3))
     far = torch.zeros_like(x)
     far[..., :6, :6, :6] = far[..., -6:, -6:, -6:] = 1
     A(far)
-    assert A.skipped.mode == "brick" and A.skipped.fractions["brick"] < 0.5 * A.skipped.fractions["box"]
+    assert (
+        A.skipped.mode == "brick"
+        and A.skipped.fractions["brick"] < 0.5 * A.skipped.fractions["box"]
+    )
     assert "bricks" in A.skipped.why
 
 
@@ -248,7 +282,9 @@ def test_small_work_is_not_looked_at(monkeypatch):
 
 
 def test_a_full_volume_is_not_looked_at_brick_by_brick(monkeypatch):
-    monkeypatch.setattr("mvrecon.kernels.rays.choice.bricks_of", lambda *_: pytest.fail("every voxel was read"))
+    monkeypatch.setattr(
+        "mvrecon.kernels.rays.choice.bricks_of", lambda *_: pytest.fail("every voxel was read")
+    )
     A = CASES["cone"].build(skip="auto")
     A(volumes("full"))
     assert A.skipped.mode == "off"

@@ -11,7 +11,9 @@ from tests.projectors.test_skipping import CASES, GRID, METHODS, volumes
 
 def support() -> torch.Tensor:
     """A ball, off the centre, that leaves bricks of its box empty."""
-    places = torch.meshgrid(*[torch.arange(n, dtype=torch.float64) for n in GRID.shape], indexing="ij")
+    places = torch.meshgrid(
+        *[torch.arange(n, dtype=torch.float64) for n in GRID.shape], indexing="ij"
+    )
     return sum((p - c).square() for p, c in zip(places, (9, 14, 18), strict=True)) < 8.4**2
 
 
@@ -19,7 +21,9 @@ def support() -> torch.Tensor:
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", CASES)
 def test_a_support_is_part_of_operator_and_adjoint(kind, method, skip):
-    """A_M = A diag(M), A_M^T = diag(M) A^T, exactly adjoint, and the same to the last bit as the dense operator's."""
+    """A_M = A diag(M), A_M^T = diag(M) A^T, exactly adjoint, and the same to the last bit as the
+    dense operator's.
+    """
     M, dense = support(), CASES[kind].build(method=method, skip="off")
     A = CASES[kind].build(method=method, skip=skip, support=M)
     for dtype, close in ((torch.float32, 1e-5), (torch.float64, 1e-12)):
@@ -35,10 +39,15 @@ def test_a_support_is_part_of_operator_and_adjoint(kind, method, skip):
 
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:9"])
 def test_the_oracle_has_supports_too(method):
-    A, oracle = (CASES["dome"].build(method=method, backend=b, support=support()) for b in ("cpu", "reference"))
+    A, oracle = (
+        CASES["dome"].build(method=method, backend=b, support=support())
+        for b in ("cpu", "reference")
+    )
     x = torch.randn(1, 1, *GRID.shape, dtype=torch.float64)
     y = torch.randn(1, 1, 5, 17, 14, dtype=torch.float64)
-    assert torch.allclose(A(x), oracle(x), atol=1e-11) and torch.allclose(A.T(y), oracle.T(y), atol=1e-11)
+    assert torch.allclose(A(x), oracle(x), atol=1e-11) and torch.allclose(
+        A.T(y), oracle.T(y), atol=1e-11
+    )
     assert oracle.skipped.mode == "off" and A.skipped.mode in ("box", "brick")
 
 
@@ -56,8 +65,13 @@ def test_gradients_with_a_support_are_exact():
     grid = Grid.centred((9, 10, 11), 3.0)
     mask = torch.zeros(grid.shape, dtype=torch.bool)
     mask[4:6, 3:5, 8] = mask[5, 7, 1] = True
-    A = Case(grid, dome(2, 45.0, 30.0, 120.0, {"pixels": [3, 2], "pixel_mm": 20.0})).build(support=mask)
-    x, y = torch.randn(1, 1, *grid.shape, dtype=torch.float64), torch.randn(1, 1, 2, 3, 2, dtype=torch.float64)
+    A = Case(grid, dome(2, 45.0, 30.0, 120.0, {"pixels": [3, 2], "pixel_mm": 20.0})).build(
+        support=mask
+    )
+    x, y = (
+        torch.randn(1, 1, *grid.shape, dtype=torch.float64),
+        torch.randn(1, 1, 2, 3, 2, dtype=torch.float64),
+    )
     places = mask.nonzero().T
 
     def forward(values):
@@ -71,7 +85,11 @@ def test_gradients_with_a_support_are_exact():
 def test_an_empty_support_gives_nothing():
     A = CASES["cone"].build(support=torch.zeros(GRID.shape, dtype=torch.bool))
     y = torch.ones(1, 1, 5, 17, 14)
-    assert not A(torch.rand(1, 1, *GRID.shape)).any() and not A.T(y).any() and A.T(y).shape[2:] == GRID.shape
+    assert (
+        not A(torch.rand(1, 1, *GRID.shape)).any()
+        and not A.T(y).any()
+        and A.T(y).shape[2:] == GRID.shape
+    )
 
 
 def test_a_support_can_be_changed_and_follows_the_module():

@@ -26,7 +26,9 @@ def test_compiled_equals_the_reference_and_its_transpose_is_exact(kind, weight):
         exact = backproject(y, rig, GRID, weight, "reference")
         assert exact.norm() > 0.1 and (seen - exact).norm() < tolerance * exact.norm()
         x = torch.randn_like(seen)
-        back = voxel_ops.show(x.flatten(0, 1), maps, window, weighted, list(rig.shape)).unflatten(0, (2, 2))
+        back = voxel_ops.show(x.flatten(0, 1), maps, window, weighted, list(rig.shape)).unflatten(
+            0, (2, 2)
+        )
         assert ((seen * x).sum() - (y * back).sum()).abs() < tolerance * seen.norm() * x.norm()
 
 
@@ -51,7 +53,10 @@ def test_one_pixel_back_projects_to_the_cone_through_it():
     seen = backproject(views, rig, grid)[0, 0]
     off = (rig.project(voxel_centres(grid))[..., :2] - uv[:, None, None, None]).abs()
     assert torch.allclose(seen, (1 - off).clamp_min(0).prod(dim=-1).sum(dim=0))
-    assert seen.argmax() == (voxel_centres(grid) - torch.tensor([3.0, -2.0, 4.0])).norm(dim=-1).argmin()
+    assert (
+        seen.argmax()
+        == (voxel_centres(grid) - torch.tensor([3.0, -2.0, 4.0])).norm(dim=-1).argmin()
+    )
 
 
 def test_the_weight_of_a_uniform_view_is_the_square_of_magnification():
@@ -60,7 +65,9 @@ def test_the_weight_of_a_uniform_view_is_the_square_of_magnification():
     ones = torch.ones(1, 1, 1, 40, 40, dtype=torch.float64)
     z = (voxel_centres(grid) - rig.source[0]) @ torch.nn.functional.normalize(-rig.source[0], dim=0)
     feldkamp = (60.0 / z) ** 2
-    assert torch.allclose(backproject(ones, rig, grid, "distance")[0, 0] * (60.0 / 90.0) ** 2, feldkamp)
+    assert torch.allclose(
+        backproject(ones, rig, grid, "distance")[0, 0] * (60.0 / 90.0) ** 2, feldkamp
+    )
     beam = parallel(1, {"pixels": [40, 40], "pixel_mm": 2.0}, 90.0)
     assert (backproject(ones, beam, grid, "distance") == 1).all()
 
@@ -72,7 +79,9 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
     shift = torch.full((3,), offset, dtype=torch.float64)
     grid = Grid.centred((18, 20, 22), (1.0, 1.1, 0.9))
     rig = circular(3, sid, sid + 30, {"pixels": [20, 21], "pixel_mm": 1.3}, start_degrees=7.0)
-    scaled = replace(rig, **{each: voxel * getattr(rig, each) for each in ("source", "origin", "u", "v")})
+    scaled = replace(
+        rig, **{each: voxel * getattr(rig, each) for each in ("source", "origin", "u", "v")}
+    )
     other = Grid.centred(grid.shape, [voxel * each for each in grid.spacing], shift.tolist())
     y = torch.rand(1, 1, 3, 20, 21, dtype=torch.float64)
     exact = backproject(y, rig, grid, "distance", "reference")
@@ -84,7 +93,13 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
 def test_voxels_off_their_rays_get_nothing():
     """Behind the source of a cone, and behind the detector of a segment."""
     source = GRID.centre + 0.02 * (CONE.source - GRID.centre)
-    rig = replace(CONE, source=source, origin=source + 0.06 * (CONE.origin - source), u=CONE.u / 5, v=CONE.v / 5)[:1]
+    rig = replace(
+        CONE,
+        source=source,
+        origin=source + 0.06 * (CONE.origin - source),
+        u=CONE.u / 5,
+        v=CONE.v / 5,
+    )[:1]
     seen = backproject(torch.ones(1, 1, 1, *rig.shape), rig, GRID)[0, 0]
     z = rig.project(voxel_centres(GRID))[0, ..., 2]
     off = (z <= 0) | (z >= rig.distance)
@@ -95,7 +110,9 @@ def test_gradients_in_views_and_cameras():
     rig, grid = CONE[:2], Grid.centred((2, 3, 2), 1.3, GRID.centre.tolist())
     y = torch.randn(1, 1, 2, *rig.shape, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda y: backproject(y, rig, grid, "distance", "cpu"), (y,))
-    assert torch.autograd.gradgradcheck(lambda y: backproject(y, rig, grid, "distance", "cpu") ** 2, (y,))
+    assert torch.autograd.gradgradcheck(
+        lambda y: backproject(y, rig, grid, "distance", "cpu") ** 2, (y,)
+    )
 
     def moved(source, backend="auto"):
         return backproject(y.detach(), replace(rig, source=source), grid, "distance", backend)
@@ -112,20 +129,28 @@ def test_torch_accepts_the_operators_and_compiles_and_maps_them():
     x = torch.randn(2, *GRID.shape, dtype=torch.float64, requires_grad=True)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(voxel_ops.look, (y, maps, window, True, shape), test_utils=checks)
-    torch.library.opcheck(voxel_ops.show, (x, maps, window, True, list(CONE.shape)), test_utils=checks)
+    torch.library.opcheck(
+        voxel_ops.show, (x, maps, window, True, list(CONE.shape)), test_utils=checks
+    )
     mapped = torch.func.vmap(lambda y: voxel_ops.look(y, maps, window, True, shape), in_dims=1)
     several = torch.randn(2, 3, 4, *CONE.shape)
     one = voxel_ops.look(several[:, 1], maps, window, True, shape)
     assert torch.equal(mapped(several)[1], one)
     compiled = torch.compile(
-        lambda y: voxel_ops.look(2 * y, maps, window, True, shape), fullgraph=True, backend="aot_eager"
+        lambda y: voxel_ops.look(2 * y, maps, window, True, shape),
+        fullgraph=True,
+        backend="aot_eager",
     )
     assert torch.equal(compiled(several[:, 1] / 2), one)
 
 
 def test_threads_change_no_bit(monkeypatch):
     monkeypatch.setattr("mvrecon.kernels.threads.LEAST", 1)
-    y, x, before = torch.randn(1, 2, 4, *CONE.shape), torch.randn(2, *GRID.shape), torch.get_num_threads()
+    y, x, before = (
+        torch.randn(1, 2, 4, *CONE.shape),
+        torch.randn(2, *GRID.shape),
+        torch.get_num_threads(),
+    )
     maps, window, results = image_maps(CONE, GRID), list(CONE.limits), []
     for count in (1, 2, 3, 7):
         torch.set_num_threads(count)

@@ -1,9 +1,10 @@
-"""How random the properties are: the same examples in every run, or those of a seed that is printed.
+"""How random the properties are: the same examples in every run, or those of a seed that is
+printed.
 
-`HYPOTHESIS_PROFILE=thorough` takes twenty times as many. `--hypothesis-seed=<number>`, or `random`, draws new ones with
-either profile; a failure also prints the blob with which `@reproduce_failure` repeats it. Hypothesis draws some numbers
-from the source of whatever is loaded, too, so a seed stands for its examples as long as no number in mvrecon changes
-and no plugin is loaded beside it.
+`HYPOTHESIS_PROFILE=thorough` takes twenty times as many. `--hypothesis-seed=<number>`, or `random`,
+draws new ones with either profile; a failure also prints the blob with which `@reproduce_failure`
+repeats it. Hypothesis draws some numbers from the source of whatever is loaded, too, so a seed
+stands for its examples as long as no number in mvrecon changes and no plugin is loaded beside it.
 """
 
 import importlib
@@ -19,7 +20,13 @@ import mvrecon
 
 EXAMPLES = 15
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large]
-COMMON = {"deadline": None, "print_blob": True, "derandomize": True, "database": None, "suppress_health_check": SLOW}
+COMMON = {
+    "deadline": None,
+    "print_blob": True,
+    "derandomize": True,
+    "database": None,
+    "suppress_health_check": SLOW,
+}
 settings.register_profile("quick", max_examples=EXAMPLES, **COMMON)
 settings.register_profile("thorough", max_examples=20 * EXAMPLES, **COMMON)
 # a property takes the profile of the moment that it is defined in, which comes next
@@ -49,4 +56,6 @@ def pytest_collection_modifyitems(config, items) -> None:
 
 def pytest_terminal_summary(terminalreporter, config) -> None:
     if (number := _seed(config)) is not None:
-        terminalreporter.write_line(f"The properties' examples are those of --hypothesis-seed={number}")
+        terminalreporter.write_line(
+            f"The properties' examples are those of --hypothesis-seed={number}"
+        )

@@ -1,4 +1,6 @@
-"""Rays and boxes by themselves: chords, and by how much a rounding error of a place may change a ray's integral."""
+"""Rays and boxes by themselves: chords, and by how much a rounding error of a place may change a
+ray's integral.
+"""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -15,7 +17,9 @@ NEAR = 1e-6
 
 
 class Course(NamedTuple):
-    """Where the rays of a case run through a box: fractions of the way, places there, mm of a whole way."""
+    """Where the rays of a case run through a box: fractions of the way, places there, mm of a whole
+    way.
+    """
 
     enter: Float[Tensor, "m v u"]
     leave: Float[Tensor, "m v u"]
@@ -52,8 +56,16 @@ def course(case: Case, grown: float = 0.0, inner: bool = False) -> Course:
     near, far = (-margin - one) / safe, (high - one) / safe
     within = (one >= -margin) & (one <= high)
     none, least, most = torch.tensor(torch.inf).double(), *case.rays.limits
-    enter = torch.where(moves, torch.minimum(near, far), torch.where(within, -none, none)).amax(dim=-1).clamp_min(least)
-    leave = torch.where(moves, torch.maximum(near, far), torch.where(within, none, -none)).amin(dim=-1).clamp_max(most)
+    enter = (
+        torch.where(moves, torch.minimum(near, far), torch.where(within, -none, none))
+        .amax(dim=-1)
+        .clamp_min(least)
+    )
+    leave = (
+        torch.where(moves, torch.maximum(near, far), torch.where(within, none, -none))
+        .amin(dim=-1)
+        .clamp_max(most)
+    )
     hits = leave > enter
     enter, leave = (torch.where(hits, t, 0.0) for t in (enter, leave))
     first, last = (one + t[..., None] * way for t in (enter, leave))
@@ -61,12 +73,14 @@ def course(case: Case, grown: float = 0.0, inner: bool = False) -> Course:
 
 
 def faded(case: Case) -> Float[Tensor, "m v u"]:
-    """What Joseph's method sees of ones, in mm, and so of any volume at most per unit of its greatest value.
+    """What Joseph's method sees of ones, in mm, and so of any volume at most per unit of its
+    greatest value.
 
-    A ray's length in each slab of its main axis, times the ones in the slab's middle. Across that axis they fade from
-    one at the outermost centres to zero a voxel further out, half a voxel beyond the box. No chord bounds it but that
-    of a box grown by a voxel across: before and behind the middle the ray may be half a voxel further out still, as
-    its slope is at most one. All of it is said in voxels, so a sheared grid is like any other.
+    A ray's length in each slab of its main axis, times the ones in the slab's middle. Across that
+    axis they fade from one at the outermost centres to zero a voxel further out, half a voxel
+    beyond the box. No chord bounds it but that of a box grown by a voxel across: before and behind
+    the middle the ray may be half a voxel further out still, as its slope is at most one. All of it
+    is said in voxels, so a sheared grid is like any other.
     """
     (one, way), (least, most) = _indexed(case), case.rays.limits
     sizes = torch.tensor(case.grid.shape[::-1], dtype=torch.float64)
@@ -83,37 +97,52 @@ def faded(case: Case) -> Float[Tensor, "m v u"]:
     return total * (end - start).norm(dim=-1)
 
 
-def sharpness(case: Case, dtype: torch.dtype = torch.float64) -> tuple[Float[Tensor, "m v u"], Bool[Tensor, "m v u"]]:
-    """By which part of (greatest value x length) rounding may change a ray's integral, and which rays are steady.
+def sharpness(
+    case: Case, dtype: torch.dtype = torch.float64
+) -> tuple[Float[Tensor, "m v u"], Bool[Tensor, "m v u"]]:
+    """By which part of (greatest value x length) rounding may change a ray's integral, and which
+    rays are steady.
 
-    A place in the volume, in voxels, is known to delta. Where a ray crosses a face at slope s it may cross delta / s
-    sooner or later; one that runs along a face belongs to either side of it, and one whose main axis is as good as
-    another may take either in Joseph's method. These are not steady: their integral jumps.
+    A place in the volume, in voxels, is known to delta. Where a ray crosses a face at slope s it
+    may cross delta / s sooner or later; one that runs along a face belongs to either side of it,
+    and one whose main axis is as good as another may take either in Joseph's method. These are not
+    steady: their integral jumps.
     """
     through = course(case, grown=1.0)
     step = min(case.grid.spacing)
     ends = torch.stack([points.abs().amax(dim=-1) for points in case.rays.rays()])
     size = (ends.amax(dim=0) + case.grid.corners().abs().max()) / step
     reach = 1 + torch.maximum(through.enter.abs(), through.leave.abs())
-    # a sheared voxel's own size is less than its sides': the inverse of its affine grows what it is given
+    # a sheared voxel's own size is less than its sides': the inverse of its affine grows what it is
+    # given
     axes = case.grid.affine[:3, :3] / case.grid.affine[:3, :3].norm(dim=0)
     skew = torch.linalg.cond(axes).item()
-    delta = 8 * skew * torch.finfo(torch.float64).eps * size * reach + 4 * max(case.grid.shape) * torch.finfo(dtype).eps
+    delta = (
+        8 * skew * torch.finfo(torch.float64).eps * size * reach
+        + 4 * max(case.grid.shape) * torch.finfo(dtype).eps
+    )
     way = (through.last - through.first).abs()
     slope = way / way.amax(dim=-1, keepdim=True).clamp_min(1e-300)
-    low, high = torch.minimum(through.first, through.last), torch.maximum(through.first, through.last)
+    low, high = (
+        torch.minimum(through.first, through.last),
+        torch.maximum(through.first, through.last),
+    )
     margin = NEAR + delta[..., None]
     crosses = (high + 0.5 + margin).floor() != (low + 0.5 - margin).floor()
     gain = torch.where(crosses, 1 / slope, 0.0).amax(dim=-1)
     two = slope.topk(2).values
-    steady = (delta * gain < 1e-3) & ((two[..., 0] - two[..., 1] > 1e-9 + delta) | (through.length == 0))
+    steady = (delta * gain < 1e-3) & (
+        (two[..., 0] - two[..., 1] > 1e-9 + delta) | (through.length == 0)
+    )
     return delta * (8 + 4 * gain), steady
 
 
 def allowed(
     case: Case, x: Tensor, dtype: torch.dtype = torch.float64, per_pixel: int = 1
 ) -> tuple[Float[Tensor, "m v u"], Bool[Tensor, "m v u"]]:
-    """What two ways to integrate may differ by at the pixels, and at which of them, see `sharpness`."""
+    """What two ways to integrate may differ by at the pixels, and at which of them, see
+    `sharpness`.
+    """
     fine = replace(case, rays=case.rays.refined(per_pixel)) if per_pixel > 1 else case
     part, steady = sharpness(fine, dtype)
     apart = part * x.abs().max().double() * course(fine, grown=1.0).length

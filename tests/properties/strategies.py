@@ -1,4 +1,6 @@
-"""Random geometry: grids, rigs about them and volumes, all in units of the grid's own size so that rays meet it."""
+"""Random geometry: grids, rigs about them and volumes, all in units of the grid's own size so that
+rays meet it.
+"""
 
 import itertools
 import math
@@ -23,8 +25,12 @@ def real(least: float, most: float) -> st.SearchStrategy[float]:
 
 def vectors(least: float, most: float, size: int = 3) -> st.SearchStrategy[Tensor]:
     """Vectors whose components lie in a range, often round numbers."""
-    each = real(least, most) | st.sampled_from([x for x in (-1.0, -0.5, 0.0, 0.5, 1.0) if least <= x <= most])
-    return st.lists(each, min_size=size, max_size=size).map(lambda x: torch.tensor(x, dtype=torch.float64))
+    each = real(least, most) | st.sampled_from(
+        [x for x in (-1.0, -0.5, 0.0, 0.5, 1.0) if least <= x <= most]
+    )
+    return st.lists(each, min_size=size, max_size=size).map(
+        lambda x: torch.tensor(x, dtype=torch.float64)
+    )
 
 
 def quaternion_rotation(q: Tensor) -> Tensor:
@@ -42,7 +48,9 @@ def cube_rotations() -> list[Tensor]:
     """The 24 rotations that take the axes to one another."""
     eye = torch.eye(3, dtype=torch.float64)
     signs = [torch.tensor(s, dtype=torch.float64) for s in itertools.product((1.0, -1.0), repeat=3)]
-    every = [eye[list(order)] * sign for order in itertools.permutations(range(3)) for sign in signs]
+    every = [
+        eye[list(order)] * sign for order in itertools.permutations(range(3)) for sign in signs
+    ]
     return [turn for turn in every if torch.linalg.det(turn) > 0]
 
 
@@ -52,7 +60,9 @@ ROTATIONS = CUBE | TURNS
 
 
 def upright(angle: float) -> Tensor:
-    """A camera's axes (right, down, forward) that looks along a direction in the plane z = 0, its columns along -z."""
+    """A camera's axes (right, down, forward) that looks along a direction in the plane z = 0, its
+    columns along -z.
+    """
     x, y = math.cos(angle), math.sin(angle)
     return torch.tensor([[y, -x, 0.0], [0.0, 0.0, -1.0], [x, y, 0.0]], dtype=torch.float64)
 
@@ -63,7 +73,8 @@ POSES = ROTATIONS | real(-math.pi, math.pi).map(upright)
 
 @st.composite
 def grids(draw: st.DrawFn, away: float = 10.0) -> Grid:
-    """1 to 9 voxels along each axis, or some more along z, of 1e-3 to 1e3 mm, isotropic or not, turned or sheared.
+    """1 to 9 voxels along each axis, or some more along z, of 1e-3 to 1e3 mm, isotropic or not,
+    turned or sheared.
 
     Its centre lies up to ten sizes away from the origin.
     """
@@ -90,19 +101,31 @@ def radius(grid: Grid) -> float:
 
 @st.composite
 def rigs(
-    draw: st.DrawFn, grid: Grid, parallel: bool | None = None, extents: tuple[str, ...] = tuple(EXTENTS)
+    draw: st.DrawFn,
+    grid: Grid,
+    parallel: bool | None = None,
+    extents: tuple[str, ...] = tuple(EXTENTS),
 ) -> Cameras:
-    """1 to 3 central or parallel cameras with 1 to 9 x 1 to 9 pixels whose sources are inside, on or outside."""
+    """1 to 3 central or parallel cameras with 1 to 9 x 1 to 9 pixels whose sources are inside, on
+    or outside.
+    """
     parallel = draw(st.booleans()) if parallel is None else parallel
     extent = draw(st.sampled_from(extents))
     shape = draw(st.tuples(st.integers(1, 9), st.integers(1, 9)))
-    cameras = [draw(_cameras(grid, parallel, extent, shape)) for _ in range(draw(st.integers(1, 3)))]
-    joined = {name: torch.cat([getattr(each, name) for each in cameras]) for name in ("source", "origin", "u", "v")}
+    cameras = [
+        draw(_cameras(grid, parallel, extent, shape)) for _ in range(draw(st.integers(1, 3)))
+    ]
+    joined = {
+        name: torch.cat([getattr(each, name) for each in cameras])
+        for name in ("source", "origin", "u", "v")
+    }
     return replace(cameras[0], **joined)
 
 
 @st.composite
-def _cameras(draw: st.DrawFn, grid: Grid, parallel: bool, extent: str, shape: tuple[int, int]) -> Cameras:
+def _cameras(
+    draw: st.DrawFn, grid: Grid, parallel: bool, extent: str, shape: tuple[int, int]
+) -> Cameras:
     r = radius(grid)
     right, down, forward = draw(POSES)
     target = grid.centre + r * draw(vectors(-0.5, 0.5))
@@ -111,7 +134,12 @@ def _cameras(draw: st.DrawFn, grid: Grid, parallel: bool, extent: str, shape: tu
     reach = magnified * max(near, 0.3 * r)
     width = 2 * r * (1.0 if parallel else magnified) * draw(real(0.1, 1.5) | st.just(1.0))
     u = right * width / shape[1]
-    v = (down + draw(st.just(0.0) | real(-0.4, 0.4)) * right) * width / shape[0] * draw(st.just(1.0) | real(0.3, 2.0))
+    v = (
+        (down + draw(st.just(0.0) | real(-0.4, 0.4)) * right)
+        * width
+        / shape[0]
+        * draw(st.just(1.0) | real(0.3, 2.0))
+    )
     source = target - near * forward
     middle = source + (-reach if extent == "behind" else reach) * forward
     offset = draw(st.just((0.0, 0.0)) | st.tuples(real(-2, 2), real(-2, 2)))
@@ -128,10 +156,15 @@ def cases(draw: st.DrawFn, **options) -> Case:
 
 
 @st.composite
-def volumes(draw: st.DrawFn, shape: tuple[int, ...], dtype: torch.dtype = torch.float64, signed: bool = True) -> Tensor:
+def volumes(
+    draw: st.DrawFn, shape: tuple[int, ...], dtype: torch.dtype = torch.float64, signed: bool = True
+) -> Tensor:
     """Values [1 c *shape] of noise, with zeros, with 1e-30 and 1e30 among them, or all zero."""
     rng = torch.Generator().manual_seed(draw(SEEDS))
-    x = torch.rand(1, draw(st.sampled_from([1, 1, 4])), *shape, generator=rng, dtype=torch.float64) + 0.1
+    x = (
+        torch.rand(1, draw(st.sampled_from([1, 1, 4])), *shape, generator=rng, dtype=torch.float64)
+        + 0.1
+    )
     kind = draw(st.sampled_from(["noise", "sparse", "wild", "small", "great", "one", "none"]))
     if signed:
         x *= torch.randint(0, 2, x.shape, generator=rng) * 2 - 1

@@ -1,4 +1,6 @@
-"""Volumes of ones: what an operator sees of them is the length of its rays, found here by another way."""
+"""Volumes of ones: what an operator sees of them is the length of its rays, found here by another
+way.
+"""
 
 import math
 
@@ -29,7 +31,9 @@ def test_siddon_sees_the_chord(case, dtype):
 
 @given(**ANY)
 def test_joseph_sees_the_chord_of_a_ray_between_the_outermost_centres(case, dtype):
-    """There its weights sum to one in every slab; elsewhere the ones fade to zero over one voxel, and it sees less."""
+    """There its weights sum to one in every slab; elsewhere the ones fade to zero over one voxel,
+    and it sees less.
+    """
     seen, through = case.build(method="joseph")(ones(case, dtype))[0, 0].double(), course(case)
     apart, steady = allowed(case, ones(case, dtype), dtype)
     way = (through.last - through.first).abs()
@@ -53,8 +57,12 @@ def test_joseph_sees_ones_that_fade_over_a_voxel(case, dtype):
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_joseph_sees_a_ray_beside_the_box_by_the_middles_of_its_slabs(backend):
-    """Shrunk: a ray that begins behind the middle, where it is more than half a voxel beyond the box already."""
-    ends = torch.tensor([[0.2, 1.06, 0.0], [1.2, 1.86, 0.0]], dtype=torch.float64).reshape(2, 1, 1, 1, 3)
+    """Shrunk: a ray that begins behind the middle, where it is more than half a voxel beyond the
+    box already.
+    """
+    ends = torch.tensor([[0.2, 1.06, 0.0], [1.2, 1.86, 0.0]], dtype=torch.float64).reshape(
+        2, 1, 1, 1, 3
+    )
     case = Case(Grid.centred((1, 1, 1), 1.0), ExplicitRays(*ends))
     seen = case.build(backend=backend)(ones(case, torch.float64)).item()
     assert course(case, grown=0.5).length.item() == 0
@@ -63,7 +71,9 @@ def test_joseph_sees_a_ray_beside_the_box_by_the_middles_of_its_slabs(backend):
 
 
 def reached(case: Case, method: str) -> torch.Tensor:
-    """The length, in mm, over which a ray sees a volume: least bounds for siddon and joseph, since ones attain them."""
+    """The length, in mm, over which a ray sees a volume: least bounds for siddon and joseph, since
+    ones attain them.
+    """
     if method == "joseph":
         return faded(case)
     return course(case, grown=0.0 if method == "siddon" else 0.5).length
@@ -71,7 +81,9 @@ def reached(case: Case, method: str) -> torch.Tensor:
 
 @given(**ANY, method=st.sampled_from(METHODS), data=st.data())
 def test_a_mean_lies_between_zero_and_the_greatest_value(case, dtype, method, data):
-    """P7: 0 <= A x <= max x times what is seen of ones, or the length in which any trilinear sample can lie."""
+    """P7: 0 <= A x <= max x times what is seen of ones, or the length in which any trilinear sample
+    can lie.
+    """
     x = data.draw(volumes(case.grid.shape, dtype, signed=False))
     views = case.build(method=method)(x).double()
     most = x.double().amax(dim=(2, 3, 4))[:, :, None, None, None] * reached(case, method)
@@ -81,7 +93,9 @@ def test_a_mean_lies_between_zero_and_the_greatest_value(case, dtype, method, da
 
 @given(**ANY)
 def test_trilinear_sees_the_way_between_the_outermost_centres(case, dtype):
-    """All samples there are one; those beyond are less, and each stands for an equal share of the longer way."""
+    """All samples there are one; those beyond are less, and each stands for an equal share of the
+    longer way.
+    """
     seen = case.build(method="trilinear:40")(ones(case, dtype))[0, 0].double()
     inner, grown = course(case, inner=True).length, course(case, grown=0.5).length
     apart, steady = allowed(case, ones(case, dtype), dtype)

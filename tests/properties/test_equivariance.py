@@ -1,4 +1,6 @@
-"""The same scene seen otherwise: moved, scaled, stored along other axes, looked at from the other end."""
+"""The same scene seen otherwise: moved, scaled, stored along other axes, looked at from the other
+end.
+"""
 
 from dataclasses import replace
 
@@ -11,15 +13,30 @@ from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 from tests.projectors.cases import Case
 from tests.properties.rays import allowed
-from tests.properties.strategies import CUBE, DTYPES, METHODS, ROTATIONS, cases, radius, real, vectors, volumes
+from tests.properties.strategies import (
+    CUBE,
+    DTYPES,
+    METHODS,
+    ROTATIONS,
+    cases,
+    radius,
+    real,
+    vectors,
+    volumes,
+)
 
 ANY = {"case": cases(), "method": st.sampled_from(METHODS), "data": st.data()}
 
 
-def check_same(views: Tensor, others: Tensor, x: Tensor, *scenes: Case, dtype: torch.dtype = torch.float64) -> None:
+def check_same(
+    views: Tensor, others: Tensor, x: Tensor, *scenes: Case, dtype: torch.dtype = torch.float64
+) -> None:
     """Apart by no more than rounding may change in any of the scenes."""
     bounds = [allowed(case, x, dtype) for case in scenes]
-    apart, steady = sum(each for each, _ in bounds), torch.stack([each for _, each in bounds]).all(dim=0)
+    apart, steady = (
+        sum(each for each, _ in bounds),
+        torch.stack([each for _, each in bounds]).all(dim=0),
+    )
     assert ((views - others).abs().double() <= apart)[..., steady].all()
 
 
@@ -31,7 +48,9 @@ def moved(grid: Grid, R: Tensor, t: Tensor) -> Grid:
 
 
 @given(**ANY, R=ROTATIONS, shift=vectors(-10, 10))
-def test_moving_everything_changes_nothing_and_moving_the_object_unmoves_the_cameras(case, method, data, R, shift):
+def test_moving_everything_changes_nothing_and_moving_the_object_unmoves_the_cameras(
+    case, method, data, R, shift
+):
     x, t = data.draw(volumes(case.grid.shape)), shift * radius(case.grid)
     views = case.build(method=method)(x)
     both = Case(moved(case.grid, R, t), case.rays.moved(R, t))
@@ -45,7 +64,10 @@ def test_moving_everything_changes_nothing_and_moving_the_object_unmoves_the_cam
 def scaled(case: Case, s: float) -> Case:
     affine = case.grid.affine.clone()
     affine[:3] *= s
-    return replace(case.moved(*(s * each for each in case.vectors.values())), grid=Grid(case.grid.shape, affine))
+    return replace(
+        case.moved(*(s * each for each in case.vectors.values())),
+        grid=Grid(case.grid.shape, affine),
+    )
 
 
 @given(**ANY, power=st.integers(-8, 8), s=real(0.01, 100), dtype=st.sampled_from(DTYPES))
@@ -82,7 +104,12 @@ def test_how_axes_are_stored_does_not_matter(case, method, data, G):
     check_same(case.build(method=method)(x), other.build(method=method)(y), x, case, other)
 
 
-@given(case=cases(extents=("segment",)), method=st.sampled_from(METHODS), data=st.data(), dtype=st.sampled_from(DTYPES))
+@given(
+    case=cases(extents=("segment",)),
+    method=st.sampled_from(METHODS),
+    data=st.data(),
+    dtype=st.sampled_from(DTYPES),
+)
 def test_a_ray_and_its_reverse_see_the_same(case, method, data, dtype):
     x = data.draw(volumes(case.grid.shape, dtype))
     start, end = (points.contiguous() for points in case.rays.rays())

@@ -16,7 +16,10 @@ TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
 NUMBERS = st.integers(-(2**70), 2**70) | st.floats(allow_nan=False)
 PLAIN = st.none() | st.booleans() | NUMBERS | TEXTS
 SETTINGS = st.dictionaries(
-    TEXTS, st.recursive(PLAIN, lambda each: st.lists(each, max_size=3) | st.dictionaries(TEXTS, each, max_size=3))
+    TEXTS,
+    st.recursive(
+        PLAIN, lambda each: st.lists(each, max_size=3) | st.dictionaries(TEXTS, each, max_size=3)
+    ),
 )
 
 
@@ -43,7 +46,10 @@ def test_volumes_of_hdf5(grid, data, mm, tmp_path_factory):
     file = VolumeFile(folder / "one.h5")
     found = [file.read(k) for k in range(len(file))]
     for one, other in zip(found, written, strict=True):
-        assert (one.name, one.spacing) == (other.name, other.spacing) and one.ct.dtype == other.ct.dtype
+        assert (one.name, one.spacing) == (
+            other.name,
+            other.spacing,
+        ) and one.ct.dtype == other.ct.dtype
         assert np.array_equal(one.ct, other.ct)
     write_volumes(folder / "two.h5", found, orientation=file.orientation)
     assert (folder / "one.h5").read_bytes() == (folder / "two.h5").read_bytes()
@@ -64,7 +70,9 @@ def test_volumes_of_nifti(grid, data, tmp_path_factory):
     assert torch.equal(y.flatten().sort().values, x.flatten().sort().values)
     corners = torch.cdist(there.corners(), grid.corners())
     assert (corners.amin(dim=0) <= size).all() and (corners.amin(dim=1) <= size).all()
-    place = there.to_index(grid.to_world(torch.cartesian_prod(*[torch.arange(n).double() for n in grid.shape[::-1]])))
+    place = there.to_index(
+        grid.to_world(torch.cartesian_prod(*[torch.arange(n).double() for n in grid.shape[::-1]]))
+    )
     k, j, i = place.round().long().flip(-1).unbind(dim=-1)
     assert torch.equal(y[k, j, i].reshape(grid.shape[::-1]), x.permute(2, 1, 0))
     # its affine is single precision by now, and its axes are in order: the same bytes from here on
@@ -92,12 +100,20 @@ def test_names_of_volumes(name, tmp_path_factory):
 
 
 def test_floats_whose_axes_are_reversed(tmp_path):
-    """Shrunk: a NIfTI volume of single precision that does not run to the patient's right, front and head."""
+    """Shrunk: a NIfTI volume of single precision that does not run to the patient's right, front
+    and head.
+    """
     pytest.importorskip("nibabel")
     from mvrecon.data.nifti import read_nifti
     from mvrecon.engine.export import save_nifti
 
     x = torch.arange(24.0).reshape(2, 3, 4)
-    save_nifti(tmp_path / "lps.nii.gz", x, Grid((2, 3, 4), torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))))
+    save_nifti(
+        tmp_path / "lps.nii.gz",
+        x,
+        Grid((2, 3, 4), torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))),
+    )
     y, there = read_nifti(tmp_path / "lps.nii.gz")
-    assert torch.equal(y, x.flip(1, 2)) and torch.equal(there.affine.diagonal(), torch.ones(4).double())
+    assert torch.equal(y, x.flip(1, 2)) and torch.equal(
+        there.affine.diagonal(), torch.ones(4).double()
+    )

@@ -1,4 +1,6 @@
-"""Conservation: what is lifted along rays gives the views back, and what all cameras say is what they say together."""
+"""Conservation: what is lifted along rays gives the views back, and what all cameras say is what
+they say together.
+"""
 
 import pytest
 import torch
@@ -30,7 +32,9 @@ FRUSTA = st.builds(frusta_of, cases(), st.integers(1, 12), st.sampled_from(["z",
 
 @given(case=cases(), depth=st.integers(1, 12), spacing=st.sampled_from(["z", "k"]))
 def test_a_box_holds_the_samples_whose_places_lie_in_it(case, depth, spacing):
-    """Voxels in every frustum, and its bins in the grid; within 1e-12 of a face rounding decides."""
+    """Voxels in every frustum, and its bins in the grid; within 1e-12 of a face rounding
+    decides.
+    """
     frusta = frusta_of(case, depth, spacing)
     ways = (
         (frusta.frusta_from_world, frusta.shape, case.grid.shape),
@@ -54,10 +58,14 @@ def test_the_lift_keeps_every_ray_s_integral(frusta, data):
     sees = (frusta.chord > 0)[:, 0, 0]
     lifted = frusta.spread(views)
     assert not (lifted * ~frusta.occupied).any()
-    assert ((frusta.integrate(lifted) - views * sees).abs() <= 4 * frusta.shape[0] * EPS * views).all()
+    assert (
+        (frusta.integrate(lifted) - views * sees).abs() <= 4 * frusta.shape[0] * EPS * views
+    ).all()
 
 
-@given(frusta=FRUSTA, data=st.data(), size=SIZES, shift=st.sampled_from([0.0, 1e5, -1e5]), seed=SEEDS)
+@given(
+    frusta=FRUSTA, data=st.data(), size=SIZES, shift=st.sampled_from([0.0, 1e5, -1e5]), seed=SEEDS
+)
 @pytest.mark.parametrize("name", [name for name in HEADS.names() if HEADS.build(name).keeps_views])
 def test_heads_that_keep_views_keep_them_for_any_logits(name, frusta, data, size, shift, seed):
     views = measured(frusta, data)[:, :1]
@@ -66,9 +74,14 @@ def test_heads_that_keep_views_keep_them_for_any_logits(name, frusta, data, size
     logits = size * torch.randn(shape, generator=rng) + shift
     prior = data.draw(volumes(shape[1:], torch.float32))[:, :1].reshape(shape)
     density = HEADS.build(name)(logits, prior, views, frusta)
-    assert density.isfinite().all() and (density >= 0).all() and not (density * ~frusta.occupied).any()
+    assert (
+        density.isfinite().all() and (density >= 0).all() and not (density * ~frusta.occupied).any()
+    )
     sees = (frusta.chord > 0)[:, 0, 0]
-    assert ((frusta.integrate(density) - views * sees).abs() <= 8 * frusta.shape[0] * EPS * views + 1e-37).all()
+    assert (
+        (frusta.integrate(density) - views * sees).abs()
+        <= 8 * frusta.shape[0] * EPS * views + 1e-37
+    ).all()
 
 
 def seen(shape, seed: int, share: float) -> torch.Tensor:
@@ -77,9 +90,13 @@ def seen(shape, seed: int, share: float) -> torch.Tensor:
     return torch.rand(m, 1, *sizes, generator=torch.Generator().manual_seed(seed)) < share
 
 
-@given(shape=SHAPES, size=SIZES, shift=st.sampled_from([0.0, 1e5, -1e5]), share=real(0, 1), seed=SEEDS)
+@given(
+    shape=SHAPES, size=SIZES, shift=st.sampled_from([0.0, 1e5, -1e5]), share=real(0, 1), seed=SEEDS
+)
 def test_fusion_is_a_mean(shape, size, shift, share, seed):
-    """Weights sum to one over those that see; equal opinions are kept; no mean leaves the opinions' range."""
+    """Weights sum to one over those that see; equal opinions are kept; no mean leaves the opinions'
+    range.
+    """
     visible, rng = seen(shape, seed, share), torch.Generator().manual_seed(seed + 1)
     m, *sizes = shape
     logits = size * torch.randn(2, m, 1, *sizes, generator=rng) + shift
@@ -93,9 +110,14 @@ def test_fusion_is_a_mean(shape, size, shift, share, seed):
     slack = 8 * m * EPS * opinions.abs().amax(dim=1)
     assert (((fused >= low - slack) & (fused <= high + slack)) | ~some).all()
     equal = opinions[:, :1].expand_as(opinions)
-    assert ((fuse(equal, logits, visible)[0] - equal[:, 0] * some).abs() <= 8 * m * EPS * equal[:, 0].abs()).all()
+    assert (
+        (fuse(equal, logits, visible)[0] - equal[:, 0] * some).abs()
+        <= 8 * m * EPS * equal[:, 0].abs()
+    ).all()
     order = torch.randperm(m, generator=rng)
-    assert torch.allclose(fuse(opinions[:, order], logits[:, order], visible[order])[0], fused, rtol=0, atol=1e-5)
+    assert torch.allclose(
+        fuse(opinions[:, order], logits[:, order], visible[order])[0], fused, rtol=0, atol=1e-5
+    )
 
 
 @given(shape=SHAPES, share=real(0, 1), seed=SEEDS, away=st.sampled_from([0.0, 1.0, 1e3]))

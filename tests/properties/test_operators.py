@@ -1,4 +1,6 @@
-"""What makes an operator linear, matched to its adjoint and positive, on any geometry and for values of any size."""
+"""What makes an operator linear, matched to its adjoint and positive, on any geometry and for
+values of any size.
+"""
 
 import pytest
 import torch
@@ -13,11 +15,18 @@ from tests.properties.rays import allowed
 from tests.properties.strategies import DTYPES, METHODS, SEEDS, cases, epsilon, real, volumes
 
 ADJOINT = {torch.float32: 1e-5, torch.float64: 1e-12}
-ANY = {"case": cases(), "method": st.sampled_from(METHODS), "dtype": st.sampled_from(DTYPES), "data": st.data()}
+ANY = {
+    "case": cases(),
+    "method": st.sampled_from(METHODS),
+    "dtype": st.sampled_from(DTYPES),
+    "data": st.data(),
+}
 
 
 def noise(shape, seed: int, dtype: torch.dtype) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    return torch.randn(
+        shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    ).to(dtype)
 
 
 @given(**ANY, rays=st.sampled_from([1, 1, 2]), seed=SEEDS)
@@ -31,12 +40,23 @@ def test_the_adjoint_is_the_transpose(case, method, dtype, data, rays, seed):
 
 
 def beside_nothing(away: float, shape: tuple[int, int]) -> tuple[Case, torch.Tensor]:
-    """Rays that run level a little before slice 6, which is empty; slice 5 is not, and weighs that little."""
+    """Rays that run level a little before slice 6, which is empty; slice 5 is not, and weighs that
+    little.
+    """
     z = 0.5 - away
-    source, origin, u, v = [0.1, -20.0, z], [0.1, 20.0, z], [-0.1, 0.0, 0.0], [0.0, 0.0, 1e-3 * away]
-    cameras = Cameras(*(torch.tensor([each], dtype=torch.float64) for each in (source, origin, u, v)), shape=shape)
+    source, origin, u, v = (
+        [0.1, -20.0, z],
+        [0.1, 20.0, z],
+        [-0.1, 0.0, 0.0],
+        [0.0, 0.0, 1e-3 * away],
+    )
+    cameras = Cameras(
+        *(torch.tensor([each], dtype=torch.float64) for each in (source, origin, u, v)), shape=shape
+    )
     x = torch.zeros(1, 1, 12, 5, 5, dtype=torch.float64)
-    x[:, :, 5] = torch.rand(5, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1
+    x[:, :, 5] = (
+        torch.rand(5, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1
+    )
     return Case(Grid.centred((12, 5, 5), 1.0), cameras), x
 
 
@@ -44,7 +64,9 @@ def beside_nothing(away: float, shape: tuple[int, int]) -> tuple[Case, torch.Ten
 @pytest.mark.parametrize("shape", [(9, 3), (1, 3)])  # read column by column, and ray by ray
 @pytest.mark.parametrize("method", ["joseph", "trilinear"])
 def test_weights_near_zero_are_the_same_in_the_transpose(method, shape, channels):
-    """Shrunk: to rounding errors of the weights themselves, not of the empty voxel that has nearly all the weight."""
+    """Shrunk: to rounding errors of the weights themselves, not of the empty voxel that has nearly
+    all the weight.
+    """
     for dtype, away in ((torch.float32, 1e-5), (torch.float64, 1e-12)):
         case, x = beside_nothing(away, shape)
         x, A = x.to(dtype).expand(1, channels, -1, -1, -1).contiguous(), case.build(method=method)
@@ -59,7 +81,8 @@ def test_sums_and_multiples(case, method, dtype, data, a, b):
     A = case.build(method=method)
     x, y = (data.draw(volumes(case.grid.shape, dtype))[:, :1] for _ in range(2))
     size = abs(a) * A(x.abs()) + abs(b) * A(y.abs())
-    # a cell is interpolated to some rounding errors of the greatest value in it, however little that weighs
+    # a cell is interpolated to some rounding errors of the greatest value in it, however little
+    # that weighs
     most = (abs(a) * x.abs().max() + abs(b) * y.abs().max()) * A(torch.ones_like(x))
     apart = (A(a * x + b * y) - (a * A(x) + b * A(y))).abs()
     assert (apart.double() <= 100 * epsilon(dtype) * (size.double() + most.double())).all()
@@ -84,7 +107,9 @@ def test_a_view_twice_counts_twice(case, method, dtype, data, seed):
     A = case.build(method=method)
     x = data.draw(volumes(case.grid.shape, dtype))
     m = len(case.rays)
-    twice = case.moved(*[torch.cat([each, each]) for each in case.vectors.values()]).build(method=method)
+    twice = case.moved(*[torch.cat([each, each]) for each in case.vectors.values()]).build(
+        method=method
+    )
     views = A(x)
     assert torch.equal(twice(x), torch.cat([views, views], dim=2))
     y = noise(views.shape, seed, dtype)
@@ -95,9 +120,13 @@ def test_a_view_twice_counts_twice(case, method, dtype, data, seed):
 
 @given(**ANY)
 def test_the_compiled_loops_and_the_reference_agree(case, method, dtype, data):
-    """They share no arithmetic. In float32 the compiled ones keep a ray's place in float64 until the last step."""
+    """They share no arithmetic. In float32 the compiled ones keep a ray's place in float64 until
+    the last step.
+    """
     x = data.draw(volumes(case.grid.shape, dtype))
-    views, oracle = (case.build(method=method, backend=backend)(x) for backend in ("cpu", "reference"))
+    views, oracle = (
+        case.build(method=method, backend=backend)(x) for backend in ("cpu", "reference")
+    )
     apart, steady = allowed(case, x, dtype)
     assert ((views - oracle).abs().double() <= apart)[..., steady].all()
 
@@ -109,6 +138,10 @@ def test_a_ray_that_begins_on_a_face_sees_nothing_behind_it(method, backend):
     grid = Grid.centred((1, 1, 2), 1.0)
     x = torch.tensor([1.0, 0.0], dtype=torch.float64).reshape(1, 1, 1, 1, 2)
     for near, far in ((1e-17, 0.9), (-1e-17, -0.9)):
-        ends = torch.tensor([[near, 0.0, 0.0], [far, 0.0, 0.0]], dtype=torch.float64).reshape(2, 1, 1, 1, 3)
-        views = Case(grid, ExplicitRays(*ends)).build(method=method, backend=backend)(x if far > 0 else x.flip(4))
+        ends = torch.tensor([[near, 0.0, 0.0], [far, 0.0, 0.0]], dtype=torch.float64).reshape(
+            2, 1, 1, 1, 3
+        )
+        views = Case(grid, ExplicitRays(*ends)).build(method=method, backend=backend)(
+            x if far > 0 else x.flip(4)
+        )
         assert (views >= 0).all() and (method == "trilinear" or not views.any())

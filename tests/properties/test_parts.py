@@ -1,4 +1,6 @@
-"""Parts and the whole: bricks add up, what is empty may be left out, chosen rays are those of all."""
+"""Parts and the whole: bricks add up, what is empty may be left out, chosen rays are those of
+all.
+"""
 
 from dataclasses import replace
 
@@ -14,7 +16,12 @@ from tests.projectors.cases import CASES
 from tests.properties.rays import allowed
 from tests.properties.strategies import DTYPES, METHODS, SEEDS, cases, epsilon, volumes
 
-ANY = {"case": cases(), "method": st.sampled_from(METHODS), "dtype": st.sampled_from(DTYPES), "data": st.data()}
+ANY = {
+    "case": cases(),
+    "method": st.sampled_from(METHODS),
+    "dtype": st.sampled_from(DTYPES),
+    "data": st.data(),
+}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -32,7 +39,9 @@ def masks(seed: int, shape, share: float) -> torch.Tensor:
 
 @given(**ANY, cuts=st.tuples(*[st.floats(0, 1)] * 3))
 def test_bricks_add_up_to_the_whole(case, method, dtype, data, cuts):
-    """P8: each cut out of the volume and alone on its own grid; samples of a ray depend on its way through the grid."""
+    """P8: each cut out of the volume and alone on its own grid; samples of a ray depend on its way
+    through the grid.
+    """
     x = data.draw(volumes(case.grid.shape, dtype))
     ends = [sorted({0, round(cut * n), n}) for cut, n in zip(cuts, case.grid.shape, strict=True)]
     axes = [list(zip(each[:-1], each[1:], strict=True)) for each in ends]
@@ -73,7 +82,10 @@ def test_leaving_out_what_is_empty_changes_no_bit(case, method, dtype, data, see
 def test_some_views_are_those_of_all_to_the_last_bit(case, method, dtype, data, seed, rays):
     x = data.draw(volumes(case.grid.shape, dtype))
     A, m = case.build(method=method, rays_per_pixel=rays), len(case.rays)
-    B = view_subset(A, torch.randperm(m, generator=torch.Generator().manual_seed(seed))[: seed % (m + 1)].tolist())
+    B = view_subset(
+        A,
+        torch.randperm(m, generator=torch.Generator().manual_seed(seed))[: seed % (m + 1)].tolist(),
+    )
     assert torch.equal(B(x), B.selection(A(x)))
 
 
@@ -81,7 +93,10 @@ def test_some_views_are_those_of_all_to_the_last_bit(case, method, dtype, data, 
 def test_some_rays_are_those_of_all(case, method, dtype, data, seed, rays):
     """Rows and single pixels, to what `Subset` promises."""
     x = data.draw(volumes(case.grid.shape, dtype))
-    A, (m, v, u) = case.build(method=method, rays_per_pixel=rays), (len(case.rays), *case.rays.shape)
+    A, (m, v, u) = (
+        case.build(method=method, rays_per_pixel=rays),
+        (len(case.rays), *case.rays.shape),
+    )
     rows = (torch.arange(v) % 2 == seed % 2)[None, :, None].expand(m, v, u)
     for B in (ray_subset(A, rows), ray_subset(A, masks(seed, (m, v, u), 0.4))):
         apart, size = (each.double().norm() for each in (B(x) - B.selection(A(x)), A(x.abs())))

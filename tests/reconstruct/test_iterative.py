@@ -59,8 +59,11 @@ def test_nothing_is_negative_unless_allowed(A):
 def test_a_batch_is_its_cases(A):
     y = torch.rand(2, 2, 9, 9, 11)
     whole = sirt(A, y, 3)
-    # several volumes travel side by side, which sums in another order: the last digits alone may differ
-    torch.testing.assert_close(whole[1:, :1], sirt(A, y[1:, :1].contiguous(), 3), rtol=1e-5, atol=1e-6)
+    # several volumes travel side by side, which sums in another order: the last digits alone may
+    # differ
+    torch.testing.assert_close(
+        whole[1:, :1], sirt(A, y[1:, :1].contiguous(), 3), rtol=1e-5, atol=1e-6
+    )
     assert torch.equal(whole, sirt(A, y, 3, weights=sirt_weights(A)))
 
 
@@ -75,7 +78,9 @@ def test_weights_invert_the_sums_and_skip_what_is_empty():
 
 def test_gradients_flow_through_it():
     A = PROJECTORS.build(
-        "drr", grid=Grid.centred((2, 3, 3), 2.0), cameras=circular(2, 60.0, 100.0, {"pixels": [2, 3], "pixel_mm": 3.0})
+        "drr",
+        grid=Grid.centred((2, 3, 3), 2.0),
+        cameras=circular(2, 60.0, 100.0, {"pixels": [2, 3], "pixel_mm": 3.0}),
     )
     y = torch.rand(1, 1, 2, 2, 3, dtype=torch.float64, requires_grad=True)
     torch.autograd.gradcheck(lambda y: sirt(A, y, 2, nonnegative=False), (y,))

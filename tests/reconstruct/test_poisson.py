@@ -73,7 +73,9 @@ def test_differences_confirm_the_derivatives(moving):
         A = PROJECTORS.build("drr", grid=grid, cameras=replace(rig, **{moving: vector}))
         return PoissonLikelihood(A, counts)(x)
 
-    x = 0.2 + torch.rand(1, 1, *grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x = 0.2 + torch.rand(
+        1, 1, *grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     vector = getattr(rig, moving).clone().requires_grad_()
     assert torch.autograd.gradcheck(likelihood, (x.requires_grad_(), vector), atol=1e-5)
 
@@ -87,14 +89,18 @@ def test_leaving_out_empty_bins_changes_nothing(kind, dtype, subsets):
     assert 0.8 < (counts == 0).double().mean() < 0.95
     for background in (0.0, 0.01):
         with_all, without = (
-            mlem(A, counts, 4, background, subsets=subsets, skip_zero_bins=skip) for skip in (False, True)
+            mlem(A, counts, 4, background, subsets=subsets, skip_zero_bins=skip)
+            for skip in (False, True)
         )
         assert without.dtype == dtype and without.max() > 0.01
         # every step, of four or of four for each subset, hands its rounding on to the next
         assert gap(without, with_all) < TOLERANCE[dtype] * subsets
         # subsets may have left bins with counts that no voxel explains
         x = with_all + (1e-3 if subsets > 1 else 0)
-        one, other = (PoissonLikelihood(A, counts, background, skip_zero_bins=skip)(x) for skip in (False, True))
+        one, other = (
+            PoissonLikelihood(A, counts, background, skip_zero_bins=skip)(x)
+            for skip in (False, True)
+        )
         assert ((one - other) / one).abs().max() < TOLERANCE[dtype]
 
 
@@ -115,8 +121,15 @@ def test_counts_are_conserved(kind):
     counts = measured(A, 0.05, batch=2)
     s = PoissonLikelihood(A, counts).sensitivity(torch.float64)
     start = 0.1 + torch.rand(2, 1, *GRID.shape, dtype=torch.float64)
-    for x in (mlem(A, counts, 0), mlem(A, counts, 1), mlem(A, counts, 1, start=start), mlem(A, counts, 3)):
-        assert ((s * x).sum(dim=(1, 2, 3, 4)) / counts.sum(dim=(1, 2, 3, 4)) - 1).abs().max() < 1e-12
+    for x in (
+        mlem(A, counts, 0),
+        mlem(A, counts, 1),
+        mlem(A, counts, 1, start=start),
+        mlem(A, counts, 3),
+    ):
+        assert (
+            (s * x).sum(dim=(1, 2, 3, 4)) / counts.sum(dim=(1, 2, 3, 4)) - 1
+        ).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("kind", RIGS)
@@ -125,7 +138,9 @@ def test_what_no_counts_reach_is_zero_after_one_iteration_and_for_ever(kind):
     counts = measured(A, 0.01)
     nothing = A.T(counts) == 0
     assert 0.05 < nothing.double().mean() < 0.95
-    assert torch.equal(mlem(A, counts, 1) == 0, nothing) and torch.equal(mlem(A, counts, 5) == 0, nothing)
+    assert torch.equal(mlem(A, counts, 1) == 0, nothing) and torch.equal(
+        mlem(A, counts, 5) == 0, nothing
+    )
     start = torch.ones(1, 1, *GRID.shape, dtype=torch.float64)
     start[..., 4, 3, :4] = 0
     assert not mlem(A, counts, 2, 0.1, start=start)[start == 0].any()
@@ -167,8 +182,14 @@ def test_subsets_of_the_views_share_the_likelihood():
 def test_it_says_which_bins_it_takes_and_why(kind):
     A = operator(kind)
     few, many = PoissonLikelihood(A, measured(A, 0.05)), PoissonLikelihood(A, measured(A, 30.0))
-    assert few.why.startswith("bins with counts: ") and "20%" in few.why and isinstance(few.bins, SomePixels)
-    assert many.why.startswith("all bins: ") and "20%" in many.why and isinstance(many.bins, SomeViews)
+    assert (
+        few.why.startswith("bins with counts: ")
+        and "20%" in few.why
+        and isinstance(few.bins, SomePixels)
+    )
+    assert (
+        many.why.startswith("all bins: ") and "20%" in many.why and isinstance(many.bins, SomeViews)
+    )
     assert "asked for" in PoissonLikelihood(A, measured(A, 0.05), skip_zero_bins=False).why
 
 
@@ -193,21 +214,54 @@ def counted(value: float = 1.0) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda A: PoissonLikelihood(A, counted(-1.0)), "counts that are finite and not negative, got 660 bins"),
-        (lambda A: PoissonLikelihood(A, counted(torch.nan)), "counts that are finite and not negative, got 660 bins"),
-        (lambda A: PoissonLikelihood(A, counted(), -0.1), "background that are finite .* got 660 bins"),
-        (lambda A: PoissonLikelihood(A, counted(), torch.inf), "background that are finite .* got 660 bins"),
-        (lambda A: PoissonLikelihood(A, counted(), torch.ones(5)), r"broadcast to \(1, 1, 6, 10, 11\), got \(5,\)"),
-        (lambda A: PoissonLikelihood(A, counted()[:, :, 1:]), r"counts .*\(6, 10, 11\), got \(1, 1, 5, 10, 11\)"),
-        (lambda A: PoissonLikelihood(A, counted(), views=[6]), r"different views from 0 to 5, got \[6\]"),
-        (lambda A: PoissonLikelihood(A, counted())(torch.ones(2, 1, *GRID.shape)), r"\[b c\] \(1, 1\), got \(2, 1"),
-        (lambda A: PoissonLikelihood(A, counted())(torch.ones(1, 1, 9, 8, 9)), r"volume .*\(9, 8, 10\), got"),
+        (
+            lambda A: PoissonLikelihood(A, counted(-1.0)),
+            "counts that are finite and not negative, got 660 bins",
+        ),
+        (
+            lambda A: PoissonLikelihood(A, counted(torch.nan)),
+            "counts that are finite and not negative, got 660 bins",
+        ),
+        (
+            lambda A: PoissonLikelihood(A, counted(), -0.1),
+            "background that are finite .* got 660 bins",
+        ),
+        (
+            lambda A: PoissonLikelihood(A, counted(), torch.inf),
+            "background that are finite .* got 660 bins",
+        ),
+        (
+            lambda A: PoissonLikelihood(A, counted(), torch.ones(5)),
+            r"broadcast to \(1, 1, 6, 10, 11\), got \(5,\)",
+        ),
+        (
+            lambda A: PoissonLikelihood(A, counted()[:, :, 1:]),
+            r"counts .*\(6, 10, 11\), got \(1, 1, 5, 10, 11\)",
+        ),
+        (
+            lambda A: PoissonLikelihood(A, counted(), views=[6]),
+            r"different views from 0 to 5, got \[6\]",
+        ),
+        (
+            lambda A: PoissonLikelihood(A, counted())(torch.ones(2, 1, *GRID.shape)),
+            r"\[b c\] \(1, 1\), got \(2, 1",
+        ),
+        (
+            lambda A: PoissonLikelihood(A, counted())(torch.ones(1, 1, 9, 8, 9)),
+            r"volume .*\(9, 8, 10\), got",
+        ),
         (
             lambda A: PoissonLikelihood(A, counted())(torch.zeros(1, 1, *GRID.shape)),
             "660 bins hold counts where .* allow none: .* background > 0, a grid or support",
         ),
-        (lambda A: mlem(A, counted(), 1, start=torch.zeros(1, 1, *GRID.shape)), "660 bins hold counts"),
-        (lambda A: mlem(A, counted(), 1, 1.0, start=-torch.ones(1, 1, *GRID.shape)), "nowhere negative"),
+        (
+            lambda A: mlem(A, counted(), 1, start=torch.zeros(1, 1, *GRID.shape)),
+            "660 bins hold counts",
+        ),
+        (
+            lambda A: mlem(A, counted(), 1, 1.0, start=-torch.ones(1, 1, *GRID.shape)),
+            "nowhere negative",
+        ),
         (lambda A: mlem(A, counted(), 1, 1.0, subsets=7), "1 to 6 subsets, .* got 7"),
     ],
 )

@@ -5,7 +5,9 @@ from mvrecon.geometry.grid import Grid
 
 
 class ParallelRig:
-    """Rays along x and along y through a cube of 120 mm, three to a voxel, with no camera behind them."""
+    """Rays along x and along y through a cube of 120 mm, three to a voxel, with no camera behind
+    them.
+    """
 
     limits = (0.0, 1.0)
 

@@ -27,7 +27,9 @@ def test_a_sample_has_the_promised_form(name, grid, rig):
 
 @pytest.mark.parametrize("name", [*ENDLESS, "shepp_logan"])
 def test_views_and_volume_show_the_same_object(name, grid, rig):
-    """Each view of a parallel beam holds the whole mass, and its profiles are the volume's sums along the rays."""
+    """Each view of a parallel beam holds the whole mass, and its profiles are the volume's sums
+    along the rays.
+    """
     sample = SCENES.build(name).sample(0, 1, grid, rig)
     along_x = sample.volume[0].sum(dim=2) * 5  # rows z, columns y
     along_y = sample.volume[0].sum(dim=1) * 5  # rows z, columns x
@@ -44,7 +46,9 @@ def test_a_case_depends_on_seed_and_index_alone(name, grid, rig):
     torch.manual_seed(99)
     back = [SCENES.build(name).sample(i, 5, grid, rig) for i in (2, 1, 0)][::-1]
     for a, b in zip(forth, back, strict=True):
-        assert torch.equal(a.views, b.views) and torch.equal(a.volume, b.volume) and a.name == b.name
+        assert (
+            torch.equal(a.views, b.views) and torch.equal(a.volume, b.volume) and a.name == b.name
+        )
     assert not torch.equal(forth[0].volume, forth[1].volume)
     assert not torch.equal(forth[0].volume, scene.sample(0, 6, grid, rig).volume)
 
@@ -63,7 +67,9 @@ def test_the_object_stays_in_its_field(name, rig):
     radius = scene.radius(grid)
     assert radius == pytest.approx(scene.field * 100)
     rng = torch.Generator().manual_seed(0)
-    direction = torch.nn.functional.normalize(torch.randn(4000, 3, generator=rng, dtype=torch.float64), dim=-1)
+    direction = torch.nn.functional.normalize(
+        torch.randn(4000, 3, generator=rng, dtype=torch.float64), dim=-1
+    )
     for index in range(8):
         phantom = scene.phantom(generator(0, index), grid)
         assert (phantom.values(grid.centre + direction * radius * 1.0001) == 0).all()
@@ -102,7 +108,9 @@ def test_views_follow_the_limits_of_the_rig(grid, rig):
 
 
 @pytest.mark.parametrize("name", [*ENDLESS, "shepp_logan"])
-@pytest.mark.parametrize("options", [{"field": 0.0}, {"field": 0.6}, {"value": 0.0}, {"value": -1.0}])
+@pytest.mark.parametrize(
+    "options", [{"field": 0.0}, {"field": 0.6}, {"value": 0.0}, {"value": -1.0}]
+)
 def test_bad_options_are_refused(name, options):
     with pytest.raises(ValueError, match=f"got {next(iter(options.values()))}"):
         SCENES.build(name, **options)

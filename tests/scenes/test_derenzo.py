@@ -22,12 +22,16 @@ def test_neighbours_stand_two_diameters_apart(diameter):
     xy = sector_wells(diameter, 40)
     apart = torch.cdist(xy, xy) + 1e9 * torch.eye(len(xy))
     if len(xy) > 1:
-        torch.testing.assert_close(apart.amin(dim=1), torch.full((len(xy),), 2.0 * diameter, dtype=torch.float64))
+        torch.testing.assert_close(
+            apart.amin(dim=1), torch.full((len(xy),), 2.0 * diameter, dtype=torch.float64)
+        )
     assert (xy.norm(dim=1) + diameter / 2 <= 40).all()
     assert (xy[:, 0] > 0).all() and (xy[:, 1].abs() < xy[:, 0] * math.tan(math.pi / 6)).all()
 
 
-@pytest.mark.parametrize("diameters", [DIAMETERS, (2,) * 6, (8, 7.5, 7, 6, 5, 4), (0.5, 10, 0.5, 10, 0.5, 10)])
+@pytest.mark.parametrize(
+    "diameters", [DIAMETERS, (2,) * 6, (8, 7.5, 7, 6, 5, 4), (0.5, 10, 0.5, 10, 0.5, 10)]
+)
 def test_no_two_wells_overlap_and_none_leaves_the_phantom(diameters):
     (wells,) = derenzo(diameters).parts
     xy, radii = wells.centres[:, :2], wells.semi_axes[:, 0]
@@ -41,12 +45,17 @@ def test_the_sectors_go_round_counter_clockwise():
     angles = torch.rad2deg(torch.atan2(wells.centres[:, 1], wells.centres[:, 0]))
     sector = torch.round(angles / 60).long() % 6
     for k, d in enumerate(DIAMETERS):
-        assert (wells.semi_axes[sector == k, 0] == d / 2).all() and (sector == k).sum() == len(sector_wells(d, 40))
+        assert (wells.semi_axes[sector == k, 0] == d / 2).all() and (sector == k).sum() == len(
+            sector_wells(d, 40)
+        )
 
 
 def test_pose_and_background():
     R, t = euler_rotation((30, 40, 50)), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    upright, turned = derenzo(background=0.25), derenzo(centre=t.tolist(), euler_degrees=(30, 40, 50), background=0.25)
+    upright, turned = (
+        derenzo(background=0.25),
+        derenzo(centre=t.tolist(), euler_degrees=(30, 40, 50), background=0.25),
+    )
     well = upright.parts[0].centres[1]
     between = torch.zeros(3, dtype=torch.float64)
     outside = torch.tensor([0.0, 0.0, 41.0], dtype=torch.float64)
@@ -57,8 +66,12 @@ def test_pose_and_background():
 
 def test_a_ray_along_the_axis_reads_the_height():
     phantom = derenzo(height=30, value=2.0)
-    start = torch.nn.functional.pad(sector_wells(6, 40) @ euler_rotation((60, 0, 0))[:2, :2].T, (0, 1), value=-100.0)
-    assert phantom.integrals(start, start * torch.tensor([1, 1, -1])).tolist() == pytest.approx([60] * 3)
+    start = torch.nn.functional.pad(
+        sector_wells(6, 40) @ euler_rotation((60, 0, 0))[:2, :2].T, (0, 1), value=-100.0
+    )
+    assert phantom.integrals(start, start * torch.tensor([1, 1, -1])).tolist() == pytest.approx(
+        [60] * 3
+    )
 
 
 def test_sizes_keep_their_voxels_on_every_grid():
@@ -73,7 +86,10 @@ def test_sizes_keep_their_voxels_on_every_grid():
 
 def test_true_size_is_kept_or_refused():
     scene = RandomDerenzo(fill=None)
-    assert scene.phantom(generator(0, 0), Grid.centred((32, 32, 32), 5.0)).parts[0].semi_axes[0, 0] == 4
+    assert (
+        scene.phantom(generator(0, 0), Grid.centred((32, 32, 32), 5.0)).parts[0].semi_axes[0, 0]
+        == 4
+    )
     with pytest.raises(ValueError, match=r"field of radius 46.6\d* mm, got 29.4\d* mm"):
         scene.phantom(generator(0, 0), Grid.centred((32, 32, 32), 2.0))
 

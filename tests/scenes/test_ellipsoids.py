@@ -20,18 +20,30 @@ def test_values_stay_in_range_and_the_body_holds_all(seed, grid):
 
 
 def test_some_are_higher_and_some_lower_than_the_body(grid):
-    values = torch.cat([RandomEllipsoids().phantom(generator(0, i), grid).parts[0].values[1:] for i in range(20)])
+    values = torch.cat(
+        [RandomEllipsoids().phantom(generator(0, i), grid).parts[0].values[1:] for i in range(20)]
+    )
     assert (values > 0).float().mean() > 0.3 and (values < 0).float().mean() > 0.2
 
 
 def test_the_count_is_kept(grid):
-    counts = {len(RandomEllipsoids(count=(2, 4)).phantom(generator(1, i), grid).parts[0].values) - 1 for i in range(40)}
+    counts = {
+        len(RandomEllipsoids(count=(2, 4)).phantom(generator(1, i), grid).parts[0].values) - 1
+        for i in range(40)
+    }
     assert counts == {2, 3, 4}
     assert len(RandomEllipsoids(count=(0, 0)).phantom(generator(1, 0), grid).parts[0].values) == 1
 
 
 @pytest.mark.parametrize(
-    "options", [{"count": (5, 3)}, {"count": (-1, 3)}, {"count": (3,)}, {"sizes": (0.0, 0.4)}, {"sizes": (0.4, 0.1)}]
+    "options",
+    [
+        {"count": (5, 3)},
+        {"count": (-1, 3)},
+        {"count": (3,)},
+        {"sizes": (0.0, 0.4)},
+        {"sizes": (0.4, 0.1)},
+    ],
 )
 def test_bad_options_are_refused(options):
     with pytest.raises(ValueError, match=f"{next(iter(options))}.*got"):

@@ -11,9 +11,17 @@ CONF = Path(__file__).parents[2] / "conf" / "scene"
 
 
 def test_scenes_take_turns(grid, rig):
-    scene = Mixture([{"name": "ellipsoids"}, {"name": "derenzo", "unit": "1/mm"}, {"name": "shepp_logan"}])
+    scene = Mixture(
+        [{"name": "ellipsoids"}, {"name": "derenzo", "unit": "1/mm"}, {"name": "shepp_logan"}]
+    )
     names = [scene.sample(i, 4, grid, rig).name for i in (5, 0, 1, 2, 3)]
-    assert names == ["shepp_logan-4-0", "ellipsoids-4-0", "derenzo-4-1", "shepp_logan-4-0", "ellipsoids-4-3"]
+    assert names == [
+        "shepp_logan-4-0",
+        "ellipsoids-4-0",
+        "derenzo-4-1",
+        "shepp_logan-4-0",
+        "ellipsoids-4-3",
+    ]
     own = SCENES.build("ellipsoids").sample(3, 4, grid, rig)
     assert torch.equal(scene.sample(3, 4, grid, rig).volume, own.volume)
 

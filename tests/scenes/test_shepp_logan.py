@@ -9,7 +9,8 @@ def test_known_places():
     """Skull, brain, both ventricles, the upper tumour, air; from the table of Yu, Ye and Wang."""
     head = shepp_logan(half_edge=100, centre=(5, 6, 7), value=2.0)
     places = torch.tensor(
-        [[0, 90, 0], [0, -50, 0], [-22, 0, -25], [22, 0, -25], [0, 40, -25], [80, 0, 0]], dtype=torch.float64
+        [[0, 90, 0], [0, -50, 0], [-22, 0, -25], [22, 0, -25], [0, 40, -25], [80, 0, 0]],
+        dtype=torch.float64,
     )
     values = head.values(places + torch.tensor([5, 6, 7], dtype=torch.float64))
     torch.testing.assert_close(
@@ -18,7 +19,9 @@ def test_known_places():
 
 
 def test_the_ventricles_lean_outwards():
-    """Turned by 108 and 72 degrees from +x, their long axes meet above the head: left leans left, right leans right."""
+    """Turned by 108 and 72 degrees from +x, their long axes meet above the head: left leans left,
+    right leans right.
+    """
     head = shepp_logan()
     tilt = lambda x, y: head.values(torch.tensor([x, y, -0.25], dtype=torch.float64)).item()  # noqa: E731
     along = (

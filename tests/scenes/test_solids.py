@@ -21,7 +21,9 @@ def one(kind="ellipsoid", centre=(0, 0, 0), axes=(1, 1, 1), value=1.0, R=None):
 
 def many(kind, n, rng):
     draw = lambda *shape: torch.rand(*shape, generator=rng, dtype=torch.float64)  # noqa: E731
-    return Solids(kind, draw(n, 3) * 30 - 15, random_rotation(rng, n), 4 + 12 * draw(n, 3), draw(n) - 0.3)
+    return Solids(
+        kind, draw(n, 3) * 30 - 15, random_rotation(rng, n), 4 + 12 * draw(n, 3), draw(n) - 0.3
+    )
 
 
 @pytest.fixture
@@ -84,7 +86,9 @@ def test_a_skew_ray_through_a_box_and_a_cylinder():
     assert one("box").integrals(*diagonal).item() == pytest.approx(2 * math.sqrt(3))
     # it leaves the round wall of radius 1 at x = y = 1/sqrt(2), before the caps at |z| = 1
     assert one("cylinder").integrals(*diagonal).item() == pytest.approx(math.sqrt(6))
-    assert one("cylinder", axes=(9, 9, 1)).integrals(*diagonal).item() == pytest.approx(2 * math.sqrt(3))
+    assert one("cylinder", axes=(9, 9, 1)).integrals(*diagonal).item() == pytest.approx(
+        2 * math.sqrt(3)
+    )
 
 
 def test_integrals_are_the_sum_of_the_values(mixed, rays):
@@ -93,7 +97,10 @@ def test_integrals_are_the_sum_of_the_values(mixed, rays):
     w = (torch.arange(n, dtype=torch.float64) + 0.5) / n
     length = (end - start).norm(dim=-1)
     sums = torch.stack(
-        [mixed.values(s + w[:, None] * (e - s)).mean() for s, e in zip(start[:20], end[:20], strict=True)]
+        [
+            mixed.values(s + w[:, None] * (e - s)).mean()
+            for s, e in zip(start[:20], end[:20], strict=True)
+        ]
     )
     exact = mixed.integrals(start, end)[:20]
     assert (exact.abs() > 1).sum() > 10
@@ -104,13 +111,22 @@ def test_integrals_are_the_sum_of_the_values(mixed, rays):
 def test_moving_the_phantom_and_the_rays_changes_nothing(mixed, rays, rng):
     R, t = random_rotation(rng), 100 * torch.randn(3, generator=rng, dtype=torch.float64)
     start, end = (x @ R.T + t for x in rays)
-    torch.testing.assert_close(mixed.moved(R, t).integrals(start, end), mixed.integrals(*rays), rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(mixed.moved(R, t).values(start * 0.1), mixed.values((start * 0.1 - t) @ R))
+    torch.testing.assert_close(
+        mixed.moved(R, t).integrals(start, end), mixed.integrals(*rays), rtol=1e-10, atol=1e-10
+    )
+    torch.testing.assert_close(
+        mixed.moved(R, t).values(start * 0.1), mixed.values((start * 0.1 - t) @ R)
+    )
 
 
 def test_a_far_source_loses_no_digits():
     direction = torch.nn.functional.normalize(points((1.0, 2.0, -0.5)), dim=-1)
-    across = torch.nn.functional.normalize(torch.linalg.cross(direction, points((0.0, 0.0, 1.0))), dim=-1) * 6
+    across = (
+        torch.nn.functional.normalize(
+            torch.linalg.cross(direction, points((0.0, 0.0, 1.0))), dim=-1
+        )
+        * 6
+    )
     chord = one(axes=(10, 10, 10)).integrals(across - 1e6 * direction, across + 1e6 * direction)
     assert chord.item() == pytest.approx(16, rel=1e-9)
 
@@ -118,14 +134,18 @@ def test_a_far_source_loses_no_digits():
 def test_only_the_extent_counts(mixed, rays):
     start, end = rays
     middle = (start + end) / 2
-    behind, ahead, line = (mixed.integrals(middle, end, e) for e in ((-INF, 0.0), (0.0, INF), (-INF, INF)))
+    behind, ahead, line = (
+        mixed.integrals(middle, end, e) for e in ((-INF, 0.0), (0.0, INF), (-INF, INF))
+    )
     torch.testing.assert_close(behind + ahead, line)
     torch.testing.assert_close(behind, mixed.integrals(start, middle))
     torch.testing.assert_close(ahead, mixed.integrals(middle, end))
     assert not torch.allclose(behind, line)
     sphere = one(centre=(5, 0, 0))
     assert sphere.integrals(points((0, 0, 0)), points((1, 0, 0)), (-INF, 0.0)).item() == 0
-    assert sphere.integrals(points((0, 0, 0)), points((-1, 0, 0)), (-INF, 0.0)).item() == pytest.approx(2)
+    assert sphere.integrals(
+        points((0, 0, 0)), points((-1, 0, 0)), (-INF, 0.0)
+    ).item() == pytest.approx(2)
     assert sphere.integrals(points((0, 0, 0)), points((5, 0, 0))).item() == pytest.approx(1)
 
 

@@ -20,8 +20,12 @@ def points(*places):
 def test_a_ray_reads_the_wall_twice():
     heart = ventricle(value=2.0)
     ends = points((0, 0, 100), (100, 0, 0), (0, -100, 0))
-    assert heart.integrals(-ends, ends).tolist() == pytest.approx([2 * 20] * 3)  # 10 mm in, 10 mm out
-    beside = points((27, 0, 100))  # outside of the cavity's radius of 22 mm: one chord, of the outer surface alone
+    assert heart.integrals(-ends, ends).tolist() == pytest.approx(
+        [2 * 20] * 3
+    )  # 10 mm in, 10 mm out
+    beside = points(
+        (27, 0, 100)
+    )  # outside of the cavity's radius of 22 mm: one chord, of the outer surface alone
     chord = 2 * 45 * math.sqrt(1 - (27 / 32) ** 2)
     assert heart.integrals(beside, beside * points((1, 1, -1))).item() == pytest.approx(2 * chord)
 
@@ -52,7 +56,9 @@ def test_voxels_hold_the_mass_of_the_wall_and_an_empty_cavity():
 
 
 def test_exact_views_hold_the_mass_too(rig):
-    """A parallel view's rays, 5/3 mm apart, add up to the wall's volume; the cavity is of the object, and empty."""
+    """A parallel view's rays, 5/3 mm apart, add up to the wall's volume; the cavity is of the
+    object, and empty.
+    """
     grid = Grid.centred((24, 24, 24), 5.0)
     sample = render(ventricle(euler_degrees=(20, 50, 0)), grid, rig, "heart")
     for view in sample.views[0]:

@@ -16,7 +16,13 @@ UNIT_VOLUMES = {"ellipsoid": 4 / 3 * math.pi, "cylinder": 2 * math.pi, "box": 8.
 def solids(kind, n=3, seed=0, spread=20.0):
     rng = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.rand(*shape, generator=rng, dtype=torch.float64)  # noqa: E731
-    return Solids(kind, spread * (2 * draw(n, 3) - 1), random_rotation(rng, n), 6 + 10 * draw(n, 3), draw(n) + 0.2)
+    return Solids(
+        kind,
+        spread * (2 * draw(n, 3) - 1),
+        random_rotation(rng, n),
+        6 + 10 * draw(n, 3),
+        draw(n) + 0.2,
+    )
 
 
 def skew_grid():
@@ -41,7 +47,10 @@ def test_it_is_the_mean_over_the_finer_grid(kind, factor):
 def test_it_keeps_the_mass_and_converges(kind):
     grid, part = Grid.centred((24, 24, 24), 4.0), solids(kind)
     mass = (part.values * part.semi_axes.prod(dim=1)).sum().item() * UNIT_VOLUMES[kind]
-    error = [abs(voxelise(Phantom((part,)), grid, f).double().sum().item() * 64 / mass - 1) for f in (1, 4, 12)]
+    error = [
+        abs(voxelise(Phantom((part,)), grid, f).double().sum().item() * 64 / mass - 1)
+        for f in (1, 4, 12)
+    ]
     assert error[1] < 0.01 and error[2] < 1e-3 and error[2] < error[0]
 
 
@@ -54,7 +63,15 @@ def test_voxels_converge_to_the_share_that_is_covered():
 
 def test_solids_that_leave_the_grid_are_cut():
     big = Phantom(
-        (Solids("box", torch.zeros(1, 3), torch.eye(3)[None], torch.full((1, 3), 500.0), torch.tensor([2.0])),)
+        (
+            Solids(
+                "box",
+                torch.zeros(1, 3),
+                torch.eye(3)[None],
+                torch.full((1, 3), 500.0),
+                torch.tensor([2.0]),
+            ),
+        )
     )
     assert (voxelise(big, Grid.centred((4, 5, 6), 3.0)) == 2).all()
     assert (voxelise(big, Grid.centred((4, 5, 6), 3.0, centre=(900, 0, 0))) == 0).all()
@@ -79,7 +96,9 @@ def test_the_voxels_that_are_subdivided_grow_with_the_surface_not_with_the_volum
     monkeypatch.setattr(voxelise_module, "_shares", counted)
     for n in (16, 32, 64):
         voxelise(Phantom((ball,)), Grid.centred((n,) * 3, 64 / n))
-    assert counts[0] < 16**3 / 2 and all(b < 4.8 * a for a, b in zip(counts, counts[1:], strict=False)), counts
+    assert counts[0] < 16**3 / 2 and all(
+        b < 4.8 * a for a, b in zip(counts, counts[1:], strict=False)
+    ), counts
 
 
 def test_a_factor_below_one_is_refused():

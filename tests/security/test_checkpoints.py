@@ -57,16 +57,24 @@ def test_a_valid_checkpoint_loads(kept: dict, tmp_path: Path):
 
 @pytest.mark.door
 @pytest.mark.parametrize("name", sorted(pickles(Path("sentinel"))))
-def test_a_pickle_builds_tensors_and_plain_values_only(name: str, kept: dict, sentinel: Path, tmp_path: Path):
-    """A checkpoint whose pickle names anything but tensors and plain values is refused, and none of it runs."""
+def test_a_pickle_builds_tensors_and_plain_values_only(
+    name: str, kept: dict, sentinel: Path, tmp_path: Path
+):
+    """A checkpoint whose pickle names anything but tensors and plain values is refused, and none of
+    it runs.
+    """
     evil = pickles(sentinel)[name]
     for raw in (with_pickle(saved(kept), evil), evil):
-        with pytest.raises(Refused, match=r"evil\.ckpt: (its pickle names|is cut short or no checkpoint)"):
+        with pytest.raises(
+            Refused, match=r"evil\.ckpt: (its pickle names|is cut short or no checkpoint)"
+        ):
             load(written(tmp_path / "evil.ckpt", raw))
     assert not sentinel.exists()
 
 
-def test_a_library_that_widens_torchs_list_does_not_widen_ours(kept: dict, sentinel: Path, tmp_path: Path):
+def test_a_library_that_widens_torchs_list_does_not_widen_ours(
+    kept: dict, sentinel: Path, tmp_path: Path
+):
     path = written(tmp_path / "evil.ckpt", saved({**kept, "x": Payload(f"touch {sentinel}")}))
     with (
         torch.serialization.safe_globals([__import__("os").system]),
@@ -79,7 +87,12 @@ def test_a_library_that_widens_torchs_list_does_not_widen_ours(kept: dict, senti
 def test_the_sample_would_work_if_it_were_unpickled(sentinel: Path, tmp_path: Path):
     path = written(tmp_path / "evil.ckpt", saved({"x": Payload(f"touch {sentinel}")}))
     code = f"import torch; torch.load({str(path)!r}, weights_only=False)"
-    subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[2], capture_output=True)
+    subprocess.run(
+        [sys.executable, "-c", code],
+        check=False,
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+    )
     assert sentinel.exists()
 
 
@@ -93,7 +106,10 @@ def test_settings_in_a_checkpoint_are_names_and_numbers(name: str, kept: dict, t
 
 
 def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: Path):
-    evil = {**kept, "hyper_parameters": {**kept["hyper_parameters"], "model": {"name": "os.system"}}}
+    evil = {
+        **kept,
+        "hyper_parameters": {**kept["hyper_parameters"], "model": {"name": "os.system"}},
+    }
     with pytest.raises(Refused, match="No model is named 'os.system'"):
         load(written(tmp_path / "evil.ckpt", saved(evil)))
 
@@ -118,14 +134,26 @@ def test_members_that_share_their_bytes_are_refused(kept: dict, tmp_path: Path):
         start += len(entries[-1])
     large = max(entries, key=lambda entry: struct.unpack("<I", entry[24:28]))
     overlapping = raw[: raw.index(b"PK\x01\x02")] + b"".join([*entries, *[large] * 60])
-    end = struct.pack("<4s4H2IH", b"PK\x05\x06", 0, 0, len(entries) + 60, len(entries) + 60,
-                      len(overlapping) - raw.index(b"PK\x01\x02"), raw.index(b"PK\x01\x02"), 0)  # fmt: skip
+    end = struct.pack(
+        "<4s4H2IH",
+        b"PK\x05\x06",
+        0,
+        0,
+        len(entries) + 60,
+        len(entries) + 60,
+        # fmt: skip
+        len(overlapping) - raw.index(b"PK\x01\x02"),
+        raw.index(b"PK\x01\x02"),
+        0,
+    )
     with pytest.raises(Refused, match="packed or overlap"):
         check_archive(written(tmp_path / "bomb.ckpt", overlapping + end))
 
 
 @pytest.mark.door
-@pytest.mark.parametrize("name", ["../evil", "/etc/evil", "archive/../../evil", "archive/code/evil.py", "evil"])
+@pytest.mark.parametrize(
+    "name", ["../evil", "/etc/evil", "archive/../../evil", "archive/code/evil.py", "evil"]
+)
 def test_members_lead_nowhere(name: str, kept: dict, tmp_path: Path):
     """A checkpoint with a member that no checkpoint has, or that leads out of it, is refused."""
     raw = zipped(repacked(saved(kept), **{name: b"x"}))
@@ -163,14 +191,24 @@ def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
 @pytest.mark.door
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_weights_that_are_not_finite_are_refused(value: float, kept: dict, tmp_path: Path):
-    """A checkpoint with a weight that is not a finite number is refused, to be evaluated and to be gone on from."""
-    name = next(name for name, weight in kept["state_dict"].items() if weight.is_floating_point() and weight.numel())
+    """A checkpoint with a weight that is not a finite number is refused, to be evaluated and to be
+    gone on from.
+    """
+    name = next(
+        name
+        for name, weight in kept["state_dict"].items()
+        if weight.is_floating_point() and weight.numel()
+    )
     weight = kept["state_dict"][name].clone()
     weight.view(-1)[-1] = value
     for key in ("state_dict", "current_model_state"):
-        path = written(tmp_path / f"{key}.ckpt", saved({**kept, key: {**kept["state_dict"], name: weight}}))
+        path = written(
+            tmp_path / f"{key}.ckpt", saved({**kept, key: {**kept["state_dict"], name: weight}})
+        )
         for reader in (load, read_newest):
-            with pytest.raises(Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'model.* among them"):
+            with pytest.raises(
+                Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'model.* among them"
+            ):
                 reader(path)
 
 
@@ -181,9 +219,15 @@ def without(mapping: dict, name: str) -> dict:
 FUTURE = {"model": {"name": "sirt", "warp": 9}}
 #: What is done to a checkpoint whose first weight has this name, and what the refusal names.
 AMISS = {
-    "a weight too few": (lambda kept, first: {**kept, "state_dict": without(kept["state_dict"], first)}, None),
+    "a weight too few": (
+        lambda kept, first: {**kept, "state_dict": without(kept["state_dict"], first)},
+        None,
+    ),
     "a weight too many": (
-        lambda kept, first: {**kept, "state_dict": {**kept["state_dict"], "spare.weight": torch.zeros(3)}},
+        lambda kept, first: {
+            **kept,
+            "state_dict": {**kept["state_dict"], "spare.weight": torch.zeros(3)},
+        },
         "spare.weight",
     ),
     "no settings": (lambda kept, first: without(kept, "hyper_parameters"), "hyper_par"),
@@ -196,8 +240,12 @@ AMISS = {
 
 @pytest.mark.door
 @pytest.mark.parametrize("name", AMISS)
-def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss(name: str, kept: dict, tmp_path: Path):
-    """A checkpoint that lacks weights or settings, or has those of another version, is refused with their names."""
+def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss(
+    name: str, kept: dict, tmp_path: Path
+):
+    """A checkpoint that lacks weights or settings, or has those of another version, is refused with
+    their names.
+    """
     change, named = AMISS[name]
     first = next(iter(kept["state_dict"]))
     with pytest.raises(Refused, match=rf"(?s)a\.ckpt: .*{named or first}"):

@@ -1,4 +1,6 @@
-"""A config is a list of names and numbers: whatever it says, nothing runs, nothing is written, nothing is read."""
+"""A config is a list of names and numbers: whatever it says, nothing runs, nothing is written,
+nothing is read.
+"""
 
 import subprocess
 import sys
@@ -24,7 +26,9 @@ def sentinel(tmp_path: Path) -> Path:
 @pytest.mark.door
 @pytest.mark.parametrize("name", sorted(targets(Path("sentinel"))))
 def test_a_target_is_a_callback_or_a_logger_or_refused(name: str, sentinel: Path):
-    """A target in a config is a callback or a logger of Lightning or mvrecon, or it is refused and does not run."""
+    """A target in a config is a callback or a logger of Lightning or mvrecon, or it is refused and
+    does not run.
+    """
     torch.save(Payload(f"touch {sentinel}"), sentinel.with_name("payload.ckpt"))
     with pytest.raises(PermissionError, match="not allowed; expected"):
         instantiate(targets(sentinel)[name], sentinel.parent)
@@ -49,7 +53,9 @@ callbacks:
 
 @pytest.fixture
 def folder(tmp_path: Path):
-    """An experiment in a folder that was fetched from somewhere; returns the overrides that choose it."""
+    """An experiment in a folder that was fetched from somewhere; returns the overrides that choose
+    it.
+    """
 
     return partial(experiment, tmp_path)
 
@@ -57,7 +63,9 @@ def folder(tmp_path: Path):
 @pytest.mark.door
 @pytest.mark.parametrize("name", sorted(experiments(Path("sentinel"))))
 def test_a_fetched_experiment_tells_hydra_nothing(name: str, sentinel: Path, folder):
-    """A fetched experiment that sets callbacks, launchers, log files or folders of Hydra is refused."""
+    """A fetched experiment that sets callbacks, launchers, log files or folders of Hydra is
+    refused.
+    """
     with pytest.raises(PermissionError, match=r"A config sets \['hydra\..*only a command line may"):
         compose(*folder(experiments(sentinel)[name]))
 
@@ -66,15 +74,26 @@ def test_a_fetched_experiment_tells_hydra_nothing(name: str, sentinel: Path, fol
 def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, root: Path, tmp_path: Path):
     """A fetched experiment is refused before Hydra makes a folder or runs a callback."""
     folder(experiments(sentinel)["a callback"])
-    command = [sys.executable, "-m", "mvrecon.simulate", f"--config-dir={tmp_path}", "+experiment=evil", "cases=[0]"]
+    command = [
+        sys.executable,
+        "-m",
+        "mvrecon.simulate",
+        f"--config-dir={tmp_path}",
+        "+experiment=evil",
+        "cases=[0]",
+    ]
     command += [f"hydra.run.dir={tmp_path}/out"]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=900, check=False)
+    done = subprocess.run(
+        command, cwd=root, capture_output=True, text=True, timeout=900, check=False
+    )
     assert done.returncode == 1 and "only a command line may" in done.stderr
     assert not sentinel.exists() and not (tmp_path / "out").exists()
 
 
 def test_what_an_experiment_may_say_of_hydra_still_composes(folder):
-    settings = compose(*folder("name: mine\nhydra: {sweeper: {params: {seed: '0,1'}}}"), "hydra.verbose=true")
+    settings = compose(
+        *folder("name: mine\nhydra: {sweeper: {params: {seed: '0,1'}}}"), "hydra.verbose=true"
+    )
     assert settings["name"] == "mine"
 
 
@@ -104,9 +123,13 @@ def test_a_name_does_not_lead_out_of_the_outputs(name: str, folder):
 
 
 @pytest.mark.door
-@pytest.mark.parametrize(("text", "error"), [("out: {}", PermissionError), ("bench: {{name: ../..{}}}", Refused)])
+@pytest.mark.parametrize(
+    ("text", "error"), [("out: {}", PermissionError), ("bench: {{name: ../..{}}}", Refused)]
+)
 def test_a_fetched_benchmark_does_not_choose_its_folder(text: str, error: type, tmp_path: Path):
-    """The folder of a benchmark is chosen by the command line, and not by a config that was fetched."""
+    """The folder of a benchmark is chosen by the command line, and not by a config that was
+    fetched.
+    """
     files = {"bench/evil.yaml": f"# @package _global_\n{text.format(tmp_path / 'x')}\n"}
     place = experiment(tmp_path, "name: mine", **files)[0]
     with pytest.raises(error, match=r"sets \['out'\]; only a command line may|has the name '\.\.'"):
@@ -119,7 +142,11 @@ def test_a_yaml_file_that_unfolds_is_refused_at_once(folder, tmp_path: Path):
     with pytest.raises(Refused, match=r"evil\.yaml: unfolds to more than"):
         compose(*folder(BOMB))
     path = tmp_path / "bomb.yaml"
-    for text, message in [(BOMB, "unfolds"), ("a: &a [*a]", "unfolds"), ("x: " + "[" * 10_000, "is not YAML")]:
+    for text, message in [
+        (BOMB, "unfolds"),
+        ("a: &a [*a]", "unfolds"),
+        ("x: " + "[" * 10_000, "is not YAML"),
+    ]:
         path.write_text(text)
         with pytest.raises(Refused, match=rf"bomb\.yaml: {message}"):
             yaml_of(path)
@@ -138,11 +165,15 @@ def test_yaml_tags_build_nothing(sentinel: Path, folder):
 @pytest.mark.parametrize(
     "module", ["os", "antigravity", "lightning.pytorch.cli", "no_such_module", "evil", "a b", ".x"]
 )
-def test_a_setting_imports_only_what_was_written_for_mvrecon(module: str, tmp_path: Path, monkeypatch, sentinel: Path):
+def test_a_setting_imports_only_what_was_written_for_mvrecon(
+    module: str, tmp_path: Path, monkeypatch, sentinel: Path
+):
     """The setting `plugins` imports only modules whose own source imports mvrecon."""
     (tmp_path / "evil.py").write_text(f"open({str(sentinel)!r}, 'w')\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(PermissionError, match="expected a module on Python's path whose own source imports mvrecon"):
+    with pytest.raises(
+        PermissionError, match="expected a module on Python's path whose own source imports mvrecon"
+    ):
         import_plugins([module])
     assert not sentinel.exists()
 
@@ -151,7 +182,9 @@ def test_a_setting_imports_only_what_was_written_for_mvrecon(module: str, tmp_pa
 def test_a_pickled_config_is_not_run_again(run_python):
     """A pickled config is not run again."""
     done = run_python(
-        "-c", "import sys; sys.argv = ['x', '--experimental-rerun=a.pickle']; import mvrecon.train as t; t.main()"
+        "-c",
+        "import sys; sys.argv = ['x', '--experimental-rerun=a.pickle']; import mvrecon.train as "
+        "t; t.main()",
     )
     assert done.returncode == 1 and "unpickles a file" in done.stderr
 

@@ -46,7 +46,9 @@ def volume_file(path: Path, change: Callable[[h5py.File], object]) -> VolumeFile
 @pytest.mark.door
 @pytest.mark.parametrize("name", DECLARED)
 def test_a_volume_file_gets_no_more_than_it_holds(name: str, tmp_path: Path):
-    """An HDF5 file that declares more than it holds, or leads to other files, is refused within 64 MB."""
+    """An HDF5 file that declares more than it holds, or leads to other files, is refused within 64
+    MB.
+    """
     change, message = DECLARED[name]
     refused(lambda: len(volume_file(tmp_path / "evil.h5", change)), rf"(?s)evil\.h5: .*{message}")
 
@@ -54,7 +56,12 @@ def test_a_volume_file_gets_no_more_than_it_holds(name: str, tmp_path: Path):
 @pytest.mark.door
 def test_a_volume_that_was_never_written_is_not_zeros(tmp_path: Path):
     """A volume that was never written is refused instead of read as zeros."""
-    made = {"shape": (2, 20, 30, 30), "dtype": "i2", "chunks": (1, 20, 30, 30), "compression": "gzip"}
+    made = {
+        "shape": (2, 20, 30, 30),
+        "dtype": "i2",
+        "chunks": (1, 20, 30, 30),
+        "compression": "gzip",
+    }
     file = volume_file(tmp_path / "a.h5", instead("ct", **made))
     refused(lambda: file.read(0), r"a\.h5: '/ct' has 0 bytes for the chunk")
 
@@ -68,9 +75,13 @@ def bomb(file: h5py.File) -> None:
 
 @pytest.mark.door
 def test_a_chunk_does_not_unfold_to_more_than_it_declares(tmp_path: Path):
-    """A chunk of an HDF5 file that unfolds to more than it declares is refused, and the other volumes are read."""
+    """A chunk of an HDF5 file that unfolds to more than it declares is refused, and the other
+    volumes are read.
+    """
     file = volume_file(tmp_path / "bomb.h5", bomb)
-    refused(lambda: file.read(0), r"bomb\.h5: has|bomb\.h5: .*(unfolds to more|bytes for the chunk)")
+    refused(
+        lambda: file.read(0), r"bomb\.h5: has|bomb\.h5: .*(unfolds to more|bytes for the chunk)"
+    )
     assert file.read(1).name == "pt_1"
 
 
@@ -82,11 +93,17 @@ def test_a_chunk_of_allowed_size_does_not_unfold_to_more_either(tmp_path: Path):
     with h5py.File(path, "r+") as file:
         assert len(raw) < noise.nbytes
         file["ct"].id.write_direct_chunk((0, 0, 0, 0), raw)
-    refused(lambda: VolumeFile(path).read(0), r"bomb\.h5: a chunk of \d+ bytes unfolds to more than", megabytes=16)
+    refused(
+        lambda: VolumeFile(path).read(0),
+        r"bomb\.h5: a chunk of \d+ bytes unfolds to more than",
+        megabytes=16,
+    )
 
 
 @pytest.mark.door
-@pytest.mark.parametrize("name", ["../../evil", "/etc/evil", "..", "a\\b", "c:evil", "a\0b", "a\nb", "", "x" * 300])
+@pytest.mark.parametrize(
+    "name", ["../../evil", "/etc/evil", "..", "a\\b", "c:evil", "a\0b", "a\nb", "", "x" * 300]
+)
 def test_a_volumes_name_leads_nowhere(name: str, tmp_path: Path):
     """A volume's name never leads to another folder."""
     with pytest.raises(Refused, match="has the name"):
@@ -95,7 +112,10 @@ def test_a_volumes_name_leads_nowhere(name: str, tmp_path: Path):
         write_volumes(tmp_path / "w.h5", [Stored(name, np.zeros((2, 2, 2), "i2"), (1.0, 1.0, 1.0))])
     assert not (tmp_path / "w.h5").exists()
     if "\0" not in name:
-        file = volume_file(tmp_path / "r.h5", instead("id", data=[name, "b"], dtype=h5py.string_dtype("utf-8", 400)))
+        file = volume_file(
+            tmp_path / "r.h5",
+            instead("id", data=[name, "b"], dtype=h5py.string_dtype("utf-8", 400)),
+        )
         refused(lambda: file.read(0), r"r\.h5: has the name")
 
 
@@ -117,7 +137,9 @@ def test_texts_of_no_fixed_length_are_read(tmp_path: Path):
 
 
 def endless(raw: bytearray) -> None:
-    """Every object of the heap of texts becomes a hole of no size: libhdf5 2.0 walks it for ever."""
+    """Every object of the heap of texts becomes a hole of no size: libhdf5 2.0 walks it for
+    ever.
+    """
     heap = raw.index(b"GCOL\x01")
     raw[heap + 16 : heap + 32] = bytes(16)
 
@@ -125,7 +147,9 @@ def endless(raw: bytearray) -> None:
 def gigantic(raw: bytearray) -> None:
     """A text of nearly 4 GiB: libhdf5 2.0 makes room for it before it looks for it."""
     heaps = [found.start() for found in re.finditer(rb"GCOL\x01", raw)]
-    references = [raw.find(struct.pack("<IQ", length, heap)) for heap in heaps for length in (4, 7, 8)]
+    references = [
+        raw.find(struct.pack("<IQ", length, heap)) for heap in heaps for length in (4, 7, 8)
+    ]
     for place in (place for place in references if place >= 0):
         raw[place : place + 4] = b"\xf0\xff\xff\xff"
 
@@ -151,15 +175,24 @@ def test_a_nifti_header_is_not_believed(name: str, suffix: str, tmp_path: Path):
 @pytest.mark.door
 def test_a_few_bytes_of_gzip_do_not_unfold(tmp_path: Path):
     """A packed NIfTI file that declares gigabytes and holds little is refused within 64 MB."""
-    path = nifti(tmp_path / "bomb.nii.gz", bytes(2**26), dim=[3, 1024, 1024, 1024, 1, 1, 1, 1], vox_offset=352)
+    path = nifti(
+        tmp_path / "bomb.nii.gz",
+        bytes(2**26),
+        dim=[3, 1024, 1024, 1024, 1, 1, 1, 1],
+        vox_offset=352,
+    )
     refused(lambda: read_nifti(path), r"bomb\.nii\.gz: cannot be read .*declares")
 
 
-def test_extensions_of_a_nifti_header_are_not_parsed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_extensions_of_a_nifti_header_are_not_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     image = nibabel.Nifti1Image(np.zeros((4, 4, 4), "i2"), np.eye(4))
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", b"x" * 64))
     nibabel.save(image, tmp_path / "a.nii")
-    monkeypatch.setattr(nibabel.nifti1.Nifti1Extensions, "from_fileobj", lambda *_: pytest.fail("was parsed"))
+    monkeypatch.setattr(
+        nibabel.nifti1.Nifti1Extensions, "from_fileobj", lambda *_: pytest.fail("was parsed")
+    )
     assert read_nifti(tmp_path / "a.nii")[1].shape == (4, 4, 4)
 
 
@@ -168,7 +201,19 @@ def rig(path: Path) -> dict:
     return json.loads(path.read_text())
 
 
-NUMBERS = ["NaN", "Infinity", "-Infinity", "1e999", "1" + "0" * 400, "1e300", '"1"', "null", "true", "[1]", "{}"]
+NUMBERS = [
+    "NaN",
+    "Infinity",
+    "-Infinity",
+    "1e999",
+    "1" + "0" * 400,
+    "1e300",
+    '"1"',
+    "null",
+    "true",
+    "[1]",
+    "{}",
+]
 
 
 @pytest.mark.door
@@ -195,7 +240,9 @@ TEXTS = {
 @pytest.mark.door
 @pytest.mark.parametrize("name", TEXTS)
 def test_a_camera_file_of_nonsense_is_refused_in_few_words(name: str, tmp_path: Path):
-    """A camera file that is no camera file is refused in less than 1000 characters, with its name."""
+    """A camera file that is no camera file is refused in less than 1000 characters, with its
+    name.
+    """
     raw, message = TEXTS[name]
     (tmp_path / "evil.json").write_bytes(raw)
     with pytest.raises(ValueError, match=message) as error:

@@ -1,4 +1,6 @@
-"""Damaged files of every kind: a reader reads them or says what is wrong, within memory, and lives."""
+"""Damaged files of every kind: a reader reads them or says what is wrong, within memory, and
+lives.
+"""
 
 import json
 import os
@@ -24,10 +26,15 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
 
     The seed is random at night only: set MVRECON_FUZZ_SEED, and MVRECON_FUZZ_COUNT for more cases.
     """
-    seed, count = os.environ.get("MVRECON_FUZZ_SEED", "5"), os.environ.get("MVRECON_FUZZ_COUNT", str(COUNT))
+    seed, count = (
+        os.environ.get("MVRECON_FUZZ_SEED", "5"),
+        os.environ.get("MVRECON_FUZZ_COUNT", str(COUNT)),
+    )
     out = tmp_path_factory.mktemp("fuzz") / "found.json"
     command = [sys.executable, "-m", "tests.faults.fuzzing", seed, count, str(out)]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False
+    )
     found = json.loads(out.read_text()) if out.exists() else {}
     said = f"seed {seed}, exit status {done.returncode}\n{done.stderr[-2000:]}"
     return found, said

@@ -1,4 +1,6 @@
-"""What the project itself promises: no call that runs data, nothing for the network, no version with known holes."""
+"""What the project itself promises: no call that runs data, nothing for the network, no version
+with known holes.
+"""
 
 import ast
 import re
@@ -13,9 +15,20 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
-CODE = sorted(f for folder in ("mvrecon", "scripts", "plugins") for f in (ROOT / folder).rglob("*.py"))
+CODE = sorted(
+    f for folder in ("mvrecon", "scripts", "plugins") for f in (ROOT / folder).rglob("*.py")
+)
 #: Calls that run what they are given, whatever module or object they are an attribute of.
-BANNED = {"eval", "exec", "load_from_checkpoint", "unsafe_load", "full_load", "Unpickler", "system", "popen"}
+BANNED = {
+    "eval",
+    "exec",
+    "load_from_checkpoint",
+    "unsafe_load",
+    "full_load",
+    "Unpickler",
+    "system",
+    "popen",
+}
 PICKLES = {"pickle", "cPickle", "dill", "joblib", "cloudpickle", "shelve", "marshal"}
 
 
@@ -50,7 +63,14 @@ def test_no_code_runs_data(file: Path):
 
 @pytest.mark.parametrize(
     "line",
-    ["eval(x)", "exec(x)", "os.system(x)", "torch.load(p)", "torch.load(p, weights_only=False)", "yaml.load(x, Loader)"]
+    [
+        "eval(x)",
+        "exec(x)",
+        "os.system(x)",
+        "torch.load(p)",
+        "torch.load(p, weights_only=False)",
+        "yaml.load(x, Loader)",
+    ]
     + [
         "pickle.loads(x)",
         "np.load(p, allow_pickle=True)",
@@ -71,12 +91,20 @@ def texts() -> list[Path]:
         for f in (ROOT / folder).rglob("*")
     ]
     kinds = (".md", ".sh", ".py", ".yaml", ".toml")
-    return [f for f in [*ROOT.glob("*.md"), *ROOT.glob("*.toml"), *folders] if f.is_file() and f.suffix in kinds]
+    return [
+        f
+        for f in [*ROOT.glob("*.md"), *ROOT.glob("*.toml"), *folders]
+        if f.is_file() and f.suffix in kinds
+    ]
 
 
 def test_nothing_is_shown_to_the_network():
     found = [
-        f for f in texts() if re.search(r"--bind[_-]all|0\.0\.0\.0|--host[= ](?!localhost|127\.0\.0\.1)", f.read_text())
+        f
+        for f in texts()
+        if re.search(
+            r"--bind[_-]all|0\.0\.0\.0|--host[= ](?!localhost|127\.0\.0\.1)", f.read_text()
+        )
     ]
     assert [f.name for f in found if f.name != "SECURITY.md"] == []
     shown = [f.name for f in texts() if "tensorboard --logdir" in f.read_text()]
@@ -88,12 +116,17 @@ def test_the_board_listens_on_this_machine_alone():
 
     board = program.TensorBoard()
     board.configure(argv=["tensorboard", "--logdir", "outputs"])
-    assert board.flags.bind_all is False and board.flags.host is None  # TensorBoard then takes localhost
+    assert (
+        board.flags.bind_all is False and board.flags.host is None
+    )  # TensorBoard then takes localhost
 
 
 FLOORS = {
     "torch": (["2.10"], ["2.9.1"]),
-    "lightning": (["2.6.6"], ["2.6.2", "2.6.3", "2.6.5"]),  # 2.6.2 and 2.6.3 ran foreign code when imported
+    "lightning": (
+        ["2.6.6"],
+        ["2.6.2", "2.6.3", "2.6.5"],
+    ),  # 2.6.2 and 2.6.3 ran foreign code when imported
     "hydra-core": (["1.3.6"], ["1.3.2", "1.3.5"]),  # a target by an alias of another module
     "h5py": (["3.14"], ["3.13"]),
     "pydicom": (["3.0.2"], ["3.0.1"]),
@@ -102,7 +135,10 @@ FLOORS = {
 
 def requirements() -> dict[str, Requirement]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lines = [*project["dependencies"], *(line for extra in project["optional-dependencies"].values() for line in extra)]
+    lines = [
+        *project["dependencies"],
+        *(line for extra in project["optional-dependencies"].values() for line in extra),
+    ]
     return {canonicalize_name(found.name): found for found in map(Requirement, lines)}
 
 
@@ -116,7 +152,10 @@ def test_versions_with_known_holes_are_not_accepted(name: str):
 
 def test_what_is_imported_is_declared():
     import_names = {"pyyaml": "yaml", "pillow": "PIL", "hydra-core": "hydra"}
-    declared = {import_names.get(name, name.replace("-", "_")) for name in requirements()} | {"mvrecon", "cuda"}
+    declared = {import_names.get(name, name.replace("-", "_")) for name in requirements()} | {
+        "mvrecon",
+        "cuda",
+    }
     modules: set[str] = set()
     for file in (ROOT / "mvrecon").rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -138,7 +177,9 @@ def test_the_lock_has_the_pinned_versions_with_hashes_and_names_no_index():
     blocks = re.split(r"\n(?=\S)", text)
     assert all("--hash=sha256:" in block for block in blocks if "==" in block)
     assert not re.search(r"://|^-|--index|--find-links", text, re.MULTILINE)
-    assert {name: version for name, version in locked.items() if pinned.get(name, version) != version} == {}
+    assert {
+        name: version for name, version in locked.items() if pinned.get(name, version) != version
+    } == {}
     assert {name for name in requirements() if name != "mvrecon"} <= set(locked)
 
 

@@ -1,4 +1,6 @@
-"""A run folder that somebody sent: whatever is in it, nothing outside it is written, and nothing is removed."""
+"""A run folder that somebody sent: whatever is in it, nothing outside it is written, and nothing is
+removed.
+"""
 
 import os
 from pathlib import Path
@@ -19,8 +21,21 @@ from mvrecon.limits import Refused
 from mvrecon.train import resumed, train
 from tests.engine.lives import OPTIONS
 
-CALLBACKS, LOGGERS, OWN = "lightning.pytorch.callbacks", "lightning.pytorch.loggers", "mvrecon.engine"
-NAMES = ("checkpoints", ".lock", "config.yaml", "versions.txt", "results.json", "metrics.csv", "review", "sirt")
+CALLBACKS, LOGGERS, OWN = (
+    "lightning.pytorch.callbacks",
+    "lightning.pytorch.loggers",
+    "mvrecon.engine",
+)
+NAMES = (
+    "checkpoints",
+    ".lock",
+    "config.yaml",
+    "versions.txt",
+    "results.json",
+    "metrics.csv",
+    "review",
+    "sirt",
+)
 PARTS = (".results.json.1.part", "events.out.tfevents.1.a.1.0", "review/planes.png", "a/b/c")
 
 
@@ -33,7 +48,10 @@ def home(tmp_path: Path) -> Path:
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
 
 
 def run_folder(path: Path, settings: dict) -> Path:
@@ -44,7 +62,9 @@ def run_folder(path: Path, settings: dict) -> Path:
 
 @pytest.mark.door
 def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: Path):
-    """`resume=` a folder whose checkpoints lead to the user's documents, with a method of that name: they stay."""
+    """`resume=` a folder whose checkpoints lead to the user's documents, with a method of that
+    name: they stay.
+    """
     settings = compose(*OPTIONS)
     settings |= {"compare": {"Documents": settings["model"]}, "model": {"name": "backprojection"}}
     folder = run_folder(tmp_path / "sent", settings)
@@ -60,18 +80,24 @@ def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: 
 @pytest.mark.door
 @pytest.mark.parametrize("name", [*NAMES, *PARTS])
 def test_a_run_folder_with_a_link_in_it_is_refused(name: str, home: Path, tmp_path: Path):
-    """A run folder in which anything is a link is refused before anything is written, whatever it leads to."""
+    """A run folder in which anything is a link is refused before anything is written, whatever it
+    leads to.
+    """
     for target in (home / "Documents", home / "Documents" / "thesis.txt", home / "new"):
         folder = tmp_path / f"sent to {target.name}"
         link = folder / name
         link.parent.mkdir(parents=True)
         link.symlink_to(target)
         before = contents(home)
-        with pytest.raises(PermissionError, match="a link, a pipe or a device; expected files and folders"):
+        with pytest.raises(
+            PermissionError, match="a link, a pipe or a device; expected files and folders"
+        ):
             with claimed(folder):
                 pytest.fail("the folder must not be taken")
         assert contents(home) == before
-        assert [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()] == []
+        assert [
+            path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()
+        ] == []
 
 
 @pytest.mark.door
@@ -92,7 +118,9 @@ def test_a_run_folder_may_be_reached_by_a_link_of_the_users(tmp_path: Path):
 
 @pytest.mark.door
 def test_only_named_files_are_removed(tmp_path: Path):
-    """A finished training removes its two last checkpoints by name, and their folder only if nothing is left in it."""
+    """A finished training removes its two last checkpoints by name, and their folder only if
+    nothing is left in it.
+    """
     last = tmp_path / "sirt" / "last.ckpt"
     last.parent.mkdir()
     for path in (last, previous(last), last.with_name("notes.txt")):
@@ -115,7 +143,12 @@ def test_a_label_is_a_name(label: str):
 def outside(home: Path) -> dict[str, dict]:
     """Callbacks and loggers that would write into the user's documents, or somewhere else."""
     documents = str(home / "Documents")
-    ways = {"absolute": documents, "up": "../home/Documents", "of the user": "~/x", "by address": f"file://{documents}"}
+    ways = {
+        "absolute": documents,
+        "up": "../home/Documents",
+        "of the user": "~/x",
+        "by address": f"file://{documents}",
+    }
     ways |= {
         "by a short address": f"file:{documents}",
         "by a chain": f"simplecache::{documents}",
@@ -125,7 +158,10 @@ def outside(home: Path) -> dict[str, dict]:
         "a checkpoint": (f"{CALLBACKS}.ModelCheckpoint", "dirpath"),
         "a checkpoint's name": (f"{CALLBACKS}.ModelCheckpoint", "filename"),
         "an exception's": (f"{CALLBACKS}.OnExceptionCheckpoint", "dirpath"),
-        "skipped batches": ("lightning.pytorch.callbacks.spike.SpikeDetection", "exclude_batches_path"),
+        "skipped batches": (
+            "lightning.pytorch.callbacks.spike.SpikeDetection",
+            "exclude_batches_path",
+        ),
         "a board's name": (f"{LOGGERS}.TensorBoardLogger", "name"),
         "a board's version": (f"{LOGGERS}.TensorBoardLogger", "version"),
         "a board's sub-folder": (f"{LOGGERS}.TensorBoardLogger", "sub_dir"),
@@ -143,7 +179,9 @@ def outside(home: Path) -> dict[str, dict]:
 @pytest.mark.door
 @pytest.mark.parametrize("name", sorted(outside(Path("home"))))
 def test_callbacks_and_loggers_write_into_the_run_folder(name: str, home: Path, tmp_path: Path):
-    """Whatever option of a callback or a logger leads out of the run folder is refused, and nothing is written."""
+    """Whatever option of a callback or a logger leads out of the run folder is refused, and nothing
+    is written.
+    """
     node, before = outside(home)[name], contents(home)
     save = {"save_dir": str(tmp_path / "run")} if "loggers" in node["_target_"] else {}
     with pytest.raises(PermissionError, match="expected a place inside the run folder"):
@@ -152,8 +190,12 @@ def test_callbacks_and_loggers_write_into_the_run_folder(name: str, home: Path, 
 
 
 @pytest.mark.door
-def test_a_place_that_a_default_leads_to_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A logger that would write into the current folder, because that is its default, is refused."""
+def test_a_place_that_a_default_leads_to_is_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A logger that would write into the current folder, because that is its default, is
+    refused.
+    """
     monkeypatch.setattr(CSVLogger, "log_dir", str(tmp_path))
     node = {"_target_": f"{LOGGERS}.CSVLogger"}
     with pytest.raises(PermissionError, match="log_dir of CSVLogger leads to"):
@@ -165,26 +207,47 @@ def test_a_place_that_a_default_leads_to_is_looked_at(tmp_path: Path, monkeypatc
     "name", ["survival.KeepLast", "survival.RandomNumbers", "callbacks.Clock", "callbacks.Confined"]
 )
 def test_what_every_run_has_is_no_target(name: str, tmp_path: Path):
-    """The callbacks that every run has, such as the one that keeps its last checkpoint, cannot be asked for."""
-    with pytest.raises(PermissionError, match="not allowed; expected none that every run has already"):
+    """The callbacks that every run has, such as the one that keeps its last checkpoint, cannot be
+    asked for.
+    """
+    with pytest.raises(
+        PermissionError, match="not allowed; expected none that every run has already"
+    ):
         instantiate({"_target_": f"{OWN}.{name}", "path": "x"}, tmp_path)
 
 
 def test_a_place_inside_is_taken_from_the_run_folder(tmp_path: Path):
-    checkpoints = instantiate({"_target_": f"{CALLBACKS}.ModelCheckpoint", "dirpath": "best"}, tmp_path)
-    assert isinstance(checkpoints, ModelCheckpoint) and checkpoints.dirpath == str(tmp_path.resolve() / "best")
-    node = {"_target_": f"{LOGGERS}.TensorBoardLogger", "name": "mine", "version": "a", "sub_dir": "b"}
+    checkpoints = instantiate(
+        {"_target_": f"{CALLBACKS}.ModelCheckpoint", "dirpath": "best"}, tmp_path
+    )
+    assert isinstance(checkpoints, ModelCheckpoint) and checkpoints.dirpath == str(
+        tmp_path.resolve() / "best"
+    )
+    node = {
+        "_target_": f"{LOGGERS}.TensorBoardLogger",
+        "name": "mine",
+        "version": "a",
+        "sub_dir": "b",
+    }
     board = instantiate(node, tmp_path, save_dir=str(tmp_path))
-    assert isinstance(board, TensorBoardLogger) and board.log_dir == str(tmp_path / "mine" / "a" / "b")
+    assert isinstance(board, TensorBoardLogger) and board.log_dir == str(
+        tmp_path / "mine" / "a" / "b"
+    )
 
 
 @pytest.mark.door
 def test_checkpoints_are_kept_and_removed_inside_the_run_folder(home: Path, tmp_path: Path):
-    """No checkpoint is written or removed outside the run folder, whatever an older one says of its predecessors."""
+    """No checkpoint is written or removed outside the run folder, whatever an older one says of its
+    predecessors.
+    """
     kept, thesis = DurableCheckpoints(tmp_path / "run"), home / "Documents" / "thesis.txt"
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "out").symlink_to(home)
-    for path in (thesis, tmp_path / "run/../home/Documents/thesis.txt", tmp_path / "run/out/Documents/thesis.txt"):
+    for path in (
+        thesis,
+        tmp_path / "run/../home/Documents/thesis.txt",
+        tmp_path / "run/out/Documents/thesis.txt",
+    ):
         with pytest.raises(PermissionError, match="expected a place inside the run folder"):
             kept.save_checkpoint({"x": torch.zeros(1)}, path)
         with pytest.raises(PermissionError, match="expected a place inside the run folder"):
@@ -194,12 +257,18 @@ def test_checkpoints_are_kept_and_removed_inside_the_run_folder(home: Path, tmp_
 
 @pytest.mark.door
 def test_a_checkpoint_gives_a_callback_no_place_outside(home: Path, tmp_path: Path):
-    """A checkpoint to go on from that tells a callback to write elsewhere lets no training begin."""
+    """A checkpoint to go on from that tells a callback to write elsewhere lets no training
+    begin.
+    """
     settings = compose(*OPTIONS)
-    settings["callbacks"] = {"spikes": {"_target_": "lightning.pytorch.callbacks.spike.SpikeDetection"}}
+    settings["callbacks"] = {
+        "spikes": {"_target_": "lightning.pytorch.callbacks.spike.SpikeDetection"}
+    }
     folder = tmp_path / "run"
     trainer = fit.build_trainer(settings, folder, folder, folder / "last.ckpt")
-    spikes = next(callback for callback in trainer.callbacks if type(callback).__name__ == "SpikeDetection")
+    spikes = next(
+        callback for callback in trainer.callbacks if type(callback).__name__ == "SpikeDetection"
+    )
     guards = [callback for callback in trainer.callbacks if isinstance(callback, Confined)]
     spikes.exclude_batches_path = str(home / "Documents" / "thesis.txt")
     with pytest.raises(PermissionError, match="exclude_batches_path of SpikeDetection leads to"):

@@ -51,19 +51,27 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
 
 
 @pytest.mark.door
-@pytest.mark.parametrize("option", ["seed=5", "camera.views=12", "grid.spacing=2.0", "projector=drr"])
+@pytest.mark.parametrize(
+    "option", ["seed=5", "camera.views=12", "grid.spacing=2.0", "projector=drr"]
+)
 def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
-    """The seed, the rig, the grid and the projector of an evaluation are those of the run, and cannot be typed."""
+    """The seed, the rig, the grid and the projector of an evaluation are those of the run, and
+    cannot be typed.
+    """
     with pytest.raises(Exception, match=f"Could not override '{option.partition('=')[0]}'"):
         compose("checkpoint=x", option, config_name="eval")
 
 
 @pytest.mark.door
 def test_an_evaluation_does_not_describe_a_trained_method_anew(tmp_path: Path):
-    """Settings of a method that the run has trained are refused by its evaluation: its checkpoint decides."""
+    """Settings of a method that the run has trained are refused by its evaluation: its checkpoint
+    decides.
+    """
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "config.yaml").touch()
     (tmp_path / "checkpoints" / "mine.ckpt").touch()
     settings = compose(f"checkpoint={tmp_path}", "+compare.mine={name: sirt}", config_name="eval")
-    with pytest.raises(ValueError, match=r"compare describes \['mine'\], which the run has trained already"):
+    with pytest.raises(
+        ValueError, match=r"compare describes \['mine'\], which the run has trained already"
+    ):
         evaluate(settings, tmp_path / "out")

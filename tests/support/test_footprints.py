@@ -40,7 +40,9 @@ def test_bricks_fill_the_grid_once_and_the_last_are_cut():
 def test_no_pixel_that_a_brick_contributes_to_is_missed(kind: str, method: str):
     """Joseph and trilinear carry a value half a voxel beyond the brick, Siddon nowhere."""
     world = random_world(kind, 11)
-    world = replace(world, grid=Grid(world.grid.shape, world.grid.affine), cameras=world.cameras[:2])
+    world = replace(
+        world, grid=Grid(world.grid.shape, world.grid.affine), cameras=world.cameras[:2]
+    )
     bricks = bricks_of(world.grid, 9)
     volumes = torch.zeros(len(bricks), 1, *world.grid.shape, dtype=torch.float64)
     for n, (low, high) in enumerate(zip(bricks.low.tolist(), bricks.high.tolist(), strict=True)):
@@ -53,7 +55,9 @@ def test_no_pixel_that_a_brick_contributes_to_is_missed(kind: str, method: str):
 
 
 def test_a_whole_footprint_is_no_wider_than_the_shadow():
-    """Of a brick that a dense detector sees, the first and last row and column are hit, but for the reach."""
+    """Of a brick that a dense detector sees, the first and last row and column are hit, but for the
+    reach.
+    """
     grid = Grid.centred((8, 8, 8), 1.0)
     rig = dome(3, 60.0, 40.0, 150.0, {"pixels": [120, 120], "pixel_mm": 0.1})
     bricks = bricks_of(grid, 4)
@@ -71,7 +75,9 @@ def test_a_whole_footprint_is_no_wider_than_the_shadow():
 
 
 def test_the_footprint_of_a_cube_before_a_source_is_known():
-    """A cube of 2 mm at the axis of a cone beam: its near face, at 99 mm, is magnified 200 / 99 times."""
+    """A cube of 2 mm at the axis of a cone beam: its near face, at 99 mm, is magnified 200 / 99
+    times.
+    """
     grid = Grid.centred((2, 2, 2), 1.0)
     rig = circular(1, 100.0, 200.0, {"pixels": [21, 31], "pixel_mm": 0.5})
     prints = footprints(rig, grid, bricks_of(grid, 2), reach=0.0)
@@ -107,7 +113,9 @@ def test_a_brick_is_whole_only_where_all_of_it_counts():
     assert not whole(along(beam, 10)) and not whole(along(beam, -10)) and empty(along(beam, 30))
     assert whole(replace(along(beam, 30), extent="line"))
     assert not whole(pinhole) and empty(pinhole)
-    assert not whole(circular(1, 40.0, 60.0, {"pixels": [7, 99], "pixel_mm": 1.0}))  # beyond the rows
+    assert not whole(
+        circular(1, 40.0, 60.0, {"pixels": [7, 99], "pixel_mm": 1.0})
+    )  # beyond the rows
 
 
 def test_sums_over_footprints_are_those_of_their_pixels():
@@ -115,11 +123,17 @@ def test_sums_over_footprints_are_those_of_their_pixels():
     for kind in KINDS:
         world = random_world(kind, 13)
         prints = footprints(world.cameras, world.grid, bricks_of(world.grid, 5))
-        counts = torch.randint(0, 1000, (2, len(world.cameras), *world.cameras.shape), generator=rng)
-        direct = torch.einsum("bmvu,mnvu->bmn", counts.double(), covered(prints, world.cameras.shape).double())
+        counts = torch.randint(
+            0, 1000, (2, len(world.cameras), *world.cameras.shape), generator=rng
+        )
+        direct = torch.einsum(
+            "bmvu,mnvu->bmn", counts.double(), covered(prints, world.cameras.shape).double()
+        )
         assert torch.equal(sums(tables(counts), prints).double(), direct)
         lit = counts > 500
-        direct = torch.einsum("bmvu,mnvu->bmn", lit.double(), covered(prints, world.cameras.shape).double())
+        direct = torch.einsum(
+            "bmvu,mnvu->bmn", lit.double(), covered(prints, world.cameras.shape).double()
+        )
         assert torch.equal(sums(tables(lit), prints).double(), direct)
 
 
@@ -133,4 +147,6 @@ def test_the_gap_between_rays_is_a_pixels_diagonal_magnified_to_where_they_count
     assert ray_gap(parallel(3, detector, 100.0), grid) == pytest.approx(5.0)
     cone = circular(1, 100.0, 200.0, detector)
     assert ray_gap(cone, grid) == pytest.approx(5.0 * 120 / 200)  # the far face
-    assert ray_gap(circular(1, 100.0, 110.0, detector), grid) == pytest.approx(5.0)  # rays end in the grid
+    assert ray_gap(circular(1, 100.0, 110.0, detector), grid) == pytest.approx(
+        5.0
+    )  # rays end in the grid

@@ -26,13 +26,19 @@ def occupied(volume: torch.Tensor, brick: int) -> torch.Tensor:
     return max_pool3d((volume > 0).float()[None, None], brick, ceil_mode=True)[:, 0] > 0
 
 
-def kept(world: World, views: torch.Tensor | None = None, brick: int = EDGE, **options) -> torch.Tensor:
-    return visual_hull(world.views if views is None else views, world.cameras, world.grid, brick, **options)
+def kept(
+    world: World, views: torch.Tensor | None = None, brick: int = EDGE, **options
+) -> torch.Tensor:
+    return visual_hull(
+        world.views if views is None else views, world.cameras, world.grid, brick, **options
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_occupied_brick_is_lost_and_some_empty_ones_are(kind: str):
-    """105 random worlds, 15 of each kind, seen by exact integrals and by the operator of a voxel phantom."""
+    """105 random worlds, 15 of each kind, seen by exact integrals and by the operator of a voxel
+    phantom.
+    """
     held = []
     for seed in range(15):
         world, brick = random_world(kind, seed), BRICKS[seed % len(BRICKS)]
@@ -99,7 +105,11 @@ def test_what_no_view_sees_whole_stays_and_all_else_goes_when_nothing_is_seen():
         world = random_world(kind, 4)
         lattice = bricks_along(world.grid.shape, EDGE)
         bricks = Bricks.at(torch.ones(lattice).nonzero(), EDGE, world.grid.shape)
-        seen = footprints(world.cameras, world.grid, bricks, gaps=True).whole.any(dim=0).reshape(lattice)
+        seen = (
+            footprints(world.cameras, world.grid, bricks, gaps=True)
+            .whole.any(dim=0)
+            .reshape(lattice)
+        )
         stays = kept(world, torch.zeros_like(world.views))[0]
         assert torch.equal(stays, ~seen)
         assert seen.any()
@@ -107,7 +117,9 @@ def test_what_no_view_sees_whole_stays_and_all_else_goes_when_nothing_is_seen():
 
 @pytest.mark.parametrize("kind", ["inside", "beams", "dcspect80"])
 def test_what_is_given_up_unseen_is_what_the_data_know_nothing_of(kind: str):
-    """The adjoint of the views is zero there, so that MLEM makes it zero in its first step; the rest explains all."""
+    """The adjoint of the views is zero there, so that MLEM makes it zero in its first step; the
+    rest explains all.
+    """
     given_up = 0
     for seed in range(6):
         world = random_world(kind, seed)
@@ -118,18 +130,22 @@ def test_what_is_given_up_unseen_is_what_the_data_know_nothing_of(kind: str):
         gone = kept(world, views, 2) & ~stays
         given_up += int(gone.sum())
         assert not (A.T(views)[0] * expand(gone, 2, world.grid.shape)[0]).any()
-        assert torch.allclose(A(volume * expand(stays, 2, world.grid.shape)), views, rtol=1e-6, atol=1e-6)
+        assert torch.allclose(
+            A(volume * expand(stays, 2, world.grid.shape)), views, rtol=1e-6, atol=1e-6
+        )
     assert given_up
 
 
 def test_a_derenzo_phantom_among_parallel_beams_keeps_what_the_geometry_says():
-    """The views' shadows of the phantom's cylinder bound the hull: no brick beyond them, by its size and the gaps."""
+    """The views' shadows of the phantom's cylinder bound the hull: no brick beyond them, by its
+    size and the gaps.
+    """
     grid, brick, views, pixel = Grid.centred((48, 48, 48), 1.0), 2, 24, 0.8
     rig = parallel(views, {"pixels": [70, 90], "pixel_mm": pixel}, 90.0)
     phantom = derenzo((3, 2.5, 2.5, 2, 2, 2), 9.0, 14.0)
     stays = kept(World(grid, rig, phantom), brick=brick)
-    x, y, z = (centres[brick // 2 :: brick, brick // 2 :: brick, brick // 2 :: brick] - 0.5 for centres in
-               voxel_centres(grid).unbind(dim=-1))  # fmt: skip
+    inner = (slice(brick // 2, None, brick),) * 3
+    x, y, z = (centres[inner] - 0.5 for centres in voxel_centres(grid).unbind(dim=-1))
     more = 0.5 * 2**0.5 + pixel * (1 + 2**0.5) / 2 + 0.01  # the reach and the gaps
     radius = (9.0 + more + brick / 2 * 2**0.5) / torch.cos(torch.tensor(torch.pi / (2 * views)))
     bound = (torch.hypot(x, y) <= radius) & (z.abs() <= 7.0 + more + brick / 2)
@@ -162,7 +178,10 @@ def test_as_many_views_as_asked_for_must_agree():
     count = len(world.cameras)
     left_out = [[m for m in range(count) if m != out] for out in range(count)]
     any_keeps = torch.stack(
-        [kept(replace(world, cameras=world.cameras[some]), world.views[:, :, some]) for some in left_out]
+        [
+            kept(replace(world, cameras=world.cameras[some]), world.views[:, :, some])
+            for some in left_out
+        ]
     ).any(dim=0)
     assert torch.equal(kept(world, witnesses=2), any_keeps)
     assert kept(world, witnesses=count + 1).all()
@@ -193,20 +212,42 @@ def test_views_that_are_not_finite_are_no_evidence(value: float):
 
 
 def test_solids_beyond_the_field_of_view_do_not_count_against_the_bricks_in_it():
-    """A truncated view: the body beyond a brick shines into all footprints, so that nothing is told, and none lost."""
+    """A truncated view: the body beyond a brick shines into all footprints, so that nothing is
+    told, and none lost.
+    """
     grid = Grid.centred((8, 8, 8), 1.0)
     rig = parallel(6, {"pixels": [12, 12], "pixel_mm": 1.1}, 400.0)
-    slab = Phantom((Solids("box", torch.zeros(1, 3), torch.eye(3)[None], torch.full((1, 3), 100.0), torch.ones(1)),))
+    slab = Phantom(
+        (
+            Solids(
+                "box",
+                torch.zeros(1, 3),
+                torch.eye(3)[None],
+                torch.full((1, 3), 100.0),
+                torch.ones(1),
+            ),
+        )
+    )
     assert kept(World(grid, rig, slab), brick=2).all()
 
 
 def test_a_body_that_sticks_out_of_the_part_of_the_rays_that_counts_is_kept():
-    """The rays end in a ball as wide as a pixel's diagonal, beside the tip of it that lies before their end."""
+    """The rays end in a ball as wide as a pixel's diagonal, beside the tip of it that lies before
+    their end.
+    """
     grid = Grid.centred((8, 8, 8), 1.0)
-    rig = parallel(1, {"pixels": [12, 12], "pixel_mm": 1.0}, 9.01)  # along -x, to 0.505 mm beyond the grid
+    rig = parallel(
+        1, {"pixels": [12, 12], "pixel_mm": 1.0}, 9.01
+    )  # along -x, to 0.505 mm beyond the grid
     radius = 0.7075
     centre = torch.tensor([[-3.97 - radius, 0.0, 0.0]])  # half a pixel from four rays
-    ball = Phantom((Solids("ellipsoid", centre, torch.eye(3)[None], torch.full((1, 3), radius), torch.ones(1)),))
+    ball = Phantom(
+        (
+            Solids(
+                "ellipsoid", centre, torch.eye(3)[None], torch.full((1, 3), radius), torch.ones(1)
+            ),
+        )
+    )
     world = World(grid, rig, ball)
     assert ball.values(torch.tensor([-3.98, 0.0, 0.0])) > 0 and not world.views.any()
     stays = kept(world, brick=1)[0]

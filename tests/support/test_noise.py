@@ -37,12 +37,16 @@ KNOWN = {
 
 @pytest.mark.parametrize("delta", [0.9, 5e-2, 1e-3, 1e-6, 1e-12])
 def test_no_count_leaves_a_mean_of_minus_the_logarithm_of_delta(delta: float):
-    assert poisson_bound(torch.tensor(0.0), delta).item() == pytest.approx(-math.log(delta), rel=1e-9)
+    assert poisson_bound(torch.tensor(0.0), delta).item() == pytest.approx(
+        -math.log(delta), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(("n", "delta"), KNOWN)
 def test_the_bound_is_the_quantile_of_chi_squared(n: int, delta: float):
-    assert poisson_bound(torch.tensor([float(n)]), delta).item() == pytest.approx(KNOWN[n, delta], rel=1e-9)
+    assert poisson_bound(torch.tensor([float(n)]), delta).item() == pytest.approx(
+        KNOWN[n, delta], rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("delta", [0.05, 1e-4])
@@ -50,8 +54,12 @@ def test_the_bound_is_below_the_mean_with_no_more_than_its_probability(delta: fl
     """Summed over all counts, for any mean; and with all of it for means just above a bound."""
     n = torch.arange(200, dtype=torch.float64)
     bounds = poisson_bound(n, delta)
-    means = torch.cat([torch.linspace(0.01, 80, 400, dtype=torch.float64), bounds[:20] * (1 + 1e-6)])[:, None]
-    below = torch.where(bounds < means, (n * means.log() - means - (n + 1).lgamma()).exp(), 0.0).sum(dim=1)
+    means = torch.cat(
+        [torch.linspace(0.01, 80, 400, dtype=torch.float64), bounds[:20] * (1 + 1e-6)]
+    )[:, None]
+    below = torch.where(
+        bounds < means, (n * means.log() - means - (n + 1).lgamma()).exp(), 0.0
+    ).sum(dim=1)
     assert (below <= delta).all()
     assert below[400:].tolist() == pytest.approx([delta] * 20, rel=1e-3)
 
@@ -60,7 +68,9 @@ def test_the_family_of_tests_is_every_view_groups_of_ten_and_all():
     for count, tests in ((1, 1), (7, 8), (10, 11), (20, 23), (80, 89), (81, 90)):
         sets = view_sets(count)  # the last of 81 views is a group of its own
         assert len(sets) == tests
-        assert {tuple(row) for row in torch.eye(count).tolist()} <= {tuple(row) for row in sets.tolist()}
+        assert {tuple(row) for row in torch.eye(count).tolist()} <= {
+            tuple(row) for row in sets.tolist()
+        }
         assert sets.sum(dim=1).max() == count
         assert sets.sum().item() == (count == 1 or 2 + (count > 10)) * count - (count == 81)
 
@@ -73,7 +83,9 @@ def test_the_sensitivity_of_a_brick_is_the_sum_over_its_voxels():
 
 
 def emission() -> tuple[World, torch.Tensor]:
-    """Twelve pinholes about a grid of 4^3 bricks, and what a unit of activity in each brick sends to each view."""
+    """Twelve pinholes about a grid of 4^3 bricks, and what a unit of activity in each brick sends
+    to each view.
+    """
     grid = Grid.centred((12, 12, 12), 1.0)
     rig = dome(12, 30.0, 20.0, 150.0, {"pixels": [16, 16], "pixel_mm": 0.8})
     world = World(grid, rig, Phantom(()))
@@ -82,7 +94,9 @@ def emission() -> tuple[World, torch.Tensor]:
 
 
 def test_an_active_brick_is_lost_no_more_often_than_stated(monkeypatch):
-    """1000 draws of Poisson counts. Four bricks apart, at the tolerance: nothing else adds to their counts."""
+    """1000 draws of Poisson counts. Four bricks apart, at the tolerance: nothing else adds to their
+    counts.
+    """
     rng, tolerance, delta = torch.Generator().manual_seed(0), 0.2, 0.05
     world, back = emission()
     active = torch.zeros(1, 4, 4, 4, dtype=torch.bool)
@@ -126,7 +140,8 @@ def test_bricks_that_no_view_is_sensitive_to_are_not_bounded():
     bound = activity_bound(torch.zeros(1, 1, 12, 16, 16), world.cameras, world.grid, 3, sensitivity)
     assert bound[0, 1, 2, 3] == torch.inf
     assert bound.isfinite().sum() == 63
-    # of no counts at all the tightest bound is that of all views: -ln of delta's share over all that they expect
+    # of no counts at all the tightest bound is that of all views: -ln of delta's share over all
+    # that they expect
     expected = -math.log(1e-3 / (64 * 15)) / sensitivity.sum(dim=0)
     assert torch.allclose(bound[0], expected)
 
@@ -156,7 +171,10 @@ def test_a_body_in_air_is_found_in_noisy_x_rays_and_none_of_it_is_lost():
     grid = Grid.centred((32, 32, 32), 4.0)
     rig = circular(16, 500.0, 800.0, {"pixels": [64, 64], "pixel_mm": 4.0})
     axes = torch.tensor([[40.0, 30.0, 45.0], [8.0, 8.0, 8.0]])
-    centres, turns = torch.tensor([[5.0, -4.0, 0.0], [10.0, 0.0, 5.0]]), torch.eye(3).expand(2, 3, 3)
+    centres, turns = (
+        torch.tensor([[5.0, -4.0, 0.0], [10.0, 0.0, 5.0]]),
+        torch.eye(3).expand(2, 3, 3),
+    )
     body = Phantom((Solids("ellipsoid", centres, turns, axes, torch.tensor([0.02, 0.02])),))
     world, rng = World(grid, rig, body), torch.Generator().manual_seed(3)
     p = world.views.expand(10, -1, -1, -1, -1)
@@ -178,7 +196,9 @@ def test_a_ray_that_no_photon_passes_is_not_taken_for_an_empty_one():
 
 
 def test_behind_more_matter_a_brick_needs_more_to_be_seen():
-    """The threshold is 4 exp(p / 2) / sqrt(photons): what is empty at few photons is not at many."""
+    """The threshold is 4 exp(p / 2) / sqrt(photons): what is empty at few photons is not at
+    many.
+    """
     grid = Grid.centred((8, 8, 8), 1.0)
     rig = circular(5, 60.0, 90.0, {"pixels": [40, 40], "pixel_mm": 1.0})
     flat = torch.full((1, 1, 5, 40, 40), 0.5, dtype=torch.float64)

@@ -16,7 +16,9 @@ CONF = Path(__file__).parents[2] / "conf"
 
 def shipped(kind: str) -> dict[str, dict[str, Any]]:
     """Configurations that need no file, by name."""
-    configs = {file.stem: yaml.safe_load(file.read_text()) for file in sorted((CONF / kind).glob("*.yaml"))}
+    configs = {
+        file.stem: yaml.safe_load(file.read_text()) for file in sorted((CONF / kind).glob("*.yaml"))
+    }
     return {name: config for name, config in configs.items() if "path" not in config}
 
 
@@ -45,8 +47,12 @@ def test_no_shipped_rig_loses_a_voxel_of_a_shipped_scene(scene: str, rig: str):
 
 
 @pytest.mark.parametrize(
-    ("rig", "options"), [("dcspect80", {}), ("dcspect80", {"pixels": 24}), ("parallel", {})], ids=str
+    ("rig", "options"),
+    [("dcspect80", {}), ("dcspect80", {"pixels": 24}), ("parallel", {})],
+    ids=str,
 )
 def test_wells_that_are_thinner_than_rays_are_apart_are_kept(rig: str, options: dict[str, Any]):
     """Each of these was cut, by single views that missed a well."""
-    assert set(lost(SCENE["derenzo"], RIG[rig] | options, Grid.centred((64, 64, 64), 2.0), range(4))) == {0}
+    assert set(
+        lost(SCENE["derenzo"], RIG[rig] | options, Grid.centred((64, 64, 64), 2.0), range(4))
+    ) == {0}

@@ -20,7 +20,10 @@ from mvrecon.support.noise import noise_threshold
 from mvrecon.support.support import brick_edge, support_from_views
 from tests.support.cases import World, random_world
 
-SMALL, LARGE = random_world("pinholes", 4), random_world("inside", 0)  # a hull of a part, and of nearly all of the grid
+SMALL, LARGE = (
+    random_world("pinholes", 4),
+    random_world("inside", 0),
+)  # a hull of a part, and of nearly all of the grid
 
 
 def of(world: World, kind: str = "auto", **options):
@@ -31,7 +34,8 @@ def test_a_hull_is_a_mask_of_bricks_in_its_box_with_all_that_is_there():
     support = of(SMALL, "hull", brick=2)
     assert support.mask is not None
     assert torch.equal(
-        support.mask, expand(visual_hull(SMALL.views, SMALL.cameras, SMALL.grid, 2), 2, SMALL.grid.shape)
+        support.mask,
+        expand(visual_hull(SMALL.views, SMALL.cameras, SMALL.grid, 2), 2, SMALL.grid.shape),
     )
     assert support.box == Box.around(support.mask)
     assert support.fraction == pytest.approx(support.mask.double().mean().item())
@@ -41,12 +45,16 @@ def test_a_hull_is_a_mask_of_bricks_in_its_box_with_all_that_is_there():
 def test_the_box_of_a_hull_has_no_mask():
     hull, box = of(SMALL, "hull"), of(SMALL, "box")
     assert box.mask is None and box.kind == "box" and box.box == hull.box
-    assert box.fraction == pytest.approx(box.box.size / torch.tensor(SMALL.grid.shape).prod().item())
+    assert box.fraction == pytest.approx(
+        box.box.size / torch.tensor(SMALL.grid.shape).prod().item()
+    )
     assert hull.fraction < box.fraction < 1
 
 
 def test_no_support_is_all_of_the_grid_and_looks_at_nothing():
-    support = support_from_views(torch.full_like(SMALL.views, torch.nan), SMALL.cameras, SMALL.grid, "none")
+    support = support_from_views(
+        torch.full_like(SMALL.views, torch.nan), SMALL.cameras, SMALL.grid, "none"
+    )
     assert (support.box, support.mask, support.fraction) == (Box.whole(SMALL.grid.shape), None, 1.0)
 
 
@@ -54,7 +62,11 @@ def test_auto_takes_the_hull_only_where_its_box_is_a_part_of_the_grid():
     assert of(SMALL).kind == "hull"
     assert torch.equal(of(SMALL).mask, of(SMALL, "hull").mask)
     assert of(LARGE, "box").fraction > 0.7
-    assert of(LARGE).kind == "none" and of(LARGE).mask is None and of(LARGE).box == Box.whole(LARGE.grid.shape)
+    assert (
+        of(LARGE).kind == "none"
+        and of(LARGE).mask is None
+        and of(LARGE).box == Box.whole(LARGE.grid.shape)
+    )
 
 
 def test_a_box_holds_the_hulls_of_all_items_of_a_batch():
@@ -78,17 +90,33 @@ def test_views_of_nothing_give_an_empty_mask_in_one_brick_at_the_centre():
 def test_noise_chooses_how_emptiness_is_told():
     edge, shape = brick_edge(SMALL.grid), SMALL.grid.shape
     noisy = of(SMALL, "hull", noise={"photons": 1e4, "witnesses": 2})
-    bricks = visual_hull(SMALL.views, SMALL.cameras, SMALL.grid, edge, noise_threshold(SMALL.views, 1e4), 2)
+    bricks = visual_hull(
+        SMALL.views, SMALL.cameras, SMALL.grid, edge, noise_threshold(SMALL.views, 1e4), 2
+    )
     assert torch.equal(noisy.mask, expand(bricks, edge, shape)) and noisy.evidence is None
     lattice = [-(-n // 4) for n in shape]
-    told = {"sensitivity": torch.ones(len(SMALL.cameras), *lattice), "tolerance": 0.5, "delta": 1e-2}
+    told = {
+        "sensitivity": torch.ones(len(SMALL.cameras), *lattice),
+        "tolerance": 0.5,
+        "delta": 1e-2,
+    }
     counts = support_from_views(SMALL.views.round(), SMALL.cameras, SMALL.grid, "hull", told, 4)
-    assert counts.evidence is not None and (counts.evidence.tolerance, counts.evidence.delta) == (0.5, 1e-2)
+    assert counts.evidence is not None and (counts.evidence.tolerance, counts.evidence.delta) == (
+        0.5,
+        1e-2,
+    )
     told["sensitivity"][:, 0, 0, 0] = 0.0
     for keep in (True, False):
-        counts = support_from_views(SMALL.views.round(), SMALL.cameras, SMALL.grid, "hull", told, 4, keep)
+        counts = support_from_views(
+            SMALL.views.round(), SMALL.cameras, SMALL.grid, "hull", told, 4, keep
+        )
         assert bool(counts.mask[0, 0, 0, 0, 0]) == keep
-    for unknown in ({"photon": 1e5}, {"witness": 1}, {"photons": 1e5, "tolerance": 1.0}, {"tolerance": 1.0}):
+    for unknown in (
+        {"photon": 1e5},
+        {"witness": 1},
+        {"photons": 1e5, "tolerance": 1.0},
+        {"tolerance": 1.0},
+    ):
         with pytest.raises(ValueError, match="got \\['"):
             of(SMALL, noise=unknown)
 
@@ -107,7 +135,9 @@ def test_a_support_is_told_from_finite_views_of_cameras(kind: str):
         of(SMALL, "hulls")
 
 
-@pytest.mark.parametrize(("longest", "edge"), [(5, 1), (48, 1), (64, 2), (128, 4), (256, 8), (512, 8)])
+@pytest.mark.parametrize(
+    ("longest", "edge"), [(5, 1), (48, 1), (64, 2), (128, 4), (256, 8), (512, 8)]
+)
 def test_bricks_are_fine_on_small_grids(longest: int, edge: int):
     assert brick_edge(Grid.centred((3, longest, 4), 1.0)) == edge
 
@@ -115,18 +145,29 @@ def test_bricks_are_fine_on_small_grids(longest: int, edge: int):
 def rods(pixel: float) -> World:
     """Four rods of 1 mm, each turned its own way, in voxels of 1 mm, seen by 40 parallel views."""
     rng = torch.Generator().manual_seed(4)
-    grid, rig = Grid.centred((24, 24, 24), 1.0), parallel(40, {"pixels": [24, 24], "pixel_mm": pixel}, 90.0)
+    grid, rig = (
+        Grid.centred((24, 24, 24), 1.0),
+        parallel(40, {"pixels": [24, 24], "pixel_mm": pixel}, 90.0),
+    )
     centres = 8 * torch.rand(4, 3, generator=rng, dtype=torch.float64) - 4
     sizes = torch.tensor([[0.5, 0.5, 5.0]] * 4, dtype=torch.float64)
-    return World(grid, rig, Phantom((Solids("cylinder", centres, random_rotation(rng, 4), sizes, torch.ones(4)),)))
+    return World(
+        grid,
+        rig,
+        Phantom((Solids("cylinder", centres, random_rotation(rng, 4), sizes, torch.ones(4)),)),
+    )
 
 
 def test_a_tenth_of_many_views_must_agree_so_that_thin_rods_stay():
-    """Rods of half a pixel pass between the rays of some views: one view is no proof for them, four of 40 are."""
+    """Rods of half a pixel pass between the rays of some views: one view is no proof for them, four
+    of 40 are.
+    """
     world = rods(2.0)
     thin = voxelise(world.phantom, world.grid, 4) > 0
     one, tenth = (of(world, "hull", noise=noise).mask for noise in ({"witnesses": 1}, None))
-    assert torch.equal(tenth[0, 0], visual_hull(world.views, world.cameras, world.grid, 1, witnesses=4)[0])
+    assert torch.equal(
+        tenth[0, 0], visual_hull(world.views, world.cameras, world.grid, 1, witnesses=4)[0]
+    )
     assert (thin & ~one[0, 0]).any()
     assert not (thin & ~tenth[0, 0]).any()
     assert tenth.float().mean() < 0.5
@@ -135,8 +176,12 @@ def test_a_tenth_of_many_views_must_agree_so_that_thin_rods_stay():
 
 @pytest.mark.door
 def test_voxels_that_are_smaller_than_rays_are_apart_are_warned_of():
-    """A hull says when things as small as a voxel can pass between rays, and how far apart the rays are."""
-    with pytest.warns(UserWarning, match=r"up to 2.83 mm apart .*, voxels are 1 mm: .* thinner than 2.83 mm"):
+    """A hull says when things as small as a voxel can pass between rays, and how far apart the rays
+    are.
+    """
+    with pytest.warns(
+        UserWarning, match=r"up to 2.83 mm apart .*, voxels are 1 mm: .* thinner than 2.83 mm"
+    ):
         of(rods(2.0), "hull")
     fine = rods(0.7)  # a diagonal of 0.99 mm
     with warnings.catch_warnings():

@@ -17,7 +17,12 @@ def flat(level, shape=(2, 3)):
 def test_tiles_keep_their_places():
     image = montage.tiled([[flat(10), flat(20)], [flat(30), flat(40)]])
     assert image.shape == (4 + GAP, 6 + GAP, 3)
-    assert image[0, 0, 0] == 10 and image[0, -1, 0] == 20 and image[-1, 0, 0] == 30 and image[-1, -1, 0] == 40
+    assert (
+        image[0, 0, 0] == 10
+        and image[0, -1, 0] == 20
+        and image[-1, 0, 0] == 30
+        and image[-1, -1, 0] == 40
+    )
     assert (image[2 : 2 + GAP] == 0).all() and (image[:, 3 : 3 + GAP] == 0).all()
 
 
@@ -67,7 +72,9 @@ def test_equal_weights_are_one_third_grey_for_any_number_of_cameras():
 def test_opinions_and_projections_have_a_column_each():
     volumes = torch.rand(5, 8, 8, 8)
     assert montage.opinions(volumes, 1.0).shape[1] == LEFT + 5 * EDGE + 4 * GAP
-    assert montage.projections(volumes[0], {"ours": volumes[1]}, 1.0).shape[1] == LEFT + 2 * EDGE + GAP
+    assert (
+        montage.projections(volumes[0], {"ours": volumes[1]}, 1.0).shape[1] == LEFT + 2 * EDGE + GAP
+    )
 
 
 def test_all_planes_have_one_scale():

@@ -45,7 +45,9 @@ def test_a_sphere_is_round_on_any_grid(draw):
 def test_equal_spacing_shows_voxels_as_they_are():
     volume = torch.rand(6, 8, 10)
     volume[3, 4, 5] = torch.nan
-    for plain, scaled in zip(middle_planes(volume), middle_planes(volume, (4.0, 4.0, 4.0)), strict=True):
+    for plain, scaled in zip(
+        middle_planes(volume), middle_planes(volume, (4.0, 4.0, 4.0)), strict=True
+    ):
         assert plain.isnan().sum() == 1 and torch.equal(plain.nan_to_num(), scaled.nan_to_num())
 
 
@@ -59,7 +61,13 @@ def test_grey_maps_the_window_to_black_and_white():
 
 def test_signed_colours_tell_the_sign():
     image = signed(torch.tensor([[0.0, 2.0, -2.0, 1.0, 50.0]]), 2.0)
-    assert image[0].tolist() == [[255, 255, 255], [255, 0, 0], [0, 0, 255], [255, 128, 128], [255, 0, 0]]
+    assert image[0].tolist() == [
+        [255, 255, 255],
+        [255, 0, 0],
+        [0, 0, 255],
+        [255, 128, 128],
+        [255, 0, 0],
+    ]
 
 
 def test_an_empty_window_is_refused():

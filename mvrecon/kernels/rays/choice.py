@@ -1,4 +1,6 @@
-"""What to leave out of a volume: counted on some rays, so that nothing is skipped that does not pay."""
+"""What to leave out of a volume: counted on some rays, so that nothing is skipped that does not
+pay.
+"""
 
 import math
 from collections.abc import Sequence
@@ -21,9 +23,11 @@ from mvrecon.kernels.rays.trace import main_axis, trace
 SOME, MUCH = 2**21, 2**25
 #: Rays on which work is counted.
 RAYS = 1024
-#: What a ray costs before its first slab, and what it costs to ask for one layer of bricks, in slabs.
+#: What a ray costs before its first slab, and what it costs to ask for one layer of bricks, in
+#: slabs.
 SET_UP, ASK = 16.0, 3.0
-#: The share of empty bricks from which on all of them are looked at, and the part of the work that they must leave.
+#: The share of empty bricks from which on all of them are looked at, and the part of the work that
+#: they must leave.
 WORTH, LESS = 0.35, 0.85
 
 
@@ -46,14 +50,19 @@ def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
     Args:
         volumes: what is looked at, or a mask.
         scene: the rays.
-        skip: "box"; "brick"; "auto", what costs least if it is looked for in every call; "once", what costs least.
+        skip: "box"; "brick"; "auto", what costs least if it is looked for in every call; "once",
+            what costs least.
     """
     values = readable(volumes)
     shape = Box.whole(values.shape[1:]).high
     if skip == "auto" and scene.slabs(shape) < SOME:
         return Occupancy.whole(shape)
     held = Occupancy(shape, box_of(values))
-    fine = "trilinear" not in scene.method and held.box.size > 0 and (skip != "auto" or scene.slabs(shape) >= MUCH)
+    fine = (
+        "trilinear" not in scene.method
+        and held.box.size > 0
+        and (skip != "auto" or scene.slabs(shape) >= MUCH)
+    )
     if skip == "box" or not fine or (skip != "brick" and empty_share(values, held.box) < WORTH):
         return held
     bricked = Occupancy(shape, held.box, bricks_of(values, held.box))
@@ -63,8 +72,12 @@ def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
 
 
 def cheapest(held: Occupancy, bricked: Occupancy, scene: Scene) -> Occupancy:
-    """The one of two occupancies by which rays have less to do, with the shares of the work that either leaves."""
-    whole, box, bricks = (work(each, scene) for each in (Occupancy.whole(held.shape), held, bricked))
+    """The one of two occupancies by which rays have less to do, with the shares of the work that
+    either leaves.
+    """
+    whole, box, bricks = (
+        work(each, scene) for each in (Occupancy.whole(held.shape), held, bricked)
+    )
     chosen = bricked if bricks < LESS * box else held
     return Occupancy(held.shape, held.box, chosen.bricks, (box / whole, bricks / whole))
 

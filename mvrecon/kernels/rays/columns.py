@@ -1,10 +1,12 @@
-"""Detector columns that stand upright over the volume: their rays share all but z, so slabs are read as whole rows.
+"""Detector columns that stand upright over the volume: their rays share all but z, so slabs are
+read as whole rows.
 
-When a step from one detector row to the next runs along the volume's z axis (every circular orbit about it, every
-stack of slices), the rays of one detector column lie in one upright plane. In a slab they all meet the same two rows of
-voxels along z (joseph) or the same one or two (siddon). These rows are blended once, as contiguous vectors, and each
-ray then takes one pair of neighbours out of the blend: a third of the work of `loops.py`, in the level plane not even
-that, with the same weights. The volume must be turned so that z is contiguous, see `stores.py`.
+When a step from one detector row to the next runs along the volume's z axis (every circular orbit
+about it, every stack of slices), the rays of one detector column lie in one upright plane. In a
+slab they all meet the same two rows of voxels along z (joseph) or the same one or two (siddon).
+These rows are blended once, as contiguous vectors, and each ray then takes one pair of neighbours
+out of the blend: a third of the work of `loops.py`, in the level plane not even that, with the same
+weights. The volume must be turned so that z is contiguous, see `stores.py`.
 """
 
 from collections import namedtuple
@@ -31,7 +33,9 @@ def _clear(room, group, lanes, span):
 
 @scalar
 def _blend(room, store, group, k, weights, span, add):
-    """A group's row of the room = low * (voxels along z at k) + high * (those of the next row), added where `add`."""
+    """A group's row of the room = low * (voxels along z at k) + high * (those of the next row),
+    added where `add`.
+    """
     row, flat, low, high = room.row, store.values, weights[0], weights[1]
     first, lanes = np.uint64((group * room.width + 1) * store.lanes), store.lanes
     below = np.uint64(k * lanes)
@@ -45,7 +49,11 @@ def _blend(room, store, group, k, weights, span, add):
 def _read_lanes(room, group, rays):
     """`_read` of four volumes side by side."""
     places, row, shares, sums = room.places, room.row, room.shares, room.values[group]
-    four, start, one = np.uint64(LANES), np.uint64(group * room.width * LANES), room.shares.dtype.type(1)
+    four, start, one = (
+        np.uint64(LANES),
+        np.uint64(group * room.width * LANES),
+        room.shares.dtype.type(1),
+    )
     for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
         below, here = np.uint64(places[v]) * four + start, np.uint64(v) * four
         value = mix(take(row, below), take(row, below + four), shares[v], one - shares[v])
@@ -59,8 +67,16 @@ def _read(room, lanes, group, rays):
         _read_lanes(room, group, rays)
         return
     first = group * room.width
-    start, count = rays[0], np.uint32(rays[1] - rays[0])  # loops from zero on: compilers make vectors of these
-    places, pairs, row, parts = room.places[start:], room.pairs[start:], room.row_pairs, room.parts[2 * start :]
+    start, count = (
+        rays[0],
+        np.uint32(rays[1] - rays[0]),
+    )  # loops from zero on: compilers make vectors of these
+    places, pairs, row, parts = (
+        room.places[start:],
+        room.pairs[start:],
+        room.row_pairs,
+        room.parts[2 * start :],
+    )
     shares, sums, one = room.shares[start:], room.values[group][start:], room.shares.dtype.type(1)
     for v in range(count):
         pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
@@ -68,12 +84,25 @@ def _read(room, lanes, group, rays):
         sums[v] += between(parts[2 * v], parts[2 * v + 1], shares[v], one - shares[v])
 
 
-#: Room for one column: flat indices of its pieces, four numbers each, from where to where they are held; per ray its
-#: place in a row of voxels, its share of the upper neighbour, its two neighbours whole and in their parts; values
-#: [g v l]; a blended row [z l]; rows.
+#: Room for one column: flat indices of its pieces, four numbers each, from where to where they are
+#: held; per ray its place in a row of voxels, its share of the upper neighbour, its two neighbours
+#: whole and in their parts; values [g v l]; a blended row [z l]; rows.
 Column = namedtuple(
     "Column",
-    ["index", "pieces", "held", "places", "shares", "pairs", "parts", "values", "blended", "row", "row_pairs", "width"],
+    [
+        "index",
+        "pieces",
+        "held",
+        "places",
+        "shares",
+        "pairs",
+        "parts",
+        "values",
+        "blended",
+        "row",
+        "row_pairs",
+        "width",
+    ],
 )
 
 
@@ -84,10 +113,27 @@ def column_of(rig: Rig, store: Store, volumes: int) -> Column:
     pairs = np.empty(height, store.pairs.dtype)
     groups = -(-volumes // lanes)
     row, row_pairs, *_ = store_of(np.zeros((1, 1, 1, max(ROWS, groups) * width, lanes), real), 0)
-    index, pieces, held = np.empty(length, store.strides.dtype), np.empty((4, length)), np.empty((2, length), np.int64)
+    index, pieces, held = (
+        np.empty(length, store.strides.dtype),
+        np.empty((4, length)),
+        np.empty((2, length), np.int64),
+    )
     places, shares = np.empty(height, np.uint32), np.empty(height, real)
     values, blended = np.empty((groups, height * lanes), real), np.empty(rig.sizes[2] * lanes, real)
-    return Column(index, pieces, held, places, shares, pairs, pairs.view(real), values, blended, row, row_pairs, width)
+    return Column(
+        index,
+        pieces,
+        held,
+        places,
+        shares,
+        pairs,
+        pairs.view(real),
+        values,
+        blended,
+        row,
+        row_pairs,
+        width,
+    )
 
 
 @compiled
@@ -98,7 +144,12 @@ def project_columns(store, rig, room, reads, views, first, last):
     """
     chosen, spans = reads
     rows, columns = rig.detector
-    volumes, groups, lanes, real = len(views), len(room.values), store.lanes, store.values.dtype.type
+    volumes, groups, lanes, real = (
+        len(views),
+        len(room.values),
+        store.lanes,
+        store.values.dtype.type,
+    )
     for column in range(first, last):
         m, u = chosen[column // columns], column % columns
         rays = spans[column // columns, u, 0], spans[column // columns, u, 1]
@@ -121,7 +172,9 @@ def project_columns(store, rig, room, reads, views, first, last):
                 if rig.heights.size and (not level or i == 0):
                     _clear(room, group, lanes, span)
                 k = group * store.size + np.int64(room.index[i])
-                _blend(room, store, group, k, weights, some, level and (i > 0 or rig.heights.size > 0))
+                _blend(
+                    room, store, group, k, weights, some, level and (i > 0 or rig.heights.size > 0)
+                )
                 if not level or i == count - 1:
                     _read(room, lanes, group, rays)
         for v in range(rays[0], rays[1] if count else rays[0]):
@@ -149,13 +202,20 @@ def _write(room, lanes, group, rays):
         _write_lanes(room, group, rays)
         return
     start, count = rays[0], np.uint32(rays[1] - rays[0])
-    places, pairs, row, parts = room.places[start:], room.pairs[start:], room.row_pairs, room.parts[2 * start :]
+    places, pairs, row, parts = (
+        room.places[start:],
+        room.pairs[start:],
+        room.row_pairs,
+        room.parts[2 * start :],
+    )
     shares, values = room.shares[start:], room.values[group][start:]
     one, width, lane = room.shares.dtype.type(1), np.uint32(room.width), np.uint32(start)
     for v in range(count):
         parts[2 * v], parts[2 * v + 1] = values[v] * (one - shares[v]), values[v] * shares[v]
     for v in range(count):
-        row[np.uint64(places[v] + np.uint32(np.uint32(v + lane) % np.uint32(ROWS)) * width)] += pairs[v]
+        row[np.uint64(places[v] + np.uint32(np.uint32(v + lane) % np.uint32(ROWS)) * width)] += (
+            pairs[v]
+        )
 
 
 @scalar
@@ -195,10 +255,17 @@ def _heard(views, m, u, rays):
 
 @compiled
 def backproject_columns(store, rig, room, reads, views, low, high):
-    """Spread views [n m v u] into the slabs [low, high) of the store, for some upright views and one main axis."""
+    """Spread views [n m v u] into the slabs [low, high) of the store, for some upright views and
+    one main axis.
+    """
     chosen, spans, axis = reads
     rows, columns = rig.detector
-    volumes, lanes, real, steps = len(views), store.lanes, store.values.dtype.type, steps_of(rig, store, axis)
+    volumes, lanes, real, steps = (
+        len(views),
+        store.lanes,
+        store.values.dtype.type,
+        steps_of(rig, store, axis),
+    )
     for column in range(len(chosen) * columns):
         m, u = chosen[column // columns], column % columns
         line, here = rig.lines[m], pixel(rig, u, 0)

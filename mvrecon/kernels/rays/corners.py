@@ -1,8 +1,10 @@
-"""The voxels that a ray meets at one step, and their weights, for kernels that keep nothing from step to step.
+"""The voxels that a ray meets at one step, and their weights, for kernels that keep nothing from
+step to step.
 
-The CPU writes whole rays into rooms (`joseph.py`, `siddon.py`, `march.py`); a thread of a GPU has no room and does one
-step after the other in registers. A step is a slab (joseph, siddon), or a sample and one of its two slabs (trilinear).
-The volume is padded, see `padding.py`, in any layout; `real` and `whole` are the types of weights and of flat indices.
+The CPU writes whole rays into rooms (`joseph.py`, `siddon.py`, `march.py`); a thread of a GPU has
+no room and does one step after the other in registers. A step is a slab (joseph, siddon), or a
+sample and one of its two slabs (trilinear). The volume is padded, see `padding.py`, in any layout;
+`real` and `whole` are the types of weights and of flat indices.
 """
 
 from math import floor
@@ -16,7 +18,9 @@ from mvrecon.kernels.rays.trace import TRILINEAR
 
 @scalar
 def steps_in(ray, steps, method):
-    """The first step of a ray, and the one behind the last; small integers, which a GPU counts faster."""
+    """The first step of a ray, and the one behind the last; small integers, which a GPU counts
+    faster.
+    """
     if method != TRILINEAR:
         return np.int32(ray.first), np.int32(ray.last)
     first, last = samples_in(ray, steps.samples)
@@ -25,9 +29,13 @@ def steps_in(ray, steps, method):
 
 @scalar
 def place(steps, k, iy, iz, whole):
-    """The flat index in the store of a voxel: slab k counted from the volume, the others from its padding."""
+    """The flat index in the store of a voxel: slab k counted from the volume, the others from its
+    padding.
+    """
     slab, row = whole(whole(k + 1) * whole(steps.along)), whole(whole(iy) * whole(steps.far))
-    return whole(whole(whole(slab + row) + whole(whole(iz) * whole(steps.near))) - whole(steps.origin))
+    return whole(
+        whole(whole(slab + row) + whole(whole(iz) * whole(steps.near))) - whole(steps.origin)
+    )
 
 
 @scalar
@@ -47,7 +55,12 @@ def four(steps, at, share, whole):
     upper = share * y
     lower = share - upper
     low_z, high_z = lower * z, upper * z
-    return (low, whole(low + near), high, whole(high + near)), (lower - low_z, low_z, upper - high_z, high_z)
+    return (low, whole(low + near), high, whole(high + near)), (
+        lower - low_z,
+        low_z,
+        upper - high_z,
+        high_z,
+    )
 
 
 @scalar
@@ -81,10 +94,17 @@ def trilinear(ray, steps, k, real, whole):
 
 @scalar
 def crossings(ray, k, real):
-    """Where a ray crosses planes in slab k: its begin and length there, the way to b's and to c's plane, the cells."""
+    """Where a ray crosses planes in slab k: its begin and length there, the way to b's and to c's
+    plane, the cells.
+    """
     s, half = real(k) - real(ray.centre), real(0.5)
     s0, length = max(real(ray.begin), s - half), share_of(ray, s, real)
-    b, slope_b, c, slope_c = real(ray.b) + half, real(ray.slope_b), real(ray.c) + half, real(ray.slope_c)
+    b, slope_b, c, slope_c = (
+        real(ray.b) + half,
+        real(ray.slope_b),
+        real(ray.c) + half,
+        real(ray.slope_c),
+    )
     y, z = b + s0 * slope_b, c + s0 * slope_c
     b0, b1 = np.int32(y), np.int32(b + (s0 + length) * slope_b)
     c0, c1 = np.int32(z), np.int32(c + (s0 + length) * slope_c)
@@ -98,7 +118,9 @@ def crossings(ray, k, real):
 
 @scalar
 def three(steps, k, order, whole):
-    """Flat indices of the cells that a ray crosses, given whether it comes to b's plane first, and the cells."""
+    """Flat indices of the cells that a ray crosses, given whether it comes to b's plane first, and
+    the cells.
+    """
     b_first, (b0, b1, c0, c1) = order
     middle = place(steps, k, b1, c0, whole) if b_first else place(steps, k, b0, c1, whole)
     return place(steps, k, b0, c0, whole), middle, place(steps, k, b1, c1, whole)
@@ -106,7 +128,9 @@ def three(steps, k, order, whole):
 
 @scalar
 def siddon(ray, steps, k, real, whole):
-    """Flat indices of the at most three cells that a ray crosses in slab k, and its lengths in them."""
+    """Flat indices of the at most three cells that a ray crosses in slab k, and its lengths in
+    them.
+    """
     _, length, to_b, to_c, cells = crossings(ray, k, real)
     one, two = min(to_b, to_c), max(to_b, to_c)
     return three(steps, k, (to_b < to_c, cells), whole), (one, two - one, length - two)

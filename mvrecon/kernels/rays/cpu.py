@@ -1,9 +1,12 @@
-"""The compiled operators of the CPU: no compiler on the user's machine, as many threads as torch has.
+"""The compiled operators of the CPU: no compiler on the user's machine, as many threads as torch
+has.
 
-Every result is the same to the last bit for any number of threads: each ray's sum belongs to one thread, and so does
-each voxel of the adjoint (a thread owns a range of slabs, one main axis at a time, and meets the rays in one order).
+Every result is the same to the last bit for any number of threads: each ray's sum belongs to one
+thread, and so does each voxel of the adjoint (a thread owns a range of slabs, one main axis at a
+time, and meets the rays in one order).
 
-Rays read copies of the volume, see `stores.py`, made piece by piece so that little is added to the caller's memory.
+Rays read copies of the volume, see `stores.py`, made piece by piece so that little is added to the
+caller's memory.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,9 +35,15 @@ def _piece_sizes(piece: Rig) -> tuple[int, int, int]:
 
 
 def _overlap(held: Occupancy, rows: slice, piece: Rig) -> tuple[slice, tuple[slice, slice, slice]]:
-    """The rows (along y) of what is held that lie in a piece, counted from the box; and where it lies in the store."""
+    """The rows (along y) of what is held that lie in a piece, counted from the box; and where it
+    lies in the store.
+    """
     first, last = max(held.box.low[1], rows.start), min(held.box.high[1], rows.stop)
-    low = (held.box.low[2] - piece.box[0], first - rows.start - piece.box[1], held.box.low[0] - piece.box[2])
+    low = (
+        held.box.low[2] - piece.box[0],
+        first - rows.start - piece.box[1],
+        held.box.low[0] - piece.box[2],
+    )
     size = (held.box.shape[2], last - first, held.box.shape[0])
     x, y, z = (slice(start, start + n) for start, n in zip(low, size, strict=True))
     return slice(first - held.box.low[1], last - held.box.low[1]), (x, y, z)
@@ -43,7 +52,8 @@ def _overlap(held: Occupancy, rows: slice, piece: Rig) -> tuple[slice, tuple[sli
 def _copies(
     volume: Tensor, rig: Rig, held: Occupancy, plan: Plan
 ) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
-    """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that read them, rows.
+    """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that
+    read them, rows.
 
     `volume` is what is held.
     """
@@ -72,7 +82,9 @@ def project(
     detector: Sequence[int],
     method: str,
 ) -> Float[Tensor, "n m v u"]:
-    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is what is held."""
+    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is what
+    is held.
+    """
     rig = rig_of(lines, window, held, detector, method)
     plan = plan_of(rig, held, len(volume))
     views = np.zeros((len(volume), len(lines), *rig.detector), wide(volume[:0]).numpy().dtype)
@@ -81,10 +93,14 @@ def project(
     for copy, piece, axes, _ in _copies(volume, rig, held, plan):
 
         def add_rows(first: int, last: int, copy=copy, piece=piece, axes=axes) -> None:
-            project_rows(copy, piece, room_of(piece, copy), (*reads[copy.near], axes), views, first, last)
+            project_rows(
+                copy, piece, room_of(piece, copy), (*reads[copy.near], axes), views, first, last
+            )
 
         def add_columns(first: int, last: int, copy=copy, piece=piece) -> None:
-            project_columns(copy, piece, column_of(piece, copy, len(views)), columns, views, first, last)
+            project_columns(
+                copy, piece, column_of(piece, copy, len(views)), columns, views, first, last
+            )
 
         share(add_rows, oblique, views.size * max(rig.sizes), 4)
         share(add_columns, upright if copy.near == 2 else 0, views.size * max(rig.sizes), 4)
@@ -112,12 +128,18 @@ def backproject(
                 oblique = reads[near] if axes[axis] else None
                 upright = columns if near == 2 and axis < 2 and len(plan.upright) else None
                 _spread(store(into, near), piece, axis, (oblique, upright), given)
-            share(lambda a, b, source=source, to=part, near=near: add(source, near, to, a, b), part.shape[2], part.size)
+            share(
+                lambda a, b, source=source, to=part, near=near: add(source, near, to, a, b),
+                part.shape[2],
+                part.size,
+            )
     return torch.from_numpy(volume)
 
 
 def _spread(held: Store, piece: Rig, axis: int, reads: tuple, views: np.ndarray) -> None:
-    """Spread views along the rays of one main axis, slab by slab, where reads = (oblique, upright) are not None."""
+    """Spread views along the rays of one main axis, slab by slab, where reads = (oblique, upright)
+    are not None.
+    """
     oblique, upright = reads
 
     def add_slabs(low: int, high: int) -> None:
@@ -126,7 +148,9 @@ def _spread(held: Store, piece: Rig, axis: int, reads: tuple, views: np.ndarray)
 
     def add_columns(low: int, high: int) -> None:
         span = piece.box[axis] + low, piece.box[axis] + high
-        backproject_columns(held, piece, column_of(piece, held, len(views)), (*upright, axis), views, *span)
+        backproject_columns(
+            held, piece, column_of(piece, held, len(views)), (*upright, axis), views, *span
+        )
 
     slabs, steps = _piece_sizes(piece)[axis], views.size * max(piece.sizes)
     share(add_slabs, slabs if oblique is not None else 0, steps)
@@ -141,7 +165,9 @@ def lines_vjp(
     held: Occupancy,
     method: str,
 ) -> Float[Tensor, "m 4 3 k"]:
-    """The derivative of <views, project(volume, lines)> by the lines, all methods by hand; float64."""
+    """The derivative of <views, project(volume, lines)> by the lines, all methods by hand;
+    float64.
+    """
     rig = rig_of(lines, window, held, views.shape[2:], method)
     plan, given = ray_plan_of(rig, held), np.ascontiguousarray(views.numpy())
     total = torch.zeros(lines.shape, dtype=torch.float64)
@@ -155,5 +181,7 @@ def lines_vjp(
             vary_rows(copy, piece, room_of(piece, copy), rays, (given, change), first, last)
 
         share(vary, len(lines) * max(rig.detector), given.size * max(rig.sizes), 4)
-        total += unshifted(torch.from_numpy(change).sum(dim=1), (rows.start + rows.stop - rig.sizes[1]) / 2)
+        total += unshifted(
+            torch.from_numpy(change).sum(dim=1), (rows.start + rows.stop - rig.sizes[1]) / 2
+        )
     return total

@@ -1,8 +1,8 @@
 """The compiled operators of CUDA devices: the same three as `cpu.py`, on torch's current stream.
 
-Forward and derivative by the geometry are the same to the last bit in every run. So is the adjoint where it gathers,
-voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of additions, and so the last digits, vary;
-under `torch.use_deterministic_algorithms` it never does.
+Forward and derivative by the geometry are the same to the last bit in every run. So is the adjoint
+where it gathers, voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of
+additions, and so the last digits, vary; under `torch.use_deterministic_algorithms` it never does.
 """
 
 import math
@@ -25,7 +25,8 @@ from mvrecon.kernels.rays.trace import numbered
 
 #: Pixels per voxel, by area, up to which a voxel asks all pixels of its picture.
 GATHER = 4.0
-#: Pixels whose rays are kept at a time for the gather, and threads of a derivative: 32 and 36 MB in single precision.
+#: Pixels whose rays are kept at a time for the gather, and threads of a derivative: 32 and 36 MB in
+#: single precision.
 RAYS, THREADS = 2**20, 2**17
 #: Voxels from which on a volume needs indices of 64 bits.
 WIDE = 2**32
@@ -41,12 +42,21 @@ def project(
     detector: Sequence[int],
     method: str,
 ) -> Float[Tensor, "n m v u"]:
-    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is what is held."""
+    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is what
+    is held.
+    """
     x = wide(volume)
     scene = scene_of(window, held, detector, method)
     views = x.new_empty(len(x), len(lines), *detector)
     kernel = cuda_loops.project_kernel(numbered(method)[0], *_shares(len(x), scene))
-    launch(kernel, (_blocks(scene, len(lines)), _groups(len(x))), padded(x, held), maps(lines), scene, views)
+    launch(
+        kernel,
+        (_blocks(scene, len(lines)), _groups(len(x))),
+        padded(x, held),
+        maps(lines),
+        scene,
+        views,
+    )
     return views
 
 
@@ -64,9 +74,11 @@ def backproject(
 
 
 def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method: str) -> bool:
-    """Whether the adjoint goes by voxels: for Joseph's method, where few pixels lie on the picture of a voxel.
+    """Whether the adjoint goes by voxels: for Joseph's method, where few pixels lie on the picture
+    of a voxel.
 
-    The detector is taken to show the whole volume: to know better would mean to wait for the device.
+    The detector is taken to show the whole volume: to know better would mean to wait for the
+    device.
 
     Raises:
         RuntimeError: torch is to use deterministic algorithms alone, and there is none.
@@ -77,7 +89,8 @@ def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method:
     if not possible:
         what = f"method {method!r}" if columns == 3 else "explicit rays"
         raise RuntimeError(
-            f"The adjoint of {what} adds up in no fixed order on a GPU, and torch.use_deterministic_algorithms was "
+            f"The adjoint of {what} adds up in no fixed order on a GPU, and "
+            f"torch.use_deterministic_algorithms was "
             "called; it needs a camera's rays by method 'joseph', or backend 'reference'"
         )
     return True
@@ -131,12 +144,16 @@ def lines_vjp(
     threads = min(math.prod(scene.detector), max(1, THREADS // max(1, len(lines))))
     change = lines.new_zeros(4, 3, lines.shape[3], len(lines), threads, dtype=torch.float64)
     kernel = cuda_loops.vary_kernel(numbered(method)[0])
-    launch(kernel, (-(-len(lines) * threads // BLOCK),), padded(x, held), y, maps(lines), scene, change)
+    launch(
+        kernel, (-(-len(lines) * threads // BLOCK),), padded(x, held), y, maps(lines), scene, change
+    )
     return change.sum(dim=4).permute(3, 0, 1, 2).contiguous()
 
 
 def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
-    """Start a kernel on torch's current stream; under numba's simulator, run it on tensors in main memory."""
+    """Start a kernel on torch's current stream; under numba's simulator, run it on tensors in main
+    memory.
+    """
     if 0 in blocks:
         return
     device = next(each.device for each in arguments if isinstance(each, Tensor))
@@ -148,12 +165,15 @@ def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
     with torch.cuda.device(index), cuda.gpus[index]:
         stream = cuda.external_stream(torch.cuda.current_stream(index).cuda_stream)
         given = [
-            cuda.as_cuda_array(each.detach(), sync=False) if isinstance(each, Tensor) else each for each in arguments
+            cuda.as_cuda_array(each.detach(), sync=False) if isinstance(each, Tensor) else each
+            for each in arguments
         ]
         kernel[blocks, BLOCK, stream](*given)
 
 
-def scene_of(window: Sequence[float], held: Occupancy, detector: Sequence[int], method: str) -> Scene:
+def scene_of(
+    window: Sequence[float], held: Occupancy, detector: Sequence[int], method: str
+) -> Scene:
     """The numbers of a scene."""
     around = held.read
     depth, height, width = padded_shape(around.shape)
@@ -174,7 +194,9 @@ def scene_of(window: Sequence[float], held: Occupancy, detector: Sequence[int], 
 
 
 def padded(volume: Float[Tensor, "n d h w"], held: Occupancy) -> Float[Tensor, " p"]:
-    """Volumes, as much of them as is held, in the box that is read, with their border of nothing, in one row."""
+    """Volumes, as much of them as is held, in the box that is read, with their border of nothing,
+    in one row.
+    """
     margins = held.box.margins(held.read)
     return F.pad(volume, [n + border for n, border in zip(margins, PAD * 3, strict=True)]).flatten()
 

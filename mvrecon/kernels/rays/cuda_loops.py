@@ -1,10 +1,12 @@
-# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false, reportOptionalSubscript=false
-# (numba.cuda declares what kernels see as stubs without types)
-"""The kernels of the CUDA back end, in Python: numba compiles them for a device, its simulator runs them without one.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false,
+# reportOptionalSubscript=false (numba.cuda declares what kernels see as stubs without types)
+"""The kernels of the CUDA back end, in Python: numba compiles them for a device, its simulator runs
+them without one.
 
-Rays and their derivatives are computed by the very functions of the CPU (`rays.py`, `march.py`, `loops.py`), the steps
-along them by `corners.py` and `gather.py`. One thread follows one ray, or owns one voxel; several volumes share its
-index work. A kernel is made for a method, a number of volumes and a type of flat indices, which are constants in it.
+Rays and their derivatives are computed by the very functions of the CPU (`rays.py`, `march.py`,
+`loops.py`), the steps along them by `corners.py` and `gather.py`. One thread follows one ray, or
+owns one voxel; several volumes share its index work. A kernel is made for a method, a number of
+volumes and a type of flat indices, which are constants in it.
 """
 
 from collections import namedtuple
@@ -23,22 +25,33 @@ BLOCK, TILE = 128, (16, 8)
 #: Volumes that share a thread.
 GROUP = 4
 
-#: What a kernel knows of the scene, all numbers: sizes (x, y, z) of the volume; strides (x, y, z) and size of what is
-#: stored of it, padded; detector (rows, columns), tile (columns, rows), window, samples a ray; box, see `trace.Space`;
-#: how far its first voxel lies behind the volume's in the store.
-Scene = namedtuple("Scene", ["sizes", "strides", "size", "detector", "tile", "window", "samples", "box", "origin"])
+#: What a kernel knows of the scene, all numbers: sizes (x, y, z) of the volume; strides (x, y, z)
+#: and size of what is stored of it, padded; detector (rows, columns), tile (columns, rows), window,
+#: samples a ray; box, see `trace.Space`; how far its first voxel lies behind the volume's in the
+#: store.
+Scene = namedtuple(
+    "Scene", ["sizes", "strides", "size", "detector", "tile", "window", "samples", "box", "origin"]
+)
 
 
 @scalar
 def steps_of(scene, axis):
     """How a ray of a main axis steps through the padded volume."""
     near = gather.near_of(axis)
-    return Steps(scene.strides[axis], scene.strides[3 - axis - near], scene.strides[near], scene.samples, scene.origin)
+    return Steps(
+        scene.strides[axis],
+        scene.strides[3 - axis - near],
+        scene.strides[near],
+        scene.samples,
+        scene.origin,
+    )
 
 
 @scalar
 def pixel_of(scene, thread):
-    """The view, column and row that belong to a thread; tile by tile, so that a block's rays stay together."""
+    """The view, column and row that belong to a thread; tile by tile, so that a block's rays stay
+    together.
+    """
     rows, columns = scene.detector
     wide, high = scene.tile
     across, down = (columns + wide - 1) // wide, (rows + high - 1) // high
@@ -74,13 +87,22 @@ def _sum3(flat, offset, index, weight):
 
 @scalar
 def _sum4(flat, offset, index, weight):
-    low = weight[0] * flat[offset + np.uint64(index[0])] + weight[1] * flat[offset + np.uint64(index[1])]
-    return low + weight[2] * flat[offset + np.uint64(index[2])] + weight[3] * flat[offset + np.uint64(index[3])]
+    low = (
+        weight[0] * flat[offset + np.uint64(index[0])]
+        + weight[1] * flat[offset + np.uint64(index[1])]
+    )
+    return (
+        low
+        + weight[2] * flat[offset + np.uint64(index[2])]
+        + weight[3] * flat[offset + np.uint64(index[3])]
+    )
 
 
 @cache
 def project_kernel(method, group, whole):
-    """Kernel: views [n m v u] from padded volumes, one after the other in `flat`; a thread a ray."""
+    """Kernel: views [n m v u] from padded volumes, one after the other in `flat`; a thread a
+    ray.
+    """
     corners_of, total = _corners(method), _sum3 if method == SIDDON else _sum4
 
     @cuda.jit
@@ -111,7 +133,9 @@ def project_kernel(method, group, whole):
 
 @cache
 def scatter_kernel(method, group, whole):
-    """Kernel: add views [n m v u] to padded volumes, one after the other in `flat`, in no fixed order of addition."""
+    """Kernel: add views [n m v u] to padded volumes, one after the other in `flat`, in no fixed
+    order of addition.
+    """
     corners_of, count = _corners(method), 3 if method == SIDDON else 4
 
     @cuda.jit
@@ -139,7 +163,9 @@ def scatter_kernel(method, group, whole):
 
 @cache
 def record_kernel():
-    """Kernel: what the gather needs of views first, first + 1, ..: rays [8 p], matrices, main axes that occur."""
+    """Kernel: what the gather needs of views first, first + 1, ..: rays [8 p], matrices, main axes
+    that occur.
+    """
 
     @cuda.jit
     def record(lines, scene, first, rays, frames, axes):
@@ -163,7 +189,9 @@ def record_kernel():
 
 @cache
 def gather_kernel(group):
-    """Kernel: add to the box of volumes [n d h w] what some views give; a thread a voxel, always in the same order."""
+    """Kernel: add to the box of volumes [n d h w] what some views give; a thread a voxel, always in
+    the same order.
+    """
 
     @cuda.jit
     def collect(values, rays, frames, axes, scene, first_view, volumes):
@@ -195,7 +223,8 @@ def gather_kernel(group):
 
 @cache
 def vary_kernel(method):
-    """Kernel: partial sums, `change` [4 3 k m t], of the derivative of sum(views * projections) by the maps.
+    """Kernel: partial sums, `change` [4 3 k m t], of the derivative of sum(views * projections) by
+    the maps.
 
     Thread t of a view adds up every pixel t, t + threads, ..; the caller sums over threads.
     """
@@ -215,7 +244,15 @@ def vary_kernel(method):
             ray, here = ray_of(scene, lines, (view, u, v), method)
             steps, p = steps_of(scene, ray.axis), (here[0], here[1], 1.0)
             for n in range(len(views) if ray.first < ray.last else 0):
-                pull_back(lines[view], ray, p, scene.window, views[n, view, v, u], slopes_of(held, n, ray, steps), own)
+                pull_back(
+                    lines[view],
+                    ray,
+                    p,
+                    scene.window,
+                    views[n, view, v, u],
+                    slopes_of(held, n, ray, steps),
+                    own,
+                )
         for kind in range(4):
             for axis in range(3):
                 for k in range(columns):

@@ -1,9 +1,11 @@
-"""The adjoint of Joseph's method, voxel by voxel: no two threads write the same number, so none waits for another.
+"""The adjoint of Joseph's method, voxel by voxel: no two threads write the same number, so none
+waits for another.
 
-A voxel X gets something from a ray of main axis a where the ray passes its slab less than a voxel from X along both
-other axes. In a view these rays hit the picture of a square of two voxels about X, which stays convex as long as it
-lies on one side of the source. Every pixel of the picture's box is asked for the weight that `joseph.py` gives it, so
-the result is the exact transpose also where a view mixes main axes. Box and weights need nothing but scalars.
+A voxel X gets something from a ray of main axis a where the ray passes its slab less than a voxel
+from X along both other axes. In a view these rays hit the picture of a square of two voxels about
+X, which stays convex as long as it lies on one side of the source. Every pixel of the picture's box
+is asked for the weight that `joseph.py` gives it, so the result is the exact transpose also where a
+view mixes main axes. Box and weights need nothing but scalars.
 """
 
 from math import ceil, floor
@@ -27,15 +29,20 @@ def near_of(axis):
 def cross(matrix, one, two, axis):
     """A component of the cross product of two columns (kind, column) of a view's maps."""
     p, q = (axis + 1) % 3, (axis + 2) % 3
-    return matrix[one[0], p, one[1]] * matrix[two[0], q, two[1]] - matrix[one[0], q, one[1]] * matrix[two[0], p, two[1]]
+    return (
+        matrix[one[0], p, one[1]] * matrix[two[0], q, two[1]]
+        - matrix[one[0], q, one[1]] * matrix[two[0], p, two[1]]
+    )
 
 
 @scalar
 def camera(line, into):
-    """Write the matrix [3 4] that takes points (x, y, z, 1) of a view to pixels (u, v, 1) up to a factor.
+    """Write the matrix [3 4] that takes points (x, y, z, 1) of a view to pixels (u, v, 1) up to a
+    factor.
 
-    It solves source + w (U u + V v + A) = X, for parallel beams O + U u + V v + w A = X (Cramer's rule). For explicit
-    rays, and where U, V and A lie in one plane, it takes everything to (0, 0, 0).
+    It solves source + w (U u + V v + A) = X, for parallel beams O + U u + V v + w A = X (Cramer's
+    rule). For explicit rays, and where U, V and A lie in one plane, it takes everything to (0, 0,
+    0).
     """
     into[:] = 0
     if line.shape[2] == 1:
@@ -68,7 +75,10 @@ def record(line, here, space, into, k):
     """Write into column k what `weight` needs of the ray of a pixel, and tell its main axis."""
     axis = main_axis(line, here[0], here[1])
     ray = trace(line, axis, near_of(axis), here, space, JOSEPH)
-    into[B, k], into[SLOPE_B, k] = ray.b - 1, ray.slope_b  # voxels here are counted without their padding
+    into[B, k], into[SLOPE_B, k] = (
+        ray.b - 1,
+        ray.slope_b,
+    )  # voxels here are counted without their padding
     into[C, k], into[SLOPE_C, k] = ray.c - 1, ray.slope_c
     into[BEGIN, k], into[END, k], into[LENGTH, k] = ray.begin, ray.end, ray.length
     into[AXIS, k] = axis if ray.first < ray.last else -1
@@ -77,7 +87,9 @@ def record(line, here, space, into, k):
 
 @scalar
 def limits(low, high, size, real):
-    """The first and the last pixel from low to high, counted from the detector's centre, of `size` pixels."""
+    """The first and the last pixel from low to high, counted from the detector's centre, of `size`
+    pixels.
+    """
     # what rounding may move a corner by, in single precision
     slack, centre = real(0.02) + real(1e-5) * real(size), real(size - 1) / real(2)
     one = min(max(low - slack + centre, real(0)), real(size))
@@ -87,7 +99,8 @@ def limits(low, high, size, real):
 
 @scalar
 def box(frame, point, axis, detector, real):
-    """The pixels (first and last column, first and last row) whose rays can pass a voxel less than a voxel away.
+    """The pixels (first and last column, first and last row) whose rays can pass a voxel less than
+    a voxel away.
 
     Args:
         frame: the view's matrix from `camera`, in the type `real`.
@@ -114,7 +127,12 @@ def box(frame, point, axis, detector, real):
             per = one / (w + i * frame[2, far] + j * frame[2, near])
             pu = (u + i * frame[0, far] + j * frame[0, near]) * per
             pv = (v + i * frame[1, far] + j * frame[1, near]) * per
-            low_u, high_u, low_v, high_v = min(low_u, pu), max(high_u, pu), min(low_v, pv), max(high_v, pv)
+            low_u, high_u, low_v, high_v = (
+                min(low_u, pu),
+                max(high_u, pu),
+                min(low_v, pv),
+                max(high_v, pv),
+            )
     u0, u1 = limits(low_u, high_u, columns, real)
     v0, v1 = limits(low_v, high_v, rows, real)
     return u0, u1, v0, v1
@@ -131,7 +149,9 @@ def weight(rays, k, s, b, c, real):
     """What the ray in column k gives to the voxel (b, c) of the slab at s; lengths in mm."""
     half, one = real(0.5), real(1)
     share = min(rays[END, k], s + half) - max(rays[BEGIN, k], s - half)
-    across = hat(rays[B, k] + s * rays[SLOPE_B, k] - b, one) * hat(rays[C, k] + s * rays[SLOPE_C, k] - c, one)
+    across = hat(rays[B, k] + s * rays[SLOPE_B, k] - b, one) * hat(
+        rays[C, k] + s * rays[SLOPE_C, k] - c, one
+    )
     return max(real(0), share) * rays[LENGTH, k] * across
 
 
@@ -140,8 +160,9 @@ def collect(view, voxel, axis, first, totals, real):
     """Add to totals what the rays of one view and one main axis give to a voxel (x, y, z).
 
     Args:
-        view: matrix [3 4] from `camera`; rays [8 p] of `record`; values [n p'] of all pixels; where the view begins in
-            the rays, and where in the values; sizes (x, y, z); detector (rows, columns).
+        view: matrix [3 4] from `camera`; rays [8 p] of `record`; values [n p'] of all pixels; where
+            the view begins in the rays, and where in the values; sizes (x, y, z); detector (rows,
+            columns).
         voxel: its indices.
         axis: the rays' main axis.
         first: the first of the volumes, of which `totals` has a few.

@@ -1,10 +1,11 @@
 """Joseph's method on one ray: in each slab of the main axis, bilinear in the two other axes.
 
-P. M. Joseph, An improved algorithm for reprojecting rays through pixel images, IEEE Trans. Med. Imaging 1, 1982.
+P. M. Joseph, An improved algorithm for reprojecting rays through pixel images, IEEE Trans. Med.
+Imaging 1, 1982.
 
-`cells` writes where the ray goes; `sum`, `spread` and `slopes` read it. The two corners of a cell that lie beside each
-other in memory are fetched as one complex number, and all arithmetic is left to loops without gathers, which every CPU
-vectorises.
+`cells` writes where the ray goes; `sum`, `spread` and `slopes` read it. The two corners of a cell
+that lie beside each other in memory are fetched as one complex number, and all arithmetic is left
+to loops without gathers, which every CPU vectorises.
 """
 
 import numpy as np
@@ -16,7 +17,9 @@ from mvrecon.kernels.rays.order import fold
 
 @scalar
 def cells(ray, count, steps, room):
-    """Per slab that `order.visit` has chosen: flat index of a bilinear cell, place in it towards b and c, length."""
+    """Per slab that `order.visit` has chosen: flat index of a bilinear cell, place in it towards b
+    and c, length.
+    """
     index, y, z, share, slab = room.index, room.one, room.two, room.three, room.four
     real, whole = y.dtype.type, index.dtype.type
     b, slope_b, c, slope_c = real(ray.b), real(ray.slope_b), real(ray.c), real(ray.slope_c)
@@ -29,7 +32,9 @@ def cells(ray, count, steps, room):
         y[i], z[i] = py - real(iy), pz - real(iz)
         share[i] = min(end, s + half) - max(begin, s - half)
         k = whole(np.int32(s + first))
-        index[i] = whole(whole(whole(k * along) - origin) + whole(whole(whole(iy) * far) + whole(iz)))
+        index[i] = whole(
+            whole(whole(k * along) - origin) + whole(whole(whole(iy) * far) + whole(iz))
+        )
 
 
 @scalar
@@ -44,7 +49,9 @@ def fetch(pairs, offset, far, count, room):
 
 @scalar
 def sum(store, n, steps, visited, room):
-    """The sum of volume n along a ray, in voxels of the main axis; visited = (how many cells, lead of their terms)."""
+    """The sum of volume n along a ray, in voxels of the main axis; visited = (how many cells, lead
+    of their terms).
+    """
     count, lead = visited
     fetch(store.pairs, n * store.size, steps.far, count, room)
     y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
@@ -110,10 +117,18 @@ def slopes(store, n, steps, count, room, ray):
     """How a ray's `sum` changes with its place.
 
     Returns:
-        the sum; its derivatives by b, slope_b, c, slope_c; the volume where the ray begins and ends inside the box.
+        the sum; its derivatives by b, slope_b, c, slope_c; the volume where the ray begins and ends
+        inside the box.
     """
     fetch(store.pairs, n * store.size, steps.far, count, room)
-    y, z, share, slab, low, high = room.one, room.two, room.three, room.four, room.low_parts, room.high_parts
+    y, z, share, slab, low, high = (
+        room.one,
+        room.two,
+        room.three,
+        room.four,
+        room.low_parts,
+        room.high_parts,
+    )
     real = y.dtype.type
     half, none, begin, end = real(0.5), real(0), real(ray.begin), real(ray.end)
     total = by_b = by_slope_b = by_c = by_slope_c = at_begin = at_end = none

@@ -1,6 +1,8 @@
-"""Four numbers side by side, one of each of four volumes: written out, so that they travel as one vector.
+"""Four numbers side by side, one of each of four volumes: written out, so that they travel as one
+vector.
 
-A loop over them would store the first before it loads the second, which forbids the compiler to join them.
+A loop over them would store the first before it loads the second, which forbids the compiler to
+join them.
 """
 
 import numpy as np
@@ -24,11 +26,12 @@ def put(values, k, four):
 
 @ordered
 def between(low, high, share, rest):
-    """The part `rest` = 1 - share of `low` and the part `share` of `high`, as the transpose gives them back.
+    """The part `rest` = 1 - share of `low` and the part `share` of `high`, as the transpose gives
+    them back.
 
-    low + share * (high - low) is one product less, but rounds to the digits of the greater of the two: next to a `low`
-    with hardly any weight a `high` of zero would get none of the digits that the transpose has. In another order a
-    compiler makes the one of the other.
+    low + share * (high - low) is one product less, but rounds to the digits of the greater of the
+    two: next to a `low` with hardly any weight a `high` of zero would get none of the digits that
+    the transpose has. In another order a compiler makes the one of the other.
     """
     return rest * low + share * high
 
@@ -52,7 +55,9 @@ def times(weight, four):
 
 @ordered
 def plus(four, other):
-    """four + other, in this order: the sum of a ray must not depend on how many of its terms are zero."""
+    """four + other, in this order: the sum of a ray must not depend on how many of its terms are
+    zero.
+    """
     return four[0] + other[0], four[1] + other[1], four[2] + other[2], four[3] + other[3]
 
 

@@ -1,13 +1,15 @@
 """The rays of a rig as lines in voxel space, linear in the pixel.
 
-A pixel (u, v) has p = (u - uc, v - vc, 1), counted from the detector's centre. Its ray is the Pluecker line with
-direction D(p) and moment M(p) = start(p) x D(p) about the volume's centre, in voxel indices; both are linear in p, for
-central and for parallel beams alike. Along the main axis a (the greatest |D_a|) the ray stands in slab s at
+A pixel (u, v) has p = (u - uc, v - vc, 1), counted from the detector's centre. Its ray is the
+Pluecker line with direction D(p) and moment M(p) = start(p) x D(p) about the volume's centre, in
+voxel indices; both are linear in p, for central and for parallel beams alike. Along the main axis a
+(the greatest |D_a|) the ray stands in slab s at
 
     y_b(s) = (start_b D_a - start_a D_b + s D_b) / D_a = (h_b + s D_b) / D_a
 
-in each other axis b. h_b is a component of the moment up to sign, formed in float64 without the difference of two great
-numbers, so a far source and a far world origin lose no digits (Pluecker coordinates: Hartley & Zisserman, ch. 3.2).
+in each other axis b. h_b is a component of the moment up to sign, formed in float64 without the
+difference of two great numbers, so a far source and a far world origin lose no digits (Pluecker
+coordinates: Hartley & Zisserman, ch. 3.2).
 """
 
 import numpy as np
@@ -21,14 +23,17 @@ from mvrecon.geometry.grid import Grid
 
 #: The four linear maps of a view in `lines_of`.
 DIRECTION, MOMENT, START, WORLD = range(4)
-#: Axes whose components differ by less than this part tie; the first of them is the main axis, in every back end.
+#: Axes whose components differ by less than this part tie; the first of them is the main axis, in
+#: every back end.
 TIE = 1e-12
 
 
 def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
-    """The rays of every view: the matrices that take p to (direction, moment, start, direction in world mm).
+    """The rays of every view: the matrices that take p to (direction, moment, start, direction in
+    world mm).
 
-    The first three are in voxel indices (x, y, z) about the volume's centre; float64, differentiable in the cameras.
+    The first three are in voxel indices (x, y, z) about the volume's centre; float64,
+    differentiable in the cameras.
     """
     rows, columns = cameras.shape
     voxel = torch.linalg.inv(grid.affine[:3, :3])
@@ -50,7 +55,9 @@ def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
 
 
 def lines_of_rays(rays: ExplicitRays, grid: Grid) -> Float[Tensor, "r 4 3 1"]:
-    """Rays given one by one, each as a view of one pixel: maps of the constant alone, as in `lines_of`."""
+    """Rays given one by one, each as a view of one pixel: maps of the constant alone, as in
+    `lines_of`.
+    """
     voxel = torch.linalg.inv(grid.affine[:3, :3])
     source, target = rays.source.flatten(0, 2), rays.target.flatten(0, 2)
     start, end = ((points - grid.centre) @ voxel.T for points in (source, target))
@@ -63,7 +70,8 @@ def shifted(lines: Float[np.ndarray, "m 4 3 k"], y: float) -> Float[np.ndarray, 
     if y == 0:
         return lines
     moved = lines.copy()
-    # (start - o) x direction, the start being a number and not linear in the pixel in its last column alone
+    # (start - o) x direction, the start being a number and not linear in the pixel in its last
+    # column alone
     moved[:, START, 1, -1] -= y
     moved[:, MOMENT, 0] -= y * lines[:, DIRECTION, 2]
     moved[:, MOMENT, 2] += y * lines[:, DIRECTION, 0]
@@ -71,7 +79,9 @@ def shifted(lines: Float[np.ndarray, "m 4 3 k"], y: float) -> Float[np.ndarray, 
 
 
 def unshifted(change: Float[Tensor, "m 4 3 k"], y: float) -> Float[Tensor, "m 4 3 k"]:
-    """The derivative by the rays of `lines_of` from that by `shifted` ones: the transpose of its linear part."""
+    """The derivative by the rays of `lines_of` from that by `shifted` ones: the transpose of its
+    linear part.
+    """
     moved = change.clone()
     moved[:, DIRECTION, 2] -= y * change[:, MOMENT, 0]
     moved[:, DIRECTION, 0] += y * change[:, MOMENT, 2]

@@ -1,4 +1,6 @@
-"""The compiled loops over rays: project, back-project, and how the projections change with the geometry."""
+"""The compiled loops over rays: project, back-project, and how the projections change with the
+geometry.
+"""
 
 from collections import namedtuple
 
@@ -10,15 +12,37 @@ from mvrecon.kernels.rays.lanes import LANES
 from mvrecon.kernels.rays.occupancy import EDGE
 from mvrecon.kernels.rays.order import visit
 from mvrecon.kernels.rays.stores import Store
-from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR, at, crossing, main_axis, trace, within
-
-#: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a ray (trilinear); the
-#: box of what may be there, see `trace.Space`; bricks, their strides and heights, see `occupancy.bricks_of_rig`.
-Rig = namedtuple(
-    "Rig", ["lines", "window", "sizes", "detector", "method", "samples", "box", "bricks", "strides", "heights"]
+from mvrecon.kernels.rays.trace import (
+    JOSEPH,
+    SIDDON,
+    TRILINEAR,
+    at,
+    crossing,
+    main_axis,
+    trace,
+    within,
 )
-#: Flat strides along the ray's main, far and near axis; samples a ray; how far the box's first voxel lies behind the
-#: volume's in a store of the box alone.
+
+#: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a
+#: ray (trilinear); the box of what may be there, see `trace.Space`; bricks, their strides and
+#: heights, see `occupancy.bricks_of_rig`.
+Rig = namedtuple(
+    "Rig",
+    [
+        "lines",
+        "window",
+        "sizes",
+        "detector",
+        "method",
+        "samples",
+        "box",
+        "bricks",
+        "strides",
+        "heights",
+    ],
+)
+#: Flat strides along the ray's main, far and near axis; samples a ray; how far the box's first
+#: voxel lies behind the volume's in a store of the box alone.
 Steps = namedtuple("Steps", ["along", "far", "near", "samples", "origin"])
 
 
@@ -30,11 +54,23 @@ def steps_of(rig, store, axis):
     return Steps(store.strides[axis], store.strides[3 - axis - store.near], 1, rig.samples, origin)
 
 
-#: What is known of the cells of one ray: flat indices, four numbers each, pairs of corners whole and in their parts;
-#: one number for each of a group of volumes.
+#: What is known of the cells of one ray: flat indices, four numbers each, pairs of corners whole
+#: and in their parts; one number for each of a group of volumes.
 Room = namedtuple(
     "Room",
-    ["index", "index_b", "index_c", "one", "two", "three", "four", "low", "high", "low_parts", "high_parts"]
+    [
+        "index",
+        "index_b",
+        "index_c",
+        "one",
+        "two",
+        "three",
+        "four",
+        "low",
+        "high",
+        "low_parts",
+        "high_parts",
+    ]
     + ["terms", "totals"],
 )
 
@@ -42,7 +78,10 @@ Room = namedtuple(
 def room_of(rig: Rig, store: Store) -> Room:
     """Room for the cells of one ray of a thread; the loops themselves make no arrays."""
     length = max(2 * rig.samples, max(rig.sizes))
-    index, corners = np.empty((3, length), store.strides.dtype), np.empty((2, length), store.pairs.dtype)
+    index, corners = (
+        np.empty((3, length), store.strides.dtype),
+        np.empty((2, length), store.pairs.dtype),
+    )
     numbers = np.empty((4, length), store.values.dtype)
     own = np.empty(length + 2 * EDGE, numbers.dtype), np.empty(LANES, numbers.dtype)
     return Room._make((*index, *numbers, *corners, *corners.view(numbers.dtype), *own))
@@ -57,10 +96,11 @@ def pixel(rig, u, v):
 
 @scalar
 def walk(rig, spans, unit):
-    """The part of the detector to go through as one unit: its view and place, the first of its rays and one behind.
+    """The part of the detector to go through as one unit: its view and place, the first of its rays
+    and one behind.
 
-    It is a row, or a column where a step from row to row goes along the near axis: rays in turn then meet again the
-    voxels that the cache still holds.
+    It is a row, or a column where a step from row to row goes along the near axis: rays in turn
+    then meet again the voxels that the cache still holds.
     """
     units = max(rig.detector)
     view, place = unit // units, unit % units
@@ -90,7 +130,8 @@ def silent(views, m, v, u):
 
 @compiled
 def project_rows(store, rig, room, reads, views, first, last):
-    """Add to views [n m v u] the sums of volumes along the rays of reads = (chosen views, tall ones, spans, main axes).
+    """Add to views [n m v u] the sums of volumes along the rays of reads = (chosen views, tall
+    ones, spans, main axes).
 
     Of all units of those views, see `walk`, these are the first to last.
     """
@@ -126,7 +167,8 @@ def project_rows(store, rig, room, reads, views, first, last):
 
 @compiled
 def backproject_slabs(store, rig, room, reads, views, low, high):
-    """Spread views [n m v u] into slabs [low, high) along the rays of reads = (chosen views, tall ones, spans, axis).
+    """Spread views [n m v u] into slabs [low, high) along the rays of reads = (chosen views, tall
+    ones, spans, axis).
 
     A ray on which all views are zero is left out.
     """
@@ -150,7 +192,9 @@ def backproject_slabs(store, rig, room, reads, views, low, high):
             if store.lanes > 1:
                 for n in range(0, volumes, store.lanes):
                     for lane in range(store.lanes):
-                        room.totals[lane] = length * views[n + lane, m, v, u] if n + lane < volumes else 0
+                        room.totals[lane] = (
+                            length * views[n + lane, m, v, u] if n + lane < volumes else 0
+                        )
                     joseph.spread_lanes(store, n // store.lanes, steps, count, room)
                 continue
             for n in range(volumes):
@@ -163,7 +207,9 @@ def backproject_slabs(store, rig, room, reads, views, low, high):
 
 @scalar
 def pull_back(line, ray, p, window, value, change_of, change):
-    """Add to a row's `change` [4 3 k] the derivative of value * (one ray's integral) by the maps in `line`."""
+    """Add to a row's `change` [4 3 k] the derivative of value * (one ray's integral) by the maps in
+    `line`.
+    """
     total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end = change_of
     axis, b, c = ray.axis, ray.far, ray.near
     D = at(line, 0, axis, p[0], p[1])
@@ -191,7 +237,9 @@ def pull_back(line, ray, p, window, value, change_of, change):
 
 @compiled
 def vary_rows(store, rig, room, reads, given, first, last):
-    """For given = (views, change): into `change` [m unit 4 3 k], the derivative of sum(views * projections) by maps."""
+    """For given = (views, change): into `change` [m unit 4 3 k], the derivative of sum(views *
+    projections) by maps.
+    """
     chosen, tall, spans, axes = reads
     views, change = given
     volumes = len(views)
@@ -207,7 +255,11 @@ def vary_rows(store, rig, room, reads, given, first, last):
                 continue
             ray = trace(line, axis, store.near, here, rig, rig.method)
             steps = steps_of(rig, store, axis)
-            count = _cells(rig, ray, (ray.first, ray.last), steps, room)[0] if rig.method == JOSEPH else 0
+            count = (
+                _cells(rig, ray, (ray.first, ray.last), steps, room)[0]
+                if rig.method == JOSEPH
+                else 0
+            )
             for n in range(volumes):
                 if rig.method == JOSEPH:
                     change_of = joseph.slopes(store, n, steps, count, room, ray)
@@ -216,4 +268,12 @@ def vary_rows(store, rig, room, reads, given, first, last):
                 else:
                     change_of = slopes.siddon(store, n, ray, steps)
                 value = views[n, m, v, u]
-                pull_back(line, ray, (here[0], here[1], 1.0), rig.window, value, change_of, change[m, place])
+                pull_back(
+                    line,
+                    ray,
+                    (here[0], here[1], 1.0),
+                    rig.window,
+                    value,
+                    change_of,
+                    change[m, place],
+                )

@@ -1,7 +1,9 @@
-"""Trilinear sampling along one ray: a fixed number of samples, each at the middle of its share of the ray.
+"""Trilinear sampling along one ray: a fixed number of samples, each at the middle of its share of
+the ray.
 
-The ray runs through the box grown by the kernel's reach, half a voxel on every side, so that no weight is cut off. A
-sample lies between two slabs; in each it is one bilinear cell, so `joseph.sum` and `joseph.spread` read these cells.
+The ray runs through the box grown by the kernel's reach, half a voxel on every side, so that no
+weight is cut off. A sample lies between two slabs; in each it is one bilinear cell, so `joseph.sum`
+and `joseph.spread` read these cells.
 """
 
 from math import floor
@@ -15,7 +17,9 @@ from mvrecon.kernels.rays.trace import FAR, NEAR, OWN
 
 @scalar
 def samples_in(ray, count):
-    """The first sample of a ray that may lie in the box, and the one behind the last; some beyond it are among them."""
+    """The first sample of a ray that may lie in the box, and the one behind the last; some beyond
+    it are among them.
+    """
     step = (ray.end - ray.begin) / count
     low = max(ray.enter, ray.first - ray.centre - 1)
     high = min(ray.leave, ray.last - ray.centre)
@@ -28,7 +32,8 @@ def samples_in(ray, count):
 
 @scalar
 def cells(ray, span, steps, room):
-    """Two of each sample: flat index of a bilinear cell, place in it towards b and c, weight; no weight beyond span.
+    """Two of each sample: flat index of a bilinear cell, place in it towards b and c, weight; no
+    weight beyond span.
 
     Returns:
         how many there are; where their terms begin, see `order.fold`.
@@ -61,12 +66,19 @@ def face(flat, k, steps, y, z):
 
 @scalar
 def _local(flat, steps, px, py, pz):
-    """The interpolated volume at a place, and its slopes along the main, the far and the near axis."""
+    """The interpolated volume at a place, and its slopes along the main, the far and the near
+    axis.
+    """
     below, iy, iz = int(floor(px)), int(py), int(pz)
     k, x = (below + 1) * steps.along + iy * steps.far + iz * steps.near - steps.origin, px - below
     low, low_b, low_c = face(flat, k, steps, py - iy, pz - iz)
     high, high_b, high_c = face(flat, k + steps.along, steps, py - iy, pz - iz)
-    return low + x * (high - low), high - low, low_b + x * (high_b - low_b), low_c + x * (high_c - low_c)
+    return (
+        low + x * (high - low),
+        high - low,
+        low_b + x * (high_b - low_b),
+        low_c + x * (high_c - low_c),
+    )
 
 
 @scalar
@@ -74,7 +86,8 @@ def slopes(store, n, steps, ray):
     """How a ray's `sum` changes with its place, its samples moving with its ends.
 
     Returns:
-        the sum; its derivatives by b, slope_b, c, slope_c; what it gains when the ray's own ends move outwards.
+        the sum; its derivatives by b, slope_b, c, slope_c; what it gains when the ray's own ends
+        move outwards.
     """
     flat, count = store.values[n * store.size : (n + 1) * store.size], steps.samples
     step = (ray.end - ray.begin) / count

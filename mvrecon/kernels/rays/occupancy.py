@@ -1,6 +1,8 @@
-"""Which part of a volume may be anything but zero: a box, and where it pays, bricks of eight voxels a side.
+"""Which part of a volume may be anything but zero: a box, and where it pays, bricks of eight voxels
+a side.
 
-It travels through torch's operators as one small tensor of integers, so that they know nothing of it.
+It travels through torch's operators as one small tensor of integers, so that they know nothing of
+it.
 """
 
 import math
@@ -29,9 +31,10 @@ class Occupancy:
     Args:
         shape: voxels of the whole volume along (z, y, x).
         box: outside of it all is zero.
-        bricks: which bricks hold a voxel that is not zero, or have one just behind their last ones; None: any.
-        shares: of the work on all of the volume, what is left with the box, and with bricks, as counted on some rays;
-            not a number where it was not counted.
+        bricks: which bricks hold a voxel that is not zero, or have one just behind their last ones;
+            None: any.
+        shares: of the work on all of the volume, what is left with the box, and with bricks, as
+            counted on some rays; not a number where it was not counted.
     """
 
     shape: Three
@@ -47,17 +50,23 @@ class Occupancy:
 
     @property
     def read(self) -> Box:
-        """The box that rays are clipped to: a voxel larger than what is held, as rounding may move them a little."""
+        """The box that rays are clipped to: a voxel larger than what is held, as rounding may move
+        them a little.
+        """
         return self.box.grown(1, self.shape)
 
     def rows(self, low: int, high: int) -> "Occupancy":
-        """What is held of the rows (along y) from `low`, a multiple of a brick's edge, to one behind the last."""
+        """What is held of the rows (along y) from `low`, a multiple of a brick's edge, to one
+        behind the last.
+        """
         if (low, high) == (0, self.shape[1]):
             return self
         y0, y1 = (min(max(y - low, 0), high - low) for y in (self.box.low[1], self.box.high[1]))
         box = Box((self.box.low[0], y0, self.box.low[2]), (self.box.high[0], y1, self.box.high[2]))
         bricks = None if self.bricks is None else self.bricks[:, low // EDGE : -(-high // EDGE)]
-        return replace(self, shape=(self.shape[0], high - low, self.shape[2]), box=box, bricks=bricks)
+        return replace(
+            self, shape=(self.shape[0], high - low, self.shape[2]), box=box, bricks=bricks
+        )
 
     def encoded(self) -> Tensor:
         """As integers: shape, box, shares, whether bricks are told apart, bricks."""
@@ -73,8 +82,15 @@ class Occupancy:
         """The inverse of `encoded`."""
         numbers = code.numpy()
         d, h, w, z0, y0, x0, z1, y1, x1, one, two, told_apart = numbers[:HEAD].tolist()
-        bricks = numbers[HEAD:].astype(np.uint8).reshape(bricks_along((d, h, w), EDGE)) if told_apart else None
-        shares = (one / WHOLE if one >= 0 else float("nan"), two / WHOLE if two >= 0 else float("nan"))
+        bricks = (
+            numbers[HEAD:].astype(np.uint8).reshape(bricks_along((d, h, w), EDGE))
+            if told_apart
+            else None
+        )
+        shares = (
+            one / WHOLE if one >= 0 else float("nan"),
+            two / WHOLE if two >= 0 else float("nan"),
+        )
         return cls((d, h, w), Box((z0, y0, x0), (z1, y1, x1)), bricks, shares)
 
 
@@ -84,7 +100,8 @@ def code_size(shape: Sequence[int]) -> int:
 
 
 def bricks_of_rig(held: Occupancy) -> tuple[np.ndarray, Three, np.ndarray]:
-    """The bricks in one row, their strides (x, y, z), and from where to where along z a column [y x 2] of them holds.
+    """The bricks in one row, their strides (x, y, z), and from where to where along z a column [y x
+    2] of them holds.
 
     All are empty where bricks are not told apart.
     """
@@ -100,7 +117,8 @@ def bricks_of_rig(held: Occupancy) -> tuple[np.ndarray, Three, np.ndarray]:
 
 
 def boxes_of(held: Occupancy) -> Float[np.ndarray, "n 6"] | None:
-    """Boxes (x0, y0, z0, x1, y1, z1), in voxels from the volume's centre, beside which a ray meets nothing.
+    """Boxes (x0, y0, z0, x1, y1, z1), in voxels from the volume's centre, beside which a ray meets
+    nothing.
 
     None: the box is the whole volume.
     """
@@ -111,4 +129,6 @@ def boxes_of(held: Occupancy) -> Float[np.ndarray, "n 6"] | None:
         first = np.argwhere(held.bricks) * EDGE
         low, high = np.maximum(first, low), np.minimum(first + EDGE, high)
     centre = (np.array(held.shape) - 1) / 2
-    return np.concatenate([(low - centre - REACH)[:, ::-1], (high - centre + REACH)[:, ::-1]], axis=1)
+    return np.concatenate(
+        [(low - centre - REACH)[:, ::-1], (high - centre + REACH)[:, ::-1]], axis=1
+    )

@@ -1,8 +1,10 @@
-"""The compiled kernels as torch operators: opaque to `torch.compile`, each one's derivative made of the others.
+"""The compiled kernels as torch operators: opaque to `torch.compile`, each one's derivative made of
+the others.
 
-`held` says that a volume is the part of a larger one that alone may be there, see `occupancy.py`: the operators are
-then those of this part. `occupied` says where a volume is not zero: only that is read, and derivatives stay dense.
-Second derivatives in volume and views are exact. A second derivative in the geometry raises: the reference has it.
+`held` says that a volume is the part of a larger one that alone may be there, see `occupancy.py`:
+the operators are then those of this part. `occupied` says where a volume is not zero: only that is
+read, and derivatives stay dense. Second derivatives in volume and views are exact. A second
+derivative in the geometry raises: the reference has it.
 """
 
 from collections.abc import Sequence
@@ -27,7 +29,9 @@ def project(
     held: Tensor | None = None,
     occupied: Tensor | None = None,
 ) -> Tensor:
-    """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`. Half volumes give float32."""
+    """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`. Half volumes
+    give float32.
+    """
     from mvrecon.kernels.rays import cpu
 
     part, there = _read(volume, held, occupied)
@@ -69,7 +73,12 @@ def lines_vjp(
 
 @torch.library.custom_op("mvrecon::occupied", mutates_args=(), device_types="cpu")
 def occupied(
-    volume: Tensor, lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str, skip: str
+    volume: Tensor,
+    lines: Tensor,
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+    skip: str,
 ) -> Tensor:
     """Where volumes [n d h w] are not zero, in code; see `choice.occupancy_of`."""
     from mvrecon.kernels.rays.choice import Scene, occupancy_of
@@ -150,7 +159,9 @@ def _project_back(ctx, views):
     needs_volume, needs_lines = ctx.needs_input_grad[:2]
     by_volume = by_lines = None
     if needs_volume:
-        by_volume = backproject(views, lines, ctx.window, list(ctx.shape[1:]), ctx.method, ctx.held).to(ctx.dtype)
+        by_volume = backproject(
+            views, lines, ctx.window, list(ctx.shape[1:]), ctx.method, ctx.held
+        ).to(ctx.dtype)
     if needs_lines:
         by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method, ctx.held, ctx.occupied)
     return by_volume, by_lines, None, None, None, None, None

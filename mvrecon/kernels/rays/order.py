@@ -1,8 +1,8 @@
 """Which slabs a ray visits, and in which order their terms are added.
 
-A sum is kept in eight parts, as many as a brick has slabs, each of every eighth slab of the volume. A term that is zero
-may then be left out or taken along: the parts, and so the sum, stay the same to the last bit, however the compiler
-vectorises the terms themselves.
+A sum is kept in eight parts, as many as a brick has slabs, each of every eighth slab of the volume.
+A term that is zero may then be left out or taken along: the parts, and so the sum, stay the same to
+the last bit, however the compiler vectorises the terms themselves.
 """
 
 import numpy as np
@@ -17,7 +17,9 @@ SLACK = 1e-3
 
 @ordered
 def fold(terms, lead, count):
-    """The sum of terms[lead : lead + count], a term at k being part of the sum k % 8; it writes zeros around them."""
+    """The sum of terms[lead : lead + count], a term at k being part of the sum k % 8; it writes
+    zeros around them.
+    """
     none = terms.dtype.type(0)
     blocks = (lead + count + EDGE - 1) // EDGE
     for k in range(lead):
@@ -40,7 +42,9 @@ def fold(terms, lead, count):
 
 @scalar
 def bricks_between(low, high, size):
-    """The first and the last brick that hold the voxels from low to high, as far as there are any."""
+    """The first and the last brick that hold the voxels from low to high, as far as there are
+    any.
+    """
     first = min(max(int(np.floor(low - SLACK)), 0), size - 1)
     last = min(max(int(np.floor(high + SLACK)), 0), size - 1)
     return first // EDGE, last // EDGE
@@ -48,7 +52,9 @@ def bricks_between(low, high, size):
 
 @scalar
 def empty(rig, ray, low, high):
-    """Whether all cells that a ray meets in the slabs [low, high) of one layer of bricks lie in empty bricks."""
+    """Whether all cells that a ray meets in the slabs [low, high) of one layer of bricks lie in
+    empty bricks.
+    """
     # places of lower corners, without their padding; siddon's cells are met from face to face
     more, half = (0.5, 0.5) if rig.method == SIDDON else (0.0, 0.0)
     s0, s1 = low - ray.centre - half, high - 1 - ray.centre + half
@@ -66,7 +72,8 @@ def empty(rig, ray, low, high):
 
 @scalar
 def visit(rig, ray, span, room):
-    """Write the places of the slabs in span = (first, last) that are not known to be empty into room.four.
+    """Write the places of the slabs in span = (first, last) that are not known to be empty into
+    room.four.
 
     Returns:
         how many there are; where their terms begin, see `fold`.

@@ -1,6 +1,8 @@
-"""The oracle: the same operators in plain torch. Any device, any float type, derivatives of any order by torch itself.
+"""The oracle: the same operators in plain torch. Any device, any float type, derivatives of any
+order by torch itself.
 
-It shares no arithmetic with the compiled kernels. All rays advance together, slab by slab of their own main axis.
+It shares no arithmetic with the compiled kernels. All rays advance together, slab by slab of their
+own main axis.
 """
 
 import itertools
@@ -38,7 +40,9 @@ def rays_of(
     like: Tensor,
     reach: float = 0.0,
 ) -> Rays:
-    """Where every ray runs, to `reach` voxels beyond the box; formed in float64, then cast to the volume's type."""
+    """Where every ray runs, to `reach` voxels beyond the box; formed in float64, then cast to the
+    volume's type.
+    """
     centre = lines.new_tensor([(detector[1] - 1) / 2, (detector[0] - 1) / 2])
     uv = pixel_centres(detector).to(lines) - centre
     p = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1).reshape(-1, 3)[:, -lines.shape[-1] :]
@@ -98,19 +102,29 @@ def _siddon(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]
     to = torch.where(crosses, ((torch.maximum(low, high) - one) / safe).clamp_min(0), length)
     to = torch.minimum(to, length)
     b_first = to[0] < to[1]
-    middle = torch.stack([torch.where(b_first, high[0], low[0]), torch.where(b_first, low[1], high[1])])
-    lengths = (torch.minimum(*to), torch.maximum(*to) - torch.minimum(*to), length - torch.maximum(*to))
+    middle = torch.stack(
+        [torch.where(b_first, high[0], low[0]), torch.where(b_first, low[1], high[1])]
+    )
+    lengths = (
+        torch.minimum(*to),
+        torch.maximum(*to) - torch.minimum(*to),
+        length - torch.maximum(*to),
+    )
     for cell, weight in zip((low, middle, high), lengths, strict=True):
         inside = torch.minimum(cell.clamp_min(-1), sizes.to(s.dtype)).long()
         yield (k + 1) * rays.strides[0] + ((inside + 1) * rays.strides[1:]).sum(dim=0), weight
 
 
 def _grown(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Where each ray enters and leaves the box grown by half a voxel, the reach of the trilinear kernel."""
+    """Where each ray enters and leaves the box grown by half a voxel, the reach of the trilinear
+    kernel.
+    """
     half = rays.sizes / 2 + 0.5
     # a ray on its way to a face that it cannot reach is let through by the box or misses it
     slope = torch.where(
-        rays.slope == 0, torch.full_like(rays.slope, 1e-300 if rays.slope.dtype == torch.float64 else 1e-30), rays.slope
+        rays.slope == 0,
+        torch.full_like(rays.slope, 1e-300 if rays.slope.dtype == torch.float64 else 1e-30),
+        rays.slope,
     )
     one, two = (-half[1:] - rays.value) / slope, (half[1:] - rays.value) / slope
     enter = torch.maximum(rays.begin, torch.minimum(one, two).amax(dim=0))
@@ -118,7 +132,9 @@ def _grown(rays: Rays) -> tuple[Tensor, Tensor]:
 
 
 def _trilinear(rays: Rays, samples: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Flat indices and weights of a fixed number of samples a ray, each in the middle of its share."""
+    """Flat indices and weights of a fixed number of samples a ray, each in the middle of its
+    share.
+    """
     begin, end = _grown(rays)
     axes = rays.sizes
     for j in range(samples):
@@ -134,11 +150,20 @@ def _trilinear(rays: Rays, samples: int) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def _weights(
-    lines: Tensor, window: Sequence[float], detector: Sequence[int], shape: Sequence[int], like: Tensor, method: str
+    lines: Tensor,
+    window: Sequence[float],
+    detector: Sequence[int],
+    shape: Sequence[int],
+    like: Tensor,
+    method: str,
 ):
-    """Every flat index and weight, in mm, of all rays: the rows of the system matrix, slab by slab."""
+    """Every flat index and weight, in mm, of all rays: the rows of the system matrix, slab by
+    slab.
+    """
     name, _, samples = method.partition(":")
-    exact = lines if name == "siddon" else like  # a crossing moves by many times what a place is rounded by
+    exact = (
+        lines if name == "siddon" else like
+    )  # a crossing moves by many times what a place is rounded by
     rays = rays_of(lines, window, detector, shape, exact, 0.5 if name == "trilinear" else 0.0)
     if name == "trilinear":
         for index, weight in _trilinear(rays, int(samples)):
@@ -167,8 +192,9 @@ def project(
         lines: the views' rays, from `lines_of`.
         window: the part of each ray that counts, as fractions of the way from source to pixel.
         detector: pixels (rows, columns).
-        method: "joseph" (second order in the voxel size for smooth volumes), "siddon" (exact for constant voxels), or
-            "trilinear:n" with n samples a ray (second order in both the voxel size and the distance of samples).
+        method: "joseph" (second order in the voxel size for smooth volumes), "siddon" (exact for
+            constant voxels), or "trilinear:n" with n samples a ray (second order in both the voxel
+            size and the distance of samples).
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
     total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1])

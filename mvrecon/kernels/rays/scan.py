@@ -15,7 +15,9 @@ SOME = 6
 
 
 def readable(volumes: Tensor) -> np.ndarray:
-    """Volumes in which what is zero is zero; halves as the integers that their bits are, so that -0 counts as there."""
+    """Volumes in which what is zero is zero; halves as the integers that their bits are, so that -0
+    counts as there.
+    """
     volumes = volumes.detach().cpu()
     return (volumes.view(torch.int16) if volumes.element_size() == 2 else volumes).numpy()
 
@@ -42,7 +44,9 @@ def box_of(volumes: np.ndarray) -> Box:
 
 @compiled
 def inward(volumes, axis, side, low, high):
-    """The bound of a box along an axis, moved inwards until its face holds something; side 0: the lower one."""
+    """The bound of a box along an axis, moved inwards until its face holds something; side 0: the
+    lower one.
+    """
     for step in range(high[axis] - low[axis]):
         place = high[axis] - 1 - step if side else low[axis] + step
         if _face_holds(volumes, axis, place, low, high):
@@ -68,7 +72,9 @@ def _face_holds(volumes, axis, place, low, high):
 
 @compiled
 def mark(volumes, low, high, bricks):
-    """Set the bricks [z y x] that hold a voxel of the box that is not zero, or have one just behind their last ones."""
+    """Set the bricks [z y x] that hold a voxel of the box that is not zero, or have one just behind
+    their last ones.
+    """
     for n in range(len(volumes)):
         for z in range(low[0], high[0]):
             for y in range(low[1], high[1]):
@@ -119,7 +125,9 @@ def _brick_holds(volumes, z0, y0, x0):
 
 
 def bricks_of(volumes: np.ndarray, box: Box) -> UInt8[np.ndarray, "z y x"]:
-    """The bricks of volumes [n d h w] as an `Occupancy` has them, where all that is not zero lies in a box."""
+    """The bricks of volumes [n d h w] as an `Occupancy` has them, where all that is not zero lies
+    in a box.
+    """
     bricks = np.zeros(bricks_along(volumes.shape[1:], EDGE), np.uint8)
     if box.size:
         mark(volumes, np.array(box.low), np.array(box.high), bricks)

@@ -1,4 +1,6 @@
-"""Whether the CUDA back end may be trusted on a device: each operator is tried once against the reference."""
+"""Whether the CUDA back end may be trusted on a device: each operator is tried once against the
+reference.
+"""
 
 import logging
 import warnings
@@ -13,15 +15,20 @@ from mvrecon.kernels.rays.occupancy import Occupancy
 
 logger = logging.getLogger(__name__)
 
-#: The greatest difference to the reference, by its greatest value: rounding, and where a ray falls on an edge.
+#: The greatest difference to the reference, by its greatest value: rounding, and where a ray falls
+#: on an edge.
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
 
 
 @torch.compiler.assume_constant_result
 def reason(
-    device: torch.device | str, method: str = "joseph", dtype: torch.dtype = torch.float32, volumes: int = 1
+    device: torch.device | str,
+    method: str = "joseph",
+    dtype: torch.dtype = torch.float32,
+    volumes: int = 1,
 ) -> str | None:
-    """Why the kernels for some input cannot be used on a device, or None. Tried once, which compiles them; logged once.
+    """Why the kernels for some input cannot be used on a device, or None. Tried once, which
+    compiles them; logged once.
 
     Args:
         device: a CUDA device.
@@ -31,7 +38,9 @@ def reason(
     """
     place = torch.device(device)
     if place.type == "cuda" and place.index is None:
-        place = torch.device("cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0)
+        place = torch.device(
+            "cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0
+        )
     computed = torch.float64 if dtype == torch.float64 else torch.float32
     return _reason(str(place), method.partition(":")[0], computed, volumes > 1)
 
@@ -39,26 +48,37 @@ def reason(
 @cache
 def _reason(device: str, name: str, dtype: torch.dtype, several: bool) -> str | None:
     # a tiny grid of blocks is no mistake of ours
-    warnings.filterwarnings("ignore", message="Grid size .* will likely result in GPU under-utilization")
+    warnings.filterwarnings(
+        "ignore", message="Grid size .* will likely result in GPU under-utilization"
+    )
     bound, found = TOLERANCE[dtype], None
     try:
         for what, error in differences(
             device, f"{name}:8" if name == "trilinear" else name, dtype, 5 if several else 1
         ):
             if not error <= bound:
-                found = found or f"{what} differs from the reference by {error:.1e}, expected at most {bound:.0e}"
-    except Exception as problem:  # a missing package, no driver, no compiler, a kernel that fails: all mean the same
+                found = (
+                    found
+                    or f"{what} differs from the reference by {error:.1e}, expected at most "
+                    f"{bound:.0e}"
+                )
+    # a missing package, no driver, no compiler, a kernel that fails: all mean the same
+    except Exception as problem:
         found = f"{type(problem).__name__}: {problem}"
     if found:
         logger.warning("The reference computes %s of %s on %s: %s", name, dtype, device, found)
     return found
 
 
-def differences(device: str, method: str, dtype: torch.dtype, volumes: int) -> Iterator[tuple[str, float]]:
-    """What was tried on a tiny scene, and its greatest difference to the reference, by the reference's greatest value.
+def differences(
+    device: str, method: str, dtype: torch.dtype, volumes: int
+) -> Iterator[tuple[str, float]]:
+    """What was tried on a tiny scene, and its greatest difference to the reference, by the
+    reference's greatest value.
 
     Raises:
-        ImportError: numba is missing, or on a device numba-cuda: what numba itself brings cannot compile the kernels.
+        ImportError: numba is missing, or on a device numba-cuda: what numba itself brings cannot
+            compile the kernels.
     """
     from numba import cuda as numba_cuda
 
@@ -84,7 +104,9 @@ def differences(device: str, method: str, dtype: torch.dtype, volumes: int) -> I
 
 
 def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:
-    """Lines [3 4 3 3], window, detector and shape: three cone beams, each with another main axis, all slanted."""
+    """Lines [3 4 3 3], window, detector and shape: three cone beams, each with another main axis,
+    all slanted.
+    """
     maps = []
     for axis in range(3):
         source, look, u, v = (torch.zeros(3, dtype=torch.float64) for _ in range(4))
@@ -93,7 +115,9 @@ def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:
         u[axis - 1], v[axis - 2], u[axis - 2] = 1.13, 1.07, 0.11
         none, direction = torch.zeros_like(u), torch.stack([u, v, look], dim=-1)
         moment = torch.linalg.cross(source[:, None].expand(3, 3), direction, dim=0)
-        maps.append(torch.stack([direction, moment, torch.stack([none, none, source], dim=-1), direction]))
+        maps.append(
+            torch.stack([direction, moment, torch.stack([none, none, source], dim=-1), direction])
+        )
     return torch.stack(maps).to(device), [0.0, 1.0], [5, 6], [5, 4, 6]
 
 

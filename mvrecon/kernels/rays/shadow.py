@@ -1,4 +1,6 @@
-"""Which pixels of a view see a box: along every row, or column, of its detector the first of them and one behind."""
+"""Which pixels of a view see a box: along every row, or column, of its detector the first of them
+and one behind.
+"""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,7 +24,8 @@ def spans_of(
         lines: the views' rays.
         detector: pixels (rows, columns).
         tall: views whose units are columns; those of the others are rows.
-        boxes: first and last corner (x0, y0, z0, x1, y1, z1) in voxels from the volume's centre; None: all is seen.
+        boxes: first and last corner (x0, y0, z0, x1, y1, z1) in voxels from the volume's centre;
+            None: all is seen.
     """
     rows, columns = detector
     spans = np.zeros((len(lines), max(rows, columns), 2), np.int32)
@@ -52,7 +55,12 @@ def cover(frames, detector, tall, boxes, spans):
                 i, j, k = corner & 1, corner >> 1 & 1, corner >> 2
                 x, y, z = boxes[n, 3 * i], boxes[n, 1 + 3 * j], boxes[n, 2 + 3 * k]
                 w = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3]
-                reach = abs(frame[2, 0] * x) + abs(frame[2, 1] * y) + abs(frame[2, 2] * z) + abs(frame[2, 3])
+                reach = (
+                    abs(frame[2, 0] * x)
+                    + abs(frame[2, 1] * y)
+                    + abs(frame[2, 2] * z)
+                    + abs(frame[2, 3])
+                )
                 if abs(w) > 1e-9 * reach:
                     side += 1 if w > 0 else -1
                     u = (frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3]) / w
@@ -67,10 +75,16 @@ def cover(frames, detector, tall, boxes, spans):
                 continue
             if tall[m]:
                 for u in range(first_u, last_u):
-                    spans[m, u, 0], spans[m, u, 1] = min(spans[m, u, 0], first_v), max(spans[m, u, 1], last_v)
+                    spans[m, u, 0], spans[m, u, 1] = (
+                        min(spans[m, u, 0], first_v),
+                        max(spans[m, u, 1], last_v),
+                    )
             else:
                 for v in range(first_v, last_v):
-                    spans[m, v, 0], spans[m, v, 1] = min(spans[m, v, 0], first_u), max(spans[m, v, 1], last_u)
+                    spans[m, v, 0], spans[m, v, 1] = (
+                        min(spans[m, v, 0], first_u),
+                        max(spans[m, v, 1], last_u),
+                    )
 
 
 @compiled

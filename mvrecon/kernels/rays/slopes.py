@@ -1,7 +1,9 @@
-"""How the integral along one ray changes with its place, for kernels that keep nothing from step to step.
+"""How the integral along one ray changes with its place, for kernels that keep nothing from step to
+step.
 
-Each function returns the sum in voxels of the main axis; its derivatives by b, slope_b, c, slope_c; and the volume
-where the ray begins and ends inside the box. `loops.pull_back` makes derivatives by the geometry of them.
+Each function returns the sum in voxels of the main axis; its derivatives by b, slope_b, c, slope_c;
+and the volume where the ray begins and ends inside the box. `loops.pull_back` makes derivatives by
+the geometry of them.
 """
 
 from collections import namedtuple
@@ -39,10 +41,15 @@ def joseph(held, n, ray, steps):
 
 @scalar
 def siddon(held, n, ray, steps):
-    """How a ray's sum by Siddon's method changes with its place: at each plane by the difference of the two cells."""
+    """How a ray's sum by Siddon's method changes with its place: at each plane by the difference of
+    the two cells.
+    """
     flat, offset = held.values, np.int64(n * held.size)
     total = by_b = by_slope_b = by_c = by_slope_c = at_begin = at_end = 0.0
-    per_b, per_c = 1 / ray.slope_b if ray.slope_b != 0 else 0.0, 1 / ray.slope_c if ray.slope_c != 0 else 0.0
+    per_b, per_c = (
+        1 / ray.slope_b if ray.slope_b != 0 else 0.0,
+        1 / ray.slope_c if ray.slope_c != 0 else 0.0,
+    )
     for k in range(ray.first, ray.last):
         s0, length, to_b, to_c, cells = corners.crossings(ray, k, np.float64)
         index = corners.three(steps, k, (to_b < to_c, cells), np.int64)

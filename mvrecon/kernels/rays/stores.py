@@ -1,7 +1,9 @@
-"""Copies of volumes as the loops over rays want them: one axis contiguous, neighbours along it readable as a pair.
+"""Copies of volumes as the loops over rays want them: one axis contiguous, neighbours along it
+readable as a pair.
 
-Around each volume lies nothing, one voxel in front and two behind, so that no loop tests a bound: a ray is clipped to
-where its cell touches the volume, and the rounding of single precision may carry it half a cell further.
+Around each volume lies nothing, one voxel in front and two behind, so that no loop tests a bound: a
+ray is clipped to where its cell touches the volume, and the rounding of single precision may carry
+it half a cell further.
 """
 
 import math
@@ -13,18 +15,22 @@ import numpy as np
 from mvrecon.kernels.compiling import compiled
 from mvrecon.kernels.padding import PAD, padded_shape
 
-#: values [g p l] in one row, of g groups of l volumes; pairs, each value and the next as one complex number on the same
-#: memory; p, the voxels of a volume; strides in voxels of the axes (x, y, z); the contiguous axis; l.
+#: values [g p l] in one row, of g groups of l volumes; pairs, each value and the next as one
+#: complex number on the same memory; p, the voxels of a volume; strides in voxels of the axes (x,
+#: y, z); the contiguous axis; l.
 Store = namedtuple("Store", ["values", "pairs", "size", "strides", "near", "lanes"])
 COMPLEX = {np.dtype(np.float32): np.complex64, np.dtype(np.float64): np.complex128}
 #: Edge in voxels of the tiles in which a volume is turned.
 TILE = 16
 
 
-def empty(count: int, sizes: Sequence[int], plan: tuple[int, int], dtype: np.dtype, memory=None) -> np.ndarray:
+def empty(
+    count: int, sizes: Sequence[int], plan: tuple[int, int], dtype: np.dtype, memory=None
+) -> np.ndarray:
     """Nothing, padded, for volumes of `sizes` (x, y, z); plan = (near axis, lanes).
 
-    It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of an array that has served, if any.
+    It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of an array that has
+    served, if any.
     """
     near, lanes = plan
     x, y, z = padded_shape(sizes)
@@ -45,10 +51,14 @@ def part_of(padded: np.ndarray, near: int, where: tuple[slice, slice, slice]) ->
 def store(volumes: np.ndarray, near: int) -> Store:
     """Padded volumes as a store."""
     values, size, lanes = volumes.reshape(-1), volumes[:1, ..., 0].size, volumes.shape[4]
-    pairs = np.ndarray((max(0, values.size - 1),), COMPLEX[values.dtype], values, strides=values.strides)
+    pairs = np.ndarray(
+        (max(0, values.size - 1),), COMPLEX[values.dtype], values, strides=values.strides
+    )
     beside, across = volumes.shape[3], volumes.shape[3] * volumes.shape[2]
     steps = (1, beside, across) if near == 0 else (beside, across, 1)
-    return Store(values, pairs, size, np.array(steps, np.int64 if size >= 2**31 else np.int32), near, lanes)
+    return Store(
+        values, pairs, size, np.array(steps, np.int64 if size >= 2**31 else np.int32), near, lanes
+    )
 
 
 @compiled

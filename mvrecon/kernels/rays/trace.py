@@ -1,8 +1,9 @@
 """Where one ray runs through the volume, for every compiled kernel.
 
-A ray is first clipped to the slabs in which it can touch the volume, so that no later loop tests a bound. Slabs are
-counted along its main axis; of the two other axes the `near` one is contiguous in memory, the `far` one is not.
-Everything is scalar and knows no CPU, so that a GPU back end can compile the same source.
+A ray is first clipped to the slabs in which it can touch the volume, so that no later loop tests a
+bound. Slabs are counted along its main axis; of the two other axes the `near` one is contiguous in
+memory, the `far` one is not. Everything is scalar and knows no CPU, so that a GPU back end can
+compile the same source.
 """
 
 from collections import namedtuple
@@ -14,30 +15,36 @@ from mvrecon.kernels.rays.lines import TIE
 JOSEPH, SIDDON, TRILINEAR = 0, 1, 2
 METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
 
-#: One ray: main, far and near axis; padded coordinates along far (b) and near (c) at the centre slab, and their slopes;
-#: mm per slab; where it begins and ends (slab coordinate about the centre); what bounds the beginning and the end, see
-#: below; where it enters and leaves the box; its first slab there, one behind the last; the centre's slab coordinate.
+#: One ray: main, far and near axis; padded coordinates along far (b) and near (c) at the centre
+#: slab, and their slopes; mm per slab; where it begins and ends (slab coordinate about the centre);
+#: what bounds the beginning and the end, see below; where it enters and leaves the box; its first
+#: slab there, one behind the last; the centre's slab coordinate.
 Ray = namedtuple(
     "Ray",
     ["axis", "far", "near", "b", "slope_b", "c", "slope_c", "length"]
     + ["begin", "end", "from_", "to", "enter", "leave", "first", "last", "centre"],
 )
-#: What a ray is traced through: the part of it that counts (w0, w1), voxels along (x, y, z), and the box outside of
-#: which all is zero, (x0, y0, z0, x1, y1, z1).
+#: What a ray is traced through: the part of it that counts (w0, w1), voxels along (x, y, z), and
+#: the box outside of which all is zero, (x0, y0, z0, x1, y1, z1).
 Space = namedtuple("Space", ["window", "sizes", "box"])
-#: What bounds a ray: a face across its main axis, its own end, or a face across its far or near axis.
+#: What bounds a ray: a face across its main axis, its own end, or a face across its far or near
+#: axis.
 FACE, OWN, FAR, NEAR = 0, 1, 2, 3
 
 
 def numbered(method: str) -> tuple[int, int]:
-    """The number of a method, and its samples a ray: "trilinear" has them behind its name, ":samples"."""
+    """The number of a method, and its samples a ray: "trilinear" has them behind its name,
+    ":samples".
+    """
     name, _, samples = method.partition(":")
     return METHODS[name], int(samples or 0)
 
 
 @scalar
 def at(line, kind, axis, u, v):
-    """Component `axis` of one of a view's four linear maps, at the pixel (u, v) counted from the detector's centre."""
+    """Component `axis` of one of a view's four linear maps, at the pixel (u, v) counted from the
+    detector's centre.
+    """
     if line.shape[2] == 1:  # an explicit ray is the same for every pixel
         return line[kind, axis, 0]
     return line[kind, axis, 0] * u + line[kind, axis, 1] * v + line[kind, axis, 2]
@@ -54,7 +61,9 @@ def main_axis(line, u, v):
 
 @scalar
 def crossing(line, axis, other, u, v):
-    """Where the ray crosses the centre slab: its coordinate along the other axis, in voxels from the centre."""
+    """Where the ray crosses the centre slab: its coordinate along the other axis, in voxels from
+    the centre.
+    """
     moment = at(line, 1, 3 - axis - other, u, v)
     # divided, not multiplied by 1 / D: a ray on a face must stay on it to the last bit
     return (moment if (other + 1) % 3 == axis else -moment) / at(line, 0, axis, u, v)
@@ -78,20 +87,26 @@ def transverse(value, slope, low, high, lower, upper):
 
 @scalar
 def faces(space, axis, reach):
-    """Where the box begins and ends along an axis, from the volume's centre, with the reach of a voxel's values."""
+    """Where the box begins and ends along an axis, from the volume's centre, with the reach of a
+    voxel's values.
+    """
     half = space.sizes[axis] / 2.0
     return space.box[axis] - half - reach, space.box[3 + axis] - half + reach
 
 
 @scalar
 def reach_of(method):
-    """How far beyond its own cell a voxel's value is felt: hat functions reach one voxel from the centre."""
+    """How far beyond its own cell a voxel's value is felt: hat functions reach one voxel from the
+    centre.
+    """
     return 0.0 if method == SIDDON else 0.5
 
 
 @scalar
 def shortened(across, begin, end, from_, to):
-    """The part of a ray between the faces across its far and near axis, and what bounds it; across as `transverse`."""
+    """The part of a ray between the faces across its far and near axis, and what bounds it; across
+    as `transverse`.
+    """
     (value_b, slope_b, half_b), (value_c, slope_c, half_c) = across
     far_lower, far_upper = transverse(value_b, slope_b, -half_b, half_b, begin, end)
     lower, upper = transverse(value_c, slope_c, -half_c, half_c, far_lower, far_upper)
@@ -102,7 +117,9 @@ def shortened(across, begin, end, from_, to):
 
 @scalar
 def overlapped(method, first, last, begin, end):
-    """Slabs without those behind the ray's ends: a ray may end on a face, or so near that a rounded sum is beyond."""
+    """Slabs without those behind the ray's ends: a ray may end on a face, or so near that a rounded
+    sum is beyond.
+    """
     if method == TRILINEAR:  # its samples belong to no slab alone
         return first, last
     return first + int(first + 0.5 <= begin), last - int(last - 1.5 >= end)
@@ -112,7 +129,8 @@ def overlapped(method, first, last, begin, end):
 def trace(line, axis, near, pixel, space, method):
     """Where the ray of a pixel runs; `first >= last` says that it misses. All in float64.
 
-    The box changes nothing but which slabs are met, so that leaving out what is zero changes no bit of a sum.
+    The box changes nothing but which slabs are met, so that leaving out what is zero changes no bit
+    of a sum.
 
     Args:
         line: the view's maps [4 3 3], see `lines.py`.
@@ -133,11 +151,16 @@ def trace(line, axis, near, pixel, space, method):
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
     from_, to = OWN if begin > -half else FACE, OWN if end < half else FACE
     if method == TRILINEAR:  # its samples are spaced along its way through the whole volume
-        across = (value_b, slope_b, space.sizes[far] / 2 + reach), (value_c, slope_c, space.sizes[near] / 2 + reach)
+        across = (
+            (value_b, slope_b, space.sizes[far] / 2 + reach),
+            (value_c, slope_c, space.sizes[near] / 2 + reach),
+        )
         begin, end, from_, to = shortened(across, begin, end, from_, to)
     # a slab counts where it overlaps the ray
     slack, margin = (0.5, 0.0) if method == JOSEPH else (0.0, 0.5 if method == SIDDON else 1.0)
-    enter, leave = transverse(value_b, slope_b, *faces(space, far, reach), begin - slack, end + slack)
+    enter, leave = transverse(
+        value_b, slope_b, *faces(space, far, reach), begin - slack, end + slack
+    )
     enter, leave = transverse(value_c, slope_c, *faces(space, near, reach), enter, leave)
     centre, first, last = (space.sizes[axis] - 1) / 2.0, 0, 0
     if begin < end and enter <= leave:

@@ -1,4 +1,5 @@
-"""Where the rays of an upright detector column run: one way through the rows of voxels, and a height for each of them.
+"""Where the rays of an upright detector column run: one way through the rows of voxels, and a
+height for each of them.
 
 See `columns.py`, which reads and writes the rows.
 """
@@ -17,23 +18,32 @@ ENDLESS = 1 << 40
 
 @scalar
 def upright(rig, line, axis, u):
-    """A column's ray in the level plane, and its height there: z = (A0 + v A1) + s (B0 + v B1) of detector row v."""
+    """A column's ray in the level plane, and its height there: z = (A0 + v A1) + s (B0 + v B1) of
+    detector row v.
+    """
     here, box = pixel(rig, u, 0), rig.box
-    tall = Space(rig.window, (rig.sizes[0], rig.sizes[1], ENDLESS), (box[0], box[1], 0, box[3], box[4], ENDLESS))
+    tall = Space(
+        rig.window,
+        (rig.sizes[0], rig.sizes[1], ENDLESS),
+        (box[0], box[1], 0, box[3], box[4], ENDLESS),
+    )
     ray = trace(line, axis, 2, here, tall, rig.method)
     D = at(line, 0, axis, here[0], here[1])
     zero = crossing(line, axis, 2, here[0], here[1])
     more = crossing(line, axis, 2, here[0], here[1] + 1) - zero
     climb = at(line, 0, 2, here[0], here[1]) / D
     steeper = line[0, 2, 1] / D
-    # from the padding in front of the first voxel on, centres (joseph) or faces (siddon) at whole numbers
+    # from the padding in front of the first voxel on, centres (joseph) or faces (siddon) at whole
+    # numbers
     first = (rig.sizes[2] - 1) / 2.0 + (1.0 if rig.method == JOSEPH else 1.5)
     return ray, (zero + first, more, climb, steeper)
 
 
 @scalar
 def _held(rig, axis, k, y):
-    """From where to where, along z, anything may be in slab k of row y of voxels and the next one."""
+    """From where to where, along z, anything may be in slab k of row y of voxels and the next
+    one.
+    """
     if not rig.heights.size:
         return rig.box[2], rig.box[5]
     i, j = k // EDGE, min(max(y, 0), rig.sizes[1 - axis] - 1) // EDGE
@@ -59,7 +69,9 @@ def within_held(rig, room, i, span):
 
 @scalar
 def pieces(rig, ray, span, steps, room):
-    """Per blend of rows: flat index of the lower row, weights of it and of the next, where it begins and ends; held."""
+    """Per blend of rows: flat index of the lower row, weights of it and of the next, where it
+    begins and ends; held.
+    """
     count = 0
     for k in range(span[0], span[1]):
         s = k - ray.centre
@@ -69,7 +81,13 @@ def pieces(rig, ray, span, steps, room):
             held = _held(rig, ray.axis, k, int(y) - 1)
             if held[0] < held[1]:
                 row = (k + 1) * steps.along + int(y) * steps.far + 1 - steps.origin
-                _put(rig, room, count, (row, (s1 - s0) * (1 - y + int(y)), (s1 - s0) * (y - int(y)), s, s), held)
+                _put(
+                    rig,
+                    room,
+                    count,
+                    (row, (s1 - s0) * (1 - y + int(y)), (s1 - s0) * (y - int(y)), s, s),
+                    held,
+                )
                 count += 1
             continue
         y0, y1 = int(ray.b + 0.5 + s0 * ray.slope_b), int(ray.b + 0.5 + s1 * ray.slope_b)
@@ -85,7 +103,9 @@ def pieces(rig, ray, span, steps, room):
 
 @scalar
 def places(rig, height, begin, end, rays, room):
-    """Where rays = (first, one behind the last) stand in a padded row: the lower neighbour, the upper one's share."""
+    """Where rays = (first, one behind the last) stand in a padded row: the lower neighbour, the
+    upper one's share.
+    """
     places, shares = room.places, room.shares
     real = shares.dtype.type
     z0, z1 = real(height[0] + begin * height[2]), real(height[0] + end * height[2])
@@ -109,7 +129,9 @@ def places(rig, height, begin, end, rays, room):
 
 @scalar
 def extent(height, s, rays, held):
-    """The voxels along z, first and one behind the last, between which rays of a column lie in one place, if held."""
+    """The voxels along z, first and one behind the last, between which rays of a column lie in one
+    place, if held.
+    """
     bottom = height[0] + s * height[2] + rays[0] * (height[1] + s * height[3])
     top = bottom + (rays[1] - 1 - rays[0]) * (height[1] + s * height[3])
     # two more on each side: the pair of neighbours, and the rounding of single precision
@@ -118,13 +140,17 @@ def extent(height, s, rays, held):
 
 
 def columnar(rig) -> np.ndarray:
-    """Which views [m] of a `Rig` stand upright over the volume, and gain by it; never those of explicit rays."""
+    """Which views [m] of a `Rig` stand upright over the volume, and gain by it; never those of
+    explicit rays.
+    """
     rows, columns = rig.detector
     if rig.lines.shape[3] != 3 or rows < 8 or rig.sizes[2] < 8 or 2 * rows < rig.sizes[2]:
         return np.zeros(len(rig.lines), bool)
     direction, moment, start = rig.lines[:, DIRECTION], rig.lines[:, MOMENT], rig.lines[:, START]
     u, v = np.arange(columns) - (columns - 1) / 2, np.array([-0.5, 0.5]) * (rows - 1)
-    level = np.abs(direction[:, :2, 0, None] * u + direction[:, :2, 2, None]).max(axis=1).min(axis=1)
+    level = (
+        np.abs(direction[:, :2, 0, None] * u + direction[:, :2, 2, None]).max(axis=1).min(axis=1)
+    )
     climb = direction[:, 2, 0, None, None] * u + direction[:, 2, 1, None, None] * v[:, None]
     climb = np.abs(climb + direction[:, 2, 2, None, None]).max(axis=(1, 2))
     tilt = np.concatenate([direction[:, :2, 1], start[:, :2, 1], moment[:, 2:, 1]], axis=1)

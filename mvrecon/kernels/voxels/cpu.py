@@ -1,6 +1,8 @@
-"""Voxel-driven back-projection on the CPU, and its transpose: the same to the last bit for any number of threads.
+"""Voxel-driven back-projection on the CPU, and its transpose: the same to the last bit for any
+number of threads.
 
-A thread owns slabs of the volume, in the transpose rows of views, and meets what adds to them in one order.
+A thread owns slabs of the volume, in the transpose rows of views, and meets what adds to them in
+one order.
 """
 
 from collections.abc import Sequence
@@ -18,7 +20,9 @@ from mvrecon.kernels.voxels.loops import Sight, look_up, show_rows
 def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weighted: bool) -> Sight:
     numbers = np.ascontiguousarray(maps.numpy(), dtype=np.float64)
     ends = (float(window[0]), float(window[1]))
-    return Sight(numbers, (int(detector[1]), int(detector[0])), steps(detector), ends, bool(weighted))
+    return Sight(
+        numbers, (int(detector[1]), int(detector[0])), steps(detector), ends, bool(weighted)
+    )
 
 
 def look(
@@ -56,7 +60,15 @@ def show(
         for m in range(first // rows, (last - 1) // rows + 1):
             low, high = max(0, first - m * rows), min(rows, last - m * rows)
             own = (len(given), (high - low + 2) * int(sight.steps[1]))
-            show_rows(given, sight, room(given.shape[3], sight.steps, given.dtype, own), views.numpy(), m, low, high)
+            show_rows(
+                given,
+                sight,
+                room(given.shape[3], sight.steps, given.dtype, own),
+                views.numpy(),
+                m,
+                low,
+                high,
+            )
 
     share(work, len(maps) * rows, given.size * len(maps))
     return views

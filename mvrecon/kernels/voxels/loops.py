@@ -1,6 +1,8 @@
-"""The compiled loops of voxel-driven back-projection: every voxel looks up its image in every view; and the transpose.
+"""The compiled loops of voxel-driven back-projection: every voxel looks up its image in every view;
+and the transpose.
 
-Rows of voxels are cut to the part whose images touch the detector, see `rows.py`; no later loop tests a bound.
+Rows of voxels are cut to the part whose images touch the detector, see `rows.py`; no later loop
+tests a bound.
 """
 
 from collections import namedtuple
@@ -11,7 +13,8 @@ from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.faces import bilinear, face, lay
 from mvrecon.kernels.rows import affine, between, cell, over, positive, whole
 
-#: maps [m 4 2 3], detector (u, v) and flat steps (u, v) of a padded view, window, whether the distance weighs.
+#: maps [m 4 2 3], detector (u, v) and flat steps (u, v) of a padded view, window, whether the
+#: distance weighs.
 Sight = namedtuple("Sight", ["maps", "detector", "steps", "window", "weighted"])
 #: The affine functions along a row of voxels: numerators u and v, denominator, fraction of the ray.
 Row = namedtuple("Row", ["u", "v", "under", "fraction", "half", "count"])
@@ -42,16 +45,22 @@ def _seen(row, sight):
 
 @scalar
 def _near_rows(row, sight, low, high, part):
-    """The voxels that can touch the detector rows [low, high), with half a pixel to spare for rounding."""
+    """The voxels that can touch the detector rows [low, high), with half a pixel to spare for
+    rounding.
+    """
     centre = (sight.detector[1] - 1) / 2
-    interval = between(row.v, row.under, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half))
+    interval = between(
+        row.v, row.under, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half)
+    )
     first, last = whole(interval, row.half, row.count)
     return max(part[0], first), min(part[1], last)
 
 
 @scalar
 def _cells(row, part, sight, at, weight):
-    """Per voxel: flat index of its bilinear cell, the weights towards u and v, and that of the distance."""
+    """Per voxel: flat index of its bilinear cell, the weights towards u and v, and that of the
+    distance.
+    """
     real, number = weight.dtype.type, at.dtype.type
     u, v = (sight.detector[0] + 1) / 2, (sight.detector[1] + 1) / 2
     start = part[0] - row.half
@@ -78,13 +87,17 @@ def _show(flat, across, count, at, weight, line):
     seen, end = face(flat, across), np.uint64(len(flat) - across)
     for n in range(np.uint32(count)):
         k = np.uint64(at[n])
-        if k < end:  # voxels reach beyond these detector rows, and no unsigned index lies before them
+        if (
+            k < end
+        ):  # voxels reach beyond these detector rows, and no unsigned index lies before them
             lay(seen, k, weight[0, n], weight[1, n], weight[2, n] * line[n])
 
 
 @compiled
 def look_up(flat, sight, room, volumes, first, last):
-    """Add to the slabs first to last of the volumes [n d h w] what their voxels see in the views [n m p]."""
+    """Add to the slabs first to last of the volumes [n d h w] what their voxels see in the views [n
+    m p].
+    """
     depth, height, width = volumes.shape[1:]
     at, weight = room.at, room.weight
     for z in range(first, last):
@@ -97,7 +110,9 @@ def look_up(flat, sight, room, volumes, first, last):
                     continue
                 _cells(row, part, sight, at, weight)
                 for n in range(len(volumes)):
-                    _look(flat[n, m], sight.steps[1], count, at, weight, volumes[n, z, y, part[0] :])
+                    _look(
+                        flat[n, m], sight.steps[1], count, at, weight, volumes[n, z, y, part[0] :]
+                    )
 
 
 @compiled

@@ -21,8 +21,9 @@ def look(
 
     Args:
         views: values on the detectors, zero beyond them, fading over one pixel.
-        maps: numerators of u and v about the detector's centre, their denominator, positive on the side of the source
-            that counts, and the fraction of the ray; each a map of centred voxel indices, see `geometry.lattice`.
+        maps: numerators of u and v about the detector's centre, their denominator, positive on the
+            side of the source that counts, and the fraction of the ray; each a map of centred voxel
+            indices, see `geometry.lattice`.
         window: the fractions of a ray between which it counts.
         weighted: whether values are divided by the denominator's square.
         shape: voxels (d, h, w).

@@ -1,7 +1,8 @@
-"""The compiled warps of the CPU. Every result is the same to the last bit for any number of threads.
+"""The compiled warps of the CPU. Every result is the same to the last bit for any number of
+threads.
 
-Each output row belongs to one thread; in the transpose so does each slab of a source volume, and it meets the rows in
-one order.
+Each output row belongs to one thread; in the transpose so does each slab of a source volume, and it
+meets the rows in one order.
 """
 
 from collections.abc import Sequence
@@ -60,7 +61,9 @@ def warp_back(
 
 
 def warp_vjp(
-    volumes: Float[Tensor, "n s c d h w"], values: Float[Tensor, "n s k c d h w"], maps: Float[Tensor, "s k 5 2 3"]
+    volumes: Float[Tensor, "n s c d h w"],
+    values: Float[Tensor, "n s k c d h w"],
+    maps: Float[Tensor, "s k 5 2 3"],
 ) -> Float[Tensor, "s k 5 2 3"]:
     """The derivative of <values, warp(volumes, maps)> by the maps, by hand; float64."""
     plan = _warp(maps, volumes.shape[3:], values.shape[4:])

@@ -1,4 +1,6 @@
-"""The compiled loops over the rows of warped volumes: forward, transpose, and how the result changes with the maps."""
+"""The compiled loops over the rows of warped volumes: forward, transpose, and how the result
+changes with the maps.
+"""
 
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.warps import trilinear
@@ -6,7 +8,9 @@ from mvrecon.kernels.warps import trilinear
 
 @compiled
 def warp_rows(flat, warp, room, out, first, last):
-    """Write the rows first to last, counted through (s, k, d, h), of the warped volumes [n s k c d h w]."""
+    """Write the rows first to last, counted through (s, k, d, h), of the warped volumes [n s k c d
+    h w].
+    """
     at, weight = room.at, room.weight
     depth, height, width = warp.shape
     kinds = warp.maps.shape[1]
@@ -37,7 +41,8 @@ def _hand_over(own, warp, volume, low, high):
 
 @compiled
 def spread_slabs(values, warp, room, volumes, s, low, high):
-    """Into the slabs [low, high) of volume s of [n s c d h w]: everything that values [n s k c d h w] put there.
+    """Into the slabs [low, high) of volume s of [n s c d h w]: everything that values [n s k c d h
+    w] put there.
 
     The room's own is [n c p], those slabs and one on either side.
     """
@@ -86,7 +91,9 @@ def _pull_back(row, part, place, slopes, change):
 
 @compiled
 def vary_planes(flat, warp, room, values, change, first, last):
-    """Into `change` [s k d 5 2 3]: per plane of the output, the derivative of sum(values * warped) by the maps."""
+    """Into `change` [s k d 5 2 3]: per plane of the output, the derivative of sum(values * warped)
+    by the maps.
+    """
     at, weight = room.at, room.weight
     depth, height, width = warp.shape
     kinds = warp.maps.shape[1]
@@ -101,6 +108,8 @@ def vary_planes(flat, warp, room, values, change, first, last):
             for n in range(flat.shape[0]):
                 for c in range(flat.shape[2]):
                     line = values[n, s, k, c, z, y]
-                    trilinear.slopes(flat[n, s, c], warp.steps, count, at, weight, line[part[0] :], room.own)
+                    trilinear.slopes(
+                        flat[n, s, c], warp.steps, count, at, weight, line[part[0] :], room.own
+                    )
             place = (y - (height - 1) / 2, z - (depth - 1) / 2)
             _pull_back(row, part, place, room.own, change[s, k, z])

@@ -1,6 +1,8 @@
-"""The compiled warps as torch operators: opaque to `torch.compile`, each one's derivative made of the others.
+"""The compiled warps as torch operators: opaque to `torch.compile`, each one's derivative made of
+the others.
 
-Second derivatives in the values are exact. A second derivative in the maps raises: the reference has it.
+Second derivatives in the values are exact. A second derivative in the maps raises: the reference
+has it.
 """
 
 from collections.abc import Sequence
@@ -15,7 +17,9 @@ from mvrecon.kernels.mapping import batched, looped
 
 @torch.library.custom_op("mvrecon::warp", mutates_args=(), device_types="cpu")
 def warp(volumes: Tensor, maps: Tensor, shape: Sequence[int]) -> Tensor:
-    """Volumes [n s c d h w] through maps [s k 5 2 3] as [n s k c d h w]; see `warp_reference.warp`."""
+    """Volumes [n s c d h w] through maps [s k 5 2 3] as [n s k c d h w]; see
+    `warp_reference.warp`.
+    """
     from mvrecon.kernels.warps import cpu
 
     return cpu.warp(volumes, maps, shape)

@@ -13,7 +13,9 @@ from mvrecon.geometry.sample import normalised, sample
 def normalised_places(
     maps: Float[Tensor, "*n 5 2 3"], source: Sequence[int], shape: Sequence[int]
 ) -> Float[Tensor, "*n d h w 3"]:
-    """The places of an output's samples in the source's box, which is [-1, 1]; those that do not count lie outside."""
+    """The places of an output's samples in the source's box, which is [-1, 1]; those that do not
+    count lie outside.
+    """
     place, counts = places(maps, (shape[0], shape[1], shape[2]))
     centre = place.new_tensor([(size - 1) / 2 for size in source[::-1]])
     points = normalised(place + centre, (source[0], source[1], source[2]))
@@ -23,7 +25,8 @@ def normalised_places(
 def warp(
     volumes: Float[Tensor, "n s c d h w"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int]
 ) -> Float[Tensor, "n s k c d h w"]:
-    """Each volume s as its k maps show it: trilinear, fading to zero over one voxel outside, zero behind a source.
+    """Each volume s as its k maps show it: trilinear, fading to zero over one voxel outside, zero
+    behind a source.
 
     Args:
         volumes: values on the source lattices.

@@ -1,7 +1,8 @@
 """Warping one row: trilinear values of a volume at the places that a bilinear map of indices gives.
 
-`cells` writes where the row goes (a loop without gathers, in float64); `fetch`, `spread` and `slopes` read it. The
-volume is padded and flat. See `geometry/lattice.py` for the maps, and `rows.py`.
+`cells` writes where the row goes (a loop without gathers, in float64); `fetch`, `spread` and
+`slopes` read it. The volume is padded and flat. See `geometry/lattice.py` for the maps, and
+`rows.py`.
 """
 
 from collections import namedtuple
@@ -12,7 +13,8 @@ from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.faces import bilinear, face, lay
 from mvrecon.kernels.rows import affine, between, cell, over, positive, whole
 
-#: maps [s k 5 2 3]; the source's sizes and, with its border, flat steps (x, y, z); shape (d, h, w) of the output.
+#: maps [s k 5 2 3]; the source's sizes and, with its border, flat steps (x, y, z); shape (d, h, w)
+#: of the output.
 Warp = namedtuple("Warp", ["maps", "sizes", "steps", "shape"])
 #: The affine functions along a row: numerators x, y, z, the denominator of x and y, and that of z.
 Row = namedtuple("Row", ["x", "y", "z", "across", "depth", "half", "count"])
@@ -23,7 +25,9 @@ def row_of(lines, shape, k, j):
     """The row (k, j) of the output."""
     z, y = k - (shape[0] - 1) / 2, j - (shape[1] - 1) / 2
     x_, y_, z_ = affine(lines[0], y, z), affine(lines[1], y, z), affine(lines[2], y, z)
-    return Row(x_, y_, z_, affine(lines[3], y, z), affine(lines[4], y, z), (shape[2] - 1) / 2, shape[2])
+    return Row(
+        x_, y_, z_, affine(lines[3], y, z), affine(lines[4], y, z), (shape[2] - 1) / 2, shape[2]
+    )
 
 
 @scalar
@@ -40,9 +44,13 @@ def inside(row, sizes):
 
 @scalar
 def near_slabs(row, sizes, low, high, part):
-    """The positions of a row that can touch the slabs [low, high), with half a voxel to spare for rounding."""
+    """The positions of a row that can touch the slabs [low, high), with half a voxel to spare for
+    rounding.
+    """
     centre = (sizes[2] - 1) / 2
-    interval = between(row.z, row.depth, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half))
+    interval = between(
+        row.z, row.depth, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half)
+    )
     first, last = whole(interval, row.half, row.count)
     return max(part[0], first), min(part[1], last)
 
@@ -61,7 +69,9 @@ def cells(row, part, sizes, steps, at, weight):
         pz = cell(row.z, over(row.depth, i), i, z, sizes[2])
         ix, iy, iz = np.int32(px), np.int32(py), np.int32(pz)
         weight[0, n], weight[1, n], weight[2, n] = real(px - ix), real(py - iy), real(pz - iz)
-        at[n] = number(number(ix) + number(number(number(iy) * steps[1]) + number(number(iz) * steps[2])))
+        at[n] = number(
+            number(ix) + number(number(number(iy) * steps[1]) + number(number(iz) * steps[2]))
+        )
 
 
 @scalar
@@ -82,7 +92,9 @@ def fetch(flat, steps, count, at, weight, out):
 
 @scalar
 def spread(flat, steps, count, at, weight, values):
-    """Add a row's values to a volume, or to some slabs of one, with the weights of `fetch`: its transpose."""
+    """Add a row's values to a volume, or to some slabs of one, with the weights of `fetch`: its
+    transpose.
+    """
     low, high = corners(flat, steps)
     end = np.uint64(len(flat) - steps[2])
     for n in range(np.uint32(count)):
@@ -95,7 +107,9 @@ def spread(flat, steps, count, at, weight, values):
 
 @scalar
 def slopes(flat, steps, count, at, weight, values, change):
-    """Add to `change` [3 n] how the sum of values * (the volume's values) changes with each place."""
+    """Add to `change` [3 n] how the sum of values * (the volume's values) changes with each
+    place.
+    """
     low, high = corners(flat, steps)
     for n in range(count):
         k, x, y, z, value = np.uint64(at[n]), weight[0, n], weight[1, n], weight[2, n], values[n]

@@ -1,4 +1,6 @@
-"""Volumes carried from one lattice to another: frustum to world, world to frustum, frustum to frustum."""
+"""Volumes carried from one lattice to another: frustum to world, world to frustum, frustum to
+frustum.
+"""
 
 from collections.abc import Sequence
 
@@ -12,24 +14,35 @@ from mvrecon.kernels.warps import reference as warp_reference
 
 
 def warp(
-    volumes: Float[Tensor, "b s c *v"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int], backend: str = "auto"
+    volumes: Float[Tensor, "b s c *v"],
+    maps: Float[Tensor, "s k 5 2 3"],
+    shape: Sequence[int],
+    backend: str = "auto",
 ) -> Float[Tensor, "b s k c d h w"]:
-    """Each volume s on the lattices of its k maps: trilinear, zero outside and behind a camera's source.
+    """Each volume s on the lattices of its k maps: trilinear, zero outside and behind a camera's
+    source.
 
-    Values fade to zero over one voxel outside the outermost centres. Order of accuracy: second in the voxel size.
-    Differentiable in the volumes, twice, and in the maps, once ("reference": to any order). Half and bfloat16 volumes
-    are computed in float32 and given back as they came; places are float64.
+    Values fade to zero over one voxel outside the outermost centres. Order of accuracy: second in
+    the voxel size. Differentiable in the volumes, twice, and in the maps, once ("reference": to any
+    order). Half and bfloat16 volumes are computed in float32 and given back as they came; places
+    are float64.
 
     Args:
         volumes: values on s lattices; batch and channels share the work of finding the places.
         maps: from `geometry.lattice.lattice_maps`, float64.
         shape: samples (d, h, w) of the output.
-        backend: "cpu" (compiled), "reference" (torch, any device), or "auto": compiled in main memory.
+        backend: "cpu" (compiled), "reference" (torch, any device), or "auto": compiled in main
+            memory.
 
     Raises:
         ValueError: sizes that do not agree, an unknown back end, or "cpu" for tensors elsewhere.
     """
-    if volumes.ndim != 6 or maps.ndim != 5 or maps.shape[2:] != (5, 2, 3) or len(maps) != volumes.shape[1]:
+    if (
+        volumes.ndim != 6
+        or maps.ndim != 5
+        or maps.shape[2:] != (5, 2, 3)
+        or len(maps) != volumes.shape[1]
+    ):
         raise ValueError(
             "Expected volumes [b s c d h w] and maps [s k 5 2 3] of the same s, "
             f"got {tuple(volumes.shape)} and {tuple(maps.shape)}"

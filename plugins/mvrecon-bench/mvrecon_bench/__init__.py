@@ -1,1 +1,3 @@
-"""What mvrecon's parts cost, how large their errors are, and what they bear: benchmarks and the stress plan."""
+"""What mvrecon's parts cost, how large their errors are, and what they bear: benchmarks and the
+stress plan.
+"""

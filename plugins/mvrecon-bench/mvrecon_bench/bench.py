@@ -11,10 +11,11 @@ from mvrecon.config.plugins import import_plugins
 
 
 def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Run the benchmark that `settings` describes, go on where it was left, and return all its rows.
+    """Run the benchmark that `settings` describes, go on where it was left, and return all its
+    rows.
 
-    The folder then holds `results.csv`, `table.md`, `targets.md`, a plot, `config.yaml`, `versions.txt`, and all of it
-    on TensorBoard.
+    The folder then holds `results.csv`, `table.md`, `targets.md`, a plot, `config.yaml`,
+    `versions.txt`, and all of it on TensorBoard.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -40,7 +41,10 @@ def task(config: DictConfig) -> None:
     rows = bench(to_plain(config), folder)
     skipped = sum(row["status"] != "ok" for row in rows)
     tell = Console(markup=False, highlight=False).print
-    tell(f"{len(rows)} rows, {skipped} of them skipped; table, plot and targets are in {folder}", soft_wrap=True)
+    tell(
+        f"{len(rows)} rows, {skipped} of them skipped; table, plot and targets are in {folder}",
+        soft_wrap=True,
+    )
 
 
 def main() -> None:

@@ -13,8 +13,8 @@ from mvrecon.config.plugins import import_plugins
 def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     """Do the plan that `settings` describes, go on where it was left, and return all its verdicts.
 
-    The folder then holds `results.csv`, `verdicts.json`, `table.md`, `config.yaml`, `versions.txt`, and all of it on
-    TensorBoard.
+    The folder then holds `results.csv`, `verdicts.json`, `table.md`, `config.yaml`, `versions.txt`,
+    and all of it on TensorBoard.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -51,11 +51,16 @@ def task(config: DictConfig) -> None:
     for row in rows:
         if row["verdict"] == FAIL:
             tell(
-                f"FAIL {row['number']:.0f} {row['case']}, {row['part']} {row['dtype']}: {row.get('measured')} > "
+                f"FAIL {row['number']:.0f} {row['case']}, {row['part']} {row['dtype']}: "
+                f"{row.get('measured')} > "
                 f"{row['tolerance']:g} {row.get('note', '')}",
                 soft_wrap=True,
             )
-    tell(f"{', '.join(f'{count} {verdict}' for verdict, count in found.items())}; all is in {folder}", soft_wrap=True)
+    tell(
+        f"{', '.join(f'{count} {verdict}' for verdict, count in found.items())}; all is in "
+        f"{folder}",
+        soft_wrap=True,
+    )
     if found[FAIL]:
         raise SystemExit(1)
 

@@ -1,1 +1,3 @@
-"""Other people's projectors as mvrecon projectors: RTK, nanodrr, DiffDRR, ASTRA, mbirtorch and scikit-image."""
+"""Other people's projectors as mvrecon projectors: RTK, nanodrr, DiffDRR, ASTRA, mbirtorch and
+scikit-image.
+"""

@@ -1,4 +1,6 @@
-"""ASTRA's 2-D projectors on the CPU, slice by slice (https://astra-toolbox.com; GPLv3, imported only for use)."""
+"""ASTRA's 2-D projectors on the CPU, slice by slice (https://astra-toolbox.com; GPLv3, imported
+only for use).
+"""
 
 import torch
 from jaxtyping import Float
@@ -13,7 +15,8 @@ METHODS = ("linear", "line", "strip")
 
 
 def vectors(rig: Cameras) -> Float[Tensor, "m 6"]:
-    """Each view in its plane: ray (or source, for a fan), detector's centre, step between columns; x and y of each.
+    """Each view in its plane: ray (or source, for a fan), detector's centre, step between columns;
+    x and y of each.
 
     y is turned round, since ASTRA's first row of pixels is the one of greatest y.
     """
@@ -24,17 +27,21 @@ def vectors(rig: Cameras) -> Float[Tensor, "m 6"]:
 
 
 class Astra(Paired):
-    """ASTRA's CPU projectors, matched pairs on one thread: a parallel beam slice by slice, a fan in one slice.
+    """ASTRA's CPU projectors, matched pairs on one thread: a parallel beam slice by slice, a fan in
+    one slice.
 
-    Detector rows must run in the middle planes of slices (or beside the grid); a fan's source lies in its slice.
+    Detector rows must run in the middle planes of slices (or beside the grid); a fan's source lies
+    in its slice.
 
     Args:
         grid: where the voxels lie.
         cameras: the rig.
-        method: "line" (Siddon), or for parallel beams "linear" (Joseph) or "strip" (the average over a column's width).
+        method: "line" (Siddon), or for parallel beams "linear" (Joseph) or "strip" (the average
+            over a column's width).
 
     Raises:
-        ValueError: an unknown method, a geometry that ASTRA does not take, or cameras that require a gradient.
+        ValueError: an unknown method, a geometry that ASTRA does not take, or cameras that require
+            a gradient.
         ImportError: ASTRA is not installed.
     """
 
@@ -47,15 +54,23 @@ class Astra(Paired):
         require_between(self.box, self.rig, "ASTRA")
         width, height = self.box.spacing[:2]
         if method != "line" and not self.rig.parallel:
-            raise ValueError(f"ASTRA's projector {method!r} takes parallel beams, got a fan; use 'line'")
+            raise ValueError(
+                f"ASTRA's projector {method!r} takes parallel beams, got a fan; use 'line'"
+            )
         if abs(width / height - 1) > 1e-4:
-            raise ValueError(f"ASTRA in 2-D takes square voxels, got {width:.6g} by {height:.6g} mm")
+            raise ValueError(
+                f"ASTRA in 2-D takes square voxels, got {width:.6g} by {height:.6g} mm"
+            )
         self.astra = load("astra", "astra-toolbox")
         _, rows, columns = grid.shape
         x, y = columns * width / 2, rows * height / 2
         self.plane = self.astra.create_vol_geom(rows, columns, -x, x, -y, y)
-        kind = ("parallel_vec", method) if self.rig.parallel else ("fanflat_vec", f"{method}_fanflat")
-        self.fan = self.astra.create_proj_geom(kind[0], self.rig.shape[1], vectors(self.rig).numpy())
+        kind = (
+            ("parallel_vec", method) if self.rig.parallel else ("fanflat_vec", f"{method}_fanflat")
+        )
+        self.fan = self.astra.create_proj_geom(
+            kind[0], self.rig.shape[1], vectors(self.rig).numpy()
+        )
         self.kind = kind[1]
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
@@ -83,7 +98,11 @@ class Astra(Paired):
         views = astra.data2d.link("-sino", self.fan, lines.numpy())
         projector = astra.create_projector(self.kind, self.fan, self.plane)
         result = {"FP": "VolumeDataId", "BP": "ReconstructionDataId"}[kind]
-        config = astra.astra_dict(kind) | {"ProjectorId": projector, "ProjectionDataId": views, result: volume}
+        config = astra.astra_dict(kind) | {
+            "ProjectorId": projector,
+            "ProjectionDataId": views,
+            result: volume,
+        }
         algorithm = astra.algorithm.create(config)
         astra.algorithm.run(algorithm)
         astra.algorithm.delete(algorithm)

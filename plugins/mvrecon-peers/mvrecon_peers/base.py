@@ -35,7 +35,9 @@ def load(module: str, package: str, attribute: str = "") -> Any:
             found = import_module(module)
             return getattr(found, attribute) if attribute else found
     except (ImportError, AttributeError) as error:
-        raise ImportError(f"This projector needs the package {package}: pip install {package} ({error})") from error
+        raise ImportError(
+            f"This projector needs the package {package}: pip install {package} ({error})"
+        ) from error
 
 
 @contextmanager
@@ -60,8 +62,9 @@ def choice(what: str, given: str, known: tuple[str, ...]) -> str:
 class Peer(nn.Module, Projector):
     """Another library's projector: [b c d h w] -> [b c m v u], in (unit of the volume) * mm.
 
-    `box` and `rig` are the grid and the cameras in the volume's own frame, where the library is given them. A subclass
-    gives `project` and `backproject`, which take one contiguous tensor in float32 or float64, without a graph.
+    `box` and `rig` are the grid and the cameras in the volume's own frame, where the library is
+    given them. A subclass gives `project` and `backproject`, which take one contiguous tensor in
+    float32 or float64, without a graph.
     """
 
     #: What the library computes in; halves become float32, anything else is refused.
@@ -87,7 +90,8 @@ class Peer(nn.Module, Projector):
 
         Raises:
             TypeError: no tensor.
-            ValueError: a wrong rank or size, or a dtype or a device that the library does not work in.
+            ValueError: a wrong rank or size, or a dtype or a device that the library does not work
+                in.
         """
         check(volume, "a volume [b c d h w]", self.domain_shape, getattr(volume, "device", CPU))
         return self._act(volume, "a volume", back=False)
@@ -111,7 +115,10 @@ class Peer(nn.Module, Projector):
         given = wide(given)
         if given.dtype not in self.precisions:
             names = " or ".join(str(dtype) for dtype in self.precisions)
-            raise ValueError(f"{type(self).__name__} computes in {names}, got {what} of {given.dtype}; convert it")
+            raise ValueError(
+                f"{type(self).__name__} computes in {names}, got {what} of {given.dtype}; convert "
+                f"it"
+            )
         primal, tangent = unpack_dual(given)
         if tangent is not None:
             return make_dual(self._act(primal, what, back), self._act(tangent, what, back))
@@ -130,7 +137,8 @@ class Peer(nn.Module, Projector):
 
 
 class Paired(Peer):
-    """A library with a forward and a back projection, outside autograd, in main memory: each is the other's gradient.
+    """A library with a forward and a back projection, outside autograd, in main memory: each is the
+    other's gradient.
 
     Raises:
         ValueError: cameras that require a gradient, which the library does not have.
@@ -139,17 +147,22 @@ class Paired(Peer):
     def __init__(self, grid: Grid, cameras: Cameras):
         if wants_gradient(cameras):
             who = type(self).__name__
-            raise ValueError(f"{who} has no gradient in the cameras, got cameras that require one; detach them")
+            raise ValueError(
+                f"{who} has no gradient in the cameras, got cameras that require one; detach them"
+            )
         super().__init__(grid, cameras)
 
     def _act(self, given: Tensor, what: str, back: bool) -> Tensor:
         if given.device.type != "cpu":
-            raise ValueError(f"{type(self).__name__} works in main memory, got a tensor on {given.device}")
+            raise ValueError(
+                f"{type(self).__name__} works in main memory, got a tensor on {given.device}"
+            )
         return super()._act(given, what, back)
 
 
 class Traced(Peer):
-    """A library in torch, which takes a ray as two points: its gradients, in the pose too, are autograd's.
+    """A library in torch, which takes a ray as two points: its gradients, in the pose too, are
+    autograd's.
 
     A subclass gives `render`. The adjoint is the matched one, by autograd.
     """
@@ -159,14 +172,18 @@ class Traced(Peer):
         self._held: tuple[Tensor, Tensor] | None = None
 
     def _linear(self, given: Tensor, back: bool) -> Tensor:
-        """An operator of torch's, but for gradients in the pose, of which only the library's own graph knows."""
+        """An operator of torch's, but for gradients in the pose, of which only the library's own
+        graph knows.
+        """
         if not wants_gradient(self.cameras):
             return super()._linear(given, back)
         act = self._transposed if back else self.project
         return torch.stack([act(one) for one in given])
 
     def _rays(self, like: Tensor) -> tuple[Float[Tensor, "m r 3"], Float[Tensor, "m r 3"]]:
-        """First and last points of all rays in mm in the volume's frame, as `like`; made once if they stay."""
+        """First and last points of all rays in mm in the volume's frame, as `like`; made once if
+        they stay.
+        """
         held = self._held  # another thread may replace it
         if held is None or held[0].dtype != like.dtype or held[0].device != like.device:
             _, rig = framed(self.grid, self.cameras)
@@ -181,7 +198,9 @@ class Traced(Peer):
         return torch.get_num_threads() if device.type == "cpu" else len(self.cameras)
 
     def _parts(self, volume: Tensor) -> Iterator[Tensor]:
-        for first, last in zip(*(p.split(self.at_once(volume.device)) for p in self._rays(volume)), strict=True):
+        for first, last in zip(
+            *(p.split(self.at_once(volume.device)) for p in self._rays(volume)), strict=True
+        ):
             yield self.render(volume, first, last).unflatten(1, self.cameras.shape)
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
@@ -189,7 +208,9 @@ class Traced(Peer):
         return torch.cat(list(self._parts(volume)))
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
-        """Their derivative by the volume; in a thread of its own, since autograd sleeps inside of an operator."""
+        """Their derivative by the volume; in a thread of its own, since autograd sleeps inside of
+        an operator.
+        """
         with ThreadPoolExecutor(1) as pool:
             return pool.submit(self._transposed, views).result()
 
@@ -202,7 +223,10 @@ class Traced(Peer):
         return torch.as_tensor(total)
 
     def render(
-        self, volume: Float[Tensor, "d h w"], first: Float[Tensor, "k r 3"], last: Float[Tensor, "k r 3"]
+        self,
+        volume: Float[Tensor, "d h w"],
+        first: Float[Tensor, "k r 3"],
+        last: Float[Tensor, "k r 3"],
     ) -> Float[Tensor, "k r"]:
         """The library's integrals along rays."""
         raise NotImplementedError

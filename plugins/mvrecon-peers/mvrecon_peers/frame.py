@@ -1,8 +1,9 @@
 """A rig in the frame that every library can take: the volume's own.
 
-Libraries differ in what they let a volume and a ray be. All of them take a volume whose axes are x, y, z and whose
-centre is the origin, and rays from one point to another. So a rig is first moved into that frame, in float64, where an
-oblique grid is no longer oblique and a far world origin is gone; then rays without an end are cut off beyond the box.
+Libraries differ in what they let a volume and a ray be. All of them take a volume whose axes are x,
+y, z and whose centre is the origin, and rays from one point to another. So a rig is first moved
+into that frame, in float64, where an oblique grid is no longer oblique and a far world origin is
+gone; then rays without an end are cut off beyond the box.
 """
 
 from dataclasses import replace
@@ -16,7 +17,8 @@ from mvrecon.geometry.grid import Grid
 
 
 def framed(grid: Grid, cameras: Cameras) -> tuple[Grid, Cameras]:
-    """The grid in its own frame, axis-aligned about the origin, and the rig there, its rays as segments.
+    """The grid in its own frame, axis-aligned about the origin, and the rig there, its rays as
+    segments.
 
     Differentiable in the cameras.
 
@@ -26,7 +28,8 @@ def framed(grid: Grid, cameras: Cameras) -> tuple[Grid, Cameras]:
     axes = grid.affine[:3, :3] / grid.affine[:3, :3].norm(dim=0)
     if not torch.allclose(axes.T @ axes, torch.eye(3, dtype=axes.dtype), atol=1e-6):
         raise ValueError(
-            f"Other libraries take voxels with right angles, got axes with cosines {(axes.T @ axes).tolist()}"
+            f"Other libraries take voxels with right angles, got axes with cosines "
+            f"{(axes.T @ axes).tolist()}"
         )
     box = Grid.centred(grid.shape, grid.spacing)
     return box, segments(box, cameras.moved(axes.T, -axes.T @ grid.centre))
@@ -35,8 +38,9 @@ def framed(grid: Grid, cameras: Cameras) -> tuple[Grid, Cameras]:
 def segments(box: Grid, cameras: Cameras) -> Cameras:
     """The same rays on a box, each from its first point to its last: a rig of extent "segment".
 
-    A ray that never ends is cut off beyond the box. A pinhole's detector behind it becomes one in front, the mirror
-    image at the pinhole, and every detector is set as far as its pixels are as wide as all others'.
+    A ray that never ends is cut off beyond the box. A pinhole's detector behind it becomes one in
+    front, the mirror image at the pinhole, and every detector is set as far as its pixels are as
+    wide as all others'.
 
     Raises:
         ValueError: central cameras of extent "line", whose rays begin at no source.
@@ -44,27 +48,41 @@ def segments(box: Grid, cameras: Cameras) -> Cameras:
     if cameras.extent == "segment":
         return cameras
     if cameras.extent == "line" and not cameras.parallel:
-        raise ValueError("Other libraries take rays that begin at their source, got central cameras of extent 'line'")
-    margin = 2 * torch.linalg.vector_norm(torch.tensor(box.spacing)).item()  # beyond what a kernel reaches
+        raise ValueError(
+            "Other libraries take rays that begin at their source, got central cameras of extent "
+            "'line'"
+        )
+    margin = (
+        2 * torch.linalg.vector_norm(torch.tensor(box.spacing)).item()
+    )  # beyond what a kernel reaches
     depth = cameras.depth_range(box).detach() + torch.tensor([-margin, margin]).to(cameras.source)
     w = depth / cameras.distance.detach()[:, None]
     low, high = w.clamp(*cameras.limits).unbind(dim=-1)
     axis = cameras.origin - cameras.source
     if cameras.parallel:
-        high = torch.maximum(high, low + 1e-6)  # a box on the side that does not count leaves a ray next to nothing
+        high = torch.maximum(
+            high, low + 1e-6
+        )  # a box on the side that does not count leaves a ray next to nothing
         source, origin = (cameras.source + end[:, None] * axis for end in (low, high))
         return replace(cameras, source=source, origin=origin, extent="segment")
     side = 1.0 if cameras.extent == "ahead" else -1.0
     pitch = cameras.u.detach().norm(dim=-1)
     reach = ((high if side > 0 else -low).clamp(min=1e-6) * pitch).max()
     k = (side * reach / pitch)[:, None]
-    return replace(cameras, origin=cameras.source + k * axis, u=k * cameras.u, v=k * cameras.v, extent="segment")
+    return replace(
+        cameras,
+        origin=cameras.source + k * axis,
+        u=k * cameras.u,
+        v=k * cameras.v,
+        extent="segment",
+    )
 
 
 def chords(
     box: Grid, first: Float[Tensor, "*n 3"], last: Float[Tensor, "*n 3"], grown: float = 0.0
 ) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
-    """Where whole lines enter and leave the box, grown by so many voxels: 0 at `first`, 1 at `last`.
+    """Where whole lines enter and leave the box, grown by so many voxels: 0 at `first`, 1 at
+    `last`.
 
     Of a line that misses, the first is not less than the second.
     """
@@ -77,16 +95,20 @@ def chords(
 def near(
     box: Grid, first: Float[Tensor, "*n 3"], last: Float[Tensor, "*n 3"]
 ) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n 3"]]:
-    """The same rays, cut off where they are more than a voxel away from the box: far ends would cost them their digits.
+    """The same rays, cut off where they are more than a voxel away from the box: far ends would
+    cost them their digits.
 
-    One that does not come as near is replaced by another that misses the box. Differentiable in both ends.
+    One that does not come as near is replaced by another that misses the box. Differentiable in
+    both ends.
     """
     enter, leave = (part[..., None] for part in chords(box, first.detach(), last.detach(), 1.5))
     start = torch.where(enter > 0, first + enter.clamp(0, 1) * (last - first), first)
     end = torch.where(leave < 1, first + leave.clamp(0, 1) * (last - first), last)
     met = (enter < leave) & (enter < 1) & (leave > 0)
     size = first.new_tensor(box.spacing) * (first.new_tensor(box.shape[::-1]) + 3)
-    return torch.where(met, start, size), torch.where(met, end, size * size.new_tensor([1.0, 1.15, 1.3]))
+    return torch.where(met, start, size), torch.where(
+        met, end, size * size.new_tensor([1.0, 1.15, 1.3])
+    )
 
 
 def wants_gradient(cameras: Cameras) -> bool:
@@ -104,25 +126,33 @@ def require_between(box: Grid, rig: Cameras, who: str) -> None:
     if (near < -1e-9).any() or (far > 1 + 1e-9).any():
         worst = f"{near.min().item():.3g} to {far.max().item():.3g}"
         raise ValueError(
-            f"{who} follows whole lines, so the box must lie between sources and detectors, got it {worst} of the way"
+            f"{who} follows whole lines, so the box must lie between sources and detectors, got "
+            f"it {worst} of the way"
         )
 
 
 def plane_of_rows(box: Grid, rig: Cameras, who: str) -> list[tuple[int, int]]:
-    """For a 2-D library: each detector row that sees the box, and the slice in whose middle plane its rays run.
+    """For a 2-D library: each detector row that sees the box, and the slice in whose middle plane
+    its rays run.
 
     Raises:
-        ValueError: rays that leave a slice's middle plane, or rows whose pixels do not lie one above the other.
+        ValueError: rays that leave a slice's middle plane, or rows whose pixels do not lie one
+            above the other.
     """
-    z = torch.stack([ends[..., 2] for ends in rig.rays()]).transpose(0, 2).flatten(1)  # [rows, everything else]
+    z = (
+        torch.stack([ends[..., 2] for ends in rig.rays()]).transpose(0, 2).flatten(1)
+    )  # [rows, everything else]
     index = z / box.spacing[2] + (box.shape[0] - 1) / 2
     slices = index.mean(dim=-1).round()
     off = (index - slices[:, None]).abs().max().item()
     if off > 1e-3:
         raise ValueError(
-            f"{who} takes rays that stay in the middle of a slice of voxels, got rays {off:.3g} slices off"
+            f"{who} takes rays that stay in the middle of a slice of voxels, got rays {off:.3g} "
+            f"slices off"
         )
     lean = rig.v[:, :2].norm(dim=-1).max().item() * (rig.shape[0] - 1)
     if lean > 1e-3 * min(box.spacing):
-        raise ValueError(f"{who} takes rows one above the other, got a detector that leans by {lean:.3g} mm")
+        raise ValueError(
+            f"{who} takes rows one above the other, got a detector that leans by {lean:.3g} mm"
+        )
     return [(row, int(s)) for row, s in enumerate(slices) if 0 <= s < box.shape[0]]

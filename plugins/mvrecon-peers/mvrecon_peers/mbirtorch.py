@@ -1,4 +1,6 @@
-"""mbirtorch: separable footprints, fan by fan, in torch, with Triton kernels on CUDA (C. Bouman and G. Buzzard)."""
+"""mbirtorch: separable footprints, fan by fan, in torch, with Triton kernels on CUDA (C. Bouman and
+G. Buzzard).
+"""
 
 from typing import Any, NamedTuple
 
@@ -13,10 +15,11 @@ from mvrecon_peers.frame import plane_of_rows, require_between
 
 
 class Scan(NamedTuple):
-    """A scan about the z axis as mbirtorch has it: it turns the object, its rows run up z, its channels against ours.
+    """A scan about the z axis as mbirtorch has it: it turns the object, its rows run up z, its
+    channels against ours.
 
-    `turned` says that rows and columns are those of the rig in reverse. Lengths in mm, angles in radians; `offset` is
-    that of channels and rows, `rise` the source's height in each view.
+    `turned` says that rows and columns are those of the rig in reverse. Lengths in mm, angles in
+    radians; `offset` is that of channels and rows, `rise` the source's height in each view.
     """
 
     angles: Float[Tensor, " m"]
@@ -29,7 +32,8 @@ class Scan(NamedTuple):
 
 
 def scan_of(rig: Cameras) -> Scan:
-    """A rig's scan about the z axis: taken from the first view, and right if it makes all the others.
+    """A rig's scan about the z axis: taken from the first view, and right if it makes all the
+    others.
 
     Raises:
         ValueError: a rig that is no such scan.
@@ -37,7 +41,9 @@ def scan_of(rig: Cameras) -> Scan:
     sign = 1.0 if rig.v[0, 2] > 0 else -1.0
     pitch = rig.u[0].norm().item(), rig.v[0].norm().item()
     normal = torch.nn.functional.normalize(torch.linalg.cross(rig.u[0], rig.v[0]), dim=-1)
-    middle = torch.zeros_like(normal) if rig.parallel else rig.source[0] + normal  # seen by the channels' zero
+    middle = (
+        torch.zeros_like(normal) if rig.parallel else rig.source[0] + normal
+    )  # seen by the channels' zero
     seen, zero = rig[0].project(middle)[0, :2].tolist(), [(n - 1) / 2 for n in rig.shape[::-1]]
     scan = Scan(
         angles=torch.atan2(-sign * rig.u[:, 1], sign * rig.u[:, 0]),
@@ -51,18 +57,31 @@ def scan_of(rig: Cameras) -> Scan:
     off = departure(rig, rig_of(scan, rig))
     if off > 1e-6 * scan.sdd:
         raise ValueError(
-            "mbirtorch takes a circle or a helix about the z axis through the volume's centre, with equal distances, "
-            f"pixels and offsets, its detectors upright and square to it; got a rig {off:.3g} mm off"
+            "mbirtorch takes a circle or a helix about the z axis through the volume's centre, "
+            "with equal distances, "
+            f"pixels and offsets, its detectors upright and square to it; got a rig {off:.3g} mm "
+            f"off"
         )
     return scan
 
 
 def departure(rig: Cameras, other: Cameras) -> float:
-    """By how many mm two rigs differ; of parallel beams, where their rays start and end is no matter."""
-    pairs = [(getattr(rig, name), getattr(other, name)) for name in (("u", "v") if rig.parallel else VECTORS)]
+    """By how many mm two rigs differ; of parallel beams, where their rays start and end is no
+    matter.
+    """
+    pairs = [
+        (getattr(rig, name), getattr(other, name))
+        for name in (("u", "v") if rig.parallel else VECTORS)
+    ]
     if rig.parallel:
-        looks = [torch.nn.functional.normalize(each.origin - each.source, dim=-1) for each in (rig, other)]
-        middle, pitch = torch.zeros(3, dtype=torch.float64), torch.stack([rig.u[0].norm(), rig.v[0].norm()])
+        looks = [
+            torch.nn.functional.normalize(each.origin - each.source, dim=-1)
+            for each in (rig, other)
+        ]
+        middle, pitch = (
+            torch.zeros(3, dtype=torch.float64),
+            torch.stack([rig.u[0].norm(), rig.v[0].norm()]),
+        )
         seen = [each.project(middle)[:, :2] * pitch for each in (rig, other)]
         pairs += [(looks[0] * rig.distance[0], looks[1] * rig.distance[0]), (seen[0], seen[1])]
     return max((a - b).abs().max().item() for a, b in pairs)
@@ -72,11 +91,17 @@ def rig_of(scan: Scan, like: Cameras) -> Cameras:
     """The rig that a scan stands for, with the detector of another."""
     sign = -1.0 if scan.turned else 1.0
     sine, cosine, none = scan.angles.sin(), scan.angles.cos(), torch.zeros_like(scan.angles)
-    outwards, across = torch.stack([sine, cosine, none], dim=-1), torch.stack([cosine, -sine, none], dim=-1)
+    outwards, across = (
+        torch.stack([sine, cosine, none], dim=-1),
+        torch.stack([cosine, -sine, none], dim=-1),
+    )
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(across)
     u, v = sign * scan.pitch[0] * across, sign * scan.pitch[1] * up
     (rows, columns), axis = like.shape, scan.rise[:, None] * up
-    u0, v0 = (sign * o / p + (n - 1) / 2 for o, p, n in zip(scan.offset, scan.pitch, (columns, rows), strict=True))
+    u0, v0 = (
+        sign * o / p + (n - 1) / 2
+        for o, p, n in zip(scan.offset, scan.pitch, (columns, rows), strict=True)
+    )
     corner = axis - u0 * u - v0 * v
     source = scan.sid * outwards + (corner if like.parallel else axis)
     origin = (scan.sid - scan.sdd) * outwards + corner
@@ -86,17 +111,18 @@ def rig_of(scan: Scan, like: Cameras) -> Cameras:
 class Mbirtorch(Paired):
     """mbirtorch's forward and back projection, a matched pair in float32, on the CPU.
 
-    Takes cone beams on a circle or helix about the grid's z axis, through its centre, and parallel beams about it whose
-    detector rows run in the middle planes of slices (or beside the grid).
+    Takes cone beams on a circle or helix about the grid's z axis, through its centre, and parallel
+    beams about it whose detector rows run in the middle planes of slices (or beside the grid).
 
     Args:
         grid: where the voxels lie.
         cameras: the rig.
-        compile_mode: mbirtorch's own: "auto" compiles at the first call, and again for another number of threads, where
-            there is a compiler, which takes minutes; or "off".
+        compile_mode: mbirtorch's own: "auto" compiles at the first call, and again for another
+            number of threads, where there is a compiler, which takes minutes; or "off".
 
     Raises:
-        ValueError: an unknown mode, a geometry that mbirtorch does not take, or cameras that require a gradient.
+        ValueError: an unknown mode, a geometry that mbirtorch does not take, or cameras that
+            require a gradient.
         ImportError: mbirtorch is not installed.
     """
 
@@ -107,23 +133,45 @@ class Mbirtorch(Paired):
     def __init__(self, grid: Grid, cameras: Cameras, compile_mode: str = "off"):
         super().__init__(grid, cameras)
         self.scan = scan_of(self.rig)
-        self.pairs = plane_of_rows(self.box, self.rig, "mbirtorch's parallel beam") if self.rig.parallel else None
+        self.pairs = (
+            plane_of_rows(self.box, self.rig, "mbirtorch's parallel beam")
+            if self.rig.parallel
+            else None
+        )
         require_between(self.box, self.rig, "mbirtorch")
         self.model = self._model(choice("compile_mode", compile_mode, ("auto", "off")))
 
     def _model(self, mode: str) -> Any:
-        library, scan, (depth, rows, columns) = load("mbirtorch", "mbirtorch"), self.scan, self.grid.shape
+        library, scan, (depth, rows, columns) = (
+            load("mbirtorch", "mbirtorch"),
+            self.scan,
+            self.grid.shape,
+        )
         x, y, z = self.box.spacing
         angles, shape = scan.angles.numpy(), (len(self.rig), *self.rig.shape)
-        options = {"recon_shape": (rows, columns, depth), "delta_voxel": x, "voxel_row_aspect": y / x}
-        options |= {"delta_det_channel": scan.pitch[0], "det_channel_offset": scan.offset[0], "use_ror_mask": False}
+        options = {
+            "recon_shape": (rows, columns, depth),
+            "delta_voxel": x,
+            "voxel_row_aspect": y / x,
+        }
+        options |= {
+            "delta_det_channel": scan.pitch[0],
+            "det_channel_offset": scan.offset[0],
+            "use_ror_mask": False,
+        }
         with quiet():
             if self.rig.parallel:
-                model = library.ParallelBeamModel((shape[0], depth, shape[2]), angles, compile_mode=mode)
+                model = library.ParallelBeamModel(
+                    (shape[0], depth, shape[2]), angles, compile_mode=mode
+                )
             else:
                 rise = {"helical_z_shifts": scan.rise.numpy(), "compile_mode": mode}
                 model = library.ConeBeamModel(shape, angles, scan.sdd, scan.sid, **rise)
-                options |= {"delta_det_row": scan.pitch[1], "det_row_offset": scan.offset[1], "recon_slice_offset": 0.0}
+                options |= {
+                    "delta_det_row": scan.pitch[1],
+                    "det_row_offset": scan.offset[1],
+                    "recon_slice_offset": 0.0,
+                }
                 options |= {"voxel_slice_aspect": z / x}
             model.set_params(no_warning=True, **options)
             model.configure_devices(devices=["cpu"])
@@ -133,7 +181,9 @@ class Mbirtorch(Paired):
         """mbirtorch's sparse_forward_project of all voxels, which it takes as [(y x) z]."""
         given = volume.permute(1, 2, 0).flatten(0, 1).contiguous()
         with quiet():
-            made = self._turned(self.model.sparse_forward_project(given, self.model.full_indices_device()))
+            made = self._turned(
+                self.model.sparse_forward_project(given, self.model.full_indices_device())
+            )
         if self.pairs is None:
             return made
         views = made.new_zeros(len(self.rig), *self.rig.shape)
@@ -149,11 +199,15 @@ class Mbirtorch(Paired):
             for row, index in self.pairs:
                 given[:, index] += views[:, row]
         with quiet():
-            made = self.model.sparse_back_project(self._turned(given).contiguous(), self.model.full_indices_device())
+            made = self.model.sparse_back_project(
+                self._turned(given).contiguous(), self.model.full_indices_device()
+            )
         return made.unflatten(0, self.grid.shape[1:]).permute(2, 0, 1)
 
     def _turned(self, views: Float[Tensor, "m a u"]) -> Float[Tensor, "m a u"]:
-        """From mbirtorch's order of rows and channels to ours, or back; a parallel beam's rows are slices in both."""
+        """From mbirtorch's order of rows and channels to ours, or back; a parallel beam's rows are
+        slices in both.
+        """
         if not self.scan.turned:
             return views
         return views.flip(2) if self.rig.parallel else views.flip(1, 2)

@@ -1,4 +1,6 @@
-"""nanodrr: a trilinear ray marcher in torch, with a Triton kernel on CUDA (https://github.com/eigenvivek/nanodrr)."""
+"""nanodrr: a trilinear ray marcher in torch, with a Triton kernel on CUDA
+(https://github.com/eigenvivek/nanodrr).
+"""
 
 import math
 
@@ -12,9 +14,11 @@ from mvrecon_peers.base import Traced, load
 
 
 class Nanodrr(Traced):
-    """nanodrr's trilinear renderer: equally many samples on every ray's part in the box grown by the kernel.
+    """nanodrr's trilinear renderer: equally many samples on every ray's part in the box grown by
+    the kernel.
 
-    Matched adjoint and gradients, in the pose too, by autograd. Takes every rig of mvrecon, parallel ones included.
+    Matched adjoint and gradients, in the pose too, by autograd. Takes every rig of mvrecon,
+    parallel ones included.
 
     Args:
         grid: where the voxels lie.
@@ -27,7 +31,9 @@ class Nanodrr(Traced):
         ImportError: nanodrr is not installed.
     """
 
-    def __init__(self, grid: Grid, cameras: Cameras, samples: int | None = None, backend: str = "auto"):
+    def __init__(
+        self, grid: Grid, cameras: Cameras, samples: int | None = None, backend: str = "auto"
+    ):
         super().__init__(grid, cameras)
         self.samples, self.backend = samples or max(2, math.ceil(math.hypot(*grid.shape))), backend
         if self.samples < 2:
@@ -36,16 +42,25 @@ class Nanodrr(Traced):
         self.march = load("nanodrr.drr.renderer", "nanodrr", "render")
 
     def render(
-        self, volume: Float[Tensor, "d h w"], first: Float[Tensor, "k r 3"], last: Float[Tensor, "k r 3"]
+        self,
+        volume: Float[Tensor, "d h w"],
+        first: Float[Tensor, "k r 3"],
+        last: Float[Tensor, "k r 3"],
     ) -> Float[Tensor, "k r"]:
         """nanodrr's views; its detector is one row of all rays, since only their ends matter."""
         x, size = volume[None, None], first.shape[1]
         affine, counts = self.box.affine.to(volume), volume.new_tensor(volume.shape[::-1])
-        scale = torch.diag(torch.cat([2 / counts, counts.new_ones(1)]))  # nanodrr's own has seven digits
+        scale = torch.diag(
+            torch.cat([2 / counts, counts.new_ones(1)])
+        )  # nanodrr's own has seven digits
         scale[:3, 3] = 1 / counts - 1
-        subject = self.subject(x, torch.zeros_like(x), affine, affine.inverse(), scale, affine[:3, 3], 0)
+        subject = self.subject(
+            x, torch.zeros_like(x), affine, affine.inverse(), scale, affine[:3, 3], 0
+        )
         subject.convert_to_mu = False
         still = torch.eye(4).to(volume).expand(len(first), 4, 4)
         frame = still[:, :3, :3], still, volume.new_ones(len(first))
         ends = {"src": first, "tgt": last}
-        return self.march(subject, *frame, 1, size, self.samples, backend=self.backend, **ends)[:, 0, 0]
+        return self.march(subject, *frame, 1, size, self.samples, backend=self.backend, **ends)[
+            :, 0, 0
+        ]

@@ -1,4 +1,6 @@
-"""Any peer as an operator of torch's: opaque to `torch.compile` and to autocast, mapped by vmap, its own derivative."""
+"""Any peer as an operator of torch's: opaque to `torch.compile` and to autocast, mapped by vmap,
+its own derivative.
+"""
 
 from collections.abc import Callable
 from itertools import count
@@ -13,7 +15,9 @@ _KEYS = count()
 
 
 def known_by(peer: Any) -> int:
-    """A number by which `linear` finds a peer for as long as it lives; an operator takes no objects."""
+    """A number by which `linear` finds a peer for as long as it lives; an operator takes no
+    objects.
+    """
     key = next(_KEYS)
     _PEERS[key] = peer
     return key

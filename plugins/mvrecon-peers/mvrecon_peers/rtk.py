@@ -1,4 +1,6 @@
-"""RTK, the Reconstruction Toolkit of ITK: its Joseph filters on the CPU (https://www.openrtk.org)."""
+"""RTK, the Reconstruction Toolkit of ITK: its Joseph filters on the CPU
+(https://www.openrtk.org).
+"""
 
 import math
 from dataclasses import replace
@@ -12,11 +14,14 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Paired, load
 from mvrecon_peers.frame import require_between
 
-#: Empty voxels about the volume: RTK's own ends at the outer voxels' centres, and a ray's first step in it is rough.
+#: Empty voxels about the volume: RTK's own ends at the outer voxels' centres, and a ray's first
+#: step in it is rough.
 RIM = 2
-#: Of the volume's size: where a detector is as near to its source as this, RTK's matrices have lost their digits.
+#: Of the volume's size: where a detector is as near to its source as this, RTK's matrices have lost
+#: their digits.
 SHORT = 1e-6
-#: How many times as long as wide a voxel may be: RTK turns rays in mm, which rounds them in the finest voxels.
+#: How many times as long as wide a voxel may be: RTK turns rays in mm, which rounds them in the
+#: finest voxels.
 OBLONG = 1e3
 #: Radians that no ray notices; left in, they make ITK's inverse of a matrix fail.
 TINY = 1e-20
@@ -25,22 +30,28 @@ TINY = 1e-20
 def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
     """What RTK's `AddProjectionInRadians` takes for each view.
 
-    Depths of the source, and of the detector below it (0: parallel rays); gantry angle, the detector's offsets,
-    out-of-plane and in-plane angle, the source's offsets. RTK's own door for vectors has only five digits where a
-    detector faces the y axis.
+    Depths of the source, and of the detector below it (0: parallel rays); gantry angle, the
+    detector's offsets, out-of-plane and in-plane angle, the source's offsets. RTK's own door for
+    vectors has only five digits where a detector faces the y axis.
 
     Raises:
-        ValueError: detectors that are not rectangular, pixels that differ between views, or parallel beams that are
-            not square to their detector.
+        ValueError: detectors that are not rectangular, pixels that differ between views, or
+            parallel beams that are not square to their detector.
     """
     rows, columns = rig.shape
     u, v = (torch.nn.functional.normalize(step, dim=-1) for step in (rig.u, rig.v))
     if (skew := (u * v).sum(-1).abs().max().item()) > 1e-6:
-        raise ValueError(f"RTK takes detectors with right angles, got rows and columns with the cosine {skew:.3g}")
+        raise ValueError(
+            f"RTK takes detectors with right angles, got rows and columns with the cosine "
+            f"{skew:.3g}"
+        )
     for what, step in (("columns", rig.u), ("rows", rig.v)):
         pitch = step.norm(dim=-1)
         if not torch.allclose(pitch, pitch[0], rtol=1e-6, atol=0):
-            raise ValueError(f"RTK takes one pixel size for all views, got {what} of {pitch.unique().tolist()} mm")
+            raise ValueError(
+                f"RTK takes one pixel size for all views, got {what} of {pitch.unique().tolist()} "
+                f"mm"
+            )
     axes = torch.stack([u, v, torch.linalg.cross(u, v)], dim=1)
     centre = rig.origin + rig.u * (columns - 1) / 2 + rig.v * (rows - 1) / 2
     across, down, depth = (axes * centre[:, None]).sum(dim=-1).unbind(dim=-1)
@@ -50,9 +61,12 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
         require_square(box, rig, axes[:, 2])
         x = y = below = torch.zeros_like(depth)
         z = torch.full_like(depth, box.corners().norm(dim=-1).max().item() + 3 * sum(box.spacing))
-    elif (short := below.abs().min().item()) < SHORT * (size := box.corners().norm(dim=-1).max().item()):
+    elif (short := below.abs().min().item()) < SHORT * (
+        size := box.corners().norm(dim=-1).max().item()
+    ):
         raise ValueError(
-            f"RTK takes detectors no nearer to the source than {SHORT:g} of the volume's size, got {short / size:.2g}"
+            f"RTK takes detectors no nearer to the source than {SHORT:g} of the volume's size, "
+            f"got {short / size:.2g}"
         )
     gantry, out, inner = zip(*map(angles, axes.tolist()), strict=True)
     z, below, across, down, x, y = (each.tolist() for each in (z, below, across, down, x, y))
@@ -60,21 +74,29 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
 
 
 def require_square(box: Grid, rig: Cameras, normal: Float[Tensor, "m 3"]) -> None:
-    """Raise ValueError unless parallel rays meet their detector at right angles, with the box between their ends."""
+    """Raise ValueError unless parallel rays meet their detector at right angles, with the box
+    between their ends.
+    """
     require_between(box, rig, "RTK's parallel geometry")
     look = torch.nn.functional.normalize(rig.origin - rig.source, dim=-1)
     if (slant := torch.linalg.cross(look, normal).norm(dim=-1).max().item()) > 1e-6:
-        raise ValueError(f"RTK takes parallel beams square to their detector, got one slanted by {slant:.3g}")
+        raise ValueError(
+            f"RTK takes parallel beams square to their detector, got one slanted by {slant:.3g}"
+        )
 
 
 def angles(axes: list[list[float]]) -> tuple[float, float, float]:
-    """Gantry, out-of-plane and in-plane angle of axes u, v, n = Rz(-inner) Rx(-out) Ry(-gantry), exact in every pose.
+    """Gantry, out-of-plane and in-plane angle of axes u, v, n = Rz(-inner) Rx(-out) Ry(-gantry),
+    exact in every pose.
 
     One camera at a time: what torch computes of many, it rounds by where they stand among them.
     """
     (ux, uy, uz), _, (nx, ny, nz) = axes
     gantry, out = math.atan2(nx, nz), math.atan2(-ny, math.hypot(nx, nz))
-    rx, rz = math.cos(gantry), -math.sin(gantry)  # where columns run if the in-plane angle is 0; n x that is for rows
+    rx, rz = (
+        math.cos(gantry),
+        -math.sin(gantry),
+    )  # where columns run if the in-plane angle is 0; n x that is for rows
     inner = math.atan2(ux * ny * rz + uy * (nz * rx - nx * rz) - uz * ny * rx, ux * rx + uz * rz)
     gantry, out, inner = (0.0 if abs(angle) < TINY else angle for angle in (gantry, out, inner))
     return gantry, out, inner
@@ -83,7 +105,8 @@ def angles(axes: list[list[float]]) -> tuple[float, float, float]:
 class Rtk(Paired):
     """RTK's Joseph forward and back projection, a matched pair on the CPU, in float32 or float64.
 
-    Takes every rig with rectangular detectors and one pixel size: cone beams, pinholes, and parallel beams.
+    Takes every rig with rectangular detectors and one pixel size: cone beams, pinholes, and
+    parallel beams.
 
     Args:
         grid: where the voxels lie.
@@ -97,8 +120,11 @@ class Rtk(Paired):
     def __init__(self, grid: Grid, cameras: Cameras):
         super().__init__(grid, cameras)
         if (ratio := max(self.box.spacing) / min(self.box.spacing)) > OBLONG:
-            raise ValueError(f"RTK takes voxels at most {OBLONG:g} times as long as wide, got {ratio:.3g} times")
-        # ITK has tolerances in mm, so the unit is one, of a power of two, in which a voxel is about 1
+            raise ValueError(
+                f"RTK takes voxels at most {OBLONG:g} times as long as wide, got {ratio:.3g} times"
+            )
+        # ITK has tolerances in mm, so the unit is one, of a power of two, in which a voxel is about
+        # 1
         self.unit = 2.0 ** round(math.log2(min(self.box.spacing)))
         box = Grid.centred(grid.shape, [mm / self.unit for mm in self.box.spacing])
         rig = replace(self.rig, **{name: getattr(self.rig, name) / self.unit for name in VECTORS})
@@ -123,12 +149,16 @@ class Rtk(Paired):
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
         """JosephBackProjectionImageFilter."""
         empty = self._image(views.new_zeros([n + 2 * RIM for n in self.grid.shape]), self.voxels)
-        found = self._run(self.rtk.JosephBackProjectionImageFilter, empty, self._image(views, self.detector))
+        found = self._run(
+            self.rtk.JosephBackProjectionImageFilter, empty, self._image(views, self.detector)
+        )
         return found[RIM:-RIM, RIM:-RIM, RIM:-RIM]
 
     def _image(self, values: Tensor, frame: tuple[list[float], list[float]]):
         image = self.itk.image_view_from_array(values.numpy())
-        if values[0].numel() == 1:  # such memory ITK takes for Fortran's, and its first axis for the last
+        if (
+            values[0].numel() == 1
+        ):  # such memory ITK takes for Fortran's, and its first axis for the last
             image = type(image).New()
             image.SetRegions(values.shape[::-1])
             image.Allocate()

@@ -1,4 +1,6 @@
-"""scikit-image's Radon transform, which turns the image and sums its rows (https://scikit-image.org)."""
+"""scikit-image's Radon transform, which turns the image and sums its rows
+(https://scikit-image.org).
+"""
 
 import torch
 from jaxtyping import Float
@@ -11,11 +13,12 @@ from mvrecon_peers.frame import plane_of_rows, require_between
 
 
 def turns(box: Grid, rig: Cameras) -> tuple[list[float], list[int]]:
-    """Each view's angle in degrees, and the column that sees the axis of rotation, the centre of voxel size // 2.
+    """Each view's angle in degrees, and the column that sees the axis of rotation, the centre of
+    voxel size // 2.
 
     Raises:
-        ValueError: cameras that are not parallel or not square to their detector, columns as wide as no voxel, or an
-            axis between two columns.
+        ValueError: cameras that are not parallel or not square to their detector, columns as wide
+            as no voxel, or an axis between two columns.
     """
     width, height = box.spacing[:2]
     pitch = rig.u.norm(dim=-1)
@@ -23,18 +26,23 @@ def turns(box: Grid, rig: Cameras) -> tuple[list[float], list[int]]:
         raise ValueError("scikit-image's radon takes parallel beams, got central cameras")
     if abs(width / height - 1) > 1e-6 or (pitch / width - 1).abs().max() > 1e-6:
         raise ValueError(
-            f"scikit-image's radon takes square voxels as wide as the detector's columns, got {width:.6g} by "
+            f"scikit-image's radon takes square voxels as wide as the detector's columns, got "
+            f"{width:.6g} by "
             f"{height:.6g} mm and columns of {pitch.unique().tolist()} mm"
         )
     look = torch.nn.functional.normalize(rig.origin - rig.source, dim=-1)
     if (slant := (look * rig.u / pitch[:, None]).sum(-1).abs().max().item()) > 1e-6:
-        raise ValueError(f"scikit-image's radon takes beams square to their detector, got one slanted by {slant:.3g}")
+        raise ValueError(
+            f"scikit-image's radon takes beams square to their detector, got one slanted by "
+            f"{slant:.3g}"
+        )
     depth, rows, columns = box.shape
     axis = box.to_world(torch.tensor([columns // 2, rows // 2, depth / 2], dtype=torch.float64))
     seen = rig.project(axis)[:, 0]
     if (off := (seen - seen.round()).abs().max().item()) > 1e-3:
         raise ValueError(
-            f"scikit-image's radon turns the image about the centre of voxel size // 2, which must fall on the centre "
+            f"scikit-image's radon turns the image about the centre of voxel size // 2, which "
+            f"must fall on the centre "
             f"of a column, got it {off:.3g} columns off; take odd sizes of grid and detector"
         )
     angles = torch.rad2deg(torch.atan2(-rig.u[:, 1], rig.u[:, 0]))
@@ -42,10 +50,11 @@ def turns(box: Grid, rig: Cameras) -> tuple[list[float], list[int]]:
 
 
 class Skimage(Paired):
-    """scikit-image's radon, slice by slice on one thread; its back projection is iradon without a filter.
+    """scikit-image's radon, slice by slice on one thread; its back projection is iradon without a
+    filter.
 
-    The pair does not match: radon interpolates in the turned image, iradon in the views. Detector rows must run in the
-    middle planes of slices (or beside the grid).
+    The pair does not match: radon interpolates in the turned image, iradon in the views. Detector
+    rows must run in the middle planes of slices (or beside the grid).
 
     Args:
         grid: where the voxels lie.
@@ -70,7 +79,9 @@ class Skimage(Paired):
         views = volume.new_zeros(len(self.rig), *self.rig.shape)
         for row, index in self.pairs:
             with quiet():
-                lines = self.transform.radon(volume[index].numpy(), self.angles, circle=False, preserve_range=True)
+                lines = self.transform.radon(
+                    volume[index].numpy(), self.angles, circle=False, preserve_range=True
+                )
             views[:, row] = self._columns(torch.from_numpy(lines).T, views.shape[2], 1)
         return views * self.box.spacing[0]
 
@@ -80,7 +91,12 @@ class Skimage(Paired):
         side = max(volume.shape[1:]) * 2
         for row, index in self.pairs:
             lines = self._columns(views[:, row], side, -1).T.numpy()
-            options = {"filter_name": None, "circle": False, "output_size": side, "preserve_range": True}
+            options = {
+                "filter_name": None,
+                "circle": False,
+                "output_size": side,
+                "preserve_range": True,
+            }
             with quiet():
                 square = torch.from_numpy(self.transform.iradon(lines, self.angles, **options))
             top, left = (side // 2 - n // 2 for n in volume.shape[1:])
@@ -88,7 +104,9 @@ class Skimage(Paired):
         return volume * (2 * len(self.rig) / torch.pi * self.box.spacing[0])
 
     def _columns(self, lines: Float[Tensor, "m a"], size: int, sign: int) -> Float[Tensor, "m b"]:
-        """Views with the axis in column size // 2 of theirs, moved to our columns (sign 1) or back (sign -1)."""
+        """Views with the axis in column size // 2 of theirs, moved to our columns (sign 1) or back
+        (sign -1).
+        """
         moved = lines.new_zeros(len(lines), size)
         for line, out, axis in zip(lines, moved, self.columns, strict=True):
             shift = axis - lines.shape[1] // 2 if sign > 0 else size // 2 - axis

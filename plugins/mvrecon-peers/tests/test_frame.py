@@ -41,21 +41,31 @@ RIGS = {
     "half lines": replace(BEAM, extent="ahead"),
 }
 PLUGIN = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-PARTS = {k.partition(".")[2]: v for k, v in PLUGIN["entry-points"]["mvrecon.plugins"].items() if k[:9] == "projector"}
+PARTS = {
+    k.partition(".")[2]: v
+    for k, v in PLUGIN["entry-points"]["mvrecon.plugins"].items()
+    if k[:9] == "projector"
+}
 
 
 @pytest.mark.parametrize("kind", RIGS)
 @pytest.mark.parametrize("tilt", [False, True])
 def test_the_rays_of_a_framed_rig_measure_the_same(kind: str, tilt: bool):
     grid, rig = GRID, RIGS[kind]
-    R = random_rotation(torch.Generator().manual_seed(0)) if tilt else torch.eye(3, dtype=torch.float64)
+    R = (
+        random_rotation(torch.Generator().manual_seed(0))
+        if tilt
+        else torch.eye(3, dtype=torch.float64)
+    )
     affine = grid.affine.clone()
     affine[:3] = R @ affine[:3]
     box, inner = framed(Grid(grid.shape, affine), rig.moved(R, torch.zeros(3)))
     assert inner.extent == "segment"
     centres = torch.tensor([[1.0, 2.0, -1.0], [-2.0, 0.5, 2.0]], dtype=torch.float64)
     turn = random_rotation(torch.Generator().manual_seed(1), 2)
-    inside = Phantom((Solids("ellipsoid", centres, turn, torch.tensor([[2.0, 3, 1], [1, 2, 2]]), torch.ones(2)),))
+    inside = Phantom(
+        (Solids("ellipsoid", centres, turn, torch.tensor([[2.0, 3, 1], [1, 2, 2]]), torch.ones(2)),)
+    )
     there = inside.integrals(*inner.rays(), extent=inner.limits)
     world = inside.moved(torch.eye(3), GRID.centre).integrals(*rig.rays(), extent=rig.limits)
     assert there.any()
@@ -79,7 +89,10 @@ def test_framing_keeps_the_graph_of_the_cameras():
 
 @pytest.mark.parametrize("kind", ["cone", "tilted", "along y", "beam"])
 def test_rtk_gets_depths_offsets_and_angles_that_make_the_rays(kind: str):
-    turn = {"tilted": random_rotation(torch.Generator().manual_seed(0)), "along y": turned(90.0, 0) @ turned(-13.0, 2)}
+    turn = {
+        "tilted": random_rotation(torch.Generator().manual_seed(0)),
+        "along y": turned(90.0, 0) @ turned(-13.0, 2),
+    }
     R, rig = turn.get(kind, turned(0.0, 0)), CONE.moved(torch.eye(3), -GRID.centre)
     if kind == "beam":
         rig = parallel(4, DETECTOR, 60.0, start_degrees=25.0, arc_degrees=360.0)
@@ -97,10 +110,16 @@ def test_rtk_gets_depths_offsets_and_angles_that_make_the_rays(kind: str):
             assert sdd == 0
             along = torch.linalg.cross(end[m, 2, 3] - start[m, 2, 3], axes[2])
             assert along.abs().max() < 1e-9
-            assert torch.allclose((middle - end[m, 2, 3]) @ axes[:2].T, torch.zeros(2, dtype=torch.float64), atol=1e-12)
+            assert torch.allclose(
+                (middle - end[m, 2, 3]) @ axes[:2].T,
+                torch.zeros(2, dtype=torch.float64),
+                atol=1e-12,
+            )
         else:
             assert torch.allclose(middle, end[m, 2, 3], atol=1e-12)
-            assert torch.allclose(torch.tensor([x, y, sid], dtype=torch.float64) @ axes, rig.source[m], atol=1e-12)
+            assert torch.allclose(
+                torch.tensor([x, y, sid], dtype=torch.float64) @ axes, rig.source[m], atol=1e-12
+            )
 
 
 def test_rays_are_cut_off_near_the_box_and_stay_on_their_lines():
@@ -114,8 +133,13 @@ def test_rays_are_cut_off_near_the_box_and_stay_on_their_lines():
     hit = (enter < leave) & (leave > 0)
     assert hit.any() and not hit.all()
     assert start.abs().max() < 30 and end.abs().max() < 30
-    for fraction, found in zip((enter.clamp(min=0), leave), (again[0].clamp(min=0), again[1]), strict=True):
-        there, expected = start + found[:, None] * (end - start), first + fraction[:, None] * (last - first)
+    for fraction, found in zip(
+        (enter.clamp(min=0), leave), (again[0].clamp(min=0), again[1]), strict=True
+    ):
+        there, expected = (
+            start + found[:, None] * (end - start),
+            first + fraction[:, None] * (last - first),
+        )
         assert torch.allclose(there[hit], expected[hit], atol=1e-9)
     misses = (again[0] >= again[1]) | (again[1] <= 1e-9)
     assert torch.equal(misses, ~hit)
@@ -132,7 +156,11 @@ def turned(degrees: float, axis: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("upright", [False, True])
 def test_mbirtorch_gets_a_scan_that_makes_the_rig(upright: bool):
-    flip = replace(CONE, origin=CONE.origin + 4 * CONE.v + 6 * CONE.u, u=-CONE.u, v=-CONE.v) if upright else CONE
+    flip = (
+        replace(CONE, origin=CONE.origin + 4 * CONE.v + 6 * CONE.u, u=-CONE.u, v=-CONE.v)
+        if upright
+        else CONE
+    )
     heights = torch.linspace(0, 3, 4, dtype=torch.float64)[:, None] * torch.tensor([0, 0, 1.0])
     helix = replace(flip, source=flip.source + heights, origin=flip.origin + heights)
     _, rig = framed(GRID, helix)
@@ -146,7 +174,9 @@ def test_mbirtorch_gets_a_scan_that_makes_the_rig(upright: bool):
 
 def test_rows_know_their_slices_and_the_axis_its_column():
     detector = {"pixels": [6, 9], "pixel_mm": [1.0, 1.5], "offset_mm": [0.0, 3.0]}
-    box, rig = framed(Grid.centred((4, 7, 7), (1.5, 1.5, 1.0)), parallel(3, detector, 60.0, start_degrees=20.0))
+    box, rig = framed(
+        Grid.centred((4, 7, 7), (1.5, 1.5, 1.0)), parallel(3, detector, 60.0, start_degrees=20.0)
+    )
     assert plane_of_rows(box, rig, "it") == [(1, 3), (2, 2), (3, 1), (4, 0)]
     angles, columns = turns(box, rig)
     assert columns == [2, 2, 2]
@@ -159,25 +189,97 @@ STACK = parallel(3, {"pixels": [5, 7], "pixel_mm": 2.0}, 60.0)
 SHEARED = Grid(GRID.shape, GRID.affine + torch.tensor([[0.0, 0.3, 0.0, 0.0]] + [[0.0] * 4] * 3))
 REFUSED = {
     "sheared grid": (Nanodrr, SHEARED, CONE, {}, "right angles"),
-    "central line": (Nanodrr, GRID, replace(CONE, extent="line"), {}, "got central cameras of extent 'line'"),
+    "central line": (
+        Nanodrr,
+        GRID,
+        replace(CONE, extent="line"),
+        {},
+        "got central cameras of extent 'line'",
+    ),
     "one sample": (Nanodrr, GRID, CONE, {"samples": 1}, "at least 2 samples on a ray, got 1"),
     "unknown method": (Diffdrr, GRID, CONE, {"method": "joseph"}, "Known: siddon, trilinear"),
-    "source inside": (Diffdrr, GRID, replace(CONE, source=GRID.centre + CONE.source * 0), {}, "140 of 140 rays"),
-    "next to the source": (Rtk, GRID, replace(CONE, source=CONE.origin - 1e-6 * NORMAL), {}, "no nearer to the source"),
-    "needles": (Rtk, Grid.centred((5, 7, 7), (1.0, 1e-4, 1.0)), CONE, {}, "at most 1000 times as long as wide"),
+    "source inside": (
+        Diffdrr,
+        GRID,
+        replace(CONE, source=GRID.centre + CONE.source * 0),
+        {},
+        "140 of 140 rays",
+    ),
+    "next to the source": (
+        Rtk,
+        GRID,
+        replace(CONE, source=CONE.origin - 1e-6 * NORMAL),
+        {},
+        "no nearer to the source",
+    ),
+    "needles": (
+        Rtk,
+        Grid.centred((5, 7, 7), (1.0, 1e-4, 1.0)),
+        CONE,
+        {},
+        "at most 1000 times as long as wide",
+    ),
     "skew pixels": (Rtk, GRID, replace(CONE, v=CONE.v + 0.1 * CONE.u), {}, "right angles"),
-    "two pixel sizes": (Rtk, GRID, replace(CONE, u=CONE.u * torch.arange(1, 5)[:, None]), {}, "one pixel size"),
-    "slanted beam": (Rtk, GRID, replace(BEAM, origin=BEAM.origin + 9 * BEAM.u), {}, "square to their detector"),
-    "pose gradient": (Rtk, GRID, replace(CONE, u=CONE.u.clone().requires_grad_()), {}, "no gradient in the cameras"),
+    "two pixel sizes": (
+        Rtk,
+        GRID,
+        replace(CONE, u=CONE.u * torch.arange(1, 5)[:, None]),
+        {},
+        "one pixel size",
+    ),
+    "slanted beam": (
+        Rtk,
+        GRID,
+        replace(BEAM, origin=BEAM.origin + 9 * BEAM.u),
+        {},
+        "square to their detector",
+    ),
+    "pose gradient": (
+        Rtk,
+        GRID,
+        replace(CONE, u=CONE.u.clone().requires_grad_()),
+        {},
+        "no gradient in the cameras",
+    ),
     "cone in 2-D": (Astra, GRID, CONE, {}, "stay in the middle of a slice"),
-    "oblong voxels": (Astra, Grid.centred((5, 7, 7), (2.0, 1.5, 2.0)), STACK, {}, "square voxels, got 2 by 1.5 mm"),
-    "linear fan": (Astra, FLAT, circular(3, 40, 70, {"pixels": [1, 9], "pixel_mm": 2.0}), {"method": "linear"}, "fan"),
-    "rows between": (Astra, FLAT, STACK.moved(torch.eye(3), torch.tensor([0, 0, 1.0])), {}, "got rays 0.5 slices off"),
+    "oblong voxels": (
+        Astra,
+        Grid.centred((5, 7, 7), (2.0, 1.5, 2.0)),
+        STACK,
+        {},
+        "square voxels, got 2 by 1.5 mm",
+    ),
+    "linear fan": (
+        Astra,
+        FLAT,
+        circular(3, 40, 70, {"pixels": [1, 9], "pixel_mm": 2.0}),
+        {"method": "linear"},
+        "fan",
+    ),
+    "rows between": (
+        Astra,
+        FLAT,
+        STACK.moved(torch.eye(3), torch.tensor([0, 0, 1.0])),
+        {},
+        "got rays 0.5 slices off",
+    ),
     "pinholes": (Mbirtorch, GRID, PINHOLES, {}, "a circle or a helix about the z axis"),
     "tilted circle": (Mbirtorch, GRID, TILTED, {}, "a circle or a helix about the z axis"),
-    "axis elsewhere": (Mbirtorch, GRID, CONE.moved(torch.eye(3), torch.tensor([1.0, 0, 0])), {}, "volume's centre"),
+    "axis elsewhere": (
+        Mbirtorch,
+        GRID,
+        CONE.moved(torch.eye(3), torch.tensor([1.0, 0, 0])),
+        {},
+        "volume's centre",
+    ),
     "cone to radon": (Skimage, FLAT, CONE, {}, "takes parallel beams, got central"),
-    "wide columns": (Skimage, Grid.centred((5, 7, 7), 1.9), STACK, {}, "as wide as the detector's columns"),
+    "wide columns": (
+        Skimage,
+        Grid.centred((5, 7, 7), 1.9),
+        STACK,
+        {},
+        "as wide as the detector's columns",
+    ),
     "even size": (Skimage, Grid.centred((5, 8, 8), 2.0), STACK, {}, "take odd sizes"),
 }
 
@@ -200,7 +302,9 @@ LIBRARIES: dict[str, tuple[str, str, Grid, Cameras]] = {
 
 
 @pytest.mark.parametrize("name", LIBRARIES)
-def test_a_library_that_is_absent_is_named_with_what_installs_it(name: str, monkeypatch: pytest.MonkeyPatch):
+def test_a_library_that_is_absent_is_named_with_what_installs_it(
+    name: str, monkeypatch: pytest.MonkeyPatch
+):
     module, package, grid, rig = LIBRARIES[name]
     monkeypatch.setitem(sys.modules, module, None)
     where, _, attribute = PARTS[name].partition(":")
@@ -214,7 +318,9 @@ def test_every_part_is_configured_by_its_own_defaults():
     for name, where in PARTS.items():
         module, _, attribute = where.partition(":")
         parameters = signature(getattr(import_module(module), attribute)).parameters
-        options = {key: p.default for key, p in parameters.items() if key not in ("grid", "cameras")}
+        options = {
+            key: p.default for key, p in parameters.items() if key not in ("grid", "cameras")
+        }
         assert yaml.safe_load((folder / f"{name}.yaml").read_text()) == {"name": name} | options
 
 
@@ -222,6 +328,10 @@ def test_importing_the_parts_imports_no_library():
     import subprocess
 
     code = f"import sys\nfor m in {[w.partition(':')[0] for w in PARTS.values()]}: __import__(m)\n"
-    code += "print({'itk', 'nanodrr', 'diffdrr', 'astra', 'mbirtorch', 'skimage'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=True)
+    code += (
+        "print({'itk', 'nanodrr', 'diffdrr', 'astra', 'mbirtorch', 'skimage'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=True
+    )
     assert done.stdout == "set()\n"

@@ -1,4 +1,6 @@
-"""Each library, where it is installed, sees what mvrecon sees: same rays, same voxels, same units, and its adjoint."""
+"""Each library, where it is installed, sees what mvrecon sees: same rays, same voxels, same units,
+and its adjoint.
+"""
 
 import copy
 from dataclasses import replace
@@ -39,15 +41,29 @@ def about(rig: Cameras, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Camer
 
 CASES: dict[str, tuple[Grid, Cameras]] = {
     "cone": (GRID, about(circular(4, 70.0, 110.0, DETECTOR, start_degrees=13.0), 1.0, -2.0, 3.0)),
-    "dome": (tilted(GRID), dome(4, 70.0, 110.0, 150.0, DETECTOR, target=CENTRE.tolist(), extent="segment")),
+    "dome": (
+        tilted(GRID),
+        dome(4, 70.0, 110.0, 150.0, DETECTOR, target=CENTRE.tolist(), extent="segment"),
+    ),
     "pinholes": (GRID, dome(4, 70.0, 40.0, 150.0, DETECTOR, target=CENTRE.tolist())),
     "beam": (tilted(GRID), about(parallel(4, DETECTOR, 90.0, start_degrees=11.0), 1.0, -2.0, 3.0)),
     "scan": (GRID, about(circular(5, 70.0, 110.0, DETECTOR, start_degrees=13.0), z=2.0)),
-    "stack": (SQUARE, about(parallel(5, {"pixels": [23, 35], "pixel_mm": [1.3, 1.1], "offset_mm": [0, 2.2]}, 90.0))),
-    "fan": (SQUARE, about(circular(5, 70.0, 110.0, DETECTOR | {"pixels": [1, 38], "offset_mm": [0, 0.7]}), z=2.6)),
+    "stack": (
+        SQUARE,
+        about(
+            parallel(5, {"pixels": [23, 35], "pixel_mm": [1.3, 1.1], "offset_mm": [0, 2.2]}, 90.0)
+        ),
+    ),
+    "fan": (
+        SQUARE,
+        about(
+            circular(5, 70.0, 110.0, DETECTOR | {"pixels": [1, 38], "offset_mm": [0, 0.7]}), z=2.6
+        ),
+    ),
 }
 ANY = ("cone", "dome", "pinholes", "beam", "scan", "stack")
-#: Peer: what it imports, its options, the cases that it takes, our method, and how far from it the peer may be.
+#: Peer: what it imports, its options, the cases that it takes, our method, and how far from it the
+#: peer may be.
 PEERS = {
     "rtk": ("itk.RTK", {}, ANY, "joseph", 1e-4),
     "nanodrr": ("nanodrr", {}, ANY, "joseph", 0.012),
@@ -66,10 +82,23 @@ TOLERANCE = 0.085
 
 def phantom() -> Phantom:
     """Three ellipsoids without any symmetry, off the grid's centre."""
-    centres = torch.tensor([[-3.0, 3.0, -3.0], [4.0, -3.0, 3.0], [1.0, 5.0, 6.0]], dtype=torch.float64) + CENTRE
-    semi_axes = torch.tensor([[8.0, 5.0, 6.0], [6.0, 8.0, 5.0], [6.0, 4.0, 5.0]], dtype=torch.float64)
+    centres = (
+        torch.tensor([[-3.0, 3.0, -3.0], [4.0, -3.0, 3.0], [1.0, 5.0, 6.0]], dtype=torch.float64)
+        + CENTRE
+    )
+    semi_axes = torch.tensor(
+        [[8.0, 5.0, 6.0], [6.0, 8.0, 5.0], [6.0, 4.0, 5.0]], dtype=torch.float64
+    )
     return Phantom(
-        (Solids("ellipsoid", centres, random_rotation(torch.Generator().manual_seed(1), 3), semi_axes, torch.ones(3)),)
+        (
+            Solids(
+                "ellipsoid",
+                centres,
+                random_rotation(torch.Generator().manual_seed(1), 3),
+                semi_axes,
+                torch.ones(3),
+            ),
+        )
     )
 
 
@@ -77,7 +106,9 @@ def phantom() -> Phantom:
 def seen(case: str) -> tuple[Tensor, Tensor]:
     """The phantom's voxels and its exact views."""
     grid, rig = CASES[case]
-    return voxelise(phantom(), grid)[None, None], phantom().integrals(*rig.rays(), extent=rig.limits)[None, None]
+    return voxelise(phantom(), grid)[None, None], phantom().integrals(
+        *rig.rays(), extent=rig.limits
+    )[None, None]
 
 
 def build(peer: str, case: str, **change):
@@ -116,18 +147,26 @@ def test_half_a_voxel_or_pixel_a_flip_or_a_turn_would_exceed_the_tolerance(case:
     right = A(x)
     grid, rig = CASES[case]
     wrong = {f"flipped {axis}": A(x.flip(axis)) for axis in (2, 3, 4)}
-    wrong |= {f"views flipped {axis}": right.flip(axis) for axis in (2, 3, 4) if right.shape[axis] > 1}
+    wrong |= {
+        f"views flipped {axis}": right.flip(axis) for axis in (2, 3, 4) if right.shape[axis] > 1
+    }
     for axis in range(3):
         affine = grid.affine.clone()
         affine[:3, 3] += grid.affine[:3, axis] / 2
         if case != "fan" or axis < 2:  # a fan sees one slice
             name = "radon" if rig.parallel else "drr"
-            wrong[f"half a voxel {axis}"] = PROJECTORS.build(name, grid=Grid(grid.shape, affine), cameras=rig)(x)
+            wrong[f"half a voxel {axis}"] = PROJECTORS.build(
+                name, grid=Grid(grid.shape, affine), cameras=rig
+            )(x)
     for axis, steps in ((-1, (0.5, 0)), (-2, (0, 0.5))):
         if right.shape[axis] > 1:
             shift = rig.u * steps[0] + rig.v * steps[1]
-            moved = replace(rig, origin=rig.origin + shift, source=rig.source + (shift if rig.parallel else 0))
-            wrong[f"half a pixel {axis}"] = phantom().integrals(*moved.rays(), extent=rig.limits)[None, None]
+            moved = replace(
+                rig, origin=rig.origin + shift, source=rig.source + (shift if rig.parallel else 0)
+            )
+            wrong[f"half a pixel {axis}"] = phantom().integrals(*moved.rays(), extent=rig.limits)[
+                None, None
+            ]
     for name, views in wrong.items():
         assert error(views, exact) > TOLERANCE, name
     assert error(right, exact) < TOLERANCE
@@ -196,16 +235,26 @@ def test_every_peer_is_an_operator_of_torch(peer: str):
     weight, expected = torch.rand(views[0].shape), A.T(torch.ones_like(views[0]))
     (gradient,) = torch.autograd.grad(build(peer, PEERS[peer][2][-1])(x[0]).sum(), x)
     assert torch.equal(gradient[0], expected)
-    assert torch.equal(copy.deepcopy(A).T(weight) if peer in ("nanodrr", "diffdrr") else A.T(weight), A.T(weight))
+    assert torch.equal(
+        copy.deepcopy(A).T(weight) if peer in ("nanodrr", "diffdrr") else A.T(weight), A.T(weight)
+    )
 
 
 @pytest.mark.parametrize("peer", ["rtk", "diffdrr", "nanodrr"])
 @pytest.mark.parametrize("size", [(1, 1, 1), (7, 1, 1), (1, 1, 5), (4, 5, 6)])
-def test_boxes_of_ones_are_seen_whole_by_detectors_of_one_pixel(peer: str, size: tuple[int, int, int]):
-    """Rays through a box's middle, along and across: no half voxel is lost at the faces, and no view is for another."""
-    way = torch.cat([torch.eye(3), -torch.eye(3), torch.tensor([[1.0, 0.03, 0.0], [0.0, 1.0, -0.03]])]).double()
+def test_boxes_of_ones_are_seen_whole_by_detectors_of_one_pixel(
+    peer: str, size: tuple[int, int, int]
+):
+    """Rays through a box's middle, along and across: no half voxel is lost at the faces, and no
+    view is for another.
+    """
+    way = torch.cat(
+        [torch.eye(3), -torch.eye(3), torch.tensor([[1.0, 0.03, 0.0], [0.0, 1.0, -0.03]])]
+    ).double()
     way = way if peer == "diffdrr" else way[:6]  # kernels that interpolate fade to the sides, too
-    right = torch.nn.functional.normalize(torch.linalg.cross(way, way.roll(1, dims=1) + 0.1), dim=-1)
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(way, way.roll(1, dims=1) + 0.1), dim=-1
+    )
     down = torch.nn.functional.normalize(torch.linalg.cross(way, right), dim=-1)
     grid = Grid.centred(size, (1.0, 1.2, 0.9), CENTRE.tolist())
     rig = Cameras(grid.centre - 20 * way, grid.centre + 20 * way, right, down, (1, 1))
@@ -220,7 +269,10 @@ def test_boxes_of_ones_are_seen_whole_by_detectors_of_one_pixel(peer: str, size:
 def test_gradients_in_the_pose_are_those_of_differences(peer: str):
     grid, rig = CASES["dome"]
     x = seen("dome")[0].double()
-    rig, (way,) = rig[:2], torch.randn(1, 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rig, (way,) = (
+        rig[:2],
+        torch.randn(1, 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64),
+    )
     weight = torch.linspace(0, 1, rig.shape[1], dtype=torch.float64)
 
     def value(step: Tensor) -> Tensor:

@@ -1,13 +1,15 @@
 """Counts behind an ideal knife-edge pinhole.
 
-Along a detector pixel's line through the pinhole, the growth of the seen tube with r^2 cancels the 1/r^2 of each
-point's solid angle, so a ray-driven projector has no factor of distance: with lambda in counts / mm^3,
+Along a detector pixel's line through the pinhole, the growth of the seen tube with r^2 cancels the
+1/r^2 of each point's solid angle, so a ray-driven projector has no factor of distance: with lambda
+in counts / mm^3,
 
-    counts(u, v) = d^2 cos^4(phi) du dv / (16 l^2) * integral of lambda along the line on the object's side,
+    counts(u, v) = d^2 cos^4(phi) du dv / (16 l^2) * integral of lambda along the line on the
+    object's side,
 
-phi the angle from the pinhole's axis, l the distance from pinhole to detector, d the pinhole's diameter. Integrated
-over the detector this is a point source's d^2 cos^3(phi) / (16 h^2), h its distance from the pinhole's plane: Van
-Audenhaege et al., Med. Phys. 42 (2015) 4796.
+phi the angle from the pinhole's axis, l the distance from pinhole to detector, d the pinhole's
+diameter. Integrated over the detector this is a point source's d^2 cos^3(phi) / (16 h^2), h its
+distance from the pinhole's plane: Van Audenhaege et al., Med. Phys. 42 (2015) 4796.
 """
 
 from functools import partial
@@ -24,7 +26,8 @@ from mvrecon.projectors.operator import Scaled
 
 
 class Spect(Scaled):
-    """Counts that ideal pinholes see, no attenuation, no blur: [b c d h w] in counts / mm^3 -> [b c m v u] in counts.
+    """Counts that ideal pinholes see, no attenuation, no blur: [b c d h w] in counts / mm^3 -> [b c
+    m v u] in counts.
 
     Args:
         grid: where the activity lies.
@@ -33,13 +36,16 @@ class Spect(Scaled):
         options: those of `drr`.
 
     Raises:
-        ValueError: cameras whose detectors are not behind a pinhole, or a diameter that is not positive.
+        ValueError: cameras whose detectors are not behind a pinhole, or a diameter that is not
+            positive.
     """
 
     def __init__(self, grid: Grid, cameras: Cameras, diameter_mm: float = 2.3, **options: Any):
         if cameras.extent != "behind" or cameras.parallel:
             kind = "parallel" if cameras.parallel else cameras.extent
-            raise ValueError(f"Pinhole SPECT needs central cameras of extent 'behind', got {kind!r}")
+            raise ValueError(
+                f"Pinhole SPECT needs central cameras of extent 'behind', got {kind!r}"
+            )
         if not diameter_mm > 0:
             raise ValueError(f"A pinhole's diameter must be positive mm, got {diameter_mm}")
         A = Drr(grid, cameras, **options)

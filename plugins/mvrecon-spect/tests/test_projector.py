@@ -1,4 +1,6 @@
-"""A pinhole's counts follow the inverse square law of a point source, with no 1/r^2 in the projector."""
+"""A pinhole's counts follow the inverse square law of a point source, with no 1/r^2 in the
+projector.
+"""
 
 from math import pi
 
@@ -45,7 +47,9 @@ def test_a_sphere_is_seen_like_a_point_in_its_centre():
     activity = 4 / 3 * pi * RADIUS**3
     assert total(0, 244) == pytest.approx(activity * DIAMETER**2 / (16 * 244**2), rel=5e-3)
     cosine = 200 / (200**2 + 20**2) ** 0.5
-    assert total(20, 200) == pytest.approx(activity * DIAMETER**2 * cosine**3 / (16 * 200**2), rel=5e-3)
+    assert total(20, 200) == pytest.approx(
+        activity * DIAMETER**2 * cosine**3 / (16 * 200**2), rel=5e-3
+    )
 
 
 def test_the_axis_pixel_and_the_corner_differ_by_cos4():
@@ -60,7 +64,8 @@ def test_the_axis_pixel_and_the_corner_differ_by_cos4():
 
 
 @pytest.mark.parametrize(
-    ("backend", "dtype", "tolerance"), [("reference", torch.float64, 1e-12), ("auto", torch.float32, 1e-5)]
+    ("backend", "dtype", "tolerance"),
+    [("reference", torch.float64, 1e-12), ("auto", torch.float32, 1e-5)],
 )
 def test_the_adjoint_matches(backend: str, dtype: torch.dtype, tolerance: float):
     torch.manual_seed(0)
@@ -73,7 +78,9 @@ def test_the_adjoint_matches(backend: str, dtype: torch.dtype, tolerance: float)
 
 
 def test_it_is_found_by_name_with_its_options():
-    A = PROJECTORS.build("spect", grid=Grid.centred((4, 4, 4), 4.0, (0, 0, 150)), cameras=pinhole(), diameter_mm=3.0)
+    A = PROJECTORS.build(
+        "spect", grid=Grid.centred((4, 4, 4), 4.0, (0, 0, 150)), cameras=pinhole(), diameter_mm=3.0
+    )
     assert isinstance(A, Spect)
     assert A.diameter_mm == 3.0
 

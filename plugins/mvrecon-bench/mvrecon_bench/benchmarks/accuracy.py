@@ -1,4 +1,6 @@
-"""How far a projector is from being right: matched, finite, repeatable, and its gradient by the pose."""
+"""How far a projector is from being right: matched, finite, repeatable, and its gradient by the
+pose.
+"""
 
 from collections.abc import Sequence
 
@@ -27,8 +29,12 @@ def same_bits(a: Tensor, b: Tensor) -> bool:
     return torch.equal(a.contiguous().view(torch.uint8), b.contiguous().view(torch.uint8))
 
 
-def rigid(gradients: Sequence[Float[Tensor, "m 3"]], cameras: Cameras, grid: Grid) -> Float[Tensor, "m 6"]:
-    """Derivatives by turns and shifts of each camera, as `truth.pose_gradient`, from those by its four vectors."""
+def rigid(
+    gradients: Sequence[Float[Tensor, "m 3"]], cameras: Cameras, grid: Grid
+) -> Float[Tensor, "m 6"]:
+    """Derivatives by turns and shifts of each camera, as `truth.pose_gradient`, from those by its
+    four vectors.
+    """
     source, origin, u, v = (g.detach().double().cpu() for g in gradients)
     pairs = (
         (cameras.source - grid.centre, source),

@@ -51,7 +51,9 @@ class Case:
     def __post_init__(self) -> None:
         for what, name, known in (("camera", self.camera, RIGS), ("dtype", self.dtype, DTYPES)):
             if name not in known:
-                raise ValueError(f"Unknown {what} {name!r} of a benchmark. Known: {', '.join(known)}")
+                raise ValueError(
+                    f"Unknown {what} {name!r} of a benchmark. Known: {', '.join(known)}"
+                )
         if self.n < 1 or not self.ratio > 0 or self.views < 1 or self.threads < 0:
             raise ValueError(f"A benchmark's n, ratio and views must be positive, got {self}")
         found = "cuda" if torch.cuda.is_available() else "cpu"
@@ -94,26 +96,38 @@ class Case:
 
 
 def boxes(field: float) -> Phantom:
-    """Three boxes whose faces lie on those of the voxels wherever 32 divides n, so that the voxels err nowhere."""
+    """Three boxes whose faces lie on those of the voxels wherever 32 divides n, so that the voxels
+    err nowhere.
+    """
     centres = torch.tensor([[1, -1, 0], [-3, 2, 4], [5, -4, -2]])
     halves = torch.tensor([[12, 10, 11], [3, 4, 2], [2, 3, 5]])
     values = torch.tensor([0.4, 0.5, -0.3])
     step = field / 32
-    return Phantom((Solids("box", centres * step, torch.eye(3).expand(3, 3, 3), halves * step, values),))
+    return Phantom(
+        (Solids("box", centres * step, torch.eye(3).expand(3, 3, 3), halves * step, values),)
+    )
 
 
-def expand(base: Mapping[str, Any], plan: Mapping[str, Mapping[str, Any]]) -> list[tuple[Case, dict[str, Any]]]:
-    """The cases of a plan, each once, with the settings and the name of its block, small volumes first.
+def expand(
+    base: Mapping[str, Any], plan: Mapping[str, Mapping[str, Any]]
+) -> list[tuple[Case, dict[str, Any]]]:
+    """The cases of a plan, each once, with the settings and the name of its block, small volumes
+    first.
 
-    A block `{about: {...}, vary: {axis: [values]}, **settings}` is the base with the changes of `about`, and from there
-    every axis varied on its own.
+    A block `{about: {...}, vary: {axis: [values]}, **settings}` is the base with the changes of
+    `about`, and from there every axis varied on its own.
     """
     found: dict[Case, dict[str, Any]] = {}
     for name, block in plan.items():
         about = Case(**{**base, **block.get("about", {})})
         axes: Mapping[str, Sequence[Any]] = block.get("vary", {})
-        points = [about, *(replace(about, **{axis: value}) for axis, values in axes.items() for value in values)]
-        settings = {key: value for key, value in block.items() if key not in ("about", "vary")} | {"block": name}
+        points = [
+            about,
+            *(replace(about, **{axis: value}) for axis, values in axes.items() for value in values),
+        ]
+        settings = {key: value for key, value in block.items() if key not in ("about", "vary")} | {
+            "block": name
+        }
         for case in sorted(points, key=lambda case: case.n):
             found.setdefault(case, settings)
     return list(found.items())
@@ -128,7 +142,9 @@ def _cone(case: Case, sid: float, sdd: float, odd: int = 0, **angles: Any) -> Ca
 def _parallel(case: Case, views: int) -> Cameras:
     count = max(1, round(case.n / case.ratio))
     start = 0.0 if views == 1 else 3.0
-    return rigs.parallel(views, {"pixels": [count, count], "pixel_mm": case.pixel}, start_degrees=start)
+    return rigs.parallel(
+        views, {"pixels": [count, count], "pixel_mm": case.pixel}, start_degrees=start
+    )
 
 
 def _dcspect80(case: Case) -> Cameras:
@@ -146,7 +162,9 @@ def _axis_parallel(case: Case) -> Cameras:
     one = _parallel(case, 1)
     turn, still = torch.eye(3, dtype=torch.float64).roll(1, 0), torch.zeros(3, dtype=torch.float64)
     turned = (one, one.moved(turn, still), one.moved(turn @ turn, still))
-    return replace(one, **{name: torch.cat([getattr(rig, name) for rig in turned]) for name in VECTORS})
+    return replace(
+        one, **{name: torch.cat([getattr(rig, name) for rig in turned]) for name in VECTORS}
+    )
 
 
 RIGS: dict[str, Callable[[Case], Cameras]] = {

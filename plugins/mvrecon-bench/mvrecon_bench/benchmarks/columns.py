@@ -7,9 +7,11 @@ OPERATORS = {
     "part": "projector, by its name in the registry",
     "method": "its option of that name, where it has one",
     "options": "all its options, as JSON",
-    "backend": "what computed, as far as the part tells: cpu, cuda, reference, or own of another library",
+    "backend": "what computed, as far as the part tells: cpu, cuda, reference, or own of another "
+    "library",
     "device": "where volume and views are",
-    "dtype": "in which volume and views are kept; float16 and bfloat16 are storage, the arithmetic is the part's",
+    "dtype": "in which volume and views are kept; float16 and bfloat16 are storage, the "
+    "arithmetic is the part's",
     "threads": "threads of torch",
     "scene": "the object, whose integrals are known in closed form",
     "camera": "the rig",
@@ -20,38 +22,47 @@ OPERATORS = {
     "rays": "views x pixels",
     "status": "ok, or skipped: and the reason",
     "note": "calls that gave no figure, or that were too slow to repeat",
-    "error_thin": "|A x - t| / |t| over all pixels, t the exact integrals along the pixels' central rays",
+    "error_thin": "|A x - t| / |t| over all pixels, t the exact integrals along the pixels' "
+    "central rays",
     "error_pixel": "the same, t the mean of exact integrals along rays x rays lines to a pixel",
     "floor_thin": "error_thin of the exact integrals of the same voxels (Siddon in float64)",
     "floor_pixel": "error_pixel of the same integrals; an interpolating method may err less",
-    "forward_ms": "y = A x, in ms: median of at least `repeats` calls, launch included, the first call not",
+    "forward_ms": "y = A x, in ms: median of at least `repeats` calls, launch included, the first "
+    "call not",
     "adjoint_ms": "A^T y, in ms, likewise",
     "volume_grad_ms": "forward and backward to the volume, in ms, likewise",
     "pose_grad_ms": "forward and backward to the cameras, in ms, likewise",
-    "first_ms": "the first forward call in ms: compiling, where this process had not done it before, and loading",
+    "first_ms": "the first forward call in ms: compiling, where this process had not done it "
+    "before, and loading",
     "calls": "the least number of calls of which one of the four times is the median",
     "forward_ratio": "forward_ms / that of the first part of the list, timed in turns with it",
     "adjoint_ratio": "adjoint_ms / that of the first part, likewise",
     "volume_grad_ratio": "volume_grad_ms / that of the first part, likewise",
     "pose_grad_ratio": "pose_grad_ms / that of the first part, likewise",
-    "peak_mb": "most memory in 2^20 bytes of a forward call beyond what was in use before it, its output included",
+    "peak_mb": "most memory in 2^20 bytes of a forward call beyond what was in use before it, its "
+    "output included",
     "adjoint_peak_mb": "the same of an adjoint call",
     "ray_slabs_per_s": "rays x n / forward time: nominal, whatever is skipped",
     "adjointness": "|<A x, y> - <x, A^T y>| / (|A x| |y|) for random x and y",
     "repeatable": "whether forward and adjoint give the same bits twice",
     "nans": "values that are NaN or infinite in views, adjoint and both gradients",
-    "pose_cosine": "cosine between the derivatives of sum(w y) by rigid motions of up to four cameras and those of the "
+    "pose_cosine": "cosine between the derivatives of sum(w y) by rigid motions of up to four "
+    "cameras and those of the "
     "closed form, averaged over 2 x 2 rays to a pixel; w is white noise",
     "load": "the machine's load average over the minute before",
 }
 
 SCALING_KEYS = (
-    "part", "options", "device", "dtype", "axis", "n", "pixels", "views", "batch", "channels", "threads",
-)  # fmt: skip
+    *("part", "options", "device", "dtype", "axis"),
+    *("n", "pixels", "views", "batch", "channels", "threads"),
+)
 
 #: `bench=scaling`.
 SCALING = {
-    **{name: OPERATORS[name] for name in ("part", "method", "options", "backend", "device", "dtype")},
+    **{
+        name: OPERATORS[name]
+        for name in ("part", "method", "options", "backend", "device", "dtype")
+    },
     "axis": "what is varied: voxels, rays (of each view), views, batch, channels or threads",
     "size": "how much of it: n^3, pixels^2, or the count",
     "n": OPERATORS["n"],
@@ -60,7 +71,10 @@ SCALING = {
     "batch": "volumes, each with channels of its own, on the same rays",
     "channels": "of each volume",
     "threads": OPERATORS["threads"],
-    **{name: OPERATORS[name] for name in ("status", "note", "forward_ms", "adjoint_ms", "calls", "load")},
+    **{
+        name: OPERATORS[name]
+        for name in ("status", "note", "forward_ms", "adjoint_ms", "calls", "load")
+    },
 }
 
 SKIP_KEYS = ("scene", "rig", "method", "task", "mode", "n", "device", "threads")
@@ -71,11 +85,15 @@ SKIP = {
     "source": "where its volume is from: a phantom, a file's case, or what stands in for it",
     "rig": "the cameras, by their name in the configuration",
     "method": "of the projector",
-    "task": "forward: A x of a volume that is another at every call; forward_static: A x, the support given once; "
-    "adjoint: A^T y inside the support, given once, y white noise; sirt20: 20 iterations of SIRT inside the hull of "
-    "the views; cross_view: the model end to end on scenes that are ever new; cross_view_static: on scenes that fill "
+    "task": "forward: A x of a volume that is another at every call; forward_static: A x, the "
+    "support given once; "
+    "adjoint: A^T y inside the support, given once, y white noise; sirt20: 20 iterations of SIRT "
+    "inside the hull of "
+    "the views; cross_view: the model end to end on scenes that are ever new; cross_view_static: "
+    "on scenes that fill "
     "the same box, whose geometry it has kept",
-    "mode": "off: nothing is skipped; cropped: nothing, on the volume cropped to the box around what is there; others: "
+    "mode": "off: nothing is skipped; cropped: nothing, on the volume cropped to the box around "
+    "what is there; others: "
     "`skip` of the projector, of the model its `support`",
     "n": "voxels along each edge; none where a checkpoint brings its own grid",
     "device": OPERATORS["device"],
@@ -88,16 +106,20 @@ SKIP = {
     "occupancy": "part of the voxels that are not zero",
     "box": "part of the volume that the box around them takes",
     "support": "part of the voxels in the hull of the views, of sirt20 and the model",
-    "ms": "one call in ms: median of at least `repeats` taken in turns with the other modes; building the mask is part "
-    "of it but for forward_static and adjoint, and nothing is charged to off and cropped for theirs",
+    "ms": "one call in ms: median of at least `repeats` taken in turns with the other modes; "
+    "building the mask is part "
+    "of it but for forward_static and adjoint, and nothing is charged to off and cropped for "
+    "theirs",
     "over_full": "how many times as fast as off: its ms / ms",
     "over_crop": "how many times as fast as cropped: its ms / ms",
     "build_ms": "building the mask, in ms; blank where every call does so by itself",
-    "error": "greatest absolute difference of a value from that of off; of the adjoint inside the support",
+    "error": "greatest absolute difference of a value from that of off; of the adjoint inside the "
+    "support",
     "differing": "how many values differ from those of off in any bit",
     "psnr": "against the truth in dB, mean over `cases`; blank for a model that is not trained",
     "psnr_loss": "that of off less that of the mode, in dB",
-    "peak_mb": "most memory in 2^20 bytes of a call beyond what was in use before it, its result included",
+    "peak_mb": "most memory in 2^20 bytes of a call beyond what was in use before it, its result "
+    "included",
     "calls": "how many calls ms is the median of",
     "load": OPERATORS["load"],
 }
@@ -107,7 +129,8 @@ PRECISION_KEYS = ("task", "precision", "n", "device", "threads")
 #: `bench=precision`.
 PRECISION = {
     "task": "what is computed",
-    "precision": "in which volumes, views and weights are stored; autocast: in which networks compute",
+    "precision": "in which volumes, views and weights are stored; autocast: in which networks "
+    "compute",
     "n": "voxels along each edge; of a checkpoint's model its own",
     "device": OPERATORS["device"],
     "threads": OPERATORS["threads"],
@@ -117,7 +140,8 @@ PRECISION = {
     "not_finite": "values that are NaN or infinite",
     "ms": "one call in ms: median of at least `repeats` taken in turns with the other precisions",
     "ratio": "ms / that of float32",
-    "peak_mb": "most memory in 2^20 bytes of a call beyond what was in use before it, its result included",
+    "peak_mb": "most memory in 2^20 bytes of a call beyond what was in use before it, its result "
+    "included",
     "psnr": "against the truth in dB; blank for a model that is not trained",
     "calls": "how many calls ms is the median of",
     "load": OPERATORS["load"],

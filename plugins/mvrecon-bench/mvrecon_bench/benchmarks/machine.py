@@ -1,4 +1,6 @@
-"""What a benchmark ran on: processor, threads, GPU, and the versions of everything that is compared."""
+"""What a benchmark ran on: processor, threads, GPU, and the versions of everything that is
+compared.
+"""
 
 import os
 import platform
@@ -11,7 +13,16 @@ import torch
 from mvrecon.engine.record import VERSIONS, versions, write
 
 #: Distributions of other libraries whose projectors take part.
-PEERS = ("itk-rtk", "nanodrr", "diffdrr", "astra-toolbox", "mbirtorch", "scikit-image", "mvrecon-peers", "matplotlib")
+PEERS = (
+    "itk-rtk",
+    "nanodrr",
+    "diffdrr",
+    "astra-toolbox",
+    "mbirtorch",
+    "scikit-image",
+    "mvrecon-peers",
+    "matplotlib",
+)
 
 
 def describe(peers: Sequence[str] = PEERS) -> dict[str, str]:

@@ -1,4 +1,6 @@
-"""How long a call takes and how much memory it needs, launch and waiting for the device included."""
+"""How long a call takes and how much memory it needs, launch and waiting for the device
+included.
+"""
 
 import ctypes
 import os
@@ -54,7 +56,10 @@ def interleaved(
         repeats: least number of calls.
         device: on which they work.
     """
-    rounds = {key: max(repeats, min(MORE * repeats, round(WORTH_S / max(first_s[key], 1e-9)))) for key in calls}
+    rounds = {
+        key: max(repeats, min(MORE * repeats, round(WORTH_S / max(first_s[key], 1e-9))))
+        for key in calls
+    }
     times: dict[int, list[float]] = {key: [] for key in calls}
     for turn in range(max(rounds.values(), default=0)):
         for key, call in calls.items():
@@ -64,12 +69,12 @@ def interleaved(
 
 
 def with_memory(call: Call, device: str) -> tuple[Any, float]:
-    """What a call returns, and the most MB (2^20 bytes) that it needed beyond what was in use before it, its result
-    included.
+    """What a call returns, and the most MB (2^20 bytes) that it needed beyond what was in use
+    before it, its result included.
 
-    On a GPU what torch's allocator gave out; on Linux the high-water mark of resident memory, reset before the call;
-    elsewhere the growth of the process's lifetime maximum, which misses what an earlier call has used already; NaN on
-    Windows.
+    On a GPU what torch's allocator gave out; on Linux the high-water mark of resident memory, reset
+    before the call; elsewhere the growth of the process's lifetime maximum, which misses what an
+    earlier call has used already; NaN on Windows.
     """
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats(device)

@@ -46,13 +46,20 @@ class Operators:
         plan: blocks `{about: {...}, vary: {axis: [values]}, repeat_s: ...}`, see `cases.expand`.
         rays: the pixel average is over rays x rays exact integrals.
         repeats: least number of calls of which a time is the median.
-        limit_s: a call that is expected to take longer is left out. One that takes longer than a block's `repeat_s`
-            is timed once, and noted.
+        limit_s: a call that is expected to take longer is left out. One that takes longer than a
+            block's `repeat_s` is timed once, and noted.
     """
 
     columns: Mapping[str, str] = OPERATORS
     keys: Sequence[str] = KEYS
-    charts: Sequence[str] = ("error_thin", "error_pixel", "forward_ms", "adjoint_ms", "volume_grad_ms", "pose_grad_ms")
+    charts: Sequence[str] = (
+        "error_thin",
+        "error_pixel",
+        "forward_ms",
+        "adjoint_ms",
+        "volume_grad_ms",
+        "pose_grad_ms",
+    )
 
     def __init__(
         self,
@@ -73,7 +80,9 @@ class Operators:
         for case, settings in self.plan:
             parallel, block = case.cameras().parallel, settings["block"]
             parts = [part for part in self.parts if part.takes(case.n, parallel, block)]
-            found.append([Job(part, case, parts[0], settings.get("repeat_s", 5.0)) for part in parts])
+            found.append(
+                [Job(part, case, parts[0], settings.get("repeat_s", 5.0)) for part in parts]
+            )
         return found
 
     def label(self, row: Row) -> str:
@@ -81,14 +90,23 @@ class Operators:
         return report.part_label(row)
 
     def measure(self, jobs: Sequence[Job], rows: Sequence[Row], say: Say) -> Iterator[Row]:
-        """The rows of jobs on one case; `rows` are those there are, from which long times are foreseen."""
+        """The rows of jobs on one case; `rows` are those there are, from which long times are
+        foreseen.
+        """
         case = jobs[0].case
-        where, shown = {"device": case.device, "dtype": DTYPES[case.dtype]}, report.case_label(jobs[0].row)
+        where, shown = (
+            {"device": case.device, "dtype": DTYPES[case.dtype]},
+            report.case_label(jobs[0].row),
+        )
         with threads(case.threads):
             say(f"{shown}: truth")
             truth, rig, grid = truth_of(case.geometry, self.rays), case.cameras(), case.grid()
             x, y = truth.volume[None, None].to(**where), truth.cotangent[None, None].to(**where)
-            common = {"pixels": "x".join(map(str, rig.shape)), "rays": truth.thin.numel(), "load": load_average()}
+            common = {
+                "pixels": "x".join(map(str, rig.shape)),
+                "rays": truth.thin.numel(),
+                "load": load_average(),
+            }
             common |= {"floor_thin": truth.floor_thin, "floor_pixel": truth.floor_pixel}
             tried: list[tuple[Trial, Row, float]] = []
             for job in jobs:
@@ -97,7 +115,9 @@ class Operators:
                 try:
                     trial = Trial(job.part, grid, rig, x, y)
                     row |= self._examine(trial, truth, self._forecast(row, rows), job.repeat_s)
-                except Exception as error:  # whatever a part raises is its row's status, not the end of the run
+                except (
+                    Exception
+                ) as error:  # whatever a part raises is its row's status, not the end of the run
                     yield {**row, "status": f"skipped: {reason(error)}"}
                 else:
                     tried.append((trial, row, job.repeat_s))
@@ -105,12 +125,16 @@ class Operators:
             yield from self._timed(tried, case, jobs[0].first)
 
     def _forecast(self, row: Row, rows: Sequence[Row]) -> dict[str, float]:
-        """Seconds of each call by the work (rays times voxels along an edge) of the largest similar case so far."""
+        """Seconds of each call by the work (rays times voxels along an edge) of the largest similar
+        case so far.
+        """
         same = ("part", "options", "device", "dtype")
         done = [
             r
             for r in rows
-            if r.get("status") == "ok" and all(r.get(k, "") == row[k] for k in same) and number(r, "n") < row["n"]
+            if r.get("status") == "ok"
+            and all(r.get(k, "") == row[k] for k in same)
+            and number(r, "n") < row["n"]
         ]
         if not done:
             return {}
@@ -119,7 +143,9 @@ class Operators:
         times = {call: number(nearest, f"{call}_ms") for call in CALLS}
         return {call: grow * ms / 1e3 for call, ms in times.items() if ms == ms}
 
-    def _examine(self, trial: Trial, truth: Truth, forecast: Mapping[str, float], repeat_s: float) -> Row:
+    def _examine(
+        self, trial: Trial, truth: Truth, forecast: Mapping[str, float], repeat_s: float
+    ) -> Row:
         """Every call once, and again where that is quick: errors, memory, repeatability.
 
         Raises:
@@ -127,21 +153,29 @@ class Operators:
         """
         first = {}
         for call in CALLS:
-            first[call] = trial.attempt(call, expected(trial.seconds, call, forecast), repeat_s, self.limit_s)
+            first[call] = trial.attempt(
+                call, expected(trial.seconds, call, forecast), repeat_s, self.limit_s
+            )
             if first["forward"] is None:
                 raise RuntimeError("; ".join(trial.notes))
         views, volume, pose = first["forward"], first["adjoint"], first["pose_grad"]
         row: Row = {"first_ms": 1e3 * trial.first_s["forward"], "backend": trial.backend}
         for name in ("thin", "pixel"):
             row[f"error_{name}"] = relative_error(views[0, 0].cpu(), getattr(truth, name))
-        results = [found for found in (views, volume, first["volume_grad"], *(pose or ())) if found is not None]
+        results = [
+            found
+            for found in (views, volume, first["volume_grad"], *(pose or ()))
+            if found is not None
+        ]
         row["nans"] = accuracy.not_finite(results)
         if pose is not None:
             found = accuracy.rigid(pose, trial.cameras, trial.grid)[truth.watched]
             row["pose_cosine"] = accuracy.cosine(found, truth.pose)
         return row | self._repeat(trial, {"forward": views, "adjoint": volume}, repeat_s)
 
-    def _repeat(self, trial: Trial, first: Mapping[str, torch.Tensor | None], repeat_s: float) -> Row:
+    def _repeat(
+        self, trial: Trial, first: Mapping[str, torch.Tensor | None], repeat_s: float
+    ) -> Row:
         row: Row = {}
         same: list[bool] = []
         for call, name in (("forward", "peak_mb"), ("adjoint", "adjoint_peak_mb")):
@@ -152,31 +186,51 @@ class Operators:
         row["repeatable"] = all(same) if same else None
         volume = first["adjoint"]
         if volume is not None and trial.seconds["forward"] <= repeat_s:
-            trial.x, x = torch.rand(trial.x.shape, generator=torch.Generator().manual_seed(1)).to(trial.x), trial.x
+            trial.x, x = (
+                torch.rand(trial.x.shape, generator=torch.Generator().manual_seed(1)).to(trial.x),
+                trial.x,
+            )
             row["adjointness"] = accuracy.adjointness(trial.x, trial.forward(), trial.y, volume)
             trial.x = x
         return row
 
-    def _timed(self, tried: Sequence[tuple[Trial, Row, float]], case: Case, first: Part) -> Iterator[Row]:
+    def _timed(
+        self, tried: Sequence[tuple[Trial, Row, float]], case: Case, first: Part
+    ) -> Iterator[Row]:
         """Each call of all parts in turns; then the rows, with their ratios to the first part's."""
         for call in CALLS:
-            took = {n: trial.seconds[call] for n, (trial, _, _) in enumerate(tried) if call in trial.seconds}
+            took = {
+                n: trial.seconds[call]
+                for n, (trial, _, _) in enumerate(tried)
+                if call in trial.seconds
+            }
             short = {n: s for n, s in took.items() if s <= tried[n][2]}
             calls = {n: getattr(tried[n][0], call) for n in short}
             found = interleaved(calls, short, self.repeats, case.device)
             for n, seconds in took.items():
                 trial, row, _ = tried[n]
                 timing = found.get(n, Timing(1e3 * seconds, 1))
-                row[f"{call}_ms"], row["calls"] = timing.ms, min(row.get("calls", timing.calls), timing.calls)
+                row[f"{call}_ms"], row["calls"] = (
+                    timing.ms,
+                    min(row.get("calls", timing.calls), timing.calls),
+                )
                 if n not in found:
                     trial.notes.append(f"{call}: one call, which took {seconds:.1f} s")
         unit = next((row for trial, row, _ in tried if trial.part == first), {})
         for trial, row, _ in tried:
             ratios = {
-                f"{c}_ratio": row[f"{c}_ms"] / unit[f"{c}_ms"] for c in CALLS if {f"{c}_ms"} <= set(row) & set(unit)
+                f"{c}_ratio": row[f"{c}_ms"] / unit[f"{c}_ms"]
+                for c in CALLS
+                if {f"{c}_ms"} <= set(row) & set(unit)
             }
             rate = row["rays"] * case.n / (row["forward_ms"] / 1e3)
-            yield {**row, **ratios, "ray_slabs_per_s": rate, "status": "ok", "note": "; ".join(trial.notes)}
+            yield {
+                **row,
+                **ratios,
+                "ray_slabs_per_s": rate,
+                "status": "ok",
+                "note": "; ".join(trial.notes),
+            }
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """Write `pareto.png` where matplotlib is installed; the texts of the tables by name."""
@@ -184,8 +238,14 @@ class Operators:
         if find_spec("matplotlib"):
             from mvrecon_bench.benchmarks import plots  # of the optional extra `bench`
 
-            names = {"thin": "error against the thin ray", "pixel": "error against the pixel average"}
+            names = {
+                "thin": "error against the thin ray",
+                "pixel": "error against the pixel average",
+            }
             panels = {title: report.panel(rows, base, name) for name, title in names.items()}
             plots.pareto(panels, folder / "pareto.png")
         wanted = (*(targets.GPU if self.base.device != "cpu" else targets.CPU), *targets.ACCURACY)
-        return {"table": report.operators_table(rows, self.columns), "targets": targets.table(wanted, rows, base)}
+        return {
+            "table": report.operators_table(rows, self.columns),
+            "targets": targets.table(wanted, rows, base),
+        }

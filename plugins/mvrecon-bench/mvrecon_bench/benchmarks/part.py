@@ -17,7 +17,8 @@ class Part:
     Args:
         name: in the registry of projectors.
         options: of that projector, such as method and backend.
-        beam: "central" or "parallel" keeps the part to rigs of that kind; None: it says itself what it cannot do.
+        beam: "central" or "parallel" keeps the part to rigs of that kind; None: it says itself what
+            it cannot do.
         largest: keeps the part to volumes of at most so many voxels along an edge.
         only: keeps the part to these blocks of a plan.
     """
@@ -30,34 +31,59 @@ class Part:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> "Part":
-        """The part that a mapping `{name: ..., beam: ..., largest: ..., only: ..., **options}` describes.
+        """The part that a mapping `{name: ..., beam: ..., largest: ..., only: ..., **options}`
+        describes.
 
         Raises:
             ValueError: no name, or an unknown beam.
         """
         beam, only = config.get("beam"), config.get("only")
         if "name" not in config or beam not in (None, "central", "parallel"):
-            raise ValueError(f"A part needs a name, and a beam of central, parallel or none, got {dict(config)}")
-        options = {key: value for key, value in config.items() if key not in ("name", "beam", "largest", "only")}
-        return cls(config["name"], options, beam, config.get("largest"), tuple(only) if only else None)
+            raise ValueError(
+                f"A part needs a name, and a beam of central, parallel or none, got {dict(config)}"
+            )
+        options = {
+            key: value
+            for key, value in config.items()
+            if key not in ("name", "beam", "largest", "only")
+        }
+        return cls(
+            config["name"], options, beam, config.get("largest"), tuple(only) if only else None
+        )
 
     @property
     def label(self) -> str:
         """Short and different for different options."""
-        others = [f"{key}={value}" for key, value in self.options.items() if key not in ("method", "backend")]
+        others = [
+            f"{key}={value}"
+            for key, value in self.options.items()
+            if key not in ("method", "backend")
+        ]
         return " ".join(
-            [self.name, *(str(self.options[k]) for k in ("method", "backend") if k in self.options), *others]
+            [
+                self.name,
+                *(str(self.options[k]) for k in ("method", "backend") if k in self.options),
+                *others,
+            ]
         )
 
     @property
     def row(self) -> dict[str, str]:
         """What a table tells of the part."""
         options = json.dumps(dict(self.options), sort_keys=True) if self.options else ""
-        return {"part": self.name, "method": str(self.options.get("method", "")), "options": options}
+        return {
+            "part": self.name,
+            "method": str(self.options.get("method", "")),
+            "options": options,
+        }
 
     def takes(self, n: int, parallel: bool, block: str) -> bool:
-        """Whether the part is meant for n voxels along an edge under such a rig, in this block of a plan."""
-        fits = self.beam in (None, "parallel" if parallel else "central") and n <= (self.largest or n)
+        """Whether the part is meant for n voxels along an edge under such a rig, in this block of a
+        plan.
+        """
+        fits = self.beam in (None, "parallel" if parallel else "central") and n <= (
+            self.largest or n
+        )
         return fits and (self.only is None or block in self.only)
 
     def build(self, grid: Grid, cameras: Cameras, device: str = "cpu") -> Any:
@@ -67,4 +93,6 @@ class Part:
             LookupError, ImportError: it is not installed.
             ValueError: it does not do this geometry.
         """
-        return PROJECTORS.from_config({"name": self.name, **self.options}, grid=grid, cameras=cameras).to(device)
+        return PROJECTORS.from_config(
+            {"name": self.name, **self.options}, grid=grid, cameras=cameras
+        ).to(device)

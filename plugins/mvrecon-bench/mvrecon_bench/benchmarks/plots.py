@@ -12,22 +12,40 @@ Points = Sequence[tuple[float, float]]
 MARKERS = "osD^v<>PX*hd8p"
 
 
-def pareto(panels: Mapping[str, tuple[Mapping[str, Points], Mapping[int, float]]], path: Path) -> None:
-    """Error against forward time, one marker for each part, large for its largest volume; both axes logarithmic.
+def pareto(
+    panels: Mapping[str, tuple[Mapping[str, Points], Mapping[int, float]]], path: Path
+) -> None:
+    """Error against forward time, one marker for each part, large for its largest volume; both axes
+    logarithmic.
 
     Args:
-        panels: title -> (part -> (ms, error) at growing volumes, voxels along an edge -> floor of the error).
+        panels: title -> (part -> (ms, error) at growing volumes, voxels along an edge -> floor of
+            the error).
         path: of the PNG.
     """
     figure, axes = _figure(len(panels), "forward time, ms")
     for ax, (title, (curves, floors)) in zip(axes, panels.items(), strict=True):
         for marker, (label, points) in zip(cycle(MARKERS), sorted(curves.items()), strict=False):
-            (line,) = ax.plot(*zip(*points, strict=True), marker=marker, markersize=4, linewidth=0.6, alpha=0.7)
-            ax.plot(*points[-1], marker=marker, markersize=9, linestyle="", color=line.get_color(), label=label)
+            (line,) = ax.plot(
+                *zip(*points, strict=True), marker=marker, markersize=4, linewidth=0.6, alpha=0.7
+            )
+            ax.plot(
+                *points[-1],
+                marker=marker,
+                markersize=9,
+                linestyle="",
+                color=line.get_color(),
+                label=label,
+            )
         for n, floor in floors.items():
             ax.axhline(floor, color="0.6", linewidth=0.8, linestyle="--")
             ax.annotate(
-                f"floor, {n}³", (0.995, floor), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7
+                f"floor, {n}³",
+                (0.995, floor),
+                xycoords=("axes fraction", "data"),
+                ha="right",
+                va="bottom",
+                fontsize=7,
             )
         ax.set_ylabel(title)
     _save(figure, axes, path)
@@ -43,26 +61,39 @@ def scaling(panels: Mapping[str, Mapping[str, Points]], path: Path) -> None:
     figure, axes = _figure(len(panels), None)
     for ax, (axis, curves) in zip(axes, panels.items(), strict=True):
         for marker, (label, points) in zip(cycle(MARKERS), sorted(curves.items()), strict=False):
-            ax.plot(*zip(*points, strict=True), marker=marker, markersize=4, linewidth=0.8, label=label)
+            ax.plot(
+                *zip(*points, strict=True), marker=marker, markersize=4, linewidth=0.8, label=label
+            )
         ax.set_xlabel(axis)
         ax.set_ylabel("time, ms")
     _save(figure, axes, path)
 
 
 def speedups(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]], path: Path) -> None:
-    """How many times as fast, a panel for each task, a line where nothing is gained; the vertical axis logarithmic.
+    """How many times as fast, a panel for each task, a line where nothing is gained; the vertical
+    axis logarithmic.
 
     Args:
-        panels: title -> against what -> (scene, times as fast), scenes in the order in which they are first met.
+        panels: title -> against what -> (scene, times as fast), scenes in the order in which they
+            are first met.
         path: of the PNG.
     """
     figure, axes = _figure(len(panels), None)
     for ax, (title, kinds) in zip(axes, panels.items(), strict=True):
         scenes = list(dict.fromkeys(scene for points in kinds.values() for scene, _ in points))
-        for n, (marker, (label, points)) in enumerate(zip(cycle(MARKERS), kinds.items(), strict=False)):
+        for n, (marker, (label, points)) in enumerate(
+            zip(cycle(MARKERS), kinds.items(), strict=False)
+        ):
             beside = 0.3 * (n - (len(kinds) - 1) / 2)
             places = [(scenes.index(scene) + beside, times) for scene, times in points]
-            ax.plot(*zip(*places, strict=True), marker=marker, markersize=5, linestyle="", alpha=0.7, label=label)
+            ax.plot(
+                *zip(*places, strict=True),
+                marker=marker,
+                markersize=5,
+                linestyle="",
+                alpha=0.7,
+                label=label,
+            )
         ax.axhline(1, color="0.3", linewidth=1)
         ax.set_xscale("linear")
         ax.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right")
@@ -82,7 +113,10 @@ def _figure(count: int, xlabel: str | None) -> tuple[Figure, list[Any]]:
         ax.set_xscale("log")
         ax.set_yscale("log")
         ax.grid(True, which="both", linewidth=0.3)
-        for axis in (ax.xaxis, ax.yaxis):  # a decade or less needs figures between the powers of ten
+        for axis in (
+            ax.xaxis,
+            ax.yaxis,
+        ):  # a decade or less needs figures between the powers of ten
             axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axis.set_major_formatter(FormatStrFormatter("%g"))
             axis.set_minor_formatter(NullFormatter())

@@ -1,4 +1,6 @@
-"""`bench=precision`: what a precision costs in error and gains in time: operators, a U-Net, the whole model."""
+"""`bench=precision`: what a precision costs in error and gains in time: operators, a U-Net, the
+whole model.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +15,13 @@ from mvrecon_bench.benchmarks import report
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.columns import PRECISION, PRECISION_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads, with_memory
-from mvrecon_bench.benchmarks.precision_tasks import PRECISIONS, Task, model_task, net_task, operator_tasks
+from mvrecon_bench.benchmarks.precision_tasks import (
+    PRECISIONS,
+    Task,
+    model_task,
+    net_task,
+    operator_tasks,
+)
 from mvrecon_bench.benchmarks.rows import Row
 from mvrecon_bench.benchmarks.trial import reason
 
@@ -66,22 +74,34 @@ class Precision:
         model: Mapping[str, Any],
         repeats: int = 5,
     ):
-        case = Case(n=base["n"], views=base["views"], device=base["device"], threads=base["threads"])
+        case = Case(
+            n=base["n"], views=base["views"], device=base["device"], threads=base["threads"]
+        )
         self.device, self.threads, self.repeats = case.device, case.threads, repeats
         self.made: dict[str, tuple[int, Callable[[], Task]]] = {
             name: (case.n, make) for name, make in operator_tasks(case).items()
         }
         for name, make, options in zip(NETS, (net_task, model_task), (unet, model), strict=True):
             self.made[name] = options["n"], partial(make, options, self.device)
-        for what, names, known in (("task", tasks, self.made), ("precision", precisions, PRECISIONS)):
+        for what, names, known in (
+            ("task", tasks, self.made),
+            ("precision", precisions, PRECISIONS),
+        ):
             if unknown := set(names) - set(known):
-                raise ValueError(f"Unknown {what} {', '.join(sorted(unknown))}. Known: {', '.join(known)}")
+                raise ValueError(
+                    f"Unknown {what} {', '.join(sorted(unknown))}. Known: {', '.join(known)}"
+                )
         self.tasks, self.precisions = tasks, list(dict.fromkeys([TRUTH, USUAL, *precisions]))
 
     def groups(self) -> list[list[Job]]:
-        """What is measured together: the precisions of a task; autocast does nothing to operators."""
+        """What is measured together: the precisions of a task; autocast does nothing to
+        operators.
+        """
         where = {"device": self.device, "threads": self.threads}
-        return [[Job(task, each, self.made[task][0], **where) for each in self._of(task)] for task in self.tasks]
+        return [
+            [Job(task, each, self.made[task][0], **where) for each in self._of(task)]
+            for task in self.tasks
+        ]
 
     def _of(self, task: str) -> list[str]:
         return [each for each in self.precisions if task in NETS or PRECISIONS[each][1] is None]
@@ -90,8 +110,12 @@ class Precision:
         """A row's task and precision, short."""
         return f"{row['task']} {row['precision']}"
 
-    def measure(self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]) -> Iterator[Row]:
-        """The rows of a task; all of its precisions are timed, since they only compare side by side."""
+    def measure(
+        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
+        """The rows of a task; all of its precisions are timed, since they only compare side by
+        side.
+        """
         say(jobs[0].task)
         common: Row = {"load": load_average()}
         with threads(self.threads), torch.no_grad():
@@ -109,10 +133,16 @@ class Precision:
                 call = task.call(precision)
                 answer, peak = with_memory(call, self.device)
                 first[key], calls[key] = once(call, self.device)[1], call
-                found[precision] = {"status": "ok", "peak_mb": peak, **_errors(answer.double(), truth)}
+                found[precision] = {
+                    "status": "ok",
+                    "peak_mb": peak,
+                    **_errors(answer.double(), truth),
+                }
                 if task.score is not None:
                     found[precision]["psnr"] = task.score(answer)
-            except Exception as error:  # a device may not have a precision; that is its row's status
+            except (
+                Exception
+            ) as error:  # a device may not have a precision; that is its row's status
                 found[precision] = {"status": f"skipped: {reason(error)}"}
         for key, timing in interleaved(calls, first, self.repeats, self.device).items():
             found[precisions[key]] |= {"ms": timing.ms, "calls": timing.calls}
@@ -138,6 +168,21 @@ def _errors(found: Tensor, truth: Tensor) -> dict[str, float]:
 
 def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
     """Every task with its precisions side by side."""
-    names = ("task", "precision", "n", "error", "worst", "not_finite", "ms", "ratio", "peak_mb", "psnr", "status")
+    names = (
+        "task",
+        "precision",
+        "n",
+        "error",
+        "worst",
+        "not_finite",
+        "ms",
+        "ratio",
+        "peak_mb",
+        "psnr",
+        "status",
+    )
     lines = [[report.figure(row, name, ".3g") for name in names] for row in rows]
-    return f"# Error and time against precision\n\n{report.markdown(names, lines, 2)}{report.legend(columns)}"
+    return (
+        "# Error and time against "
+        f"precision\n\n{report.markdown(names, lines, 2)}{report.legend(columns)}"
+    )

@@ -19,8 +19,8 @@ from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig
 
-#: Name -> what volumes and views are stored in, and what autocast computes networks in (none: as they are stored, at
-#: least float32).
+#: Name -> what volumes and views are stored in, and what autocast computes networks in (none: as
+#: they are stored, at least float32).
 PRECISIONS: dict[str, tuple[torch.dtype, torch.dtype | None]] = {
     "float64": (torch.float64, None),
     "float32": (torch.float32, None),
@@ -55,7 +55,9 @@ def operator_tasks(case: Case) -> dict[str, Callable[[], Task]]:
 
 def _operator(case: Case, method: str, direction: str) -> Task:
     x = voxelise(case.phantom(), case.grid()).double()[None, None].to(case.device)
-    A = PROJECTORS.build("drr", grid=case.grid(), cameras=case.cameras(), method=method).to(case.device)
+    A = PROJECTORS.build("drr", grid=case.grid(), cameras=case.cameras(), method=method).to(
+        case.device
+    )
     given = x if direction == "forward" else A(x)
 
     def call(precision: str) -> Callable[[], Tensor]:
@@ -81,10 +83,14 @@ def model_task(settings: Mapping[str, Any], device: str) -> Task:
         A, net, scale = module.projector, module.model, module.hparams["data_range"]
     else:
         grid = cube({}, settings["n"])
-        A = PROJECTORS.build("drr", grid=grid, cameras=rig(settings["rig"], edge(grid), settings["n"]))
+        A = PROJECTORS.build(
+            "drr", grid=grid, cameras=rig(settings["rig"], edge(grid), settings["n"])
+        )
         torch.manual_seed(0)
         net, scale = MODELS.from_config(settings["model"], projector=A), 1.0
-        for parameter in net.parameters():  # the last layers start from zero, and would hide the rest
+        for (
+            parameter
+        ) in net.parameters():  # the last layers start from zero, and would hide the rest
             nn.init.normal_(parameter, std=0.1)
     sample = SCENES.build("ellipsoids").sample(0, 1, A.grid, A.cameras)
     views = sample.views[None].double().to(device)
@@ -92,7 +98,9 @@ def model_task(settings: Mapping[str, Any], device: str) -> Task:
     def score(volume: Tensor) -> float:
         return volume_metrics(volume[0].float().cpu(), sample.volume, sample.inside, scale)["psnr"]
 
-    return Task(lambda precision: _run(net.to(device).eval(), views, precision), score if trained else None)
+    return Task(
+        lambda precision: _run(net.to(device).eval(), views, precision), score if trained else None
+    )
 
 
 def _run(net: nn.Module, x: Tensor, precision: str) -> Callable[[], Tensor]:

@@ -31,7 +31,9 @@ CASE = ("scene", "camera", "n", "ratio", "views", "dtype", "threads", "device")
 def markdown(head: Sequence[str], lines: Iterable[Sequence[str]], texts: int = 1) -> str:
     """A table; all columns but the first `texts` are right-aligned."""
     rows = [head, ["---"] * texts + ["---:"] * (len(head) - texts), *lines]
-    return "".join(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |\n" for row in rows)
+    return "".join(
+        f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |\n" for row in rows
+    )
 
 
 def part_label(row: Mapping[str, Any]) -> str:
@@ -52,7 +54,9 @@ def case_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def operators_table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """Every measured row, case by case, the fastest forward first; then what was left out; then the columns."""
+    """Every measured row, case by case, the fastest forward first; then what was left out; then the
+    columns.
+    """
     cases: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         if row["status"] == "ok":
@@ -62,7 +66,10 @@ def operators_table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
         thin, pixel = (number(members[0], f"floor_{name}") for name in ("thin", "pixel"))
         ordered = sorted(members, key=lambda row: number(row, "forward_ms"))
         lines = [(part_label(row), *(figure(row, name) for name in SHOWN)) for row in ordered]
-        text += f"\n## {case_label(members[0])}\n\nFloors of the errors: thin {thin:.4f}, pixel {pixel:.4f}.\n\n"
+        text += (
+            f"\n## {case_label(members[0])}\n\nFloors of the errors: thin {thin:.4f}, pixel "
+            f"{pixel:.4f}.\n\n"
+        )
         text += markdown(("part", *SHOWN), lines)
     return text + left_out(rows) + legend(columns)
 
@@ -86,7 +93,11 @@ def legend(columns: Mapping[str, str]) -> str:
 def figure(row: Row, name: str, form: str | None = None) -> str:
     """A figure as the tables show it."""
     found = row.get(name, "")
-    return format(found, SHOWN.get(name, ".4g") if form is None else form) if isinstance(found, float) else str(found)
+    return (
+        format(found, SHOWN.get(name, ".4g") if form is None else form)
+        if isinstance(found, float)
+        else str(found)
+    )
 
 
 def panel(
@@ -94,10 +105,15 @@ def panel(
 ) -> tuple[dict[str, list[tuple[float, float]]], dict[int, float]]:
     """What the base case shows at all its sizes against one truth, "thin" or "pixel".
 
-    Part -> (forward time, error), small volumes first; and the floor of the error by the size of the volume.
+    Part -> (forward time, error), small volumes first; and the floor of the error by the size of
+    the volume.
     """
     fixed = {name: value for name, value in base.items() if name != "n"}
-    same = [row for row in rows if row["status"] == "ok" and all(row[name] == value for name, value in fixed.items())]
+    same = [
+        row
+        for row in rows
+        if row["status"] == "ok" and all(row[name] == value for name, value in fixed.items())
+    ]
     curves: dict[str, list[tuple[float, float]]] = {}
     for row in sorted(same, key=lambda row: row["n"]):
         point = number(row, "forward_ms"), number(row, f"error_{truth}")

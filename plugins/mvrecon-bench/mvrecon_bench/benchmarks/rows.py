@@ -1,4 +1,6 @@
-"""A table that grows by a row at a time and outlives a crash: what is in it need not be measured again."""
+"""A table that grows by a row at a time and outlives a crash: what is in it need not be measured
+again.
+"""
 
 import csv
 import io
@@ -35,10 +37,13 @@ class Rows:
             write(path, text)
         header, *lines = list(csv.reader(io.StringIO(text))) or [[]]
         if header != self.columns:
-            raise ValueError(f"{path} has the columns {header}, expected {self.columns}; give another folder")
+            raise ValueError(
+                f"{path} has the columns {header}, expected {self.columns}; give another folder"
+            )
         self._done = {self._key(dict(zip(header, line, strict=True))) for line in lines}
         self.rows: list[Row] = [
-            {name: value(text) for name, text in zip(header, line, strict=True) if text} for line in lines
+            {name: value(text) for name, text in zip(header, line, strict=True) if text}
+            for line in lines
         ]
 
     def _key(self, row: Mapping[str, Any]) -> tuple[str, ...]:
@@ -62,7 +67,9 @@ class Rows:
             file.flush()
             os.fsync(file.fileno())
         self._done.add(self._key(row))
-        self.rows.append({name: value(text) for name, text in zip(self.columns, cells, strict=True) if text})
+        self.rows.append(
+            {name: value(text) for name, text in zip(self.columns, cells, strict=True) if text}
+        )
         return self.rows[-1]
 
 

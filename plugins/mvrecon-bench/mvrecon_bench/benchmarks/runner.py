@@ -1,4 +1,6 @@
-"""Runs a benchmark: what is in its table already is left alone, what is not is measured, then the report is written."""
+"""Runs a benchmark: what is in its table already is left alone, what is not is measured, then the
+report is written.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -27,8 +29,8 @@ class Job(Protocol):
 class Bench(Protocol):
     """One kind of benchmark.
 
-    `columns`: name -> meaning and unit. `keys`: those that tell one row from all others. `charts`: those that the board
-    draws.
+    `columns`: name -> meaning and unit. `keys`: those that tell one row from all others. `charts`:
+    those that the board draws.
     """
 
     columns: Mapping[str, str]
@@ -43,8 +45,12 @@ class Bench(Protocol):
         """A row's part, short."""
         ...
 
-    def measure(self, jobs: Sequence[Any], rows: Sequence[Row], say: Callable[[str], None]) -> Iterator[Row]:
-        """A row for each of the jobs of one group; `rows` are those there are, `say` tells what is being done."""
+    def measure(
+        self, jobs: Sequence[Any], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
+        """A row for each of the jobs of one group; `rows` are those there are, `say` tells what is
+        being done.
+        """
         ...
 
     def report(self, rows: Sequence[Row], folder: Path) -> Mapping[str, str]:
@@ -55,18 +61,25 @@ class Bench(Protocol):
 def run(bench: Bench, folder: Path) -> list[Row]:
     """All rows of a benchmark, old and new.
 
-    The folder then holds `results.csv`, a Markdown file for each text of the report, its pictures, `versions.txt`, and
-    all of it on the board (TensorBoard).
+    The folder then holds `results.csv`, a Markdown file for each text of the report, its pictures,
+    `versions.txt`, and all of it on the board (TensorBoard).
     """
     machine.write_versions(folder)
     table = Rows(folder / TABLE, list(bench.columns), bench.keys)
     board = Board(str(folder))
     groups = [[job for job in group if job.row not in table] for group in bench.groups()]
-    bars = (TextColumn("{task.description}"), BarColumn(16), MofNCompleteColumn(), TimeElapsedColumn())
+    bars = (
+        TextColumn("{task.description}"),
+        BarColumn(16),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*bars, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("", total=sum(map(len, groups)))
         for jobs in filter(None, groups):
-            for row in bench.measure(jobs, table.rows, lambda text: progress.update(task, description=text)):
+            for row in bench.measure(
+                jobs, table.rows, lambda text: progress.update(task, description=text)
+            ):
                 draw(board, bench, table.append(row), len(table.rows))
                 progress.advance(task)
     report(bench, table.rows, folder, board)
@@ -90,6 +103,8 @@ def report(bench: Bench, rows: Sequence[Row], folder: Path, board: Board) -> Non
         board.experiment.add_text(name, text, len(rows))
     for path in sorted(folder.glob("*.png")):
         with Image.open(path) as picture:
-            board.experiment.add_image(path.stem, np.asarray(picture.convert("RGB")), len(rows), dataformats="HWC")
+            board.experiment.add_image(
+                path.stem, np.asarray(picture.convert("RGB")), len(rows), dataformats="HWC"
+            )
     board.save()
     board.finalize("success")

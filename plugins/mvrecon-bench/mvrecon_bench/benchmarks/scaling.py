@@ -49,7 +49,9 @@ class Point:
     @property
     def row(self) -> Row:
         """The columns that tell this row from all others, and the amount."""
-        settings = {name: getattr(self, name) for name in SCALING_KEYS if name not in ("part", "options")}
+        settings = {
+            name: getattr(self, name) for name in SCALING_KEYS if name not in ("part", "options")
+        }
         setting, power = AXES[self.axis]
         return {**self.part.row, **settings, "size": getattr(self, setting) ** power}
 
@@ -62,12 +64,15 @@ class Point:
         x = voxelise(case.phantom(), case.grid()).to(**where)
         x = x.expand(self.batch, self.channels, *x.shape).contiguous()
         rng = torch.Generator().manual_seed(0)
-        y = torch.randn(self.batch, self.channels, self.views, *rig.shape, generator=rng).to(**where)
+        y = torch.randn(self.batch, self.channels, self.views, *rig.shape, generator=rng).to(
+            **where
+        )
         return Trial(self.part, case.grid(), rig, x, y)
 
 
 class Scaling:
-    """Parts on growing amounts of work, along one axis at a time; all points of an axis timed in turns.
+    """Parts on growing amounts of work, along one axis at a time; all points of an axis timed in
+    turns.
 
     Args:
         parts: the projectors, `{name: ..., **options}`.
@@ -99,7 +104,11 @@ class Scaling:
     def groups(self) -> list[list[Point]]:
         """What is measured together: one axis."""
         return [
-            [Point(part, axis, **{**self.base, AXES[axis][0]: value}) for part in self.parts for value in values]
+            [
+                Point(part, axis, **{**self.base, AXES[axis][0]: value})
+                for part in self.parts
+                for value in values
+            ]
             for axis, values in self.vary.items()
         ]
 
@@ -107,7 +116,9 @@ class Scaling:
         """A row's part and axis, short."""
         return f"{report.part_label(row)}, {row['axis']}"
 
-    def measure(self, jobs: Sequence[Point], rows: Sequence[Row], say: Callable[[str], None]) -> Iterator[Row]:
+    def measure(
+        self, jobs: Sequence[Point], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
         """The rows of points on one axis."""
         say(jobs[0].axis)
         tried: list[tuple[Point, Trial, Row]] = []
@@ -115,7 +126,9 @@ class Scaling:
             row = {**point.row, "load": load_average()}
             try:
                 tried.append((point, point.trial(), row))
-            except Exception as error:  # whatever a part raises is its row's status, not the end of the run
+            except (
+                Exception
+            ) as error:  # whatever a part raises is its row's status, not the end of the run
                 yield {**row, "status": f"skipped: {reason(error)}"}
         for call in CALLS:
             say(f"{jobs[0].axis}: {call}")
@@ -134,7 +147,10 @@ class Scaling:
                     first[key] = trial.seconds[call]
         for key, timing in interleaved(calls, first, self.repeats, device).items():
             row = tried[key][2]
-            row |= {f"{call}_ms": timing.ms, "calls": min(row.get("calls", timing.calls), timing.calls)}
+            row |= {
+                f"{call}_ms": timing.ms,
+                "calls": min(row.get("calls", timing.calls), timing.calls),
+            }
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """Write `scaling.png` where matplotlib is installed; the texts of the tables by name."""
@@ -146,8 +162,15 @@ class Scaling:
                 panels.setdefault(axis, {})[f"{label} {call}"] = points
             plots.scaling(panels, folder / "scaling.png")
         names = ("device", "dtype", "threads")
-        base = {name: self.base[name] for name in names if name != "threads" or "threads" not in self.vary}
-        return {"table": table(rows, self.columns), "targets": targets.table(targets.SCALING, rows, base)}
+        base = {
+            name: self.base[name]
+            for name in names
+            if name != "threads" or "threads" not in self.vary
+        }
+        return {
+            "table": table(rows, self.columns),
+            "targets": targets.table(targets.SCALING, rows, base),
+        }
 
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[tuple[float, float]]]:
@@ -156,7 +179,9 @@ def series(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[tuple[float, 
     for row in sorted(rows, key=lambda row: row["size"]):
         for call in CALLS:
             if (ms := number(row, f"{call}_ms")) == ms:
-                found.setdefault((report.part_label(row), row["axis"], call), []).append((row["size"], ms))
+                found.setdefault((report.part_label(row), row["axis"], call), []).append(
+                    (row["size"], ms)
+                )
     return found
 
 
@@ -183,9 +208,23 @@ def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
         span = f"{points[0][0]:g} to {points[-1][0]:g}"
         fits.append((label, axis, call, span, f"{p:.2f}", f"{error:.2f}" if error == error else ""))
     head = ("part", "axis", "call", "work", "exponent", "standard error")
-    names = ("axis", "size", "n", "pixels", "views", "batch", "channels", "threads", "forward_ms", "adjoint_ms")
+    names = (
+        "axis",
+        "size",
+        "n",
+        "pixels",
+        "views",
+        "batch",
+        "channels",
+        "threads",
+        "forward_ms",
+        "adjoint_ms",
+    )
     good = [row for row in rows if row["status"] == "ok"]
-    done = [(report.part_label(row), *(report.figure(row, name, ".6g") for name in names)) for row in good]
+    done = [
+        (report.part_label(row), *(report.figure(row, name, ".6g") for name in names))
+        for row in good
+    ]
     text = f"# Time against work\n\nTime = c * work^exponent.\n\n{report.markdown(head, fits, 4)}"
     text += f"\n## Times\n\n{report.markdown(('part', *names), done, 2)}"
     return text + report.left_out(rows) + report.legend(columns)

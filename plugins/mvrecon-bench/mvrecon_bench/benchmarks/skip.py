@@ -1,4 +1,6 @@
-"""`bench=skip`: what skipping gains, against the full cube and against the cropped volume, and what it changes."""
+"""`bench=skip`: what skipping gains, against the full cube and against the cropped volume, and what
+it changes.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -56,8 +58,8 @@ class Skip:
         tasks: name of `skip_tasks.TASKS` -> methods of the projector.
         modes: of the projector's `skip`, besides off and cropped.
         base: n, device (or auto), threads (0: all).
-        cross_view: model, n, rig, modes (kinds of support), `checkpoints` (scene -> file), `cases` over which a trained
-            model's PSNR is averaged; null leaves it out.
+        cross_view: model, n, rig, modes (kinds of support), `checkpoints` (scene -> file), `cases`
+            over which a trained model's PSNR is averaged; null leaves it out.
         repeats: least number of calls of which a time is the median.
 
     Raises:
@@ -79,10 +81,20 @@ class Skip:
         repeats: int = 5,
     ):
         asked = {name for scene in scenes.values() for name in scene["rigs"]}
-        trained = {name for name, path in (cross_view or {}).get("checkpoints", {}).items() if path is not None}
-        for what, names, known in (("task", tasks, TASKS), ("rig", asked, rigs), ("scene", trained, scenes)):
+        trained = {
+            name
+            for name, path in (cross_view or {}).get("checkpoints", {}).items()
+            if path is not None
+        }
+        for what, names, known in (
+            ("task", tasks, TASKS),
+            ("rig", asked, rigs),
+            ("scene", trained, scenes),
+        ):
             if unknown := set(names) - set(known):
-                raise ValueError(f"Unknown {what} {', '.join(sorted(unknown))}. Known: {', '.join(known)}")
+                raise ValueError(
+                    f"Unknown {what} {', '.join(sorted(unknown))}. Known: {', '.join(known)}"
+                )
         self.scenes, self.rigs, self.tasks, self.modes = scenes, rigs, tasks, [*DENSE, *modes]
         settled = Case(device=base["device"], threads=base["threads"])
         self.n, self.device, self.threads = base["n"], settled.device, settled.threads
@@ -97,13 +109,22 @@ class Skip:
             for rig_name in scene["rigs"]:
                 for task, methods in self.tasks.items():
                     keys = [{"rig": rig_name, "method": method, "task": task} for method in methods]
-                    found += [[Job(name, **key, mode=mode, n=self.n, **where) for mode in self.modes] for key in keys]
+                    found += [
+                        [Job(name, **key, mode=mode, n=self.n, **where) for mode in self.modes]
+                        for key in keys
+                    ]
             if self.learned:
                 trained = self.learned["checkpoints"].get(name) is not None
                 n = None if trained else self.learned["n"]
                 for task in MODEL:
-                    key = {"rig": "trained" if trained else "model", "method": "joseph", "task": task}
-                    found.append([Job(name, **key, mode=mode, n=n, **where) for mode in self._modes(task)])
+                    key = {
+                        "rig": "trained" if trained else "model",
+                        "method": "joseph",
+                        "task": task,
+                    }
+                    found.append(
+                        [Job(name, **key, mode=mode, n=n, **where) for mode in self._modes(task)]
+                    )
         return found
 
     def _modes(self, task: str) -> list[str]:
@@ -113,8 +134,12 @@ class Skip:
         """A row's case and mode, short."""
         return skip_report.label(row)
 
-    def measure(self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]) -> Iterator[Row]:
-        """The rows of some modes of a task; all of its modes are timed, since they only compare side by side."""
+    def measure(
+        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
+        """The rows of some modes of a task; all of its modes are timed, since they only compare
+        side by side.
+        """
         job = jobs[0]
         say(f"{job.scene}, {job.rig}, {job.method}: {job.task}")
         common: Row = {"load": load_average()}
@@ -146,7 +171,9 @@ class Skip:
         checkpoint = self.learned["checkpoints"].get(job.scene)
         learned = Learned.of(self.scenes[job.scene], self.learned, checkpoint, job.device)
         known = facts(learned.first.source, learned.first.volume[0] != 0, learned.A.cameras)
-        return partial(learned.trial, job.task), known | {"support": learned.support("hull").fraction}
+        return partial(learned.trial, job.task), known | {
+            "support": learned.support("hull").fraction
+        }
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """Write `speedups.png` where matplotlib is installed; the texts of the tables by name."""
@@ -156,7 +183,10 @@ class Skip:
 
             plots.speedups(panels, folder / "speedups.png")
         base = {"device": self.device, "threads": self.threads}
-        return {"table": skip_report.table(rows, self.columns), "targets": targets.table(targets.SKIP, rows, base)}
+        return {
+            "table": skip_report.table(rows, self.columns),
+            "targets": targets.table(targets.SKIP, rows, base),
+        }
 
 
 def facts(source: str, there: Bool[Tensor, "d h w"], cameras: Cameras) -> Row:

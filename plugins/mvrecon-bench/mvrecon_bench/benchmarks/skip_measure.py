@@ -1,4 +1,6 @@
-"""The modes of one task side by side: what each gives, how far from skipping nothing, and how long it takes."""
+"""The modes of one task side by side: what each gives, how far from skipping nothing, and how long
+it takes.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,7 +26,9 @@ class Tried:
     row: Row
 
 
-def compared(setup: Callable[[str], Trial], modes: Sequence[str], repeats: int, device: str) -> dict[str, Row]:
+def compared(
+    setup: Callable[[str], Trial], modes: Sequence[str], repeats: int, device: str
+) -> dict[str, Row]:
     """The figures of every mode, "off" first: its result is what the others' are compared with.
 
     What a mode raises is its row's status, not the end of the run.
@@ -53,7 +57,10 @@ def difference(found: Tensor, reference: Tensor | None) -> Row:
     if reference is None:
         return {}
     bits = [values.contiguous().view(torch.int32) for values in (found, reference)]
-    return {"error": (found - reference).abs().max().item(), "differing": int((bits[0] != bits[1]).sum())}
+    return {
+        "error": (found - reference).abs().max().item(),
+        "differing": int((bits[0] != bits[1]).sum()),
+    }
 
 
 def _built(trial: Trial, device: str) -> Row:
@@ -68,13 +75,21 @@ def _timed(tried: dict[str, Tried], repeats: int, device: str) -> dict[str, Row]
     modes = list(tried)
     seconds = {n: tried[mode].seconds for n, mode in enumerate(modes)}
     repeats = 1 if max(seconds.values(), default=0.0) > LONG_S else repeats
-    times = interleaved({n: tried[mode].trial.call for n, mode in enumerate(modes)}, seconds, repeats, device)
+    times = interleaved(
+        {n: tried[mode].trial.call for n, mode in enumerate(modes)}, seconds, repeats, device
+    )
     rows = {}
     for n, mode in enumerate(modes):
         trial, row = tried[mode].trial, tried[mode].row
         charge = row.get("build_ms", 0.0) if trial.charged else 0.0
         chosen, why = trial.told()
-        rows[mode] = {**row, "ms": times[n].ms + charge, "calls": times[n].calls, "chosen": chosen, "why": why}
+        rows[mode] = {
+            **row,
+            "ms": times[n].ms + charge,
+            "calls": times[n].calls,
+            "chosen": chosen,
+            "why": why,
+        }
     for row in rows.values():
         for name, unit in (("over_full", OFF), ("over_crop", CROPPED)):
             if unit in rows:

@@ -1,4 +1,6 @@
-"""The cross-view model in `bench=skip`, end to end: on the grid, on one cropped by hand, with supports from views."""
+"""The cross-view model in `bench=skip`, end to end: on the grid, on one cropped by hand, with
+supports from views.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +24,8 @@ from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial, pasted
 
 #: Voxels left around the object where a user crops: as many as the model leaves by default.
 HALO = 4
-#: The model's own time: what it keeps of a crop's geometry is made anew at every call, as for ever new scenes, or kept.
+#: The model's own time: what it keeps of a crop's geometry is made anew at every call, as for ever
+#: new scenes, or kept.
 CHANGING, STATIC = "cross_view", "cross_view_static"
 
 
@@ -52,9 +55,14 @@ class Learned:
 
     @classmethod
     def of(
-        cls, scene: Mapping[str, Any], settings: Mapping[str, Any], checkpoint: str | None, device: str
+        cls,
+        scene: Mapping[str, Any],
+        settings: Mapping[str, Any],
+        checkpoint: str | None,
+        device: str,
     ) -> "Learned":
-        """A trained model with the grid and rig of its checkpoint, or a fresh one as the settings have it.
+        """A trained model with the grid and rig of its checkpoint, or a fresh one as the settings
+        have it.
 
         Raises:
             FileNotFoundError: no such checkpoint.
@@ -64,7 +72,16 @@ class Learned:
             known = module.hparams
             A, model, projector = module.projector, known["model"], known["geometry"]["projector"]
             weights, data_range = dict(module.model.named_parameters()), known["data_range"]
-            return cls(scene, projector, A.to(device), model, weights, data_range, settings["cases"], device)
+            return cls(
+                scene,
+                projector,
+                A.to(device),
+                model,
+                weights,
+                data_range,
+                settings["cases"],
+                device,
+            )
         grid = cube(scene, settings["n"])
         cameras = rig(settings["rig"], edge(grid), settings["n"])
         projector = {"name": "radon" if cameras.parallel else "drr"}
@@ -78,7 +95,11 @@ class Learned:
 
     def trial(self, task: str, mode: str) -> Trial:
         """The model in a mode: "off", "cropped", or a kind of support."""
-        box = Box.around(self.first.inside).grown(HALO, self.A.grid.shape).aligned(MULTIPLE, self.A.grid.shape)
+        box = (
+            Box.around(self.first.inside)
+            .grown(HALO, self.A.grid.shape)
+            .aligned(MULTIPLE, self.A.grid.shape)
+        )
         box = box if mode == CROPPED else Box.whole(self.A.grid.shape)
         net = self.net("none" if mode in DENSE else mode, self.A.grid.cropped(box))
         views = self.first.views.to(self.device)
@@ -101,11 +122,15 @@ class Learned:
 
     def support(self, kind: str) -> Support:
         """The support that the views of the first case tell."""
-        return support_from_views(self.first.views.to(self.device), self.A.cameras, self.A.grid, kind=kind)
+        return support_from_views(
+            self.first.views.to(self.device), self.A.cameras, self.A.grid, kind=kind
+        )
 
     def net(self, support: str, grid: Grid) -> Any:
         """The model on a grid with a kind of support, its weights the same in all modes."""
-        A = PROJECTORS.from_config(self.projector, grid=grid, cameras=self.A.cameras).to(self.device)
+        A = PROJECTORS.from_config(self.projector, grid=grid, cameras=self.A.cameras).to(
+            self.device
+        )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             net = MODELS.from_config({**self.model, "support": support}, projector=A)

@@ -1,4 +1,6 @@
-"""The rows of `bench=skip` as Markdown and as points of a plot, the cases in which skipping loses among them."""
+"""The rows of `bench=skip` as Markdown and as points of a plot, the cases in which skipping loses
+among them.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -18,7 +20,10 @@ SHOWN = {
     "psnr_loss": ".3f",
     "peak_mb": ".1f",
 }
-AGAINST = {"over_full": "against off on the full cube", "over_crop": "against off on the cropped volume"}
+AGAINST = {
+    "over_full": "against off on the full cube",
+    "over_crop": "against off on the cropped volume",
+}
 
 
 def label(row: Row) -> str:
@@ -27,9 +32,14 @@ def label(row: Row) -> str:
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """What was looked at, then every task with all its rows, where skipping loses, and what was left out."""
+    """What was looked at, then every task with all its rows, where skipping loses, and what was
+    left out.
+    """
     good = [row for row in rows if row["status"] == "ok"]
-    text = "# What skipping gains\n\nTimes as fast as off on the full cube, and as off on the cropped volume.\n"
+    text = (
+        "# What skipping gains\n\nTimes as fast as off on the full cube, and as off on the "
+        "cropped volume.\n"
+    )
     text += f"\n## Scenes\n\n{scenes(good)}"
     for task in dict.fromkeys(row["task"] for row in good):
         text += f"\n## {task}\n\n{lines(row for row in good if row['task'] == task)}"
@@ -43,8 +53,12 @@ def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
 def scenes(rows: Sequence[Row]) -> str:
     """What every scene is, and how much of it."""
     names = ("occupancy", "box", "support")
-    ordered = sorted(rows, key=lambda row: "support" in row)  # what tells more comes last, and stays
-    found = {(row["scene"], row["rig"], row["source"], row["grid"], row["views"]): row for row in ordered}
+    ordered = sorted(
+        rows, key=lambda row: "support" in row
+    )  # what tells more comes last, and stays
+    found = {
+        (row["scene"], row["rig"], row["source"], row["grid"], row["views"]): row for row in ordered
+    }
     cells = [(*key, *(figure(row, name, ".2%") for name in names)) for key, row in found.items()]
     return markdown(("scene", "rig", "source", "grid", "views", *names), cells, 5)
 
@@ -53,13 +67,16 @@ def lines(rows: Iterable[Row]) -> str:
     """A table of rows."""
     head = ("scene", "rig", "method", "mode")
     cells = [
-        (*(row[name] for name in head), *(figure(row, name, form) for name, form in SHOWN.items())) for row in rows
+        (*(row[name] for name in head), *(figure(row, name, form) for name, form in SHOWN.items()))
+        for row in rows
     ]
     return markdown((*head, *SHOWN), cells, 5)
 
 
 def lost(rows: Iterable[Row], over: str) -> str:
-    """A table of the rows that take longer than off, by one of the columns of `AGAINST`, the worst first."""
+    """A table of the rows that take longer than off, by one of the columns of `AGAINST`, the worst
+    first.
+    """
     slower = [row for row in rows if row["mode"] not in DENSE and number(row, over) < 1]
     slower.sort(key=lambda row: row[over])
     names = ("scene", "rig", "method", "task", "mode", "chosen")

@@ -1,4 +1,6 @@
-"""What `bench=skip` looks at: volumes that fill from a part in three hundred of their cube to all of it."""
+"""What `bench=skip` looks at: volumes that fill from a part in three hundred of their cube to all
+of it.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -50,8 +52,9 @@ def filled(config: Mapping[str, Any], grid: Grid) -> Filled:
     """The volume of a scene.
 
     Args:
-        config: `volume`: a scene of phantoms or of files in the registry, `{name: body, fill: ..., axes: ...}`, or
-            `{name: random}`; `instead`: the volume where the path of a file is null; `case`: which case.
+        config: `volume`: a scene of phantoms or of files in the registry, `{name: body, fill: ...,
+            axes: ...}`, or `{name: random}`; `instead`: the volume where the path of a file is
+                null; `case`: which case.
         grid: where its voxels lie.
 
     Raises:
@@ -59,15 +62,23 @@ def filled(config: Mapping[str, Any], grid: Grid) -> Filled:
     """
     options, case = _chosen(config), config.get("case", 0)
     if options["name"] == "random":
-        return Filled(torch.rand(grid.shape, generator=generator(0, case)) + 0.5, grid, "random values in 0.5 .. 1.5")
+        return Filled(
+            torch.rand(grid.shape, generator=generator(0, case)) + 0.5,
+            grid,
+            "random values in 0.5 .. 1.5",
+        )
     if options["name"] == "body":
         options.pop("name")
         return Filled(phantom_body(grid, **options), grid, f"body of {options['fill']:.0%}")
     scene = SCENES.from_config(options)
     if isinstance(scene, AnalyticScene):
-        return Filled(voxelise(scene.phantom(generator(0, case), grid), grid), grid, options["name"])
+        return Filled(
+            voxelise(scene.phantom(generator(0, case), grid), grid), grid, options["name"]
+        )
     if not isinstance(scene, FileScene):
-        raise TypeError(f"bench=skip needs a scene of phantoms or of files, got {options['name']!r}")
+        raise TypeError(
+            f"bench=skip needs a scene of phantoms or of files, got {options['name']!r}"
+        )
     patient, fine = scene.finely(case, 0, grid)
     truth = F.avg_pool3d(fine[None], scene.fine)[0]
     return Filled(truth * enclosed(body(truth, TISSUE)), grid, f"{patient}, without couch and air")
@@ -84,7 +95,9 @@ class Seen:
 
 
 def seen(config: Mapping[str, Any], A: Projector, index: int = 0) -> Seen:
-    """A case of a scene by its own views, exact or from a finer grid; by A's, where it is not in the registry."""
+    """A case of a scene by its own views, exact or from a finer grid; by A's, where it is not in
+    the registry.
+    """
     options, case = _chosen(config), config.get("case", 0) + index
     if options["name"] in ("random", "body"):
         found = filled({**config, "case": case}, A.grid)
@@ -100,8 +113,11 @@ def _chosen(config: Mapping[str, Any]) -> dict[str, Any]:
     return dict(config["instead"] if volume.get("path", "") is None else volume)
 
 
-def phantom_body(grid: Grid, fill: float, axes: Sequence[float | None] = (1.35, 1.0, None)) -> Float[Tensor, "d h w"]:
-    """Tissue of smoothly varying attenuation in the ellipsoid about the centre that holds a part of all voxels.
+def phantom_body(
+    grid: Grid, fill: float, axes: Sequence[float | None] = (1.35, 1.0, None)
+) -> Float[Tensor, "d h w"]:
+    """Tissue of smoothly varying attenuation in the ellipsoid about the centre that holds a part of
+    all voxels.
 
     Args:
         grid: of the volume, which cuts off what does not fit.
@@ -114,7 +130,9 @@ def phantom_body(grid: Grid, fill: float, axes: Sequence[float | None] = (1.35, 
     if not 0 < fill <= 1:
         raise ValueError(f"A body's fill must be a part in (0, 1] of the volume, got {fill}")
     xyz = voxel_centres(grid) - grid.centre
-    radius = (xyz * torch.tensor([1 / axis if axis else 0.0 for axis in axes], dtype=xyz.dtype)).norm(dim=-1)
+    radius = (
+        xyz * torch.tensor([1 / axis if axis else 0.0 for axis in axes], dtype=xyz.dtype)
+    ).norm(dim=-1)
     edge = radius.flatten().kthvalue(max(1, round(fill * radius.numel()))).values
     tissue = WATER * (1 + 0.2 * (2 * math.pi / WAVE * xyz).cos().prod(dim=-1))
     return torch.where(radius <= edge, tissue, 0.0).float()
@@ -123,8 +141,8 @@ def phantom_body(grid: Grid, fill: float, axes: Sequence[float | None] = (1.35, 
 def rig(config: Mapping[str, Any], field: float, n: int) -> Cameras:
     """The cameras of a configuration in the registry.
 
-    With `cover` the detector is square, its edge so many times the field's, with `pixels` along it (n, where that is
-    null or absent), and `detector` is left out.
+    With `cover` the detector is square, its edge so many times the field's, with `pixels` along it
+    (n, where that is null or absent), and `detector` is left out.
     """
     options = dict(config)
     if (cover := options.pop("cover", None)) is not None:

@@ -1,7 +1,8 @@
 """What `bench=skip` times: one operator at one task, in each mode of skipping.
 
-Two modes skip nothing: "off" on the whole cube, and "cropped", off on the box around what is there, which is what a
-careful user does by hand. Neither pays for the mask that tells the box; every other mode does.
+Two modes skip nothing: "off" on the whole cube, and "cropped", off on the box around what is there,
+which is what a careful user does by hand. Neither pays for the mask that tells the box; every other
+mode does.
 """
 
 from collections.abc import Callable
@@ -124,7 +125,9 @@ def pasted(part: Float[Tensor, "b c d h w"], box: Box, grid: Grid) -> Float[Tens
 
 
 def forward(bed: Bed, mode: str) -> Trial:
-    """A x of a volume that is another at every call: what is there of it is found anew from its values."""
+    """A x of a volume that is another at every call: what is there of it is found anew from its
+    values.
+    """
     A, x = bed.operator(mode), bed.cut(bed.volume, mode).clone()
 
     def call() -> Tensor:
@@ -143,7 +146,9 @@ def forward_static(bed: Bed, mode: str) -> Trial:
 def adjoint(bed: Bed, mode: str) -> Trial:
     """A^T y inside the support, given once, for views of white noise, in which no ray is empty."""
     A = bed.operator(mode, masked=mode not in DENSE)
-    y = torch.randn(1, 1, len(bed.cameras), *bed.cameras.shape, generator=torch.Generator().manual_seed(0))
+    y = torch.randn(
+        1, 1, len(bed.cameras), *bed.cameras.shape, generator=torch.Generator().manual_seed(0)
+    )
     y = y.to(bed.device)
 
     def whole(part: Tensor) -> Tensor:
@@ -153,11 +158,16 @@ def adjoint(bed: Bed, mode: str) -> Trial:
 
 
 def reconstruction(bed: Bed, mode: str) -> Trial:
-    """SIRT inside the hull of the views. Every mode has that support, so that all find the same volume."""
+    """SIRT inside the hull of the views. Every mode has that support, so that all find the same
+    volume.
+    """
     within = bed.within_hull
     A = within.operator(mode, masked=True)
     build = None if mode in DENSE else lambda: A.with_support(within.hull())
-    call, whole = (lambda: sirt(A, within.views, ITERATIONS)), (lambda part: within.pasted(part, mode))
+    call, whole = (
+        (lambda: sirt(A, within.views, ITERATIONS)),
+        (lambda part: within.pasted(part, mode)),
+    )
     return Trial(call, whole, _told(A, mode), build, charged=True)
 
 

@@ -1,4 +1,6 @@
-"""What the operators should reach, computed from the rows of a benchmark: met, missed, or not measured."""
+"""What the operators should reach, computed from the rows of a benchmark: met, missed, or not
+measured.
+"""
 
 import json
 import math
@@ -26,7 +28,9 @@ class Measured:
     base: Mapping[str, Any]
 
     def __call__(self, part: str, method: str | None, column: str, **changes: Any) -> float:
-        """The figure of a part with no options but method and back end, on the base case with changes; NaN if none."""
+        """The figure of a part with no options but method and back end, on the base case with
+        changes; NaN if none.
+        """
         wanted = {**self.base, **changes, "part": part, **({"method": method} if method else {})}
         for row in self.rows:
             if _plain(row) and all(row.get(name) == value for name, value in wanted.items()):
@@ -36,7 +40,11 @@ class Measured:
     def worst(self, figure: Callable[[Row], float], **wanted: Any) -> float:
         """The greatest figure of our own compiled parts' rows with these values; NaN if none."""
         rows = (r for r in self.rows if r.get("part") in OURS and r.get("backend") != "reference")
-        found = [figure(row) for row in rows if all(row.get(name) == value for name, value in wanted.items())]
+        found = [
+            figure(row)
+            for row in rows
+            if all(row.get(name) == value for name, value in wanted.items())
+        ]
         return max((f for f in found if f == f), default=math.nan)
 
 
@@ -52,7 +60,11 @@ class Target:
 
 def _plain(row: Row) -> bool:
     options = json.loads(row["options"]) if row.get("options") else {}
-    return row.get("status") == "ok" and row.get("backend") != "reference" and not set(options) - {"method", "backend"}
+    return (
+        row.get("status") == "ok"
+        and row.get("backend") != "reference"
+        and not set(options) - {"method", "backend"}
+    )
 
 
 def _beyond_output(row: Row) -> float:
@@ -76,7 +88,8 @@ def _joseph(over: str, under: str) -> Callable[[Measured], float]:
 def _grown(column: str, name: str, more: int, less: int, **on: Any) -> Callable[[Measured], float]:
     """Joseph's figure on more of something over that on less of it."""
     return lambda at: (
-        at("drr", "joseph", column, **{name: more}, **on) / at("drr", "joseph", column, **{name: less}, **on)
+        at("drr", "joseph", column, **{name: more}, **on)
+        / at("drr", "joseph", column, **{name: less}, **on)
     )
 
 
@@ -90,8 +103,12 @@ CPU = (
     Target("joseph forward / nanodrr's", _against("nanodrr", None, "forward_ms"), 1 / 50, 1 / 80),
     Target("joseph adjoint / RTK's", _against("rtk", None, "adjoint_ms"), 1 / 3, 1 / 6),
     Target("joseph adjoint / forward", _joseph("adjoint_ms", "forward_ms"), 2),
-    Target("siddon forward / joseph's", lambda at: 1 / _against("drr", "siddon", "forward_ms")(at), 1.5),
-    Target("joseph geometry VJP / forward", lambda at: _joseph("pose_grad_ms", "forward_ms")(at) - 1, 3),
+    Target(
+        "siddon forward / joseph's", lambda at: 1 / _against("drr", "siddon", "forward_ms")(at), 1.5
+    ),
+    Target(
+        "joseph geometry VJP / forward", lambda at: _joseph("pose_grad_ms", "forward_ms")(at) - 1, 3
+    ),
     Target("joseph forward, 256^3 / 128^3", _grown("forward_ms", "n", 256, 128), 12),
     Target("joseph adjoint, 256^3 / 128^3", _grown("adjoint_ms", "n", 256, 128), 12),
 )
@@ -99,16 +116,34 @@ CPU = (
 #: On the base case of `bench=operators`, on a GPU.
 GPU = (
     Target("joseph forward / nanodrr's", _against("nanodrr", None, "forward_ms"), 1 / 2),
-    Target("joseph forward and backward / nanodrr's", _against("nanodrr", None, "volume_grad_ms"), 1 / 2),
-    Target("joseph error on the pixel average / nanodrr's", _against("nanodrr", None, "error_pixel"), 1),
+    Target(
+        "joseph forward and backward / nanodrr's",
+        _against("nanodrr", None, "volume_grad_ms"),
+        1 / 2,
+    ),
+    Target(
+        "joseph error on the pixel average / nanodrr's", _against("nanodrr", None, "error_pixel"), 1
+    ),
     Target("joseph adjoint / forward", _joseph("adjoint_ms", "forward_ms"), 2),
-    Target("joseph, 80 views, 256^3, ms", lambda at: at("drr", "joseph", "forward_ms", n=256, views=80), 4),
+    Target(
+        "joseph, 80 views, 256^3, ms",
+        lambda at: at("drr", "joseph", "forward_ms", n=256, views=80),
+        4,
+    ),
 )
 
 #: On any device.
 ACCURACY = (
-    Target("joseph error on the pixel average / siddon's", _against("drr", "siddon", "error_pixel"), 1.03),
-    Target("joseph error on the pixel average / trilinear's", _against("drr", "trilinear", "error_pixel"), 0.92),
+    Target(
+        "joseph error on the pixel average / siddon's",
+        _against("drr", "siddon", "error_pixel"),
+        1.03,
+    ),
+    Target(
+        "joseph error on the pixel average / trilinear's",
+        _against("drr", "trilinear", "error_pixel"),
+        0.92,
+    ),
     Target("adjointness, float32, worst", _unmatched("float32"), 1e-5),
     Target("adjointness, float64, worst", _unmatched("float64"), 1e-12),
     Target("NaN or infinite values", lambda at: at.worst(lambda row: number(row, "nans")), 0),
@@ -117,19 +152,30 @@ ACCURACY = (
 
 #: Of `bench=scaling`.
 SCALING = (
-    Target("joseph forward, 4 channels / 1", _grown("forward_ms", "channels", 4, 1, axis="channels"), 2),
-    Target("joseph adjoint, 4 channels / 1", _grown("adjoint_ms", "channels", 4, 1, axis="channels"), 2),
+    Target(
+        "joseph forward, 4 channels / 1", _grown("forward_ms", "channels", 4, 1, axis="channels"), 2
+    ),
+    Target(
+        "joseph adjoint, 4 channels / 1", _grown("adjoint_ms", "channels", 4, 1, axis="channels"), 2
+    ),
 )
 
 
 def _greatest(
-    figure: Callable[[Row], float], scene: str, tasks: Sequence[str], modes: Sequence[str] = ("auto",)
+    figure: Callable[[Row], float],
+    scene: str,
+    tasks: Sequence[str],
+    modes: Sequence[str] = ("auto",),
 ) -> Callable[[Measured], float]:
     """The greatest figure of `bench=skip` on a scene, of all rigs and methods; NaN if none."""
     wanted = (("scene", [scene]), ("task", tasks), ("mode", modes))
 
     def found(at: Measured) -> float:
-        figures = [figure(row) for row in at.rows if all(row.get(name) in values for name, values in wanted)]
+        figures = [
+            figure(row)
+            for row in at.rows
+            if all(row.get(name) in values for name, values in wanted)
+        ]
         return max((f for f in figures if f == f), default=math.nan)
 
     return found
@@ -142,13 +188,21 @@ def _time_over(column: str) -> Callable[[Row], float]:
 _CALLS = ("forward", "forward_static", "adjoint")
 _EXACT = ("auto", "box", "brick", "verify")
 
-#: Of `bench=skip`: mode auto, the worst of all rigs and methods; of the differing values every mode of skipping.
+#: Of `bench=skip`: mode auto, the worst of all rigs and methods; of the differing values every mode
+#: of skipping.
 SKIP = (
     *(
-        Target(f"{scene}, {task}: time / off's on the {what}", _greatest(_time_over(column), scene, [task]), most)
+        Target(
+            f"{scene}, {task}: time / off's on the {what}",
+            _greatest(_time_over(column), scene, [task]),
+            most,
+        )
         for scene in ("derenzo", "ventricle")
         for task in _CALLS
-        for what, column, most in (("full cube", "over_full", 1 / 8), ("cropped volume", "over_crop", 1 / 1.25))
+        for what, column, most in (
+            ("full cube", "over_full", 1 / 8),
+            ("cropped volume", "over_crop", 1 / 1.25),
+        )
     ),
     Target(
         "head_neck, cross_view: time / off's on the full cube",
@@ -165,7 +219,9 @@ SKIP = (
         _greatest(lambda row: number(row, "psnr_loss"), "head_neck", ["cross_view"]),
         0.1,
     ),
-    Target("full, operators: time / off's", _greatest(_time_over("over_full"), "full", _CALLS), 1.05),
+    Target(
+        "full, operators: time / off's", _greatest(_time_over("over_full"), "full", _CALLS), 1.05
+    ),
     *(
         Target(
             f"{scene}, forward: values that differ from off's",
@@ -183,7 +239,17 @@ def table(targets: Sequence[Target], rows: Sequence[Row], base: Mapping[str, Any
     lines = []
     for target in targets:
         figure = target.figure(at)
-        verdict = "not measured" if figure != figure else "met" if figure <= target.most else "missed"
+        verdict = (
+            "not measured" if figure != figure else "met" if figure <= target.most else "missed"
+        )
         goal = "" if target.goal is None else f"{target.goal:.3g}"
-        lines.append((target.text, "" if figure != figure else f"{figure:.3g}", f"{target.most:.3g}", goal, verdict))
+        lines.append(
+            (
+                target.text,
+                "" if figure != figure else f"{figure:.3g}",
+                f"{target.most:.3g}",
+                goal,
+                verdict,
+            )
+        )
     return markdown(("target", "measured", "at most", "goal", "verdict"), lines)

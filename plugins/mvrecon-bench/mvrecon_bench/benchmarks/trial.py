@@ -1,4 +1,6 @@
-"""One part at work on one geometry: its four calls, and what each of them gave and took the first time."""
+"""One part at work on one geometry: its four calls, and what each of them gave and took the first
+time.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -74,7 +76,9 @@ class Trial:
     def pose_grad(self) -> list[Tensor]:
         """Forward, and backward to the cameras' source, origin, u and v, each [m 3]."""
         if self._poses is None:
-            leaves = [getattr(self.cameras, name).detach().clone().requires_grad_() for name in VECTORS]
+            leaves = [
+                getattr(self.cameras, name).detach().clone().requires_grad_() for name in VECTORS
+            ]
             rig = replace(self.cameras, **dict(zip(VECTORS, leaves, strict=True)))
             self._poses = self.part.build(self.grid, rig, self.device), leaves
         A, leaves = self._poses
@@ -82,23 +86,30 @@ class Trial:
         found = torch.autograd.grad(views, leaves, self.y.to(views.dtype), allow_unused=True)
         if all(g is None for g in found):
             raise NotImplementedError("no gradient reaches the cameras")
-        return [torch.zeros_like(leaf) if g is None else g for g, leaf in zip(found, leaves, strict=True)]
+        return [
+            torch.zeros_like(leaf) if g is None else g
+            for g, leaf in zip(found, leaves, strict=True)
+        ]
 
     def attempt(self, call: str, forecast_s: float, repeat_s: float, limit_s: float) -> Any:
         """The result of a call, its time kept in `seconds`; None, with a note, where it gives none.
 
-        A call that takes longer than `repeat_s`, be it for compiling, is made once more, which then counts; one that is
-        likely to take longer than `limit_s` is not made at all.
+        A call that takes longer than `repeat_s`, be it for compiling, is made once more, which then
+        counts; one that is likely to take longer than `limit_s` is not made at all.
         """
         if forecast_s > limit_s:
-            self.notes.append(f"{call} left out: about {forecast_s:.0f} s expected, limit {limit_s:g} s")
+            self.notes.append(
+                f"{call} left out: about {forecast_s:.0f} s expected, limit {limit_s:g} s"
+            )
             return None
         try:
             found, took = once(getattr(self, call), self.device)
             self.first_s.setdefault(call, took)
             if took > repeat_s:
                 found, took = once(getattr(self, call), self.device)
-        except Exception as error:  # a part of another library may raise anything; it must not end the benchmark
+        except (
+            Exception
+        ) as error:  # a part of another library may raise anything; it must not end the benchmark
             self.notes.append(f"{call}: {reason(error)}")
             return None
         self.seconds[call] = took
@@ -116,6 +127,13 @@ def reason(error: BaseException) -> str:
 
 
 def expected(seconds: Mapping[str, float], call: str, forecast: Mapping[str, float]) -> float:
-    """How long a call is likely to take: forecast from a smaller case, and at least what it is made of."""
-    made_of = {"volume_grad": ("forward", "adjoint"), "pose_grad": ("forward", "forward", "forward")}
-    return max(forecast.get(call, 0.0), sum(seconds.get(piece, 0.0) for piece in made_of.get(call, ())))
+    """How long a call is likely to take: forecast from a smaller case, and at least what it is made
+    of.
+    """
+    made_of = {
+        "volume_grad": ("forward", "adjoint"),
+        "pose_grad": ("forward", "forward", "forward"),
+    }
+    return max(
+        forecast.get(call, 0.0), sum(seconds.get(piece, 0.0) for piece in made_of.get(call, ()))
+    )

@@ -1,7 +1,8 @@
-"""What the views ought to be: closed-form integrals along thin rays, their mean over each pixel, and their derivative.
+"""What the views ought to be: closed-form integrals along thin rays, their mean over each pixel,
+and their derivative.
 
-The mean over a pixel is what a detector measures; a thin ray is what most projectors compute. Their rankings differ, so
-a benchmark shows both.
+The mean over a pixel is what a detector measures; a thin ray is what most projectors compute. Their
+rankings differ, so a benchmark shows both.
 """
 
 from dataclasses import dataclass, replace
@@ -42,9 +43,10 @@ class Truth:
 def truth_of(case: Case, rays: int) -> Truth:
     """The truth of a case (given as its `geometry`), with rays x rays to a pixel.
 
-    The cotangent is white noise; `pose` is the derivative of sum(cotangent * pixel mean) by rigid motions of each of
-    the watched cameras, see `pose_gradient`. A floor is the error of the exact integrals of the same voxels (Siddon
-    in float64), that of the discretisation alone; an interpolating method may err less against the pixel average.
+    The cotangent is white noise; `pose` is the derivative of sum(cotangent * pixel mean) by rigid
+    motions of each of the watched cameras, see `pose_gradient`. A floor is the error of the exact
+    integrals of the same voxels (Siddon in float64), that of the discretisation alone; an
+    interpolating method may err less against the pixel average.
     """
     grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
     volume = voxelise(phantom, grid)
@@ -69,7 +71,12 @@ def split(cameras: Cameras, factor: int) -> Cameras:
     source = cameras.source + shift if cameras.parallel else cameras.source
     shape = (cameras.shape[0] * factor, cameras.shape[1] * factor)
     return replace(
-        cameras, source=source, origin=cameras.origin + shift, u=cameras.u / factor, v=cameras.v / factor, shape=shape
+        cameras,
+        source=source,
+        origin=cameras.origin + shift,
+        u=cameras.u / factor,
+        v=cameras.v / factor,
+        shape=shape,
     )
 
 
@@ -81,33 +88,41 @@ def binned(views: Float[Tensor, "*n v u"], factor: int) -> Float[Tensor, "*n v2 
 def pixel_mean(phantom: Phantom, cameras: Cameras, rays: int) -> Float[Tensor, "m v u"]:
     """Mean of the exact integrals over rays x rays rays that fill each pixel evenly, in float64."""
     fine = split(cameras, rays)
-    return torch.cat([binned(phantom.integrals(*one.rays(), extent=one.limits), rays) for one in fine])
+    return torch.cat(
+        [binned(phantom.integrals(*one.rays(), extent=one.limits), rays) for one in fine]
+    )
 
 
 def pose_gradient(
     phantom: Phantom, cameras: Cameras, weights: Float[Tensor, "m v u"], grid: Grid
 ) -> Float[Tensor, "m 6"]:
-    """Derivative of sum(weights * pixel mean) by turns and shifts of each camera about the grid's centre.
+    """Derivative of sum(weights * pixel mean) by turns and shifts of each camera about the grid's
+    centre.
 
-    By central differences of the closed form. A turn is measured by the way in mm of a point half an edge of the volume
-    away, so that all six are per mm.
+    By central differences of the closed form. A turn is measured by the way in mm of a point half
+    an edge of the volume away, so that all six are per mm.
     """
     step, arm = STEP * min(grid.spacing), arm_of(grid)
     columns = []
     for k in range(6):
         ahead, behind = (
-            pixel_mean(phantom, moved(cameras, *motion(k, amount, arm), grid), POSE_RAYS) for amount in (step, -step)
+            pixel_mean(phantom, moved(cameras, *motion(k, amount, arm), grid), POSE_RAYS)
+            for amount in (step, -step)
         )
         columns.append((weights * (ahead - behind)).sum(dim=(1, 2)) / (2 * step))
     return torch.stack(columns, dim=1)
 
 
 def motion(k: int, amount: float, arm: float) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """A turn about axis k by amount / arm radians for k < 3, else a shift by the amount along axis k - 3."""
+    """A turn about axis k by amount / arm radians for k < 3, else a shift by the amount along axis
+    k - 3.
+    """
     eye = torch.eye(3, dtype=torch.float64)
     if k >= 3:
         return eye, amount * eye[k - 3]
-    return torch.linalg.matrix_exp(torch.linalg.cross(eye[k].expand(3, 3), eye).T * amount / arm), 0 * eye[0]
+    return torch.linalg.matrix_exp(
+        torch.linalg.cross(eye[k].expand(3, 3), eye).T * amount / arm
+    ), 0 * eye[0]
 
 
 def moved(cameras: Cameras, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"], grid: Grid) -> Cameras:

@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 
-#: What a case is about: a part of that kind, or what is under all parts (tensors, geometry, threads), stressed once.
+#: What a case is about: a part of that kind, or what is under all parts (tensors, geometry,
+#: threads), stressed once.
 KINDS = ("projector", "camera", "head", "model", "mvrecon")
 #: Relative, where a case does not say otherwise; halves are storage, summed in float32.
 PRECISE = {torch.float64: 1e-12, torch.float32: 1e-5, torch.bfloat16: 1e-5, torch.float16: 1e-5}
@@ -23,10 +24,11 @@ class Case:
     Args:
         number: in the plan.
         name: what is done.
-        holds: what must hold, and so what the measured number is (largest error, count of violations, ...).
+        holds: what must hold, and so what the measured number is (largest error, count of
+            violations, ...).
         kind: of the parts that it is done to; one of `KINDS`.
-        measure: does it to a subject, and returns the number that must not exceed the tolerance. It may raise
-            `DoesNotApply`; any other exception is a failure.
+        measure: does it to a subject, and returns the number that must not exceed the tolerance. It
+            may raise `DoesNotApply`; any other exception is a failure.
         tolerance: of all dtypes, or of each; 0 where it must hold to the last bit.
         dtypes: for which it is meant; others are left out.
     """

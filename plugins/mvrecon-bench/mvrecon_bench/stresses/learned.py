@@ -25,8 +25,12 @@ CHEAPER = {"iterations": 8, "start": 4}
 
 
 def small_rig(views: int = 3) -> Cameras:
-    """Cone beams that miss the grid at the detectors' edges; the detectors' sizes are multiples of 3."""
-    return circular(views, 60.0, 120.0, {"pixels": [12, 15], "pixel_mm": [5.0, 4.5]}, start_degrees=13.0)
+    """Cone beams that miss the grid at the detectors' edges; the detectors' sizes are multiples of
+    3.
+    """
+    return circular(
+        views, 60.0, 120.0, {"pixels": [12, 15], "pixel_mm": [5.0, 4.5]}, start_degrees=13.0
+    )
 
 
 class HeadSubject(Subject):
@@ -48,7 +52,11 @@ class HeadSubject(Subject):
         m, (depth, v, u) = len(self.frusta.step), self.frusta.shape
         shape = (2, m, 1, depth, v, u)
         seen = self.frusta.chord.reshape(m, v, u) > 0
-        return 6 * self.random(*shape) - 3, self.random(*shape, seed=1), self.random(2, 1, m, v, u, seed=2) * seen
+        return (
+            6 * self.random(*shape) - 3,
+            self.random(*shape, seed=1),
+            self.random(2, 1, m, v, u, seed=2) * seen,
+        )
 
 
 class ModelSubject(Subject):
@@ -66,16 +74,26 @@ class ModelSubject(Subject):
         """
         given = {**self.options, **options}
         for name, parameter in inspect.signature(MODELS.get(self.name)).parameters.items():
-            if name in ("projector", *given) or parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            if name in ("projector", *given) or parameter.kind in (
+                parameter.VAR_KEYWORD,
+                parameter.VAR_POSITIONAL,
+            ):
                 continue
             if name in CHEAPER and isinstance(parameter.default, int):
                 given[name] = CHEAPER[name]
             elif parameter.default is parameter.empty:
                 if name not in NEEDED:
-                    raise DoesNotApply(f"it needs {name}; stress it as {{kind: model, name: {self.name}, {name}: ..}}")
+                    raise DoesNotApply(
+                        f"it needs {name}; stress it as "
+                        f"{{kind: model, name: {self.name}, {name}: ..}}"
+                    )
                 given[name] = NEEDED[name]
         torch.manual_seed(0)
-        return self.build(**{**given, "projector": self.projector(cameras)}).to(self.device, self.dtype).eval()
+        return (
+            self.build(**{**given, "projector": self.projector(cameras)})
+            .to(self.device, self.dtype)
+            .eval()
+        )
 
     def stirred(self, cameras: Cameras | None = None, **options: Any) -> nn.Module:
         """A new model with random weights, so that layers which start at zero take part."""
@@ -104,7 +122,9 @@ class ModelSubject(Subject):
 
     @cached_property
     def scales(self) -> bool:
-        """Whether it claims that a multiple of the views gives that multiple of the volume: it does so for 8."""
+        """Whether it claims that a multiple of the views gives that multiple of the volume: it does
+        so for 8.
+        """
         with torch.no_grad():
             volume, other = (self.used(scale * self.views[:1]).volume for scale in (1, 8))
         return gap(other / 8, volume) < 1e-3

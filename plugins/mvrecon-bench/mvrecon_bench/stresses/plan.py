@@ -35,10 +35,16 @@ def cases() -> list[Case]:
     Raises:
         ValueError: two cases of one number are done to one kind of part.
     """
-    found = [case for file in FILES for case in import_module(f"mvrecon_bench.stresses.cases.{file}").CASES]
+    found = [
+        case
+        for file in FILES
+        for case in import_module(f"mvrecon_bench.stresses.cases.{file}").CASES
+    ]
     keys = [(case.number, case.kind, case.name) for case in found]
     if len(set(keys)) < len(keys):
-        raise ValueError(f"Two cases are the same: {sorted(key for key in set(keys) if keys.count(key) > 1)}")
+        raise ValueError(
+            f"Two cases are the same: {sorted(key for key in set(keys) if keys.count(key) > 1)}"
+        )
     return sorted(found, key=lambda case: case.number)
 
 
@@ -46,7 +52,8 @@ def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> 
     """What a plan is done to.
 
     Args:
-        parts: "all", or names and mappings `{kind: ..., name: ..., **options}`; a name alone is looked up in all kinds.
+        parts: "all", or names and mappings `{kind: ..., name: ..., **options}`; a name alone is
+            looked up in all kinds.
         device: on which it is done.
         dtypes: names of `DTYPES`.
 
@@ -57,7 +64,11 @@ def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> 
         if dtype not in DTYPES:
             raise LookupError(f"No dtype is named {dtype!r}{hint(dtype, DTYPES)}")
     named = every_part() if parts == "all" else [_part(each) for each in _listed(parts)]
-    return [subject_of(kind, name, options, device, DTYPES[dtype]) for kind, name, options in named for dtype in dtypes]
+    return [
+        subject_of(kind, name, options, device, DTYPES[dtype])
+        for kind, name, options in named
+        for dtype in dtypes
+    ]
 
 
 def every_part() -> list[tuple[str, str, dict[str, Any]]]:
@@ -69,12 +80,18 @@ def every_part() -> list[tuple[str, str, dict[str, Any]]]:
     for kind in KINDS[:-1]:
         for name in REGISTRIES[kind].names():
             ours = kind == "projector" and REGISTRIES[kind].origin(name).startswith("mvrecon.")
-            found += [(kind, name, {"method": method}) for method in METHODS] if ours else [(kind, name, {})]
+            found += (
+                [(kind, name, {"method": method}) for method in METHODS]
+                if ours
+                else [(kind, name, {})]
+            )
     return [*found, ("mvrecon", "", {})]
 
 
 def jobs(given: Iterable[Subject], chosen: Sequence[int] = ()) -> Iterator[tuple[Case, Subject]]:
-    """Each case with each subject that it is meant for; only these numbers, where some are chosen."""
+    """Each case with each subject that it is meant for; only these numbers, where some are
+    chosen.
+    """
     every = [case for case in cases() if not chosen or case.number in chosen]
     for subject in given:
         for case in every:
@@ -94,7 +111,11 @@ def _part(given: str | Mapping[str, Any]) -> tuple[str, str, dict[str, Any]]:
     name = given.get("name", "")
     if given.get("kind", name) == "mvrecon":
         return "mvrecon", "", {}
-    kinds = [given["kind"]] if "kind" in given else [kind for kind in KINDS[:-1] if name in REGISTRIES[kind].names()]
+    kinds = (
+        [given["kind"]]
+        if "kind" in given
+        else [kind for kind in KINDS[:-1] if name in REGISTRIES[kind].names()]
+    )
     if not kinds or kinds[0] not in KINDS:
         known = [each for kind in KINDS[:-1] for each in REGISTRIES[kind].names()]
         raise LookupError(f"No part to stress is {dict(given)}{hint(name, known)}")

@@ -1,11 +1,15 @@
-"""What must be refused, and how: by an error of the right kind whose message tells what was wrong."""
+"""What must be refused, and how: by an error of the right kind whose message tells what was
+wrong.
+"""
 
 import re
 from collections.abc import Callable, Mapping
 
 
 def refusal(
-    act: Callable[[], object], saying: str = "", kinds: type[Exception] | tuple[type[Exception], ...] = ValueError
+    act: Callable[[], object],
+    saying: str = "",
+    kinds: type[Exception] | tuple[type[Exception], ...] = ValueError,
 ) -> str:
     """Empty where an act is refused as it should be; else what happened instead.
 
@@ -18,7 +22,11 @@ def refusal(
         act()
     except kinds as error:
         text = f"{error}{error.__cause__ or ''}"
-        return "" if re.search(saying, text, re.DOTALL) else f"says {text[:160]!r}, expected {saying!r}"
+        return (
+            ""
+            if re.search(saying, text, re.DOTALL)
+            else f"says {text[:160]!r}, expected {saying!r}"
+        )
     except Exception as error:  # whatever else is raised is no refusal
         return f"raises {type(error).__name__}: {str(error)[:160]}"
     return "goes well"

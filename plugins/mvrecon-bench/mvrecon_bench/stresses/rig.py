@@ -1,4 +1,6 @@
-"""A camera under stress: a registered rig, with small options for all that it needs and was not given."""
+"""A camera under stress: a registered rig, with small options for all that it needs and was not
+given.
+"""
 
 import inspect
 from collections.abc import Iterator
@@ -51,13 +53,20 @@ class CameraSubject(Subject):
         if self.name == "from_file":
             save(circular(3, SMALL["sid"], SMALL["sdd"], DETECTOR), folder / "rig.json")
             return {"path": folder / "rig.json"}
-        found = {"pixels": PIXELS} if "pixels" in parameters and isinstance(parameters["pixels"].default, int) else {}
+        found = (
+            {"pixels": PIXELS}
+            if "pixels" in parameters and isinstance(parameters["pixels"].default, int)
+            else {}
+        )
         for name, parameter in parameters.items():
             if parameter.default is parameter.empty and name not in self.options:
                 if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
                     continue
                 if name not in SMALL:
-                    raise DoesNotApply(f"it needs {name}; stress it as {{kind: camera, name: {self.name}, {name}: ..}}")
+                    raise DoesNotApply(
+                        f"it needs {name}; stress it as "
+                        f"{{kind: camera, name: {self.name}, {name}: ..}}"
+                    )
                 found[name] = SMALL[name]
         return found
 
@@ -72,9 +81,14 @@ class CameraSubject(Subject):
             try:
                 return self.build(**options).to(self.device)
             except (TypeError, ValueError) as error:
-                if CAMERAS.origin(self.name).startswith("mvrecon.") or options.keys() <= self.options.keys():
+                if (
+                    CAMERAS.origin(self.name).startswith("mvrecon.")
+                    or options.keys() <= self.options.keys()
+                ):
                     raise
-                raise DoesNotApply(f"it takes no {options}; stress it with options of its own: {error}") from error
+                raise DoesNotApply(
+                    f"it takes no {options}; stress it with options of its own: {error}"
+                ) from error
 
     @cached_property
     def few(self) -> Cameras:

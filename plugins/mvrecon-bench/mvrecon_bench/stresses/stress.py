@@ -1,4 +1,6 @@
-"""The stress plan as something that the runner of benchmarks can run: rows that outlive a crash, report and board."""
+"""The stress plan as something that the runner of benchmarks can run: rows that outlive a crash,
+report and board.
+"""
 
 import json
 from collections import Counter
@@ -58,17 +60,25 @@ class Stress:
         dtypes: Sequence[str] = ("float64", "float32"),
         limit_s: float = LIMIT,
     ):
-        self.subjects, self.cases, self.limit_s = plan.subjects(parts, device, dtypes), cases, limit_s
+        self.subjects, self.cases, self.limit_s = (
+            plan.subjects(parts, device, dtypes),
+            cases,
+            limit_s,
+        )
 
     def groups(self) -> list[list[Job]]:
         """The cases of each subject."""
-        return [[Job(*pair) for pair in plan.jobs([subject], self.cases)] for subject in self.subjects]
+        return [
+            [Job(*pair) for pair in plan.jobs([subject], self.cases)] for subject in self.subjects
+        ]
 
     def label(self, row: Row) -> str:
         """A row's part and case, short."""
         return f"{row['number']:.0f} {row['part']} {row['dtype']}"
 
-    def measure(self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]) -> Iterator[Row]:
+    def measure(
+        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
         """A verdict for each job."""
         for job in jobs:
             say(f"{job.subject.label}: {job.case.name}")
@@ -102,4 +112,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def _cells(row: Row) -> list[str]:
-    return [format(found, ".3g") if isinstance(found := row.get(name, ""), float) else found for name in SHOWN]
+    return [
+        format(found, ".3g") if isinstance(found := row.get(name, ""), float) else found
+        for name in SHOWN
+    ]

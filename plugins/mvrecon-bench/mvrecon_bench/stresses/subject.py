@@ -19,11 +19,13 @@ from mvrecon_bench.stresses.case import DoesNotApply
 #: No two sizes or spacings alike, off the origin.
 GRID = Grid.centred((5, 6, 7), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
 BEAMS: tuple[tuple[bool, Extent], ...] = ((False, "segment"), (True, "segment"), (False, "behind"))
-#: What a projector is taken to claim, and what a plugin's class says by setting an attribute of this name to False.
+#: What a projector is taken to claim, and what a plugin's class says by setting an attribute of
+#: this name to False.
 CLAIMS = {
     "matched": "its adjoint is not the transpose of its forward",
     "local": "a number that is none is seen beyond the rays that meet it",
-    "bits": "its rays are rounded, so that sums which are exact in floating point are not to the last bit",
+    "bits": "its rays are rounded, so that sums which are exact in floating point are not to the "
+    "last bit",
 }
 DETECTOR = {"pixels": [6, 5], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 
@@ -49,7 +51,9 @@ class Subject:
     @property
     def label(self) -> str:
         """Short, and different for different options."""
-        return " ".join([self.name or self.kind, *(f"{key}={value}" for key, value in self.options.items())])
+        return " ".join(
+            [self.name or self.kind, *(f"{key}={value}" for key, value in self.options.items())]
+        )
 
     def build(self, **given: Any) -> Any:
         """The part, with its options and what a case adds."""
@@ -115,13 +119,17 @@ class ProjectorSubject(Subject):
         """By how much it misses the length of a ray in a box of ones, relative."""
         grid = Grid.centred((16, 16, 16), 1.0)
         start = torch.tensor([[-30.0, 0.3, 0.4]], dtype=torch.float64)
-        length = self.projector(grid, self.rays(start, -start))(torch.ones(1, 1, 16, 16, 16, device=self.device))
+        length = self.projector(grid, self.rays(start, -start))(
+            torch.ones(1, 1, 16, 16, 16, device=self.device)
+        )
         expected = 16 * float((2 * start).norm()) / 60
         return abs(float(length) - expected) / expected
 
     @cached_property
     def of_cells(self) -> bool:
-        """Whether a voxel counts where a ray is in it and nowhere else, so that any ray's length in a box is exact."""
+        """Whether a voxel counts where a ray is in it and nowhere else, so that any ray's length in
+        a box is exact.
+        """
         grid = Grid.centred((4, 4, 4), 1.0)
         start, end = torch.tensor([[[-9.0, -2.3, 0.7]], [[9.0, 5.9, -0.9]]], dtype=torch.float64)
         enter, leave = 7 / 18, (2 + 2.3) / 8.2  # by the face x = -2, and by y = 2
@@ -129,7 +137,9 @@ class ProjectorSubject(Subject):
         return abs(float(self.values(grid, start, end)) / length - 1) < 1e-4
 
     def need(self, claim: str) -> None:
-        """Raise DoesNotApply where a plugin's class says that it does not claim this; see `CLAIMS`."""
+        """Raise DoesNotApply where a plugin's class says that it does not claim this; see
+        `CLAIMS`.
+        """
         if not self.ours and not getattr(REGISTRIES[self.kind].get(self.name), claim, True):
             raise DoesNotApply(f"it says that {CLAIMS[claim]}")
 
@@ -139,7 +149,9 @@ class ProjectorSubject(Subject):
             raise DoesNotApply("its views are no plain line integrals")
 
     def need_exact(self) -> None:
-        """Raise DoesNotApply unless its line integrals are exact for ones; those of samples along a ray are not."""
+        """Raise DoesNotApply unless its line integrals are exact for ones; those of samples along a
+        ray are not.
+        """
         self.need_lines()
         if not self.error_of_ones < 1e-4:
             raise DoesNotApply("it takes samples along a ray; case 31 tells of their order")
@@ -149,14 +161,20 @@ class ProjectorSubject(Subject):
         if self.beam[1] != "segment":
             raise DoesNotApply(f"its rays are of extent {self.beam[1]!r}")
 
-    def rig(self, grid: Grid = GRID, detector: Mapping[str, Any] | None = None, views: int = 3) -> Cameras:
+    def rig(
+        self, grid: Grid = GRID, detector: Mapping[str, Any] | None = None, views: int = 3
+    ) -> Cameras:
         """A rig in a generic pose that sees the grid, in units of its size."""
         return rig_about(grid, *self.beam, detector=detector, views=views)
 
     def rays(self, start: Float[Tensor, "m 3"], end: Float[Tensor, "m 3"]) -> Cameras:
-        """One camera of one pixel for each ray from `start` to `end` (mm); a pinhole's ray goes on beyond `end`."""
+        """One camera of one pixel for each ray from `start` to `end` (mm); a pinhole's ray goes on
+        beyond `end`.
+        """
         is_parallel, extent = self.beam
-        look = (end - start) / (end - start).abs().amax(dim=-1, keepdim=True)  # of any length, however small
+        look = (end - start) / (end - start).abs().amax(
+            dim=-1, keepdim=True
+        )  # of any length, however small
         axis = torch.nn.functional.one_hot(look.abs().argmin(dim=-1), 3).to(look)
         u = torch.nn.functional.normalize(torch.linalg.cross(axis, look), dim=-1)
         v = torch.nn.functional.normalize(torch.linalg.cross(look, u), dim=-1)
@@ -164,7 +182,8 @@ class ProjectorSubject(Subject):
         return Cameras(start, target, u, v, (1, 1), is_parallel, extent)
 
     def posed(self, grid: Grid, cameras: Cameras) -> tuple[Callable[..., Tensor], list[Tensor]]:
-        """Views as a function of volumes and the cameras' vectors, and these, of which gradients are wanted.
+        """Views as a function of volumes and the cameras' vectors, and these, of which gradients
+        are wanted.
 
         Raises:
             DoesNotApply: it takes no cameras that require a gradient.
@@ -172,7 +191,9 @@ class ProjectorSubject(Subject):
         vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
 
         def views(volume: Tensor, *vectors: Tensor) -> Tensor:
-            return self.projector(grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True))))(volume)
+            return self.projector(
+                grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True)))
+            )(volume)
 
         try:
             self.projector(grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True))))
@@ -180,7 +201,9 @@ class ProjectorSubject(Subject):
             raise DoesNotApply(str(error)) from error
         return views, vectors
 
-    def values(self, grid: Grid, start: Tensor, end: Tensor, volume: Tensor | None = None) -> Float[Tensor, " m"]:
+    def values(
+        self, grid: Grid, start: Tensor, end: Tensor, volume: Tensor | None = None
+    ) -> Float[Tensor, " m"]:
         """What each ray sees of a volume [d h w], in float64; of ones, unless given."""
         x = torch.ones(grid.shape, dtype=self.dtype) if volume is None else volume
         views = self.projector(grid, self.rays(start, end))(x.to(self.device)[None, None])
@@ -194,12 +217,16 @@ def rig_about(
     detector: Mapping[str, Any] | None = None,
     views: int = 3,
 ) -> Cameras:
-    """A rig in a generic pose about a grid's centre, sized for `GRID` and scaled to the given one."""
+    """A rig in a generic pose about a grid's centre, sized for `GRID` and scaled to the given
+    one.
+    """
     scale = _radius(grid) / _radius(GRID)
     given = dict(detector or DETECTOR)
     for length in ("pixel_mm", "offset_mm"):
         value = given.get(length, 0.0)
-        given[length] = [each * scale for each in value] if isinstance(value, list) else value * scale
+        given[length] = (
+            [each * scale for each in value] if isinstance(value, list) else value * scale
+        )
     if is_parallel:
         rig = parallel(views, given, 60.0 * scale, start_degrees=11.0)
     elif extent == "behind":
@@ -229,7 +256,9 @@ def subject_of(kind: str, *arguments: Any) -> Subject:
 
 
 def gap(found: Tensor, expected: Tensor) -> float:
-    """Relative L2 error in float64; of expected zeros, the norm itself; infinite, not NaN, where a number is none."""
+    """Relative L2 error in float64; of expected zeros, the norm itself; infinite, not NaN, where a
+    number is none.
+    """
     a, b = found.detach().double().cpu(), expected.detach().double().cpu()
     norm = float(b.norm())
     return float((a - b).norm().nan_to_num(torch.inf)) / (norm if 0 < norm < torch.inf else 1.0)
@@ -238,7 +267,9 @@ def gap(found: Tensor, expected: Tensor) -> float:
 def bits(found: Tensor, expected: Tensor) -> float:
     """How many values differ; two NaN are the same."""
     if found.shape != expected.shape:
-        raise AssertionError(f"expected the shape {tuple(expected.shape)}, got {tuple(found.shape)}")
+        raise AssertionError(
+            f"expected the shape {tuple(expected.shape)}, got {tuple(found.shape)}"
+        )
     same = (found == expected) | (found.isnan() & expected.isnan())
     return float((~same).sum())
 

@@ -1,4 +1,6 @@
-"""Python in a process of its own: what must not run in this one, because it ends it or needs a fresh one."""
+"""Python in a process of its own: what must not run in this one, because it ends it or needs a
+fresh one.
+"""
 
 import os
 import subprocess

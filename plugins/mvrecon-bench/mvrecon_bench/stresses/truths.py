@@ -1,4 +1,6 @@
-"""What rays ought to see, known without a projector: rows of voxels, chords of a box, a Gaussian blob."""
+"""What rays ought to see, known without a projector: rows of voxels, chords of a box, a Gaussian
+blob.
+"""
 
 import itertools
 from dataclasses import dataclass
@@ -18,19 +20,27 @@ Seen = tuple[Float[Tensor, "r 3"], Float[Tensor, "r 3"], Float[Tensor, " r"]]
 
 
 def rows(grid: Grid, volume: Float[Tensor, "d h w"]) -> Seen:
-    """Rays through the centres of voxels along x, y and z, from outside to outside: sums times the spacing."""
+    """Rays through the centres of voxels along x, y and z, from outside to outside: sums times the
+    spacing.
+    """
     found = []
     for axis in range(3):
         counts = [grid.shape[2 - i] for i in range(3) if i != axis]
-        index = torch.cartesian_prod(*[torch.arange(count, dtype=torch.float64) for count in counts])
+        index = torch.cartesian_prod(
+            *[torch.arange(count, dtype=torch.float64) for count in counts]
+        )
         sums = volume.double().cpu().sum(dim=2 - axis).mT.flatten() * grid.spacing[axis]
         found.append((*ends(grid, axis, index), sums))
     start, end, sums = (torch.cat(each) for each in zip(*found, strict=True))
     return start, end, sums
 
 
-def ends(grid: Grid, axis: int, index: Float[Tensor, "r 2"]) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r 3"]]:
-    """Where rays along an axis start and end, outside of the grid, at voxel indices of the other two axes."""
+def ends(
+    grid: Grid, axis: int, index: Float[Tensor, "r 2"]
+) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r 3"]]:
+    """Where rays along an axis start and end, outside of the grid, at voxel indices of the other
+    two axes.
+    """
     start = torch.zeros(len(index), 3, dtype=torch.float64)
     start[:, [i for i in range(3) if i != axis]] = index
     end = start.clone()
@@ -41,14 +51,16 @@ def ends(grid: Grid, axis: int, index: Float[Tensor, "r 2"]) -> tuple[Float[Tens
 def through(grid: Grid, count: int = 12, seed: int = 0) -> Seen:
     """Slanting rays from face to opposite face, along x, y and z, and their lengths in the box.
 
-    They stay half a voxel away from the other faces, and in the middle where there is but one voxel, so that an
-    interpolating projector sees the same of ones.
+    They stay half a voxel away from the other faces, and in the middle where there is but one
+    voxel, so that an interpolating projector sees the same of ones.
     """
     rng = torch.Generator().manual_seed(seed)
     sizes = torch.tensor(grid.shape[::-1], dtype=torch.float64)
     found = []
     for axis in range(3):
-        enter, leave = ((sizes - 1) * torch.rand(count, 3, generator=rng, dtype=torch.float64) for _ in range(2))
+        enter, leave = (
+            (sizes - 1) * torch.rand(count, 3, generator=rng, dtype=torch.float64) for _ in range(2)
+        )
         way = leave - enter
         enter[:, axis], way[:, axis] = -0.5, 0
         steep = way.abs().amax(dim=-1, keepdim=True) / (0.9 * sizes[axis])
@@ -60,14 +72,23 @@ def through(grid: Grid, count: int = 12, seed: int = 0) -> Seen:
 
 
 def ways() -> Float[Tensor, "r 3"]:
-    """Every order and sign of the integer directions: lines in them, through lattice points, meet edges and corners."""
-    signed = itertools.product(DIRECTIONS, itertools.permutations(range(3)), itertools.product((-1, 1), repeat=3))
-    found = {tuple(way[i] * sign for i, sign in zip(order, signs, strict=True)) for way, order, signs in signed}
+    """Every order and sign of the integer directions: lines in them, through lattice points, meet
+    edges and corners.
+    """
+    signed = itertools.product(
+        DIRECTIONS, itertools.permutations(range(3)), itertools.product((-1, 1), repeat=3)
+    )
+    found = {
+        tuple(way[i] * sign for i, sign in zip(order, signs, strict=True))
+        for way, order, signs in signed
+    }
     return torch.tensor(sorted(found), dtype=torch.float64)
 
 
 def box_lengths(rig: Cameras, grid: Grid, grown: float = 0.0) -> Float[Tensor, "m v u"]:
-    """Mm of each ray that lie in an axis-aligned grid's box, grown by so many voxels on every side."""
+    """Mm of each ray that lie in an axis-aligned grid's box, grown by so many voxels on every
+    side.
+    """
     sizes = zip(grid.shape[::-1], grid.spacing, strict=True)
     half = torch.tensor([[(n / 2 + grown) * mm for n, mm in sizes]], dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64)[None]
@@ -87,9 +108,15 @@ class Blob:
         off = voxel_centres(grid) - self.centre
         return torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))
 
-    def integrals(self, start: Float[Tensor, "*r 3"], end: Float[Tensor, "*r 3"]) -> Float[Tensor, "*r"]:
+    def integrals(
+        self, start: Float[Tensor, "*r 3"], end: Float[Tensor, "*r 3"]
+    ) -> Float[Tensor, "*r"]:
         """Along the whole lines through these points, in mm."""
         along = end - start
         along = along / along.norm(dim=-1, keepdim=True)
         off = torch.linalg.cross(start - self.centre, along)
-        return self.sigma * (2 * torch.pi) ** 0.5 * torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))
+        return (
+            self.sigma
+            * (2 * torch.pi) ** 0.5
+            * torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))
+        )

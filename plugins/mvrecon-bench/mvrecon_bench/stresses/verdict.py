@@ -30,9 +30,11 @@ COLUMNS = {
 
 
 def judge(case: Case, subject: Subject, limit_s: float = LIMIT) -> Row:
-    """Do a case to a subject. Nothing that a part raises goes further; it fails with that as its note.
+    """Do a case to a subject. Nothing that a part raises goes further; it fails with that as its
+    note.
 
-    So does one that takes longer than `limit_s`, but for one that hangs beyond Python, which ends all; see `watched`.
+    So does one that takes longer than `limit_s`, but for one that hangs beyond Python, which ends
+    all; see `watched`.
     """
     start, measured, note = time.perf_counter(), math.nan, ""
     allowed = case.allowed(subject.dtype)
@@ -43,7 +45,10 @@ def judge(case: Case, subject: Subject, limit_s: float = LIMIT) -> Row:
         verdict = PASS if measured <= allowed else FAIL  # a NaN is no pass
     except DoesNotApply as why:
         verdict, note = LEFT_OUT, str(why)
-    except (Exception, SystemExit) as error:  # a plugin's part may raise anything; it must not end the plan
+    except (
+        Exception,
+        SystemExit,
+    ) as error:  # a plugin's part may raise anything; it must not end the plan
         verdict, note = FAIL, reason(error)
     return {
         **identity(case, subject),

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-#: Seconds that a case may take, and that a call into compiled code has more, in which no Python is interrupted.
+#: Seconds that a case may take, and that a call into compiled code has more, in which no Python is
+#: interrupted.
 LIMIT, GRACE = 120.0, 30.0
 
 
@@ -16,9 +17,10 @@ LIMIT, GRACE = 120.0, 30.0
 def watched(seconds: float = LIMIT, grace: float = GRACE) -> Iterator[None]:
     """Let a block take so many seconds and no more.
 
-    Where Python is at work it is interrupted, by POSIX's alarm in the main thread. What never comes back to Python
-    (a loop in compiled code, a lock, another system, another thread) ends the process `grace` seconds later with the
-    traceback of every thread on stderr. Within another block of this kind only the inner limit holds.
+    Where Python is at work it is interrupted, by POSIX's alarm in the main thread. What never comes
+    back to Python (a loop in compiled code, a lock, another system, another thread) ends the
+    process `grace` seconds later with the traceback of every thread on stderr. Within another block
+    of this kind only the inner limit holds.
 
     Raises:
         TimeoutError: it took longer.

@@ -12,7 +12,9 @@ import mvrecon_bench.bench
 
 def _call(folder: Path, *options: str) -> list[dict[str, str]]:
     patch = pytest.MonkeyPatch()
-    patch.setattr(sys, "argv", ["mvrecon-bench", f"out={folder}", *options, "hydra/job_logging=none"])
+    patch.setattr(
+        sys, "argv", ["mvrecon-bench", f"out={folder}", *options, "hydra/job_logging=none"]
+    )
     try:
         mvrecon_bench.bench.main()
     finally:

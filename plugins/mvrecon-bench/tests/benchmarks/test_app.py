@@ -48,13 +48,16 @@ class Seen:
 @pytest.fixture(scope="module", autouse=True)
 def registered():
     patch = pytest.MonkeyPatch()
-    patch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts, "wrong": Wrong, "broken": Broken, "seen": Seen})
+    patch.setattr(
+        PROJECTORS, "_parts", {**PROJECTORS._parts, "wrong": Wrong, "broken": Broken, "seen": Seen}
+    )
     yield
     patch.undo()
 
 
 PARTS = (
-    "[{name: seen}, {name: wrong}, {name: broken}, {name: absent}, {name: radon, backend: reference, beam: parallel}]"
+    "[{name: seen}, {name: wrong}, {name: broken}, {name: absent}, {name: radon, backend: "
+    "reference, beam: parallel}]"
 )
 TINY = (
     f"bench.parts={PARTS}",
@@ -77,14 +80,22 @@ def run(tmp_path_factory, call):
 
 def test_a_folder_holds_what_it_should(run):
     names = {path.name for path in run[0].iterdir()}
-    assert {"results.csv", "pareto.png", "table.md", "targets.md", "versions.txt", "config.yaml"} <= names
+    assert {
+        "results.csv",
+        "pareto.png",
+        "table.md",
+        "targets.md",
+        "versions.txt",
+        "config.yaml",
+    } <= names
     assert any(name.startswith("events.") for name in names)
     assert "processor" in (run[0] / "versions.txt").read_text()
 
 
 def test_every_column_is_there_and_documented(run):
     folder, rows = run
-    wanted = "part backend device dtype scene camera n forward_ms adjoint_ms error_thin error_pixel peak_mb".split()
+    wanted = "part backend device dtype scene camera n forward_ms adjoint_ms error_thin "
+    "error_pixel peak_mb".split()
     assert set(wanted) <= set(rows[0])
     table = (folder / "table.md").read_text()
     assert all(f"| {name} | " in table for name in rows[0])
@@ -92,11 +103,18 @@ def test_every_column_is_there_and_documented(run):
 
 def test_a_good_part_has_every_figure(run):
     good = [row for row in run[1] if row["part"] == "seen" and row["camera"] == "circular"]
-    assert [(row["n"], row["dtype"]) for row in good] == [("6", "float32"), ("8", "float32"), ("8", "float64")]
+    assert [(row["n"], row["dtype"]) for row in good] == [
+        ("6", "float32"),
+        ("8", "float32"),
+        ("8", "float64"),
+    ]
     for row in good:
         assert row["status"] == "ok" and row["nans"] == "0" and row["repeatable"] == "yes"
         assert 0 < float(row["error_pixel"]) < float(row["error_thin"]) < 0.3
-        assert all(float(row[f"{c}_ms"]) > 0 for c in ("forward", "adjoint", "volume_grad", "pose_grad", "first"))
+        assert all(
+            float(row[f"{c}_ms"]) > 0
+            for c in ("forward", "adjoint", "volume_grad", "pose_grad", "first")
+        )
         assert float(row["adjointness"]) < (1e-12 if row["dtype"] == "float64" else 1e-6)
         assert float(row["forward_ratio"]) == 1 and int(row["calls"]) >= 2
         assert 0 < float(row["pose_cosine"]) <= 1
@@ -111,10 +129,16 @@ def test_a_wrong_part_is_told_from_a_good_one(run):
 
 def test_what_does_not_work_is_a_row_with_its_reason(run):
     folder, rows = run
-    status = {row["part"]: row["status"] for row in rows if row["status"] != "ok" and row["camera"] == "circular"}
+    status = {
+        row["part"]: row["status"]
+        for row in rows
+        if row["status"] != "ok" and row["camera"] == "circular"
+    }
     assert status["broken"] == "skipped: ValueError: no such"
     assert status["absent"].startswith("skipped: LookupError: No projector is named 'absent'")
-    reasons = [row["status"] for row in rows if row["part"] == "seen" and row["camera"] == "parallel"]
+    reasons = [
+        row["status"] for row in rows if row["part"] == "seen" and row["camera"] == "parallel"
+    ]
     assert len(reasons) == 1 and "needs central cameras" in reasons[0]
     assert {row["camera"] for row in rows if row["part"] == "radon"} == {"parallel"}
     assert "No projector is named" in (folder / "table.md").read_text()
@@ -125,7 +149,9 @@ def test_a_restart_measures_only_what_is_missing(run, call):
     built, text = Seen.built, (folder / "results.csv").read_text()
     assert call(folder, *TINY) == rows and Seen.built == built
     lines = text.splitlines(keepends=True)
-    gone = next(n for n, row in enumerate(rows, start=1) if row["part"] == "seen" and row["n"] == "6")
+    gone = next(
+        n for n, row in enumerate(rows, start=1) if row["part"] == "seen" and row["n"] == "6"
+    )
     (folder / "results.csv").write_text("".join(lines[:gone] + lines[gone + 1 :]))
     again = call(folder, *TINY)
     assert len(again) == len(rows) and Seen.built > built
@@ -136,7 +162,9 @@ def test_the_board_shows_figures_picture_and_text(run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     tags = EventAccumulator(str(run[0])).Reload().Tags()
-    assert {"forward_ms/seen", "error_thin/seen"} <= set(tags["scalars"]) and "pareto" in tags["images"]
+    assert {"forward_ms/seen", "error_thin/seen"} <= set(tags["scalars"]) and "pareto" in tags[
+        "images"
+    ]
     assert any("targets" in tag for tag in tags["tensors"])
 
 
@@ -144,15 +172,23 @@ def test_scaling_runs_and_fits(tmp_path, call):
     vary = "{voxels: [4, 8], channels: [1, 4]}"
     parts = "bench.parts=[{name: seen}, {name: broken}]"
     options = ("bench=scaling", parts, "~bench.vary", f"+bench.vary={vary}", "bench.repeats=2")
-    base = "bench.base={n: 6, pixels: 6, views: 2, batch: 1, channels: 1, threads: 1, device: cpu, dtype: float32}"
+    base = (
+        "bench.base={n: 6, pixels: 6, views: 2, batch: 1, channels: 1, threads: 1, device: "
+        "cpu, dtype: float32}"
+    )
     rows = call(tmp_path, *options, base)
     done = [row for row in rows if row["status"] == "ok"]
     assert [(row["axis"], row["size"]) for row in done] == [
         ("voxels", "64"), ("voxels", "512"), ("channels", "1"), ("channels", "4")
     ]  # fmt: skip
-    assert all(float(row["forward_ms"]) > 0 and float(row["adjoint_ms"]) > 0 for row in done) and len(rows) == 8
+    assert (
+        all(float(row["forward_ms"]) > 0 and float(row["adjoint_ms"]) > 0 for row in done)
+        and len(rows) == 8
+    )
     assert "| seen | channels | adjoint | 1 to 4 |" in (tmp_path / "table.md").read_text()
-    assert (tmp_path / "scaling.png").exists() and "not measured" in (tmp_path / "targets.md").read_text()
+    assert (tmp_path / "scaling.png").exists() and "not measured" in (
+        tmp_path / "targets.md"
+    ).read_text()
 
 
 @pytest.mark.parametrize("kind", ["operators", "scaling"])

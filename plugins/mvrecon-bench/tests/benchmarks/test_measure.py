@@ -40,7 +40,10 @@ def test_times_are_medians_taken_in_turns(monkeypatch):
     calls = {0: worker("a", 0.02, 0.5, 0.01), 1: worker("b", 0.04, 0.03, 0.06)}
     found = interleaved(calls, {0: 0.2, 1: 0.2}, 3, "cpu")
     assert order == ["a", "b"] * 3
-    assert [(key, round(timing.ms, 9), timing.calls) for key, timing in found.items()] == [(0, 20, 3), (1, 40, 3)]
+    assert [(key, round(timing.ms, 9), timing.calls) for key, timing in found.items()] == [
+        (0, 20, 3),
+        (1, 40, 3),
+    ]
     assert interleaved({0: lambda: None}, {0: 1e-6}, 5, "cpu")[0].calls == 25 - 5
     assert once(lambda: 7, "cpu")[0] == 7
 

@@ -1,4 +1,6 @@
-"""`mvrecon-bench bench=precision` on sizes that take seconds: each precision errs by what its digits say."""
+"""`mvrecon-bench bench=precision` on sizes that take seconds: each precision errs by what its
+digits say.
+"""
 
 import math
 
@@ -8,8 +10,10 @@ from mvrecon_bench.benchmarks.precision import TRUTH, USUAL
 from mvrecon_bench.benchmarks.rows import value
 
 MODEL = (
-    "{n: 16, rig: {name: circular, views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, pixels: 12}, checkpoint: null,"
-    " model: {name: cross_view, head: {name: softmax_depth}, opinion: {width: 4}, refine: 4, start: 2, consistency: 1}}"
+    "{n: 16, rig: {name: circular, views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, pixels: 12}, "
+    "checkpoint: null,"
+    " model: {name: cross_view, head: {name: softmax_depth}, opinion: {width: 4}, refine: 4, "
+    "start: 2, consistency: 1}}"
 )
 TINY = (
     "bench=precision",
@@ -53,4 +57,6 @@ def test_each_precision_errs_by_its_digits(rows):
 def test_times_are_told_against_float32(rows):
     assert all(row["ratio"] == 1 for row in of(rows, USUAL))
     usual = {row["task"]: row["ms"] for row in of(rows, USUAL)}
-    assert all(math.isclose(row["ratio"], row["ms"] / usual[row["task"]], rel_tol=1e-4) for row in rows)
+    assert all(
+        math.isclose(row["ratio"], row["ms"] / usual[row["task"]], rel_tol=1e-4) for row in rows
+    )

@@ -14,8 +14,10 @@ pytest.importorskip("matplotlib")
 
 N = 16
 MODEL = (
-    "{n: 16, rig: {name: circular, views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, pixels: 12}, cases: 2,"
-    " modes: [auto, hull], checkpoints: {heart: null}, model: {name: cross_view, head: {name: softmax_depth},"
+    "{n: 16, rig: {name: circular, views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, pixels: 12}, "
+    "cases: 2,"
+    " modes: [auto, hull], checkpoints: {heart: null}, model: {name: cross_view, head: {name: "
+    "softmax_depth},"
     " opinion: {width: 4}, refine: 4, start: 2, consistency: 1}}"
 )
 SMALL = (
@@ -69,8 +71,14 @@ def test_every_figure_is_there(run):
         assert 0 < float(row["occupancy"]) <= float(row["box"]) <= 1
         builds = row["task"] != "forward" and row["mode"] not in ("off", "cropped")
         assert (row["build_ms"] != "") == builds and row["chosen"]
-        assert (row["support"] != "") == (row["task"] in ("sirt20", "cross_view", "cross_view_static"))
-    assert {row["source"] for row in rows} >= {"derenzo", "body of 9%", "random values in 0.5 .. 1.5"}
+        assert (row["support"] != "") == (
+            row["task"] in ("sirt20", "cross_view", "cross_view_static")
+        )
+    assert {row["source"] for row in rows} >= {
+        "derenzo",
+        "body of 9%",
+        "random values in 0.5 .. 1.5",
+    }
 
 
 def test_times_are_compared_with_both_that_skip_nothing(run):
@@ -78,8 +86,12 @@ def test_times_are_compared_with_both_that_skip_nothing(run):
     of = {tuple(row[k] for k in ("scene", "rig", "method", "task", "mode")): row for row in rows}
     for (*case, mode), row in of.items():
         off, cropped = of[*case, "off"], of[*case, "cropped"]
-        assert float(row["over_full"]) == pytest.approx(float(off["ms"]) / float(row["ms"]), rel=1e-4)
-        assert float(row["over_crop"]) == pytest.approx(float(cropped["ms"]) / float(row["ms"]), rel=1e-4)
+        assert float(row["over_full"]) == pytest.approx(
+            float(off["ms"]) / float(row["ms"]), rel=1e-4
+        )
+        assert float(row["over_crop"]) == pytest.approx(
+            float(cropped["ms"]) / float(row["ms"]), rel=1e-4
+        )
         assert mode != "off" or float(row["over_full"]) == 1
 
 
@@ -87,7 +99,9 @@ def test_skipping_is_exact(run):
     _, rows = run
     exact = [row for row in rows if row["task"].startswith("forward") and row["mode"] != "cropped"]
     assert exact and all(row["error"] == row["differing"] == "0" for row in exact)
-    for row in rows:  # sums in another order, or about another centre: 1e-5 of what the longest ray can hold
+    for row in (
+        rows
+    ):  # sums in another order, or about another centre: 1e-5 of what the longest ray can hold
         if not row["task"].startswith("cross_view"):
             assert float(row["error"]) < 1e-5 * 1.5 * 512 * 3**0.5
 
@@ -97,19 +111,25 @@ def test_the_report_tells_all_and_where_skipping_loses(run):
     names = {path.name for path in folder.iterdir()}
     assert {"results.csv", "table.md", "targets.md", "speedups.png", "versions.txt"} <= names
     table = (folder / "table.md").read_text()
-    assert all(f"| {name} | " in table for name in rows[0]) and all(f"## {task}" in table for task in TASKS)
+    assert all(f"| {name} | " in table for name in rows[0]) and all(
+        f"## {task}" in table for task in TASKS
+    )
     for over, title in skip_report.AGAINST.items():
         shown = table.split(f"## Where skipping loses {title}")[1].split("##")[0]
         lost = [row for row in rows if row["mode"] not in MODES[:2] and float(row[over]) < 1]
         assert shown.count("\n|") == (len(lost) + 2 if lost else 0)
-    assert "| derenzo, adjoint: time / off's on the full cube |" in (folder / "targets.md").read_text()
+    assert (
+        "| derenzo, adjoint: time / off's on the full cube |" in (folder / "targets.md").read_text()
+    )
 
 
 def test_a_restart_measures_only_what_is_missing(run, call):
     folder, rows = run
     text = (folder / "results.csv").read_text()
     lines = text.splitlines(keepends=True)
-    gone = next(n for n, row in enumerate(rows, 1) if row["mode"] == "box" and row["task"] == "adjoint")
+    gone = next(
+        n for n, row in enumerate(rows, 1) if row["mode"] == "box" and row["task"] == "adjoint"
+    )
     (folder / "results.csv").write_text("".join(lines[:gone] + lines[gone + 1 :]))
     again = call(folder, *TINY)
     assert len(again) == len(rows) and again[:-1] == rows[: gone - 1] + rows[gone:]
@@ -146,16 +166,31 @@ def trained(tmp_path):
         },
         "projector": {"name": "drr"},
     }
-    model = {"name": "cross_view", "head": {"name": "softmax_depth"}, "opinion": {"width": 4}, "refine": 4, "start": 2}
+    model = {
+        "name": "cross_view",
+        "head": {"name": "softmax_depth"},
+        "opinion": {"width": 4},
+        "refine": 4,
+        "start": 2,
+    }
     module = ReconstructionModule(geometry, model, {}, {"name": "adamw"}, 1.0)
     path = tmp_path / "cross_view.ckpt"
-    known = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams), "callbacks": {}}
-    torch.save({**known, "global_step": 0, "pytorch-lightning_version": lightning.__version__}, path)
+    known = {
+        "state_dict": module.state_dict(),
+        "hyper_parameters": dict(module.hparams),
+        "callbacks": {},
+    }
+    torch.save(
+        {**known, "global_step": 0, "pytorch-lightning_version": lightning.__version__}, path
+    )
     return path
 
 
 def test_a_trained_model_brings_its_grid_and_is_scored(tmp_path, trained, call):
-    options = ("~bench.scenes", "+bench.scenes={heart: {volume: {name: ventricle, field: 0.48}, rigs: [cone]}}")
+    options = (
+        "~bench.scenes",
+        "+bench.scenes={heart: {volume: {name: ventricle, field: 0.48}, rigs: [cone]}}",
+    )
     rows = call(
         tmp_path / "run",
         *SMALL,
@@ -170,7 +205,9 @@ def test_a_trained_model_brings_its_grid_and_is_scored(tmp_path, trained, call):
     }
     assert all(5 < float(row["psnr"]) < 60 for row in rows)
     for row in rows:
-        assert float(row["psnr_loss"]) == pytest.approx(float(rows[0]["psnr"]) - float(row["psnr"]), abs=1e-3)
+        assert float(row["psnr_loss"]) == pytest.approx(
+            float(rows[0]["psnr"]) - float(row["psnr"]), abs=1e-3
+        )
     assert rows[0]["psnr_loss"] == "0"
 
 
@@ -190,6 +227,12 @@ def test_the_shipped_settings_are_those_of_the_code():
     ],
 )
 def test_what_is_not_known_is_refused(changes, message):
-    settings = {"scenes": {}, "rigs": {}, "tasks": {}, "modes": [], "base": {"n": 8, "device": "cpu", "threads": 1}}
+    settings = {
+        "scenes": {},
+        "rigs": {},
+        "tasks": {},
+        "modes": [],
+        "base": {"n": 8, "device": "cpu", "threads": 1},
+    }
     with pytest.raises(ValueError, match=message):
         BENCHES.build("skip", **{**settings, **changes})

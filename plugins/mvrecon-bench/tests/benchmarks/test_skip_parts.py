@@ -30,19 +30,31 @@ def test_modes_are_compared_with_off_and_pay_for_their_mask():
             return torch.tensor([value, 0.0])
 
         build = (lambda: time.sleep(0.02)) if mode == "auto" else None
-        return Trial(act, lambda found: found, lambda: (mode, "because"), build, charged=True, score=lambda: 30 - value)
+        return Trial(
+            act,
+            lambda found: found,
+            lambda: (mode, "because"),
+            build,
+            charged=True,
+            score=lambda: 30 - value,
+        )
 
     rows = compared(setup, ["off", "cropped", "auto", "box"], 3, "cpu")
     assert rows["box"] == {"status": "skipped: ValueError: no box"}
     auto = rows["auto"]
     assert auto["error"] == 0.5 and auto["differing"] == 1 and auto["why"] == "because"
-    assert rows["off"]["error"] == rows["cropped"]["differing"] == 0 and "build_ms" not in rows["off"]
+    assert (
+        rows["off"]["error"] == rows["cropped"]["differing"] == 0 and "build_ms" not in rows["off"]
+    )
     assert auto["build_ms"] >= 20 and auto["ms"] >= 30 and auto["psnr_loss"] == pytest.approx(0.5)
     assert rows["cropped"]["over_full"] > 1 > rows["off"]["over_crop"]
 
 
 def test_minus_zero_is_another_value_than_zero():
-    assert difference(torch.tensor([0.0, 1.0]), torch.tensor([-0.0, 1.0])) == {"error": 0, "differing": 1}
+    assert difference(torch.tensor([0.0, 1.0]), torch.tensor([-0.0, 1.0])) == {
+        "error": 0,
+        "differing": 1,
+    }
 
 
 def test_a_body_fills_what_it_should():
@@ -63,11 +75,20 @@ def test_a_body_fills_what_it_should():
 
 def test_the_shipped_scenes_fill_what_they_should():
     scenes = compose("bench=skip", config_name="bench")["bench"]["scenes"]
-    wanted = {"derenzo": 0.0033, "ventricle": 0.0073, "head_neck": 0.09, "torso35": 0.35, "torso80": 0.8, "full": 1.0}
+    wanted = {
+        "derenzo": 0.0033,
+        "ventricle": 0.0073,
+        "head_neck": 0.09,
+        "torso35": 0.35,
+        "torso80": 0.8,
+        "full": 1.0,
+    }
     assert list(scenes) == list(wanted)
     for name, part in wanted.items():
         what = filled(scenes[name], cube(scenes[name], 32))
-        mass = what.volume if name in ("derenzo", "ventricle") else what.volume > 0  # voxels are filled in part
+        mass = (
+            what.volume if name in ("derenzo", "ventricle") else what.volume > 0
+        )  # voxels are filled in part
         assert mass.double().mean().item() == pytest.approx(part, rel=0.05), name
 
 
@@ -77,16 +98,24 @@ def test_head_and_neck_are_a_patient_where_a_file_is_given(tmp_path):
     hu[:, 11] = -900  # the couch
     path = tmp_path / "ct.h5"
     write_volumes(path, [Stored("pt_1", hu, (10.0, 10.0, 10.0))])
-    scene = {"volume": {"name": "hdf5", "path": str(path)}, "instead": {"name": "random"}, "field_mm": 120}
+    scene = {
+        "volume": {"name": "hdf5", "path": str(path)},
+        "instead": {"name": "random"},
+        "field_mm": 120,
+    }
     what = filled(scene, cube(scene, 12))
     assert what.source.startswith("pt_1") and what.volume.shape == (12, 12, 12)
     assert (what.volume > 0).sum() == pytest.approx(6 * 8 * 4, rel=0.2)
-    assert filled({**scene, "volume": {"name": "hdf5", "path": None}}, cube(scene, 12)).source.startswith("random")
+    assert filled(
+        {**scene, "volume": {"name": "hdf5", "path": None}}, cube(scene, 12)
+    ).source.startswith("random")
 
 
 def test_cameras_cover_the_cube():
     grid = cube({}, 8)
-    cameras = rig({"name": "circular", "views": 3, "sid": 500.0, "sdd": 1000.0, "cover": 2.0}, edge(grid), 8)
+    cameras = rig(
+        {"name": "circular", "views": 3, "sid": 500.0, "sdd": 1000.0, "cover": 2.0}, edge(grid), 8
+    )
     assert len(cameras) == 3 and cameras.shape == (8, 8)
     assert cameras.u.norm(dim=1).tolist() == pytest.approx([2 * 256 / 8] * 3)
     assert len(rig({"name": "dcspect80", "pixels": 5, "rows": [0]}, 256.0, 8)) == 20
@@ -94,18 +123,26 @@ def test_cameras_cover_the_cube():
 
 def test_the_hull_holds_what_is_there_and_the_crop_is_the_same_operator():
     scene = {"volume": {"name": "ventricle", "field": 0.3}}
-    cameras = rig({"name": "circular", "views": 4, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N)
+    cameras = rig(
+        {"name": "circular", "views": 4, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N
+    )
     bed = Bed(filled(scene, cube(scene, N)), cameras, "siddon")
     assert (bed.within_hull.mask | ~bed.mask).all() and not bed.within_hull.mask.all()
     dense, cropped = bed.operator("off"), bed.operator("cropped")
     assert bed.box.size < 0.2 * N**3
-    torch.testing.assert_close(cropped(bed.cut(bed.volume, "cropped")), dense(bed.volume), rtol=1e-4, atol=1e-3)
-    torch.testing.assert_close(bed.pasted(bed.cut(bed.volume, "cropped"), "cropped"), bed.volume, rtol=0, atol=0)
+    torch.testing.assert_close(
+        cropped(bed.cut(bed.volume, "cropped")), dense(bed.volume), rtol=1e-4, atol=1e-3
+    )
+    torch.testing.assert_close(
+        bed.pasted(bed.cut(bed.volume, "cropped"), "cropped"), bed.volume, rtol=0, atol=0
+    )
 
 
 def test_views_of_a_scene_are_its_own():
     scene = {"volume": {"name": "ventricle", "field": 0.3}}
-    cameras = rig({"name": "circular", "views": 2, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N)
+    cameras = rig(
+        {"name": "circular", "views": 2, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N
+    )
     A = PROJECTORS.build("drr", grid=cube(scene, N), cameras=cameras)
     case, other = seen(scene, A), seen(scene, A, 1)
     assert case.views.shape == (1, 1, 2, N, N) and not torch.equal(case.volume, other.volume)
@@ -128,9 +165,14 @@ def test_targets_take_the_worst_case():
 
 def test_the_points_of_the_plot_are_those_of_auto():
     common = {"scene": "full", "task": "adjoint", "status": "ok", "over_crop": 1.0}
-    rows = [{**common, "mode": mode, "over_full": times} for mode, times in (("off", 1.0), ("auto", 0.9), ("box", 0.5))]
+    rows = [
+        {**common, "mode": mode, "over_full": times}
+        for mode, times in (("off", 1.0), ("auto", 0.9), ("box", 0.5))
+    ]
     (kinds,) = skip_report.panels(rows).values()
     assert list(kinds.values()) == [[("full", 0.9)], [("full", 1.0)]]
     rows = [{**row, "rig": "cone", "method": "joseph", "chosen": "off"} for row in rows]
-    assert [line.split(" | ")[4] for line in skip_report.lost(rows, "over_full").splitlines()[2:]] == ["box", "auto"]
+    assert [
+        line.split(" | ")[4] for line in skip_report.lost(rows, "over_full").splitlines()[2:]
+    ] == ["box", "auto"]
     assert skip_report.lost(rows, "over_crop") == "Nowhere.\n"

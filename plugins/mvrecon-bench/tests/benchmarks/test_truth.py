@@ -18,14 +18,22 @@ from mvrecon_bench.benchmarks.cases import RIGS, Case, boxes, expand
 
 
 def test_the_pixel_average_of_a_box_that_half_covers_a_pixel():
-    half = torch.tensor([[20.0, 6.0, 30.0]])  # along x the ray; its face y = 6 cuts the pixel from 4 to 8 in half
-    phantom = Phantom((Solids("box", torch.zeros(1, 3), torch.eye(3)[None], half, torch.tensor([0.5])),))
+    half = torch.tensor(
+        [[20.0, 6.0, 30.0]]
+    )  # along x the ray; its face y = 6 cuts the pixel from 4 to 8 in half
+    phantom = Phantom(
+        (Solids("box", torch.zeros(1, 3), torch.eye(3)[None], half, torch.tensor([0.5])),)
+    )
     rig = RIGS["axis_parallel"](Case(n=64, camera="axis_parallel"))[0]
     thin = phantom.integrals(*rig.rays(), extent=rig.limits)
     mean = truth.pixel_mean(phantom, rig, 4)
     row = mean[0, 32]  # inside the box along z
-    assert sorted(set(row.tolist())) == pytest.approx([0.0, 10.0, 20.0])  # 40 mm of 0.5: none, half, all of a pixel
-    assert (row - 10).abs().lt(1e-9).sum() == 2 and thin[0, 32].unique().tolist() == pytest.approx([0, 20])
+    assert sorted(set(row.tolist())) == pytest.approx(
+        [0.0, 10.0, 20.0]
+    )  # 40 mm of 0.5: none, half, all of a pixel
+    assert (row - 10).abs().lt(1e-9).sum() == 2 and thin[0, 32].unique().tolist() == pytest.approx(
+        [0, 20]
+    )
 
 
 @pytest.mark.parametrize("camera", ["circular", "parallel", "dcspect80"])
@@ -60,19 +68,34 @@ def test_the_boxes_are_exact_in_voxels_and_so_is_siddon():
     grid, rig = case.grid(), case.cameras()
     volume = voxelise(boxes(case.field), grid).double()
     assert len(volume.unique().tolist()) <= 6
-    views = PROJECTORS.build("drr", grid=grid, cameras=rig, method="siddon", backend="reference")(volume[None, None])
-    assert truth.relative_error(views[0, 0], case.phantom().integrals(*rig.rays(), extent=rig.limits)) < 1e-6
+    views = PROJECTORS.build("drr", grid=grid, cameras=rig, method="siddon", backend="reference")(
+        volume[None, None]
+    )
+    assert (
+        truth.relative_error(views[0, 0], case.phantom().integrals(*rig.rays(), extent=rig.limits))
+        < 1e-6
+    )
 
 
 @pytest.fixture(params=["circular", "parallel"])
 def posed(request):
-    """A rig, a projector that differentiates by its four vectors, weights, and an ellipsoid with its voxels."""
+    """A rig, a projector that differentiates by its four vectors, weights, and an ellipsoid with
+    its voxels.
+    """
     case = Case(n=24, camera=request.param, views=2)
     grid = case.grid()
-    rig = case.cameras().moved(euler_rotation((3.0, 5.0, 8.0)), torch.tensor([1.3, -2.1, 0.7]))  # no ray on a kink
-    places = torch.tensor([[9.0, -17.0, 25.0]]), torch.eye(3)[None], torch.tensor([[80.0, 40.0, 60.0]])
+    rig = case.cameras().moved(
+        euler_rotation((3.0, 5.0, 8.0)), torch.tensor([1.3, -2.1, 0.7])
+    )  # no ray on a kink
+    places = (
+        torch.tensor([[9.0, -17.0, 25.0]]),
+        torch.eye(3)[None],
+        torch.tensor([[80.0, 40.0, 60.0]]),
+    )
     phantom = Phantom((Solids("ellipsoid", *places, torch.ones(1)),))
-    coarse = torch.randn(1, len(rig), 5, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    coarse = torch.randn(
+        1, len(rig), 5, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     weights = torch.nn.functional.interpolate(coarse, rig.shape, mode="bicubic")[0]
 
     def views(cameras):
@@ -81,7 +104,9 @@ def posed(request):
 
     leaves = [getattr(rig, name).clone().requires_grad_() for name in VECTORS]
     moving = replace(rig, **dict(zip(VECTORS, leaves, strict=True)))
-    gradient = accuracy.rigid(torch.autograd.grad((views(moving) * weights).sum(), leaves), rig, grid)
+    gradient = accuracy.rigid(
+        torch.autograd.grad((views(moving) * weights).sum(), leaves), rig, grid
+    )
     return grid, rig, phantom, weights, views, gradient
 
 
@@ -89,9 +114,13 @@ def test_the_gradient_by_four_vectors_becomes_that_by_turns_and_shifts(posed):
     grid, rig, _, weights, views, gradient = posed
     step, arm = 1e-5, truth.arm_of(grid)
     for k in range(6):
-        ahead, behind = (views(truth.moved(rig, *truth.motion(k, way, arm), grid)) for way in (step, -step))
+        ahead, behind = (
+            views(truth.moved(rig, *truth.motion(k, way, arm), grid)) for way in (step, -step)
+        )
         differences = (weights * (ahead - behind)).sum(dim=(1, 2)) / (2 * step)
-        assert torch.allclose(gradient[:, k], differences, rtol=1e-4, atol=1e-4 * gradient.abs().max().item())
+        assert torch.allclose(
+            gradient[:, k], differences, rtol=1e-4, atol=1e-4 * gradient.abs().max().item()
+        )
 
 
 def test_the_closed_form_changes_with_the_pose_as_fine_voxels_do(posed):
@@ -106,7 +135,10 @@ def test_the_closed_form_changes_with_the_pose_as_fine_voxels_do(posed):
 def test_a_plan_varies_one_thing_at_a_time_small_first():
     cases = expand(
         {"n": 64, "views": 4},
-        {"sizes": {"vary": {"n": [16, 32]}}, "rest": {"about": {"n": 16}, "vary": {"ratio": [2.0], "n": [64]}}},
+        {
+            "sizes": {"vary": {"n": [16, 32]}},
+            "rest": {"about": {"n": 16}, "vary": {"ratio": [2.0], "n": [64]}},
+        },
     )
     assert [(case.n, case.ratio, settings["block"]) for case, settings in cases] == [
         (16, 1.0, "sizes"),

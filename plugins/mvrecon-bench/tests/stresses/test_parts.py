@@ -1,4 +1,6 @@
-"""Parts that a plan meets for the first time: what they are built with, and what is said where that does not do."""
+"""Parts that a plan meets for the first time: what they are built with, and what is said where that
+does not do.
+"""
 
 import pytest
 import torch
@@ -48,7 +50,9 @@ def test_a_camera_that_needs_other_options_is_left_out_and_told_why(plugin, name
     assert rows and all(row["verdict"] == LEFT_OUT and says in row["note"] for row in rows.values())
 
 
-@pytest.mark.parametrize(("name", "options"), [("helix", {"pitch_mm": 2.0}), ("many", {"views": 6})])
+@pytest.mark.parametrize(
+    ("name", "options"), [("helix", {"pitch_mm": 2.0}), ("many", {"views": 6})]
+)
 def test_a_camera_with_options_of_its_own_is_measured(plugin, name, options):
     assert all(row["verdict"] != LEFT_OUT for row in verdicts(name, **options).values())
 
@@ -88,9 +92,14 @@ def judged(name, case):
 
 @pytest.mark.parametrize(
     ("case", "says"),
-    [("rays through corners, axes turned", "refuses: takes more"), ("the adjoint in twenty geometries", "transpose")],
+    [
+        ("rays through corners, axes turned", "refuses: takes more"),
+        ("the adjoint in twenty geometries", "transpose"),
+    ],
 )
-def test_a_plugin_is_left_out_of_what_it_refuses_or_says_it_is_not_and_mvrecon_is_not(monkeypatch, case, says):
+def test_a_plugin_is_left_out_of_what_it_refuses_or_says_it_is_not_and_mvrecon_is_not(
+    monkeypatch, case, says
+):
     monkeypatch.setitem(PROJECTORS._parts, "fussy", Fussy)
     row = judged("fussy", case)
     assert row["verdict"] == LEFT_OUT and says in row["note"]

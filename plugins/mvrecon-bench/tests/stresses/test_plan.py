@@ -1,4 +1,6 @@
-"""The stress plan holds for every built-in part and every shipped plugin; and it fails where it should."""
+"""The stress plan holds for every built-in part and every shipped plugin; and it fails where it
+should.
+"""
 
 import pytest
 import torch
@@ -18,10 +20,14 @@ def rows():
             for dtype in (torch.float64, torch.float32):
                 subject = subject_of(kind, name, options, "cpu", dtype)
                 for case, _ in plan.jobs([subject]):
-                    yield pytest.param(case, subject, id=f"{case.number}-{case.name}-{subject.label}-{dtype}")
+                    yield pytest.param(
+                        case, subject, id=f"{case.number}-{case.name}-{subject.label}-{dtype}"
+                    )
 
 
 @pytest.mark.parametrize(("case", "subject"), list(rows()))
 def test_the_plan_holds(case, subject):
     row = judge(case, subject)
-    assert row["verdict"] != FAIL, f"{case.holds}: {row['measured']} > {row['tolerance']} {row['note']}"
+    assert row["verdict"] != FAIL, (
+        f"{case.holds}: {row['measured']} > {row['tolerance']} {row['note']}"
+    )

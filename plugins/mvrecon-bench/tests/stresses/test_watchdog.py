@@ -20,7 +20,8 @@ def hang(subject):
 row = judge(Case(77, "x", "y", "mvrecon", hang), Subject("mvrecon"), 0.2)
 sys.stdout.write(f"{row['verdict']} {row['note']}\\n")
 sys.stdout.flush()
-signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})  # as compiled code, which no signal reaches
+# as compiled code, which no signal reaches
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
 with watched(0.2, 0.3):
     time.sleep(60)
 """

@@ -1,4 +1,6 @@
-"""Algebra and calculus: adjoints, linearity, orders of convergence, derivatives, maps and compiled graphs, motions."""
+"""Algebra and calculus: adjoints, linearity, orders of convergence, derivatives, maps and compiled
+graphs, motions.
+"""
 
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -26,12 +28,15 @@ GRIDS = (16, 32, 64)
 #: Few rays, in a pose where none lies on a kink.
 FEW = {"pixels": [3, 2], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 SMALL = Grid.centred((3, 4, 3), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
-#: Projectors of other libraries that take any rig, by the plugin mvrecon-peers: Joseph's, Siddon's, and samples.
+#: Projectors of other libraries that take any rig, by the plugin mvrecon-peers: Joseph's, Siddon's,
+#: and samples.
 ORACLES = ("rtk", "diffdrr", "nanodrr")
 
 
 def adjoint(subject: ProjectorSubject) -> float:
-    """<A x, y> and <x, A^T y> in twenty random geometries, relative to the greater; all positive: nothing cancels."""
+    """<A x, y> and <x, A^T y> in twenty random geometries, relative to the greater; all positive:
+    nothing cancels.
+    """
     subject.need("matched")
     rng, worst = torch.Generator().manual_seed(0), 0.0
     for seed in range(20):
@@ -41,18 +46,24 @@ def adjoint(subject: ProjectorSubject) -> float:
         pixels = torch.randint(1, 8, (2,), generator=rng).tolist()
         pitch, offset = (0.5 + 3 * torch.rand(2, 2, generator=rng)).tolist()
         grid = _turned(Grid.centred(shape, spacing.tolist(), centre.tolist()), rng)
-        rig = subject.rig(grid, {"pixels": pixels, "pixel_mm": pitch, "offset_mm": offset}, views=1 + seed % 3)
+        rig = subject.rig(
+            grid, {"pixels": pixels, "pixel_mm": pitch, "offset_mm": offset}, views=1 + seed % 3
+        )
         R = random_rotation(rng)
         A = subject.projector(grid, rig.moved(R, grid.centre - R @ grid.centre))
         x = subject.random(1, 2, *grid.shape, seed=seed)
         y = subject.random(1, 2, len(rig), *rig.shape, seed=seed + 100)
         one, two = (A(x).double() * y).sum(), (x.double() * A.T(y)).sum()
-        worst = greatest([worst, float((one - two).abs() / torch.maximum(one.abs(), two.abs()).clamp(min=1e-30))])
+        worst = greatest(
+            [worst, float((one - two).abs() / torch.maximum(one.abs(), two.abs()).clamp(min=1e-30))]
+        )
     return worst
 
 
 def linear(subject: ProjectorSubject) -> float:
-    """Sums, multiples by 3, -1e-3 and 1e6, and nothing: the views of the same, and of nothing exactly nothing."""
+    """Sums, multiples by 3, -1e-3 and 1e6, and nothing: the views of the same, and of nothing
+    exactly nothing.
+    """
     A = subject.projector(GRID, subject.rig())
     x, y = subject.random(2, 1, *GRID.shape)[:, None]
     seen, other = A(x), A(y)
@@ -71,24 +82,38 @@ def moved(subject: ProjectorSubject) -> float:
         affine = GRID.affine.clone()
         affine[:3] = R @ affine[:3]
         affine[:3, 3] += t
-        worst = greatest([worst, gap(subject.projector(Grid(GRID.shape, affine), rig.moved(R, t))(volume), views)])
+        worst = greatest(
+            [
+                worst,
+                gap(subject.projector(Grid(GRID.shape, affine), rig.moved(R, t))(volume), views),
+            ]
+        )
     return worst
 
 
 def smooth(subject: ProjectorSubject) -> float:
-    """How far the order in the voxel size is below two for a blob; below 0.9 where voxels are cells."""
+    """How far the order in the voxel size is below two for a blob; below 0.9 where voxels are
+    cells.
+    """
     blob = Blob(torch.tensor([1.3, -0.7, 0.4], dtype=torch.float64), 5.0)
-    return (0.9 if subject.of_cells else 1.8) - _order(subject, blob.values, lambda rig: blob.integrals(*rig.rays()))
+    return (0.9 if subject.of_cells else 1.8) - _order(
+        subject, blob.values, lambda rig: blob.integrals(*rig.rays())
+    )
 
 
 def sharp(subject: ProjectorSubject) -> float:
-    """How far the order in the voxel size is below one for an ellipsoid, a cylinder and a box, supersampled."""
+    """How far the order in the voxel size is below one for an ellipsoid, a cylinder and a box,
+    supersampled.
+    """
     solids = _solids()
-    return 0.9 - _order(subject, _voxels, lambda rig: solids.integrals(*rig.rays(), extent=rig.limits))
+    return 0.9 - _order(
+        subject, _voxels, lambda rig: solids.integrals(*rig.rays(), extent=rig.limits)
+    )
 
 
 def oracles(subject: ProjectorSubject) -> float:
-    """The least distance from what another library's projector sees of a blob that fades before the faces.
+    """The least distance from what another library's projector sees of a blob that fades before the
+    faces.
 
     To a plugin's projector mvrecon's own are others too.
     """
@@ -99,7 +124,9 @@ def oracles(subject: ProjectorSubject) -> float:
     views, gaps = subject.projector(grid, rig)(volume), []
     others = [{"name": name} for name in set(ORACLES) & set(PROJECTORS.names()) - {subject.name}]
     if not subject.ours:
-        others += [{"name": "radon" if rig.parallel else "drr", "method": method} for method in METHODS]
+        others += [
+            {"name": "radon" if rig.parallel else "drr", "method": method} for method in METHODS
+        ]
     for other in others:
         try:
             B = PROJECTORS.from_config(other, grid=grid, cameras=rig)
@@ -107,12 +134,16 @@ def oracles(subject: ProjectorSubject) -> float:
         except (ImportError, ValueError):  # not installed, or made for other rigs
             continue
     if not gaps:
-        raise DoesNotApply("no other library's projector is installed that takes this rig; see mvrecon-peers")
+        raise DoesNotApply(
+            "no other library's projector is installed that takes this rig; see mvrecon-peers"
+        )
     return min(gaps)
 
 
 def differences(subject: ProjectorSubject) -> float:
-    """Derivatives by the volume and by every vector of the cameras, against central differences along four ways."""
+    """Derivatives by the volume and by every vector of the cameras, against central differences
+    along four ways.
+    """
     views, vectors = subject.posed(SMALL, subject.rig(SMALL, FEW, views=2))
     inputs = [subject.random(1, 1, *SMALL.shape).requires_grad_(), *vectors]
     rng, worst = torch.Generator().manual_seed(0), 0.0
@@ -121,7 +152,10 @@ def differences(subject: ProjectorSubject) -> float:
     for index, slope in enumerate(found):
         for _ in range(4):
             way = torch.randn(slope.shape, generator=rng, dtype=torch.float64).to(slope)
-            ends = [[*inputs[:index], inputs[index] + step * way, *inputs[index + 1 :]] for step in (1e-5, -1e-5)]
+            ends = [
+                [*inputs[:index], inputs[index] + step * way, *inputs[index + 1 :]]
+                for step in (1e-5, -1e-5)
+            ]
             more, less = ((views(*each) * weights).sum() for each in ends)
             error = ((more - less) / 2e-5 - (slope * way).sum()).abs() / (slope.norm() * way.norm())
             worst = greatest([worst, float(error)])
@@ -129,7 +163,9 @@ def differences(subject: ProjectorSubject) -> float:
 
 
 def kinks(subject: ProjectorSubject) -> float:
-    """Rays along axes, on faces and edges, through corners, past the volume: derivatives by the pose not finite."""
+    """Rays along axes, on faces and edges, through corners, past the volume: derivatives by the
+    pose not finite.
+    """
     grid = Grid.centred((4, 4, 4), 1.0)
     halves = torch.cartesian_prod(*[torch.arange(-2, 10).double() / 2] * 2)
     rays = [ends(grid, axis, halves) for axis in range(3)] + [(-9 * ways(), 10 * ways())]
@@ -143,9 +179,15 @@ def kinks(subject: ProjectorSubject) -> float:
 
 
 def twice(subject: ProjectorSubject) -> float:
-    """Second derivatives: by views and volume the operator itself; by the pose right, or NotImplementedError."""
+    """Second derivatives: by views and volume the operator itself; by the pose right, or
+    NotImplementedError.
+    """
     rig = subject.rig(SMALL, FEW, views=2)
-    A, x, y = subject.projector(SMALL, rig), subject.random(1, 1, *SMALL.shape), subject.random(1, 1, 2, 3, 2)
+    A, x, y = (
+        subject.projector(SMALL, rig),
+        subject.random(1, 1, *SMALL.shape),
+        subject.random(1, 1, 2, 3, 2),
+    )
     for leaf in (x, y):
         leaf.requires_grad_()
     by_y, by_x = torch.autograd.grad((A(x) * y).sum(), (y, x), create_graph=True)
@@ -155,7 +197,9 @@ def twice(subject: ProjectorSubject) -> float:
 
 
 def twice_by_pose(subject: ProjectorSubject) -> float:
-    """A second derivative by the source, against differences of the first, unless NotImplementedError tells of none."""
+    """A second derivative by the source, against differences of the first, unless
+    NotImplementedError tells of none.
+    """
     views, (source, *others) = subject.posed(SMALL, subject.rig(SMALL, FEW, views=2))
     volume, way = subject.random(1, 1, *SMALL.shape), torch.randn(source.shape, dtype=torch.float64)
 
@@ -181,15 +225,22 @@ def mapped(subject: ProjectorSubject) -> float:
     for act, given in ((A, x), (A.T, y)):
         loop = torch.stack([torch.stack([act(one) for one in each]) for each in given])
         worst = greatest([worst, gap(torch.func.vmap(act)(given[:, 0]), loop[:, 0])])
-        worst = greatest([worst, gap(torch.func.vmap(act, in_dims=1)(given[0].transpose(0, 1)), loop[0])])
+        worst = greatest(
+            [worst, gap(torch.func.vmap(act, in_dims=1)(given[0].transpose(0, 1)), loop[0])]
+        )
         worst = greatest([worst, gap(torch.func.vmap(torch.func.vmap(act))(given), loop)])
     return worst
 
 
 def jacobian(subject: ProjectorSubject, act: Callable[..., Tensor]) -> float:
     """The Jacobian, its rows or columns mapped over: the views of every voxel alone."""
-    A, x = subject.projector(SMALL, subject.rig(SMALL, FEW, views=2)), subject.random(1, 1, *SMALL.shape)
-    columns = torch.stack([A(one) for one in torch.eye(x.numel()).to(x).reshape(-1, *x.shape)], dim=-1)
+    A, x = (
+        subject.projector(SMALL, subject.rig(SMALL, FEW, views=2)),
+        subject.random(1, 1, *SMALL.shape),
+    )
+    columns = torch.stack(
+        [A(one) for one in torch.eye(x.numel()).to(x).reshape(-1, *x.shape)], dim=-1
+    )
     try:
         return gap(act(A, x).flatten(-x.ndim), columns)
     except RuntimeError as error:
@@ -199,7 +250,9 @@ def jacobian(subject: ProjectorSubject, act: Callable[..., Tensor]) -> float:
 
 
 def pushed(subject: ProjectorSubject) -> float:
-    """Derivatives forwards, by volume and by views: the operator, or its adjoint, on the tangent."""
+    """Derivatives forwards, by volume and by views: the operator, or its adjoint, on the
+    tangent.
+    """
     A, worst = subject.projector(SMALL, subject.rig(SMALL, FEW, views=2)), 0.0
     for act, shape in ((A, (1, 1, *SMALL.shape)), (A.T, (1, 1, 2, 3, 2))):
         given, tangent = subject.random(*shape), subject.random(*shape, seed=1)
@@ -208,7 +261,9 @@ def pushed(subject: ProjectorSubject) -> float:
 
 
 def compiled(subject: ProjectorSubject) -> float:
-    """Operator, adjoint and pointwise functions in one graph, then of another size: values and gradients the same."""
+    """Operator, adjoint and pointwise functions in one graph, then of another size: values and
+    gradients the same.
+    """
     A = subject.projector(SMALL, subject.rig(SMALL, FEW, views=2))
     x = subject.random(1, 1, *SMALL.shape).requires_grad_()
 
@@ -224,13 +279,19 @@ def compiled(subject: ProjectorSubject) -> float:
     return worst
 
 
-def _order(subject: ProjectorSubject, volume: Callable[[Grid], Tensor], truth: Callable[[Cameras], Tensor]) -> float:
+def _order(
+    subject: ProjectorSubject, volume: Callable[[Grid], Tensor], truth: Callable[[Cameras], Tensor]
+) -> float:
     """The slope of the error over three grids, finest to coarsest."""
     subject.need_lines()
     rig = subject.rig(
-        _box(GRIDS[0]), {"pixels": [20, 21], "pixel_mm": [0.31, 0.33], "offset_mm": [0.03, 0.05]}, views=4
+        _box(GRIDS[0]),
+        {"pixels": [20, 21], "pixel_mm": [0.31, 0.33], "offset_mm": [0.03, 0.05]},
+        views=4,
     )
-    rig = rig.moved(random_rotation(torch.Generator().manual_seed(0)), torch.zeros(3))  # or rows would follow slices
+    rig = rig.moved(
+        random_rotation(torch.Generator().manual_seed(0)), torch.zeros(3)
+    )  # or rows would follow slices
     errors = []
     for n in GRIDS:
         x = volume(_box(n)).to(subject.device, subject.dtype)[None, None]
@@ -245,11 +306,15 @@ def _box(n: int) -> Grid:
 
 def _solids() -> Phantom:
     rng = torch.Generator().manual_seed(5)
-    places = torch.tensor([[1.0, -2.0, 4.5], [-9.0, 6.0, -12.0], [8.0, 5.0, -10.0]], dtype=torch.float64)
+    places = torch.tensor(
+        [[1.0, -2.0, 4.5], [-9.0, 6.0, -12.0], [8.0, 5.0, -10.0]], dtype=torch.float64
+    )
     axes = torch.tensor([[13.0, 16.0, 11.0], [6.0, 7.0, 9.0], [7.0, 5.0, 8.0]], dtype=torch.float64)
     kinds = zip(("ellipsoid", "cylinder", "box"), places, axes, strict=True)
     one = torch.ones(1)
-    return Phantom(tuple(Solids(kind, p[None], random_rotation(rng, 1), a[None], one) for kind, p, a in kinds))
+    return Phantom(
+        tuple(Solids(kind, p[None], random_rotation(rng, 1), a[None], one) for kind, p, a in kinds)
+    )
 
 
 @lru_cache(maxsize=8)
@@ -279,18 +344,64 @@ def _rows(A: Callable[..., Tensor], x: Tensor) -> Tensor:
 
 CASES = (
     Case(13, "all turned and moved together", "the same views", "projector", moved, DIGITS),
-    Case(29, "the adjoint in twenty geometries", "<A x, y> = <x, A^T y>", "projector", adjoint, PRECISE),
+    Case(
+        29,
+        "the adjoint in twenty geometries",
+        "<A x, y> = <x, A^T y>",
+        "projector",
+        adjoint,
+        PRECISE,
+    ),
     Case(30, "sums, multiples and nothing", "the views of the same", "projector", linear, LINEAR),
     Case(31, "a smooth blob on three grids", "what the order lacks", "projector", smooth),
     Case(31, "solids with edges on three grids", "what the order lacks", "projector", sharp),
-    Case(32, "a blob seen by other libraries", "one of them sees the same", "projector", oracles, 1e-3),
-    Case(33, "derivatives by volume and pose", "differences", "projector", differences, 1e-6, DOUBLE),
+    Case(
+        32,
+        "a blob seen by other libraries",
+        "one of them sees the same",
+        "projector",
+        oracles,
+        1e-3,
+    ),
+    Case(
+        33, "derivatives by volume and pose", "differences", "projector", differences, 1e-6, DOUBLE
+    ),
     Case(34, "derivatives where rays tie", "finite", "projector", kinks),
-    Case(35, "second derivatives by volume and views", "the operator itself", "projector", twice, DIGITS),
-    Case(35, "second derivatives by pose", "differences, or refused", "projector", twice_by_pose, 1e-5, DOUBLE),
+    Case(
+        35,
+        "second derivatives by volume and views",
+        "the operator itself",
+        "projector",
+        twice,
+        DIGITS,
+    ),
+    Case(
+        35,
+        "second derivatives by pose",
+        "differences, or refused",
+        "projector",
+        twice_by_pose,
+        1e-5,
+        DOUBLE,
+    ),
     Case(36, "vmap", "what a loop gives", "projector", mapped, LINEAR),
     Case(36, "jacrev", "the views of voxels", "projector", partial(jacobian, act=_jacrev), LINEAR),
-    Case(36, "a Jacobian by rows at once", "the views of voxels", "projector", partial(jacobian, act=_rows), LINEAR),
+    Case(
+        36,
+        "a Jacobian by rows at once",
+        "the views of voxels",
+        "projector",
+        partial(jacobian, act=_rows),
+        LINEAR,
+    ),
     Case(36, "derivatives forwards", "the operator on the tangent", "projector", pushed, LINEAR),
-    Case(37, "a compiled graph, of two sizes", "the eager one", "projector", compiled, DIGITS, (torch.float32,)),
+    Case(
+        37,
+        "a compiled graph, of two sizes",
+        "the eager one",
+        "projector",
+        compiled,
+        DIGITS,
+        (torch.float32,),
+    ),
 )

@@ -1,4 +1,6 @@
-"""Cameras: points that have no image, sizes that could be mistaken for one another, far places, bad options."""
+"""Cameras: points that have no image, sizes that could be mistaken for one another, far places, bad
+options.
+"""
 
 import inspect
 import math
@@ -32,14 +34,18 @@ NOUGHT = (0.0, -0.0, 1e-12, -1e-12, 1e-8, -1e-8, -7.0)
 
 def contract(subject: CameraSubject) -> float:
     """`mvrecon.testing.check_camera`."""
-    assert len(subject.cameras)  # it can be built with what it is given, or none of this is meant for it
+    assert len(
+        subject.cameras
+    )  # it can be built with what it is given, or none of this is meant for it
     with subject.given() as options:
         check_camera(subject.name, **options)
     return 0.0
 
 
 def about_the_source(rig: Cameras, side: float) -> Tensor:
-    """Points in, about and (the last two) before the plane of the first source, on and off its axis, in mm [n 3]."""
+    """Points in, about and (the last two) before the plane of the first source, on and off its
+    axis, in mm [n 3].
+    """
     across = torch.stack([torch.zeros_like(rig.u[0]), 0.7 * rig.u[0] - 0.4 * rig.v[0]])
     normal = torch.nn.functional.normalize(torch.linalg.cross(rig.u[0], rig.v[0]), dim=0)
     normal = normal * (normal @ (rig.origin - rig.source)[0]).sign()
@@ -55,7 +61,9 @@ def nowhere(like: Tensor) -> Tensor:
 
 
 def without_image(subject: CameraSubject) -> float:
-    """Points in the plane of the source, behind it, and of no place: what is made of them, and what is said of it."""
+    """Points in the plane of the source, behind it, and of no place: what is made of them, and what
+    is said of it.
+    """
     found: dict[str, str] = {}
     for m, rig in enumerate(subject.few):
         places = about_the_source(rig, subject.side).to(subject.dtype)
@@ -69,16 +77,24 @@ def without_image(subject: CameraSubject) -> float:
             "a depth that is not finite": ~z.isfinite(),
             "an infinite pixel": uv.isinf(),
             "a valid image that is NaN": valid[: len(places)] & uv.isnan().any(dim=-1),
-            "a valid image behind": valid[: len(places)] & (subject.side * z[:, 0] <= 0) & (not rig.parallel),
+            "a valid image behind": valid[: len(places)]
+            & (subject.side * z[:, 0] <= 0)
+            & (not rig.parallel),
             "no image of what is ahead": ~valid[len(places) - 2 : len(places)],
-            "changed by its neighbours": ((uvz[-2 - 9 : -9] - alone[-2:]).abs() > 1e-6 * (1 + alone[-2:].abs())),
+            "changed by its neighbours": (
+                (uvz[-2 - 9 : -9] - alone[-2:]).abs() > 1e-6 * (1 + alone[-2:].abs())
+            ),
         }
-        found |= {f"camera {m}: {what}": str(int(hit.sum())) for what, hit in hits.items() if hit.any()}
+        found |= {
+            f"camera {m}: {what}": str(int(hit.sum())) for what, hit in hits.items() if hit.any()
+        }
     return none_of(found)
 
 
 def slopes_without_image(subject: CameraSubject) -> float:
-    """Gradients of valid images alone, with points that have none beside them; and of the way back."""
+    """Gradients of valid images alone, with points that have none beside them; and of the way
+    back.
+    """
     wrong = 0
     for rig in subject.few:
         places = about_the_source(rig, subject.side).to(subject.dtype)
@@ -88,7 +104,9 @@ def slopes_without_image(subject: CameraSubject) -> float:
             leaf = replace(rig, **dict(zip(VECTORS, vectors, strict=True)))
             found = leaf.unproject(points[None]) if back else leaf.project(points)
             used = found.isfinite().all(dim=-1) if back else leaf.valid(found)
-            gradients = torch.autograd.grad(torch.where(used[..., None], found, 0.0).sum(), (points, *vectors))
+            gradients = torch.autograd.grad(
+                torch.where(used[..., None], found, 0.0).sum(), (points, *vectors)
+            )
             wrong += sum(int((~gradient.isfinite()).sum()) for gradient in gradients)
     return wrong
 
@@ -107,7 +125,9 @@ def source_in_the_volume(subject: CameraSubject) -> float:
     """Lifts and warps of frusta whose source is in the middle of the grid."""
     rig = subject.few
     step = float(rig.distance[0]) / 10
-    frusta = Frusta(Grid.centred((4, 5, 6), step, rig.source[0].tolist()), rig, depth=6).to(rig.source.device)
+    frusta = Frusta(Grid.centred((4, 5, 6), step, rig.source[0].tolist()), rig, depth=6).to(
+        rig.source.device
+    )
     views = torch.ones(1, 1, len(rig), *rig.shape, device=rig.source.device, requires_grad=True)
     lifted = frusta.spread(views)
     world = frusta.to_world(lifted)
@@ -119,19 +139,27 @@ def source_in_the_volume(subject: CameraSubject) -> float:
 def sizes_alike(subject: CameraSubject) -> float:
     """Three cameras, three points, three coordinates: each alone gives what all together give."""
     rig, uvz = subject.few, subject.somewhere(3)
-    R, t = random_rotation(torch.Generator().manual_seed(4)).to(rig.source), rig.source.new_tensor([3.0, -5.0, 7.0])
+    R, t = (
+        random_rotation(torch.Generator().manual_seed(4)).to(rig.source),
+        rig.source.new_tensor([3.0, -5.0, 7.0]),
+    )
     xyz, moved = rig.unproject(uvz), rig.moved(R, t)
     every, three = rig.project(xyz), rig.project(xyz[0])
     mask = torch.tensor([True, False, True], device=rig.source.device)
     pairs: list[tuple[Tensor, Tensor]] = []
     for m in range(3):
         pairs += [(xyz[m, n], rig[m].unproject(uvz[m : m + 1, n])[0]) for n in range(3)]
-        pairs += [(every[m, k, n], rig[m].project(xyz[k, n])[0]) for k in range(3) for n in range(3)]
+        pairs += [
+            (every[m, k, n], rig[m].project(xyz[k, n])[0]) for k in range(3) for n in range(3)
+        ]
         pairs += [(three[m, n], every[m, 0, n]) for n in range(3)]
         pairs += [(getattr(moved[m], name), getattr(rig[m].moved(R, t), name)) for name in VECTORS]
         pairs += [(moved.source[m], R @ rig.source[m] + t), (moved.u[m], R @ rig.u[m])]
     for chosen in ([2, 0, 1], mask, slice(1, 3), -1, torch.tensor(1)):
-        pairs += [(getattr(rig[chosen], name), getattr(rig, name)[chosen].reshape(-1, 3)) for name in VECTORS]
+        pairs += [
+            (getattr(rig[chosen], name), getattr(rig, name)[chosen].reshape(-1, 3))
+            for name in VECTORS
+        ]
     return greatest(float(((a - b).abs() / (1 + b.abs())).max()) for a, b in pairs)
 
 
@@ -142,13 +170,17 @@ def far_away(subject: CameraSubject) -> float:
     for offset in (0.0, 1e3, 1e4, 1e5, 1e6):
         t = rig.source.new_tensor([offset, -offset, offset])
         moved = rig.moved(R, t)
-        seen = torch.stack([moved.project(x @ R.T + t)[m] for m, x in enumerate(rig.unproject(uvz))])
+        seen = torch.stack(
+            [moved.project(x @ R.T + t)[m] for m, x in enumerate(rig.unproject(uvz))]
+        )
         errors.append(float(((seen - uvz).abs() / (1 + uvz.abs())).max()))
     return greatest(errors)
 
 
 def of_any_size(subject: CameraSubject) -> float:
-    """Cameras and points scaled together, down to pixels of 1e-9 and up to 1e9 mm: the same pixels, depths to scale."""
+    """Cameras and points scaled together, down to pixels of 1e-9 and up to 1e9 mm: the same pixels,
+    depths to scale.
+    """
     rig, uvz = subject.few, subject.somewhere()
     xyz, errors = rig.unproject(uvz), []
     for scale in (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9):
@@ -170,8 +202,13 @@ def bad_motions(subject: CameraSubject) -> float:
     """The rig moved by what is no rigid motion."""
     R, t = random_rotation(torch.Generator().manual_seed(7)), torch.zeros(3)
     bad = {name: (change(R), t) for name, change in NO_ROTATIONS.items()}
-    found = {name: refusal(partial(subject.few.moved, *motion), "(?i)rotation") for name, motion in bad.items()}
-    return none_of(found | {"t is NaN": refusal(partial(subject.few.moved, R, t * math.nan), "translation")})
+    found = {
+        name: refusal(partial(subject.few.moved, *motion), "(?i)rotation")
+        for name, motion in bad.items()
+    }
+    return none_of(
+        found | {"t is NaN": refusal(partial(subject.few.moved, R, t * math.nan), "translation")}
+    )
 
 
 #: What makes of a rotation something else.
@@ -214,15 +251,23 @@ def bad_options(subject: CameraSubject) -> float:
     assert len(subject.cameras)  # as for the contract
     with subject.given() as options:
         parameters = inspect.signature(CAMERAS.get(subject.name)).parameters
-        numbers = {name: each.default for name, each in parameters.items() if isinstance(each.default, float)}
+        numbers = {
+            name: each.default
+            for name, each in parameters.items()
+            if isinstance(each.default, float)
+        }
         numbers |= {name: value for name, value in options.items() if isinstance(value, float)}
         changes = {f"{name} {bad}": {name: bad} for name in numbers for bad in (math.nan, math.inf)}
         if isinstance(detector := options.get("detector"), dict):
-            changes |= {f"{name} {bad}": {"detector": {**detector, name: bad}} for name, bad in NO_DETECTORS}
+            changes |= {
+                f"{name} {bad}": {"detector": {**detector, name: bad}} for name, bad in NO_DETECTORS
+            }
         if not changes:
             raise DoesNotApply("none of its options is a length or an angle")
         build: Callable[..., Any] = partial(subject.build, **options)
-        return none_of({what: refusal(partial(build, **bad), what.split()[0]) for what, bad in changes.items()})
+        return none_of(
+            {what: refusal(partial(build, **bad), what.split()[0]) for what, bad in changes.items()}
+        )
 
 
 NO_DETECTORS = [
@@ -232,13 +277,51 @@ NO_DETECTORS = [
 ]
 
 CASES = (
-    Case(10, "points without an image", "NaN and not valid, and all others as they are", "camera", without_image),
-    Case(10, "gradients at points without an image", "all are finite", "camera", slopes_without_image),
-    Case(11, "towards the source", "the Jacobian is finite and grows", "camera", towards_the_source, dtypes=EXACT),
-    Case(11, "a source in the volume", "lifts and warps are finite", "camera", source_in_the_volume, dtypes=EXACT),
-    Case(12, "cameras of any size", "the same pixels, depths to scale", "camera", of_any_size, 1e-12, EXACT),
+    Case(
+        10,
+        "points without an image",
+        "NaN and not valid, and all others as they are",
+        "camera",
+        without_image,
+    ),
+    Case(
+        10, "gradients at points without an image", "all are finite", "camera", slopes_without_image
+    ),
+    Case(
+        11,
+        "towards the source",
+        "the Jacobian is finite and grows",
+        "camera",
+        towards_the_source,
+        dtypes=EXACT,
+    ),
+    Case(
+        11,
+        "a source in the volume",
+        "lifts and warps are finite",
+        "camera",
+        source_in_the_volume,
+        dtypes=EXACT,
+    ),
+    Case(
+        12,
+        "cameras of any size",
+        "the same pixels, depths to scale",
+        "camera",
+        of_any_size,
+        1e-12,
+        EXACT,
+    ),
     Case(13, "cameras far away", "the same pixels and depths", "camera", far_away, 1e-8, EXACT),
-    Case(21, "three cameras, three points", "what each gives alone", "camera", sizes_alike, 1e-13, EXACT),
+    Case(
+        21,
+        "three cameras, three points",
+        "what each gives alone",
+        "camera",
+        sizes_alike,
+        1e-13,
+        EXACT,
+    ),
     Case(23, "conversions and back", "the same rig", "camera", conversions, 1e-10, EXACT),
     Case(24, "moved by no rigid motion", "refused by name", "camera", bad_motions, dtypes=EXACT),
     Case(24, "moved, and moved back", "the same rig", "camera", moved_back, 1e-13, EXACT),

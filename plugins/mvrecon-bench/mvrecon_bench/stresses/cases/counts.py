@@ -1,7 +1,8 @@
 """Counts and line integrals at the ends of their ranges: likelihoods, MLEM, SIRT, noise.
 
-mvrecon works with line integrals p, not with transmissions exp(-p), and with counts as they were measured. It neither
-takes the logarithm of measured intensities nor draws noise: what came of these elsewhere is looked at at its doors.
+mvrecon works with line integrals p, not with transmissions exp(-p), and with counts as they were
+measured. It neither takes the logarithm of measured intensities nor draws noise: what came of these
+elsewhere is looked at at its doors.
 """
 
 import torch
@@ -33,9 +34,13 @@ def operator(subject: ProjectorSubject, grid: Grid = GRID, **rig) -> Projector:
 
 
 def single_precision(subject: ProjectorSubject) -> float:
-    """50 iterations of MLEM on counts of a Derenzo phantom on 32^3 voxels: float32 against float64."""
+    """50 iterations of MLEM on counts of a Derenzo phantom on 32^3 voxels: float32 against
+    float64.
+    """
     grid = Grid.centred((32, 32, 32), 2.0)
-    A = operator(subject, grid, detector={"pixels": [20, 20], "pixel_mm": 0.65, "offset_mm": 0.0}, views=5)
+    A = operator(
+        subject, grid, detector={"pixels": [20, 20], "pixel_mm": 0.65, "offset_mm": 0.0}, views=5
+    )
     phantom = derenzo(radius=30.0, height=40.0, background=0.1)
     truth = phantom.values(voxel_centres(grid)).to(subject.device)[None, None]
     bright = A(truth)
@@ -44,7 +49,9 @@ def single_precision(subject: ProjectorSubject) -> float:
 
 
 def thick_matter(subject: ProjectorSubject) -> float:
-    """Line integrals from 0 to 200, whose transmissions leave float16 at 9.7 and float32 at 87: p and its gradient."""
+    """Line integrals from 0 to 200, whose transmissions leave float16 at 9.7 and float32 at 87: p
+    and its gradient.
+    """
     A = operator(subject)
     ones = A(torch.ones(1, 1, *GRID.shape, dtype=torch.float64, device=subject.device))
     worst = 0.0
@@ -60,7 +67,9 @@ def thick_matter(subject: ProjectorSubject) -> float:
 
 
 def dense_rays(subject: Subject) -> float:
-    """A threshold of noise must not take rays through much matter, up to p = 200, for empty ones."""
+    """A threshold of noise must not take rays through much matter, up to p = 200, for empty
+    ones.
+    """
     p = torch.linspace(0, 200, 401, dtype=torch.float64)
     wrong = 0
     for photons in (1e2, 1e4, 1e6):
@@ -73,7 +82,9 @@ def dense_rays(subject: Subject) -> float:
 
 
 def logarithms(subject: ProjectorSubject) -> float:
-    """What log(0), log(-1), I0 = 0 and dead pixels leave is refused, with its number; I > I0, so p < 0, is taken."""
+    """What log(0), log(-1), I0 = 0 and dead pixels leave is refused, with its number; I > I0, so p
+    < 0, is taken.
+    """
     A = operator(subject)
     views = subject.random(1, 1, *A.range_shape).double()
     bad = {}
@@ -87,15 +98,21 @@ def logarithms(subject: ProjectorSubject) -> float:
         spoiled[0, 0, 1, 2, :2] = -(torch.tensor(intensity) / torch.tensor(open_beam)).log()
         bad[f"SIRT, {name}"] = refusal(lambda y=spoiled: sirt(A, y, 1), "finite, got 2 of")
         bad[f"MLEM, {name}"] = refusal(lambda y=spoiled: mlem(A, y, 1), "finite.*got 2 bins")
-        bad[f"hull, {name}"] = refusal(lambda y=spoiled: visual_hull(y, A.cameras, GRID, 2), "finite, got 2 of")
+        bad[f"hull, {name}"] = refusal(
+            lambda y=spoiled: visual_hull(y, A.cameras, GRID, 2), "finite, got 2 of"
+        )
     bad["MLEM, p < 0"] = refusal(lambda: mlem(A, views - 2, 1), "not negative, got")
     free = sirt(A, views - 0.5, 3, nonnegative=False)
-    bad["SIRT, p < 0"] = "" if free.isfinite().all() and free.min() < 0 else "negative line integrals are lost"
+    bad["SIRT, p < 0"] = (
+        "" if free.isfinite().all() and free.min() < 0 else "negative line integrals are lost"
+    )
     return none_of(bad)
 
 
 def odd_counts(subject: ProjectorSubject) -> float:
-    """Zero bins, an empty view, no counts at all, one bright bin, counts of 1e-3 to 1e9: what MLEM keeps of the sum."""
+    """Zero bins, an empty view, no counts at all, one bright bin, counts of 1e-3 to 1e9: what MLEM
+    keeps of the sum.
+    """
     A, worst = operator(subject), 0.0
     every = A(subject.random(1, 1, *GRID.shape))
     seen = every > 1e-3 * every.max()
@@ -106,20 +123,33 @@ def odd_counts(subject: ProjectorSubject) -> float:
     empty = torch.ones_like(every)
     empty[:, :, 1] = 0
     for level in (1e-3, 1e9):
-        for mask in (torch.ones_like(every), some, one, empty, 1e-12 + one, torch.zeros_like(every)):
+        for mask in (
+            torch.ones_like(every),
+            some,
+            one,
+            empty,
+            1e-12 + one,
+            torch.zeros_like(every),
+        ):
             counts = level * mask * every * seen
             x = mlem(A, counts, 1)
-            kept = float((PoissonLikelihood(A, counts).sensitivity(x.dtype).double() * x.double()).sum())
+            kept = float(
+                (PoissonLikelihood(A, counts).sensitivity(x.dtype).double() * x.double()).sum()
+            )
             total = float(counts.double().sum())
             worst = greatest([worst, abs(kept - total) / (total or 1.0)])
             x = mlem(A, counts, 2, start=x)
             if not (x >= 0).all() or not x.isfinite().all():
-                raise AssertionError(f"a voxel is negative or not finite at counts up to {float(counts.max()):.3g}")
+                raise AssertionError(
+                    f"a voxel is negative or not finite at counts up to {float(counts.max()):.3g}"
+                )
     return worst
 
 
 def unseen(subject: ProjectorSubject) -> float:
-    """Voxels that no ray passes are 0, frozen voxels stay 0, bins that no voxel explains are refused."""
+    """Voxels that no ray passes are 0, frozen voxels stay 0, bins that no voxel explains are
+    refused.
+    """
     A = operator(subject, detector=ASIDE)
     s = A.T(torch.ones_like(A(subject.random(1, 1, *GRID.shape))))
     start = subject.random(1, 1, *GRID.shape) + 0.1
@@ -131,15 +161,23 @@ def unseen(subject: ProjectorSubject) -> float:
     lost = int((~mlem(A, A(alone), 3, start=alone, skip_zero_bins=False).isfinite()).sum())
     lost += int(((s == 0) & (x != 0)).sum() + (frozen & (x != 0)).sum() + (~x.isfinite()).sum())
     blind = torch.where(counts == 0, 7, counts)
-    shown = {"rays that miss": "" if bool((counts == 0).any() and (s == 0).any()) else "the rig sees all of the grid"}
-    shown["counts where none can be"] = refusal(lambda: mlem(A, blind, 1), "bins hold counts where .* allow none")
+    shown = {
+        "rays that miss": ""
+        if bool((counts == 0).any() and (s == 0).any())
+        else "the rig sees all of the grid"
+    }
+    shown["counts where none can be"] = refusal(
+        lambda: mlem(A, blind, 1), "bins hold counts where .* allow none"
+    )
     return lost + none_of(shown)
 
 
 def rising(subject: ProjectorSubject) -> float:
     """By how much one of 100 iterations of MLEM lowers the likelihood, relative to it."""
     A = operator(subject)
-    counts = torch.poisson(9 * A(subject.random(1, 1, *GRID.shape).double()), generator=generator(subject))
+    counts = torch.poisson(
+        9 * A(subject.random(1, 1, *GRID.shape).double()), generator=generator(subject)
+    )
     likelihood, x, worst = PoissonLikelihood(A, counts, 0.1), mlem(A, counts, 0), 0.0
     last = float(likelihood(x))
     for _ in range(100):
@@ -155,7 +193,9 @@ def generator(subject: Subject) -> torch.Generator:
 
 
 def zero_start(subject: ProjectorSubject) -> float:
-    """A product stays zero: MLEM from zero, from values below it, from NaN; with and without the zero bins."""
+    """A product stays zero: MLEM from zero, from values below it, from NaN; with and without the
+    zero bins.
+    """
     A = operator(subject)
     counts = A(subject.random(1, 1, *GRID.shape))
     starts = {"zeros": 0.0, "below zero": -1.0, "NaN": torch.nan, "infinite": torch.inf}
@@ -171,7 +211,9 @@ def zero_start(subject: ProjectorSubject) -> float:
 
 
 def drawn(subject: ProjectorSubject) -> float:
-    """Counts drawn at rates of 0, 1e-9 and 1e8 are reconstructed; a rate or a count that is no number is refused."""
+    """Counts drawn at rates of 0, 1e-9 and 1e8 are reconstructed; a rate or a count that is no
+    number is refused.
+    """
     A = operator(subject)
     rates = A(subject.random(1, 1, *GRID.shape).double())
     rates = rates / rates.max()
@@ -181,11 +223,17 @@ def drawn(subject: ProjectorSubject) -> float:
         x = mlem(A, counts, 3)
         value = PoissonLikelihood(A, counts, 1e-3)(x)
         bad += int((~(x >= 0)).sum() + (~x.isfinite()).sum() + (~value.isfinite()).sum())
-    wrong = {"no counts": "" if not mlem(A, torch.zeros_like(rates), 2).any() else "something came of nothing"}
+    wrong = {
+        "no counts": ""
+        if not mlem(A, torch.zeros_like(rates), 2).any()
+        else "something came of nothing"
+    }
     for name, value in (("NaN", torch.nan), ("infinity", torch.inf), ("-1", -1.0)):
         spoiled = rates.clone()
         spoiled[0, 0, 0, 0, 0] = value
-        wrong[f"a count of {name}"] = refusal(lambda y=spoiled: mlem(A, y, 1), "got 1 bins that are not")
+        wrong[f"a count of {name}"] = refusal(
+            lambda y=spoiled: mlem(A, y, 1), "got 1 bins that are not"
+        )
         # torch refuses to draw at a rate below zero, and may give anything at one that is no number
         draw = generator(subject)
         wrong[f"a rate of {name}"] = refusal(
@@ -196,7 +244,9 @@ def drawn(subject: ProjectorSubject) -> float:
 
 
 def empty_rows_and_columns(subject: ProjectorSubject) -> float:
-    """SIRT on a rig that misses part of the grid, with rays that miss the grid, whatever these measured."""
+    """SIRT on a rig that misses part of the grid, with rays that miss the grid, whatever these
+    measured.
+    """
     A = operator(subject, detector=ASIDE)
     views = A(subject.random(1, 1, *GRID.shape))
     R, C = sirt_weights(A, views.dtype)
@@ -204,19 +254,50 @@ def empty_rows_and_columns(subject: ProjectorSubject) -> float:
         raise AssertionError("expected empty rows and columns with a weight of zero")
     wild = torch.where(R == 0, 1e6, views)
     x, other = sirt(A, views, 5), sirt(A, wild, 5)
-    return float((x != other).sum() + (~x.isfinite()).sum() + ((C == 0) & (x != 0)).sum() + (not x.any()))
+    return float(
+        (x != other).sum() + (~x.isfinite()).sum() + ((C == 0) & (x != 0)).sum() + (not x.any())
+    )
 
 
 CASES = (
-    Case(43, "MLEM in float32", "the image of float64", "projector", single_precision, 1e-4, (torch.float32,)),
     Case(
-        50, "line integrals up to 200", "finite, those of float64", "projector", thick_matter, VIEWS, (*FLOATS, *HALVES)
+        43,
+        "MLEM in float32",
+        "the image of float64",
+        "projector",
+        single_precision,
+        1e-4,
+        (torch.float32,),
+    ),
+    Case(
+        50,
+        "line integrals up to 200",
+        "finite, those of float64",
+        "projector",
+        thick_matter,
+        VIEWS,
+        (*FLOATS, *HALVES),
     ),
     Case(50, "noise behind much matter", "no dense ray is empty", "mvrecon", dense_rays),
     Case(51, "logarithms of no intensity", "refused, with their number", "projector", logarithms),
-    Case(53, "MLEM on odd counts", "counts kept, nothing negative or infinite", "projector", odd_counts, PRECISE),
+    Case(
+        53,
+        "MLEM on odd counts",
+        "counts kept, nothing negative or infinite",
+        "projector",
+        odd_counts,
+        PRECISE,
+    ),
     Case(53, "MLEM where nothing is seen", "zero, frozen, refused", "projector", unseen),
-    Case(54, "100 iterations of MLEM", "the likelihood never falls", "projector", rising, 1e-12, DOUBLE),
+    Case(
+        54,
+        "100 iterations of MLEM",
+        "the likelihood never falls",
+        "projector",
+        rising,
+        1e-12,
+        DOUBLE,
+    ),
     Case(55, "a product that starts from zero", "refused", "projector", zero_start),
     Case(56, "counts of 0, 1e-9, 1e8 and NaN", "finite, or refused", "projector", drawn),
     Case(

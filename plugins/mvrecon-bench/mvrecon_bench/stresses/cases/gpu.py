@@ -1,4 +1,6 @@
-"""What only a GPU can be asked: more than 2^31 voxels and pixels in its memory, and convolutions in bfloat16."""
+"""What only a GPU can be asked: more than 2^31 voxels and pixels in its memory, and convolutions in
+bfloat16.
+"""
 
 import torch
 from torch.nn.functional import conv3d
@@ -37,26 +39,36 @@ def convolution(subject: Subject) -> float:
 
 
 def huge_volume(subject: ProjectorSubject) -> float:
-    """Rays along the last slab of 2049 x 1024 x 1024 voxels in bfloat16, which is ones, and its last voxel three."""
+    """Rays along the last slab of 2049 x 1024 x 1024 voxels in bfloat16, which is ones, and its
+    last voxel three.
+    """
     need_gpu(subject, 32)
     subject.need_lines()
     grid = Grid.centred((2049, 1024, 1024), 1.0)
     volume = torch.zeros(grid.shape, dtype=torch.bfloat16, device=subject.device)
     volume[-1] = 1
     volume[-1, -1, -1] = 3
-    rows = torch.tensor([[-300.0, 0.0, 2048.0], [-300.0, 517.0, 2048.0], [-300.0, 1023.0, 2048.0]], dtype=torch.float64)
+    rows = torch.tensor(
+        [[-300.0, 0.0, 2048.0], [-300.0, 517.0, 2048.0], [-300.0, 1023.0, 2048.0]],
+        dtype=torch.float64,
+    )
     ends = rows * torch.tensor([-5.0, 1.0, 1.0], dtype=torch.float64)
     seen = subject.values(grid, grid.to_world(rows), grid.to_world(ends), volume)
     return gap(seen, torch.tensor([1024.0, 1024.0, 1026.0]))
 
 
 def huge_views(subject: ProjectorSubject) -> float:
-    """The last pixels of more than 2^31, and what the adjoint makes of them: as a detector by themselves."""
+    """The last pixels of more than 2^31, and what the adjoint makes of them: as a detector by
+    themselves.
+    """
     need_gpu(subject, 48)
     middle = (LONG - 1) / 2
     detector = {"pixels": [LONG, LONG], "pixel_mm": 1.0, "offset_mm": [3.0 - middle, 2.5 - middle]}
     rig = subject.rig(detector=detector, views=1)
-    A, B = (subject.projector(GRID, each) for each in (rig, band(rig, LONG - FEW, LONG - FEW, (FEW, FEW))))
+    A, B = (
+        subject.projector(GRID, each)
+        for each in (rig, band(rig, LONG - FEW, LONG - FEW, (FEW, FEW)))
+    )
     x = subject.random(1, 1, *GRID.shape)
     views, few = A(x), B(x)
     error = gap(views[..., -FEW:, -FEW:], few)
@@ -65,7 +77,31 @@ def huge_views(subject: ProjectorSubject) -> float:
 
 
 CASES = (
-    Case(44, "conv3d in bfloat16", "as in float32, to its rounding", "mvrecon", convolution, ROUGH, SINGLE),
-    Case(45, "more than 2^31 voxels", "the length in its last slab", "projector", huge_volume, 1e-3, SINGLE),
-    Case(45, "more than 2^31 pixels", "its last ones as by themselves", "projector", huge_views, 1e-3, SINGLE),
+    Case(
+        44,
+        "conv3d in bfloat16",
+        "as in float32, to its rounding",
+        "mvrecon",
+        convolution,
+        ROUGH,
+        SINGLE,
+    ),
+    Case(
+        45,
+        "more than 2^31 voxels",
+        "the length in its last slab",
+        "projector",
+        huge_volume,
+        1e-3,
+        SINGLE,
+    ),
+    Case(
+        45,
+        "more than 2^31 pixels",
+        "its last ones as by themselves",
+        "projector",
+        huge_views,
+        1e-3,
+        SINGLE,
+    ),
 )

@@ -29,7 +29,10 @@ def extremes(subject: HeadSubject) -> Iterator[tuple[str, tuple[Tensor, Tensor, 
     logits, prior, views = subject.given
     one = torch.full_like(logits, -1e4)
     one[:, :, :, 4] = 1e4
-    for name, bad in (("1e4", torch.full_like(logits, 1e4)), ("-1e4", torch.full_like(logits, -1e4))):
+    for name, bad in (
+        ("1e4", torch.full_like(logits, 1e4)),
+        ("-1e4", torch.full_like(logits, -1e4)),
+    ):
         yield f"logits of {name}", (bad, prior, views)
     yield "logits of 1e6 and -1e6", (1e6 * logits.sign(), prior, views)
     yield "logits of 1e4 in one bin", (one, prior, views)
@@ -56,14 +59,20 @@ def at_the_ends(subject: HeadSubject) -> float:
         wrong = {
             "densities not finite": ~density.isfinite(),
             "densities outside": (density * ~subject.frusta.occupied) != 0,
-            "gradients not finite": torch.cat([~each.isfinite().flatten() for each in slopes if each is not None]),
+            "gradients not finite": torch.cat(
+                [~each.isfinite().flatten() for each in slopes if each is not None]
+            ),
         }
-        found |= {f"{name}, {what}": str(int(hit.sum())) for what, hit in wrong.items() if hit.any()}
+        found |= {
+            f"{name}, {what}": str(int(hit.sum())) for what, hit in wrong.items() if hit.any()
+        }
     return none_of(found)
 
 
 def views_kept(subject: HeadSubject) -> float:
-    """What a head that keeps views integrates to, for the same; of any head, nothing from nothing."""
+    """What a head that keeps views integrates to, for the same; of any head, nothing from
+    nothing.
+    """
     errors = [0.0]
     for _, (logits, prior, views) in extremes(subject):
         density = subject.head(logits, prior, views, subject.frusta)
@@ -111,9 +120,26 @@ def fused_weights(subject: Subject) -> float:
 
 CASES = (
     Case(19, "rays that miss", "a density of zero", "head", no_ray_hits),
-    Case(47, "a logit that is NaN", "is not hidden, and spoils its own ray alone", "head", bad_logits),
-    Case(53, "logits, priors, views at the ends of their range", "all is finite, none outside", "head", at_the_ends),
-    Case(53, "views, with all these", "are kept where promised; nothing from nothing", "head", views_kept, SUMS),
-    Case(53, "fusion by logits of any size", "weights are one in sum", "mvrecon", fused_weights, SUMS),
+    Case(
+        47, "a logit that is NaN", "is not hidden, and spoils its own ray alone", "head", bad_logits
+    ),
+    Case(
+        53,
+        "logits, priors, views at the ends of their range",
+        "all is finite, none outside",
+        "head",
+        at_the_ends,
+    ),
+    Case(
+        53,
+        "views, with all these",
+        "are kept where promised; nothing from nothing",
+        "head",
+        views_kept,
+        SUMS,
+    ),
+    Case(
+        53, "fusion by logits of any size", "weights are one in sum", "mvrecon", fused_weights, SUMS
+    ),
     Case(61, "the contract of a head", "is kept", "head", contract),
 )

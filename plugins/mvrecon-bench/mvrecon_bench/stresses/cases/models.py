@@ -1,4 +1,6 @@
-"""Models: few cameras, copies of one, views of nothing and of any scale, batches, autocast, gradients, weights."""
+"""Models: few cameras, copies of one, views of nothing and of any scale, batches, autocast,
+gradients, weights.
+"""
 
 import inspect
 import io
@@ -38,7 +40,10 @@ def copies(subject: ModelSubject) -> float:
     """Three copies of one camera, with first weights: what the one alone gives."""
     one, views = small_rig()[[0]], subject.views[:, :, :1]
     single, triple = subject.model(one), subject.model(one[[0, 0, 0]])
-    shapes = [{name: tuple(each.shape) for name, each in model.state_dict().items()} for model in (single, triple)]
+    shapes = [
+        {name: tuple(each.shape) for name, each in model.state_dict().items()}
+        for model in (single, triple)
+    ]
     if shapes[0] != shapes[1]:
         raise DoesNotApply("its weights are made for a number of cameras")
     with torch.no_grad():
@@ -63,8 +68,12 @@ def slopes(model: torch.nn.Module, out: Reconstruction) -> dict[str, Tensor | No
 
 
 def nothing(subject: ModelSubject) -> float:
-    """Views of nothing, beside a sample of something, and with no sample beside it: nothing, if it claims to scale."""
-    views = subject.views[:2] * torch.tensor([0.0, 1.0]).to(subject.views)[:, None, None, None, None]
+    """Views of nothing, beside a sample of something, and with no sample beside it: nothing, if it
+    claims to scale.
+    """
+    views = (
+        subject.views[:2] * torch.tensor([0.0, 1.0]).to(subject.views)[:, None, None, None, None]
+    )
     wrong = 0
     for given in (views, views[:1]):
         out = subject.used(given)
@@ -74,13 +83,17 @@ def nothing(subject: ModelSubject) -> float:
 
 
 def any_scale(subject: ModelSubject) -> float:
-    """Views of 2^-100 (1e-30) to 2^40 (1e12) times the size: the volume times that, or (no such claim) finite ones."""
+    """Views of 2^-100 (1e-30) to 2^40 (1e12) times the size: the volume times that, or (no such
+    claim) finite ones.
+    """
     views, errors = subject.views[:1], []
     with torch.no_grad():
         volume = subject.used(views).volume
         for power in (-100, -60, 40):
             found = subject.used(views * 2.0**power).volume
-            errors.append(gap(found / 2.0**power, volume) if subject.scales else 0.0 * float(found.sum()))
+            errors.append(
+                gap(found / 2.0**power, volume) if subject.scales else 0.0 * float(found.sum())
+            )
     return greatest(errors)
 
 
@@ -104,7 +117,10 @@ def doors(subject: ModelSubject) -> float:
         "a column less": views[..., :-1],
         "rows for columns": views.mT,
     }
-    found = {name: refusal(partial(subject.used, bad), "(?i)views.*got.*[0-9]") for name, bad in shapes.items()}
+    found = {
+        name: refusal(partial(subject.used, bad), "(?i)views.*got.*[0-9]")
+        for name, bad in shapes.items()
+    }
     for bad in (math.nan, math.inf, -math.inf):
         spoilt = views.clone()
         spoilt[0, 0, 1, 2, 3] = bad
@@ -123,11 +139,16 @@ def batches(subject: ModelSubject) -> float:
 def not_contiguous(subject: ModelSubject) -> float:
     """Views that are transposed, or a part of something larger: what a copy of them gives."""
     views = subject.views[:1]
-    larger = torch.zeros(*views.shape[:-1], 2 * views.shape[-1], dtype=views.dtype, device=views.device)
+    larger = torch.zeros(
+        *views.shape[:-1], 2 * views.shape[-1], dtype=views.dtype, device=views.device
+    )
     larger[..., 1::2] = views
     with torch.no_grad():
         volume = subject.used(views).volume
-        return sum(bits(subject.used(other).volume, volume) for other in (views.mT.contiguous().mT, larger[..., 1::2]))
+        return sum(
+            bits(subject.used(other).volume, volume)
+            for other in (views.mT.contiguous().mT, larger[..., 1::2])
+        )
 
 
 def autocast(subject: ModelSubject) -> float:
@@ -140,7 +161,9 @@ def autocast(subject: ModelSubject) -> float:
         volume = model(subject.views[:1]).volume
         with torch.autocast(subject.device.split(":")[0], torch.bfloat16):
             found = model(subject.views[:1]).volume
-    assert {found.dtype, *given} == {torch.float32}, f"expected float32 alone, got {found.dtype} and {set(given)}"
+    assert {found.dtype, *given} == {torch.float32}, (
+        f"expected float32 alone, got {found.dtype} and {set(given)}"
+    )
     return gap(found, volume)
 
 
@@ -151,8 +174,12 @@ def gradients(subject: ModelSubject) -> float:
     if not named:
         raise DoesNotApply("it has nothing to train")
     out = model(subject.views[:2])
-    loss = ReconstructionLoss(1.0)(out, {"volume": subject.truth[:2], "views": subject.views[:2]})["total"]
-    found = dict(zip(named, torch.autograd.grad(loss, list(named.values()), allow_unused=True), strict=True))
+    loss = ReconstructionLoss(1.0)(out, {"volume": subject.truth[:2], "views": subject.views[:2]})[
+        "total"
+    ]
+    found = dict(
+        zip(named, torch.autograd.grad(loss, list(named.values()), allow_unused=True), strict=True)
+    )
     told = {name: _fault(each) for name, each in found.items()}
     return none_of(told)
 
@@ -196,7 +223,9 @@ def randomness(subject: ModelSubject) -> float:
 
 def empty_scene(subject: ModelSubject) -> float:
     """Told to find a support in views of nothing: finite, and nothing outside of it."""
-    if "support" not in inspect.signature(MODELS.get(subject.name)).parameters and not _skips(subject):
+    if "support" not in inspect.signature(MODELS.get(subject.name)).parameters and not _skips(
+        subject
+    ):
         raise DoesNotApply("it has no option 'support'")
     return none_of({name: text for name, text in _empty(subject)})
 
@@ -222,17 +251,48 @@ def _empty(subject: ModelSubject) -> Iterator[tuple[str, str]]:
 
 
 CASES = (
-    Case(19, "views of nothing", "finite, gradients too; nothing where it scales", "model", nothing),
-    Case(19, "a support in an empty scene", "finite, and nothing outside of it", "model", empty_scene, dtypes=SINGLE),
+    Case(
+        19, "views of nothing", "finite, gradients too; nothing where it scales", "model", nothing
+    ),
+    Case(
+        19,
+        "a support in an empty scene",
+        "finite, and nothing outside of it",
+        "model",
+        empty_scene,
+        dtypes=SINGLE,
+    ),
     Case(21, "three samples, three cameras", "what each gives alone", "model", batches, NETWORK),
     Case(26, "three copies of a camera", "what the one gives", "model", copies, 1e-6),
     Case(27, "one camera", "all is finite, gradients too", "model", one_camera),
     Case(33, "gradients of all parameters", "finite, and none is idle", "model", gradients),
-    Case(38, "views that are not contiguous", "what a copy gives", "model", not_contiguous, dtypes=SINGLE),
-    Case(42, "autocast to bfloat16", "float32 out, close to that without", "model", autocast, 0.02, SINGLE),
+    Case(
+        38,
+        "views that are not contiguous",
+        "what a copy gives",
+        "model",
+        not_contiguous,
+        dtypes=SINGLE,
+    ),
+    Case(
+        42,
+        "autocast to bfloat16",
+        "float32 out, close to that without",
+        "model",
+        autocast,
+        0.02,
+        SINGLE,
+    ),
     Case(48, "bad views", "refused, with what was got and expected", "model", doors),
     Case(49, "views below nought", "all is finite, gradients too", "model", below_nought),
-    Case(53, "views of any scale", "the volume times that; without such a claim, finite", "model", any_scale, NETWORK),
+    Case(
+        53,
+        "views of any scale",
+        "the volume times that; without such a claim, finite",
+        "model",
+        any_scale,
+        NETWORK,
+    ),
     Case(70, "weights saved and loaded", "the same volume", "model", saved, dtypes=SINGLE),
     Case(74, "twice the same", "the same volume and gradients", "model", twice),
     Case(75, "the global generator", "is left alone", "model", randomness),

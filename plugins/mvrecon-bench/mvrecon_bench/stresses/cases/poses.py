@@ -1,4 +1,6 @@
-"""Poses and intrinsics: rotations in special places, matrices that are nearly singular, and the doors for all of it."""
+"""Poses and intrinsics: rotations in special places, matrices that are nearly singular, and the
+doors for all of it.
+"""
 
 import math
 import re
@@ -36,7 +38,9 @@ def up_along_the_view(_: Subject) -> float:
         axis = torch.tensor(up, dtype=torch.float64)
         along = torch.nn.functional.normalize(axis if axis.norm() > 0 else axis + 1, dim=0)
         aside = torch.linalg.cross(along, torch.eye(3, dtype=torch.float64)[along.abs().argmin()])
-        target = torch.stack([70 * (s * along + tilt * aside) for tilt in tilts for s in (1, -1)]).requires_grad_()
+        target = torch.stack(
+            [70 * (s * along + tilt * aside) for tilt in tilts for s in (1, -1)]
+        ).requires_grad_()
         R = look_at(torch.zeros_like(target), target, up)
         (slope,) = torch.autograd.grad((R * torch.arange(9.0).reshape(3, 3)).sum(), target)
         assert slope.isfinite().all(), f"gradients of look_at are not finite for up = {up}"
@@ -48,8 +52,13 @@ def looking_at_itself(_: Subject) -> float:
     """A camera at its target, or at no place."""
     eye = torch.tensor([3.0, -2.0, 1.0])
     bad = {"at its target": eye, "NaN": eye * math.nan, "infinitely far": eye * math.inf}
-    found = {name: refusal(partial(look_at, eye, target), "must not be at|finite") for name, target in bad.items()}
-    return none_of(found | {"up is NaN": refusal(partial(look_at, eye, -eye, (0.0, math.nan, 1.0)), "up")})
+    found = {
+        name: refusal(partial(look_at, eye, target), "must not be at|finite")
+        for name, target in bad.items()
+    }
+    return none_of(
+        found | {"up is NaN": refusal(partial(look_at, eye, -eye, (0.0, math.nan, 1.0)), "up")}
+    )
 
 
 def intrinsics() -> Iterator[tuple[str, Tensor]]:
@@ -63,8 +72,13 @@ def intrinsics() -> Iterator[tuple[str, Tensor]]:
 
 
 def nearly_singular(_: Subject) -> float:
-    """K, R, t to the record and back, in units of eps cond(K), unless refused with a number that says how singular."""
-    R, t = random_rotation(torch.Generator().manual_seed(2))[None], torch.tensor([[3.0, -2.0, 50.0]]).double()
+    """K, R, t to the record and back, in units of eps cond(K), unless refused with a number that
+    says how singular.
+    """
+    R, t = (
+        random_rotation(torch.Generator().manual_seed(2))[None],
+        torch.tensor([[3.0, -2.0, 50.0]]).double(),
+    )
     errors = []
     for name, K in intrinsics():
         K, cond = K.double()[None], float(torch.linalg.cond(K.double()))
@@ -84,21 +98,29 @@ def no_rotations(_: Subject) -> float:
     found = {}
     for name, change in NO_ROTATIONS.items():
         bad = torch.stack([R[0], change(R[1])])
-        found[f"K R t: {name}"] = refusal(partial(convert.from_krt, K, bad, t, (6, 5), 70.0), "R must be")
+        found[f"K R t: {name}"] = refusal(
+            partial(convert.from_krt, K, bad, t, (6, 5), 70.0), "R must be"
+        )
         extrinsics = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
         extrinsics[:, :3, :3] = bad
         four = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
         four[:, :3, :3] = K
-        found[f"kornia: {name}"] = refusal(partial(convert.from_kornia, four, extrinsics, (6, 5), 70.0), "must be")
+        found[f"kornia: {name}"] = refusal(
+            partial(convert.from_kornia, four, extrinsics, (6, 5), 70.0), "must be"
+        )
     return none_of(found)
 
 
 def special_rotations(_: Subject) -> float:
-    """Euler angles at and about 0, 90 and 180 degrees: rotations, undone by their negatives, with finite gradients."""
+    """Euler angles at and about 0, 90 and 180 degrees: rotations, undone by their negatives, with
+    finite gradients.
+    """
     close = [x + tiny for x in (0.0, 37.0, 90.0, 180.0) for tiny in (0.0, 1e-300, -1e-7, 1e-7)]
     errors = []
     for axes in ("zyz", "xyz", "zxx"):
-        angles = torch.cartesian_prod(*[torch.tensor(close, dtype=torch.float64)] * 3).requires_grad_()
+        angles = torch.cartesian_prod(
+            *[torch.tensor(close, dtype=torch.float64)] * 3
+        ).requires_grad_()
         R = euler_rotation(angles, axes)
         (slope,) = torch.autograd.grad((R * torch.arange(9.0).reshape(3, 3)).sum(), angles)
         assert slope.isfinite().all(), f"gradients of Euler angles {axes} are not finite"
@@ -108,16 +130,26 @@ def special_rotations(_: Subject) -> float:
 
 
 def quaternions(_: Subject) -> float:
-    """q and -q, by what makes random rotations: the same rotation; near turns by 0 and 180 degrees too."""
+    """q and -q, by what makes random rotations: the same rotation; near turns by 0 and 180 degrees
+    too.
+    """
     from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
-    near = [torch.eye(4, dtype=torch.float64)[k] + tiny for k in range(4) for tiny in (0.0, 1e-300, 1e-9)]
-    q = torch.cat([torch.stack(near), torch.randn(8, 4, generator=torch.Generator().manual_seed(3)).double()])
+    near = [
+        torch.eye(4, dtype=torch.float64)[k] + tiny
+        for k in range(4)
+        for tiny in (0.0, 1e-300, 1e-9)
+    ]
+    q = torch.cat(
+        [torch.stack(near), torch.randn(8, 4, generator=torch.Generator().manual_seed(3)).double()]
+    )
     q = q.requires_grad_()
     R = quaternion_to_rotation_matrix(q)
     (slope,) = torch.autograd.grad((R * torch.arange(9.0).reshape(3, 3)).sum(), q)
     assert slope.isfinite().all(), "gradients of quaternions are not finite"
-    return greatest([improper(R.detach()), float((R - quaternion_to_rotation_matrix(-q)).abs().amax())])
+    return greatest(
+        [improper(R.detach()), float((R - quaternion_to_rotation_matrix(-q)).abs().amax())]
+    )
 
 
 def undone(_: Subject) -> float:
@@ -126,7 +158,12 @@ def undone(_: Subject) -> float:
     t = 1e3 * torch.randn(20, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     back, shift = inverse(R, t)
     rest = (back @ t[..., None])[..., 0] + shift
-    return greatest([float((back @ R - torch.eye(3).to(R)).abs().amax()), float(rest.abs().amax() / t.abs().amax())])
+    return greatest(
+        [
+            float((back @ R - torch.eye(3).to(R)).abs().amax()),
+            float(rest.abs().amax() / t.abs().amax()),
+        ]
+    )
 
 
 def doors(_: Subject) -> float:
@@ -153,7 +190,9 @@ def doors(_: Subject) -> float:
         }
         for name in VECTORS:
             acts[f"{name} "] = partial(_record, rig, **{name: _spoilt(getattr(rig, name), bad)})
-        found |= {f"{name} {bad}": refusal(act, rf"\b{name.strip()}\b") for name, act in acts.items()}
+        found |= {
+            f"{name} {bad}": refusal(act, rf"\b{name.strip()}\b") for name, act in acts.items()
+        }
     return none_of(found)
 
 
@@ -164,17 +203,27 @@ def flat_and_left_handed(_: Subject) -> float:
         {
             "u reversed": refusal(partial(_record, rig, u=-rig.u), "camera 0 is left-handed"),
             "v reversed": refusal(partial(_record, rig, v=-rig.v), "camera 0 is left-handed"),
-            "one reversed": refusal(partial(_record, rig, v=rig.v * torch.tensor([[1], [-1]])), "camera 1 is left"),
+            "one reversed": refusal(
+                partial(_record, rig, v=rig.v * torch.tensor([[1], [-1]])), "camera 1 is left"
+            ),
             "u = 0": refusal(partial(_record, rig, u=rig.u * 0), "flat.*determinant"),
             "v = u": refusal(partial(_record, rig, v=rig.u), "flat.*determinant"),
-            "source on the detector": refusal(partial(_record, rig, source=rig.origin), "flat.*determinant"),
+            "source on the detector": refusal(
+                partial(_record, rig, source=rig.origin), "flat.*determinant"
+            ),
             "no rows": refusal(partial(_record, rig, shape=(0, 5)), "shape"),
             "half a column": refusal(partial(_record, rig, shape=(6, 2.5)), "shape"),
             "no cameras": refusal(lambda: rig[[]], "one row a camera"),
-            "a mirrored grid": refusal(partial(Grid, (4, 4, 4), -affine), "right-handed.*determinant"),
-            "a flat grid": refusal(partial(Grid, (4, 4, 4), affine.roll(1, 0).triu()), "determinant|affine"),
+            "a mirrored grid": refusal(
+                partial(Grid, (4, 4, 4), -affine), "right-handed.*determinant"
+            ),
+            "a flat grid": refusal(
+                partial(Grid, (4, 4, 4), affine.roll(1, 0).triu()), "determinant|affine"
+            ),
             "no voxels": refusal(partial(Grid, (4, 0, 4), affine), "shape"),
-            "a spacing of nought": refusal(partial(Grid.centred, (4, 4, 4), (1.0, 0.0, 1.0)), "spacing"),
+            "a spacing of nought": refusal(
+                partial(Grid.centred, (4, 4, 4), (1.0, 0.0, 1.0)), "spacing"
+            ),
         }
     )
 
@@ -192,15 +241,44 @@ def _spoilt(tensor: Tensor, bad: float) -> Tensor:
 
 
 CASES = (
-    Case(22, "up along the view", "proper rotations, finite gradients", "mvrecon", up_along_the_view, 1e-12, EXACT),
+    Case(
+        22,
+        "up along the view",
+        "proper rotations, finite gradients",
+        "mvrecon",
+        up_along_the_view,
+        1e-12,
+        EXACT,
+    ),
     Case(22, "a camera at its target", "refused", "mvrecon", looking_at_itself, dtypes=EXACT),
     Case(
-        23, "nearly singular K", "the same K, R, t in eps cond(K), or a refusal", "mvrecon", nearly_singular, 10, EXACT
+        23,
+        "nearly singular K",
+        "the same K, R, t in eps cond(K), or a refusal",
+        "mvrecon",
+        nearly_singular,
+        10,
+        EXACT,
     ),
     Case(24, "R that is no rotation", "refused by name", "mvrecon", no_rotations, dtypes=EXACT),
-    Case(25, "turns by 0 and 180 degrees", "rotations, and undone", "mvrecon", special_rotations, 1e-10, EXACT),
+    Case(
+        25,
+        "turns by 0 and 180 degrees",
+        "rotations, and undone",
+        "mvrecon",
+        special_rotations,
+        1e-10,
+        EXACT,
+    ),
     Case(25, "quaternions q and -q", "the same rotation", "mvrecon", quaternions, 1e-10, EXACT),
     Case(25, "the inverse of a motion", "undoes it", "mvrecon", undone, 1e-12, EXACT),
     Case(48, "geometry that is not finite", "refused by name", "mvrecon", doors, dtypes=EXACT),
-    Case(48, "flat, left-handed, empty", "refused by name", "mvrecon", flat_and_left_handed, dtypes=EXACT),
+    Case(
+        48,
+        "flat, left-handed, empty",
+        "refused by name",
+        "mvrecon",
+        flat_and_left_handed,
+        dtypes=EXACT,
+    ),
 )

@@ -1,4 +1,6 @@
-"""Rays in special places: along axes, on faces, through corners, inside, beside and beyond the volume."""
+"""Rays in special places: along axes, on faces, through corners, inside, beside and beyond the
+volume.
+"""
 
 import itertools
 from dataclasses import replace
@@ -15,14 +17,17 @@ from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, gap, greatest
 from mvrecon_bench.stresses.truths import DIRECTIONS, box_lengths, ends, rows, ways
 
-#: Exact in float64 but for the rotation of a ray into voxels; float32 rounds each of about ten sums.
+#: Exact in float64 but for the rotation of a ray into voxels; float32 rounds each of about ten
+#: sums.
 EXACT = {torch.float64: 1e-13, torch.float32: 1e-6}
 #: How far a ray leaves its axis, as a part of its length; the last two are subnormal.
 TILTS = (1e-3, 1e-5, 1e-8, 1e-12, 1e-20, 1e-30, 1e-160, 1e-310, 5e-324)
 
 
 def axis_aligned(subject: ProjectorSubject) -> float:
-    """Rays through rows of voxel centres, along all three axes, both ways: plain sums times the spacing."""
+    """Rays through rows of voxel centres, along all three axes, both ways: plain sums times the
+    spacing.
+    """
     subject.need_exact()
     worst = 0.0
     for n in (4, 5):
@@ -36,7 +41,9 @@ def axis_aligned(subject: ProjectorSubject) -> float:
 
 
 def on_faces(subject: ProjectorSubject) -> float:
-    """Rays on every face and edge of voxels: by how much they miss the upper voxel, or leave the neighbours' range."""
+    """Rays on every face and edge of voxels: by how much they miss the upper voxel, or leave the
+    neighbours' range.
+    """
     subject.need_exact()
     subject.need("bits")
     grid, volume = _integers(subject)
@@ -46,7 +53,9 @@ def on_faces(subject: ProjectorSubject) -> float:
         halves = torch.cartesian_prod(*[torch.arange(-1, 2 * n).double() / 2 for n in sums.shape])
         lower, upper = ((halves - 0.5).ceil().long() + 1, (halves + 0.5).floor().long() + 1)
         padded = torch.nn.functional.pad(sums, (1, 1, 1, 1))
-        around = torch.stack([padded[b[:, 0], c[:, 1]] for b in (lower, upper) for c in (lower, upper)])
+        around = torch.stack(
+            [padded[b[:, 0], c[:, 1]] for b in (lower, upper) for c in (lower, upper)]
+        )
         least, most = (around[-1], around[-1]) if subject.of_cells else around.aminmax(dim=0)
         start, end = ends(grid, axis, halves)
         for a, b in ((start, end), (end, start)):
@@ -56,10 +65,15 @@ def on_faces(subject: ProjectorSubject) -> float:
 
 
 def abutting(subject: ProjectorSubject) -> float:
-    """Two volumes that touch, along each axis: on faces and edges, and oblique, their views add up to the whole's."""
+    """Two volumes that touch, along each axis: on faces and edges, and oblique, their views add up
+    to the whole's.
+    """
     subject.need_exact()
     grid, volume = _integers(subject)
-    rays = [ends(grid, axis, torch.cartesian_prod(*[torch.arange(-1, 8).double() / 2] * 2)) for axis in range(3)]
+    rays = [
+        ends(grid, axis, torch.cartesian_prod(*[torch.arange(-1, 8).double() / 2] * 2))
+        for axis in range(3)
+    ]
     aim = subject.random(40, 3, seed=1).double().cpu() - 0.5
     rays.append((aim - 30, aim.flip(0) + 30))
     start, end = (torch.cat(points) for points in zip(*rays, strict=True))
@@ -69,13 +83,17 @@ def abutting(subject: ProjectorSubject) -> float:
         low, high = [0, 0, 0], [4, 4, 4]
         low[axis] = high[axis] = at
         parts = Box((0, 0, 0), three(high)), Box(three(low), (4, 4, 4))
-        total = sum(subject.values(grid.cropped(box), start, end, volume[box.slices]) for box in parts)
+        total = sum(
+            subject.values(grid.cropped(box), start, end, volume[box.slices]) for box in parts
+        )
         worst = greatest([worst, float((total - whole).abs().max() / whole.max())])
     return worst
 
 
 def through_corners(subject: ProjectorSubject) -> float:
-    """Lines in integer directions through the centre of six voxels a side, which is a corner of eight of them."""
+    """Lines in integer directions through the centre of six voxels a side, which is a corner of
+    eight of them.
+    """
     subject.need_exact()
     grid, way = Grid.centred((6, 6, 6), 1.0), ways()
     lengths = 6 * way.norm(dim=-1) / way.abs().amax(dim=-1)
@@ -83,7 +101,9 @@ def through_corners(subject: ProjectorSubject) -> float:
 
 
 def turned_corners(subject: ProjectorSubject) -> float:
-    """Lines through lattice points, axes in another order or reversed: the same of a volume that is turned so, too."""
+    """Lines through lattice points, axes in another order or reversed: the same of a volume that is
+    turned so, too.
+    """
     grid, way = Grid.centred((6, 6, 6), 1.0), ways()
     point = torch.randint(-2, 3, way.shape, generator=torch.Generator().manual_seed(0)).double()
     start, end, volume = point - 9 * way, point + 9 * way, subject.random(6, 6, 6)
@@ -96,34 +116,48 @@ def turned_corners(subject: ProjectorSubject) -> float:
     for axis in range(3):
         sign = torch.ones(3, dtype=torch.float64)
         sign[axis] = -1
-        again = subject.values(grid, (start * sign)[free], (end * sign)[free], volume.flip(2 - axis))
+        again = subject.values(
+            grid, (start * sign)[free], (end * sign)[free], volume.flip(2 - axis)
+        )
         worst = greatest([worst, float((again - seen[free]).abs().max() / seen.max())])
     return worst
 
 
 def grazing(subject: ProjectorSubject) -> float:
-    """A fan with a ray along an axis, past a volume that is displaced bit by bit; how many rays are wrong.
+    """A fan with a ray along an axis, past a volume that is displaced bit by bit; how many rays are
+    wrong.
 
-    Wrong is what is not finite, what is not zero though the ray misses, and nothing where it does not.
+    Wrong is what is not finite, what is not zero though the ray misses, and nothing where it does
+    not.
     """
     grid = Grid.centred((5, 6, 7), (1.0, 1.2, 0.9))
     half = torch.tensor([3.15, 3.6, 2.5], dtype=torch.float64)
-    steps = torch.tensor([0.0, 0.9, 1 - 1e-9, 1.0, 1 + 1e-12, 1 + 1e-9, 1.0001, 1.5, 4.0, 1e3], dtype=torch.float64)
+    steps = torch.tensor(
+        [0.0, 0.9, 1 - 1e-9, 1.0, 1 + 1e-12, 1 + 1e-9, 1.0001, 1.5, 4.0, 1e3], dtype=torch.float64
+    )
     shifts = torch.cat([steps[:, None] * half * torch.tensor(way) for way in DIRECTIONS[:3]])
     fan = torch.cartesian_prod(*[2.0 * torch.arange(-3, 4, dtype=torch.float64)] * 2)
     source, pixel = torch.zeros(2, len(fan), 3, dtype=torch.float64).unbind()
     source[:, 0], pixel[:, 0], pixel[:, 1:] = -40, 30, fan
     orders = [[0, 1, 2], [2, 0, 1], [1, 2, 0]]
-    start, end = (torch.cat([(p[:, o][:, None] + shifts).flatten(0, 1) for o in orders]) for p in (source, pixel))
+    start, end = (
+        torch.cat([(p[:, o][:, None] + shifts).flatten(0, 1) for o in orders])
+        for p in (source, pixel)
+    )
     rig, volume = subject.rays(start, end), 1 + subject.random(5, 6, 7)
     seen = subject.values(grid, start, end, volume)
     reach = 1e-6 if subject.of_cells else 1.0
-    misses, hits = box_lengths(rig, grid, reach).flatten() == 0, box_lengths(rig, grid, -0.5).flatten() > 0.1
+    misses, hits = (
+        box_lengths(rig, grid, reach).flatten() == 0,
+        box_lengths(rig, grid, -0.5).flatten() > 0.1,
+    )
     return float((~seen.isfinite() | (misses & (seen != 0)) | (hits & ~(seen > 0))).sum())
 
 
 def nearly_aligned(subject: ProjectorSubject) -> float:
-    """Rays that leave a row of voxel centres bit by bit, both ways: how much more than the tilt tells it changes."""
+    """Rays that leave a row of voxel centres bit by bit, both ways: how much more than the tilt
+    tells it changes.
+    """
     grid, worst = Grid.centred((5, 7, 9), (0.9, 1.2, 1.0)), 0.0
     volume = subject.random(*grid.shape)
     for axis in range(3):
@@ -134,14 +168,18 @@ def nearly_aligned(subject: ProjectorSubject) -> float:
 
 
 def nearly_on_faces(subject: ProjectorSubject) -> float:
-    """Rays that leave the face between two rows of voxels bit by bit: how far from what is between the two rows."""
+    """Rays that leave the face between two rows of voxels bit by bit: how far from what is between
+    the two rows.
+    """
     grid, worst = Grid.centred((4, 4, 4), (0.9, 1.2, 1.0)), 0.0
     volume = subject.random(*grid.shape)
     for axis in range(3):
         tilts, way = _tilted(axis)
         start, end = torch.zeros_like(way), 60 * way
         start[:, axis], end[:, axis] = -30, 30
-        beside = torch.cartesian_prod(*[torch.tensor([0.0] if i == axis else [-0.5, 0.5]) for i in range(3)])
+        beside = torch.cartesian_prod(
+            *[torch.tensor([0.0] if i == axis else [-0.5, 0.5]) for i in range(3)]
+        )
         offset = beside.double() * torch.tensor(grid.spacing)
         known = subject.values(grid, start[:1] + offset, end[:1] + offset, volume)
         seen = subject.values(grid, start, end, volume)
@@ -151,7 +189,9 @@ def nearly_on_faces(subject: ProjectorSubject) -> float:
 
 
 def short(subject: ProjectorSubject) -> float:
-    """Rays down to 1e-18 mm in the middle of a voxel: its value times their length, and finite gradients."""
+    """Rays down to 1e-18 mm in the middle of a voxel: its value times their length, and finite
+    gradients.
+    """
     subject.need_segment()
     subject.need_lines()
     grid, volume = Grid.centred((5, 7, 9), (0.9, 1.2, 1.0)), subject.random(5, 7, 9)
@@ -186,8 +226,14 @@ def inside(subject: ProjectorSubject, source: bool, pixel: bool) -> float:
     subject.need_lines() if source and pixel else subject.need_exact()
     grid, rng = Grid.centred((16, 16, 16), 1.0, (3.0, -2.0, 4.0)), torch.Generator().manual_seed(0)
     place = torch.rand(2, 60, 3, generator=rng, dtype=torch.float64) * 6 - 3
-    place[0, :, 0], place[1, :, 0] = (place[0, :, 0] - 4 if source else -30), (place[1, :, 0] + 4 if pixel else 30)
-    start, end = (torch.stack([p.roll(k, dims=1) for k in range(3)]).flatten(0, 1) + grid.centre for p in place)
+    place[0, :, 0], place[1, :, 0] = (
+        (place[0, :, 0] - 4 if source else -30),
+        (place[1, :, 0] + 4 if pixel else 30),
+    )
+    start, end = (
+        torch.stack([p.roll(k, dims=1) for k in range(3)]).flatten(0, 1) + grid.centre
+        for p in place
+    )
     lengths = box_lengths(subject.rays(start, end), grid).flatten()
     return float((subject.values(grid, start, end) / lengths - 1).abs().max())
 
@@ -195,7 +241,12 @@ def inside(subject: ProjectorSubject, source: bool, pixel: bool) -> float:
 def tiled(subject: ProjectorSubject) -> float:
     """A detector that cuts the volume, seen whole, and in tiles of 1, 7 and 64 pixels."""
     grid = Grid.centred((16, 16, 16), 1.0, (3.0, -2.0, 4.0))
-    rig = _cut(subject.rig(grid, {"pixels": [5, 9], "pixel_mm": [2.2, 1.3], "offset_mm": [0.4, -0.3]}, views=2), grid)
+    rig = _cut(
+        subject.rig(
+            grid, {"pixels": [5, 9], "pixel_mm": [2.2, 1.3], "offset_mm": [0.4, -0.3]}, views=2
+        ),
+        grid,
+    )
     volume = subject.random(1, 1, 16, 16, 16)
     whole, worst = subject.projector(grid, rig)(volume), 0.0
     if subject.of_cells:
@@ -209,15 +260,22 @@ def tiled(subject: ProjectorSubject) -> float:
             shift = row * rig.v + column * rig.u
             source = rig.source + shift if rig.parallel else rig.source
             cut = replace(rig, source=source, origin=rig.origin + shift, shape=shape)
-            parts[..., row : row + shape[0], column : column + shape[1]] = subject.projector(grid, cut)(volume)
+            parts[..., row : row + shape[0], column : column + shape[1]] = subject.projector(
+                grid, cut
+            )(volume)
         worst = greatest([worst, gap(parts, whole)])
     return worst
 
 
 def out_of_reach(subject: ProjectorSubject) -> float:
     """A volume wholly behind the source, or beyond the detector: how many rays see anything."""
-    grid, rng = Grid.centred((5, 6, 7), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0)), torch.Generator().manual_seed(0)
-    way = torch.nn.functional.normalize(torch.randn(60, 3, generator=rng, dtype=torch.float64), dim=-1)
+    grid, rng = (
+        Grid.centred((5, 6, 7), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0)),
+        torch.Generator().manual_seed(0),
+    )
+    way = torch.nn.functional.normalize(
+        torch.randn(60, 3, generator=rng, dtype=torch.float64), dim=-1
+    )
     way = torch.cat([way, torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
     aim = grid.centre + 2 * torch.rand(len(way), 3, generator=rng, dtype=torch.float64) - 1
     seen = [subject.values(grid, aim + near * way, aim + 40 * way) for near in (9.0, 30.0)]
@@ -232,7 +290,9 @@ def _integers(subject: ProjectorSubject) -> tuple[Grid, Tensor]:
 
 
 def _tilted(axis: int) -> tuple[Tensor, Tensor]:
-    """Tilts, the first of them 0, and directions along an axis that are tilted so towards either or both others."""
+    """Tilts, the first of them 0, and directions along an axis that are tilted so towards either or
+    both others.
+    """
     one, two = (axis + 1) % 3, (axis + 2) % 3
     tilts, ways = [0.0], [torch.eye(3, dtype=torch.float64)[axis]]
     for tilt, b, c in itertools.product(TILTS, (-1, 0, 1), (-1, 0, 1)):
@@ -253,19 +313,99 @@ def _cut(rig: Cameras, grid: Grid) -> Cameras:
 
 
 CASES = (
-    Case(1, "rays along the axes", "a sum of voxels times the spacing", "projector", axis_aligned, EXACT),
-    Case(2, "rays on faces and edges of voxels", "the voxel above, or what lies between", "projector", on_faces),
-    Case(2, "two volumes that touch", "their views add up to the whole's", "projector", abutting, EXACT),
-    Case(3, "rays through corners", "the chord of a box of ones", "projector", through_corners, EXACT),
-    Case(3, "rays through corners, axes turned", "the same of the turned volume", "projector", turned_corners, EXACT),
+    Case(
+        1,
+        "rays along the axes",
+        "a sum of voxels times the spacing",
+        "projector",
+        axis_aligned,
+        EXACT,
+    ),
+    Case(
+        2,
+        "rays on faces and edges of voxels",
+        "the voxel above, or what lies between",
+        "projector",
+        on_faces,
+    ),
+    Case(
+        2,
+        "two volumes that touch",
+        "their views add up to the whole's",
+        "projector",
+        abutting,
+        EXACT,
+    ),
+    Case(
+        3, "rays through corners", "the chord of a box of ones", "projector", through_corners, EXACT
+    ),
+    Case(
+        3,
+        "rays through corners, axes turned",
+        "the same of the turned volume",
+        "projector",
+        turned_corners,
+        EXACT,
+    ),
     Case(4, "rays that graze a volume", "finite, and 0 where they miss", "projector", grazing),
-    Case(5, "rays nearly along an axis", "what a ray along it sees", "projector", nearly_aligned, EXACT),
-    Case(5, "rays nearly on faces", "between what the rows beside see", "projector", nearly_on_faces, EXACT),
-    Case(6, "rays of 1e-3 to 1e-18 mm", "the voxel's value times their length", "projector", short, EXACT),
+    Case(
+        5,
+        "rays nearly along an axis",
+        "what a ray along it sees",
+        "projector",
+        nearly_aligned,
+        EXACT,
+    ),
+    Case(
+        5,
+        "rays nearly on faces",
+        "between what the rows beside see",
+        "projector",
+        nearly_on_faces,
+        EXACT,
+    ),
+    Case(
+        6,
+        "rays of 1e-3 to 1e-18 mm",
+        "the voxel's value times their length",
+        "projector",
+        short,
+        EXACT,
+    ),
     Case(6, "rays without length", "refused", "mvrecon", pointless),
-    Case(7, "source inside", "the length from it on", "projector", partial(inside, source=True, pixel=False), EXACT),
-    Case(7, "pixel inside", "the length up to it", "projector", partial(inside, source=False, pixel=True), EXACT),
-    Case(7, "both inside", "the length between them", "projector", partial(inside, source=True, pixel=True), EXACT),
-    Case(8, "a detector that cuts the volume, in tiles", "the whole's views", "projector", tiled, EXACT),
-    Case(9, "a volume behind the source or the detector", "nothing at all", "projector", out_of_reach),
+    Case(
+        7,
+        "source inside",
+        "the length from it on",
+        "projector",
+        partial(inside, source=True, pixel=False),
+        EXACT,
+    ),
+    Case(
+        7,
+        "pixel inside",
+        "the length up to it",
+        "projector",
+        partial(inside, source=False, pixel=True),
+        EXACT,
+    ),
+    Case(
+        7,
+        "both inside",
+        "the length between them",
+        "projector",
+        partial(inside, source=True, pixel=True),
+        EXACT,
+    ),
+    Case(
+        8,
+        "a detector that cuts the volume, in tiles",
+        "the whole's views",
+        "projector",
+        tiled,
+        EXACT,
+    ),
+    Case(
+        9, "a volume behind the source or the detector", "nothing at all", "projector", out_of_reach
+    ),
 )

@@ -1,4 +1,6 @@
-"""Again: twice, on more threads, in other threads and processes, many times over; and what a call leaves behind."""
+"""Again: twice, on more threads, in other threads and processes, many times over; and what a call
+leaves behind.
+"""
 
 import multiprocessing
 import random
@@ -60,7 +62,9 @@ def more_threads(subject: ProjectorSubject) -> float:
 
 
 def at_once(subject: ProjectorSubject) -> float:
-    """One operator called by eight threads of Python at once, each with a volume of its own, most of it empty."""
+    """One operator called by eight threads of Python at once, each with a volume of its own, most
+    of it empty.
+    """
     A = subject.projector(WORK, rig := subject.rig(WORK, {"pixels": [12, 11], "pixel_mm": 1.1}))
     layers = torch.arange(WORK.shape[0], device=subject.device)[:, None, None] // 4
     volumes = [subject.random(1, 1, *WORK.shape, seed=i) * (layers == i) for i in range(8)]
@@ -79,7 +83,9 @@ def at_once(subject: ProjectorSubject) -> float:
 
 
 def forked(subject: ProjectorSubject) -> float:
-    """In a process forked from this one, whose threads have worked before: as torch's own workers, on one thread."""
+    """In a process forked from this one, whose threads have worked before: as torch's own workers,
+    on one thread.
+    """
     if subject.device != "cpu" or "fork" not in multiprocessing.get_all_start_methods():
         raise DoesNotApply("a GPU's context does not survive a fork, and some systems have none")
     with threads(2):
@@ -110,9 +116,14 @@ def undrawn() -> Iterator[list[str]]:
     """Names, when it ends, the global generators from which something was drawn inside."""
     states: dict[str, Callable[[], object]] = {
         "random": random.getstate,
-        "numpy": lambda: [str(part) if isinstance(part, int | float | str) else part.tobytes() for part in _numpy()],
+        "numpy": lambda: [
+            str(part) if isinstance(part, int | float | str) else part.tobytes()
+            for part in _numpy()
+        ],
         "torch": lambda: torch.get_rng_state().tolist(),
-        "cuda": lambda: [state.tolist() for state in torch.cuda.get_rng_state_all()] if _has_gpu() else None,
+        "cuda": lambda: (
+            [state.tolist() for state in torch.cuda.get_rng_state_all()] if _has_gpu() else None
+        ),
     }
     before, drawn = {name: state() for name, state in states.items()}, []
     yield drawn
@@ -150,7 +161,12 @@ def evaluation_draws_nothing(subject: Subject) -> float:
     model = MODELS.build("backprojection", projector=A)
     with undrawn() as drawn, TemporaryDirectory() as folder:
         scene = SCENES.build("ellipsoids").sample(3, 5, grid, rig)
-        batch = {"views": scene.views[None], "volume": scene.volume[None], "inside": scene.inside[None], "name": ["0"]}
+        batch = {
+            "views": scene.views[None],
+            "volume": scene.volume[None],
+            "inside": scene.inside[None],
+            "name": ["0"],
+        }
         scores = evaluate({"model": model}, [batch], A, 1.0)
         board = Board(folder)
         board.log_metrics({"psnr": scores["model"][0]["psnr"]}, 0)
@@ -171,12 +187,16 @@ def loops(subject: ProjectorSubject) -> float:
             torch.autograd.grad(A(x).square().sum(), x)
 
     run(FIRST)
-    short, long = (with_memory(lambda count=count: run(count), subject.device)[1] for count in (FIRST, LOOPS))
+    short, long = (
+        with_memory(lambda count=count: run(count), subject.device)[1] for count in (FIRST, LOOPS)
+    )
     return (long - short) * 2**20 / (LOOPS - FIRST) / (x.numel() * x.element_size())
 
 
 def imported(subject: Subject) -> float:
-    """A fresh process imports every part of ours: its seconds of work beyond torch's; without end if it woke a GPU."""
+    """A fresh process imports every part of ours: its seconds of work beyond torch's; without end
+    if it woke a GPU.
+    """
     code = (
         "import time, torch; begin = time.process_time()\n"
         "from mvrecon.parts import REGISTRIES as known\n"
@@ -198,7 +218,30 @@ CASES = (
     Case(74, "in a forked process", "the same bits", "projector", forked, dtypes=SINGLE),
     Case(74, "in a spawned process", "the same bits", "mvrecon", spawned, dtypes=SINGLE),
     Case(75, "random numbers of others", "none is drawn", "projector", draws_nothing),
-    Case(75, "random numbers of others", "none is drawn", "mvrecon", evaluation_draws_nothing, dtypes=SINGLE),
-    Case(76, "memory over 500 loops", "grows by less than a tenth of a volume each", "projector", loops, 0.1, SINGLE),
-    Case(78, "a fresh process imports all parts", "within 2 s beyond torch, no GPU", "mvrecon", imported, 2.0, SINGLE),
+    Case(
+        75,
+        "random numbers of others",
+        "none is drawn",
+        "mvrecon",
+        evaluation_draws_nothing,
+        dtypes=SINGLE,
+    ),
+    Case(
+        76,
+        "memory over 500 loops",
+        "grows by less than a tenth of a volume each",
+        "projector",
+        loops,
+        0.1,
+        SINGLE,
+    ),
+    Case(
+        78,
+        "a fresh process imports all parts",
+        "within 2 s beyond torch, no GPU",
+        "mvrecon",
+        imported,
+        2.0,
+        SINGLE,
+    ),
 )

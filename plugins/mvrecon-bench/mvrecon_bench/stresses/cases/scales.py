@@ -1,4 +1,6 @@
-"""Scales: tiny and huge voxels, far worlds, far sources, flat voxels, coarse and fine pixels, thin volumes; turns."""
+"""Scales: tiny and huge voxels, far worlds, far sources, flat voxels, coarse and fine pixels, thin
+volumes; turns.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -14,12 +16,23 @@ from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
 from mvrecon_bench.stresses.truths import Blob, rows, through
 
-#: Of the plan: what float32 loses where geometry is formed in float64, relative to the volume, before it is cast.
+#: Of the plan: what float32 loses where geometry is formed in float64, relative to the volume,
+#: before it is cast.
 DIGITS = {torch.float64: 1e-12, torch.float32: 2e-6}
 #: 1e6 mm away, float64 knows a place to 1e-10 mm.
 FAR = {torch.float64: 1e-9, torch.float32: 2e-6}
 #: Boxes of which no ray may be lost: one voxel, a slice, a row, and sizes that are prime.
-SHAPES = ((1, 1, 1), (1, 5, 6), (6, 1, 5), (5, 6, 1), (9, 1, 1), (1, 9, 1), (1, 1, 9), (2, 3, 5), (13, 7, 11))
+SHAPES = (
+    (1, 1, 1),
+    (1, 5, 6),
+    (6, 1, 5),
+    (5, 6, 1),
+    (9, 1, 1),
+    (1, 9, 1),
+    (1, 1, 9),
+    (2, 3, 5),
+    (13, 7, 11),
+)
 #: Unlike each of its images in a mirror.
 LETTER = torch.tensor([[1, 1, 1], [1, 0, 0], [1, 1, 0], [1, 0, 0], [1, 0, 0]])
 
@@ -66,7 +79,9 @@ def far_source(subject: ProjectorSubject) -> float:
 
 
 def magnified(subject: ProjectorSubject) -> float:
-    """Detectors at 1.0001 to 50 times the object's distance, pixels in proportion: what the rays one by one see."""
+    """Detectors at 1.0001 to 50 times the object's distance, pixels in proportion: what the rays
+    one by one see.
+    """
     subject.need_lines()
     if subject.beam[0]:
         raise DoesNotApply("parallel rays magnify nothing")
@@ -79,7 +94,9 @@ def magnified(subject: ProjectorSubject) -> float:
         rig = _facing(subject, (corner, 1.1 * right, 1.2 * down), shape, distance, k)
         source = (-distance * look).expand_as(points)
         seen = subject.projector(grid, rig)(volume[None, None]).flatten()
-        worst = greatest([worst, gap(seen, subject.values(grid, source, source + 3 * (points - source), volume))])
+        worst = greatest(
+            [worst, gap(seen, subject.values(grid, source, source + 3 * (points - source), volume))]
+        )
     return worst
 
 
@@ -99,21 +116,36 @@ def flat(_: Subject) -> float:
 
 
 def anisotropic(subject: ProjectorSubject) -> float:
-    """Flat and long voxels, up to 1e4 times as long as wide, full of ones: the chords of rays from face to face."""
+    """Flat and long voxels, up to 1e4 times as long as wide, full of ones: the chords of rays from
+    face to face.
+    """
     subject.need_exact()
-    spacings = ((0.7, 0.7, 5.0), (5.0, 0.7, 0.7), (1e-2, 1.0, 1e2), (1e2, 1e-2, 1.0), (1.0, 1e4, 1.0))
-    return greatest(_chords(subject, Grid.centred((5, 6, 7), mm, (3.0, -2.0, 4.0))) for mm in spacings)
+    spacings = (
+        (0.7, 0.7, 5.0),
+        (5.0, 0.7, 0.7),
+        (1e-2, 1.0, 1e2),
+        (1e2, 1e-2, 1.0),
+        (1.0, 1e4, 1.0),
+    )
+    return greatest(
+        _chords(subject, Grid.centred((5, 6, 7), mm, (3.0, -2.0, 4.0))) for mm in spacings
+    )
 
 
 def coarse_and_fine(subject: ProjectorSubject) -> float:
-    """Pixels as wide as 9 voxels, and as 1 / 40 of one: the mean of a blob's integrals, and no view is lost."""
+    """Pixels as wide as 9 voxels, and as 1 / 40 of one: the mean of a blob's integrals, and no view
+    is lost.
+    """
     subject.need_lines()
     grid = Grid.centred((48, 48, 48), 1.0, (3.0, -2.0, 4.0))
     blob, worst = Blob(grid.centre + torch.tensor([0.3, -0.2, 0.4]), 7.0), 0.0
     volume = blob.values(grid).to(subject.device, subject.dtype)[None, None]
     for mm in (1.2, 0.003):
         rig = subject.rig(grid, {"pixels": [6, 5], "pixel_mm": mm}, views=7)
-        seen, expected = subject.projector(grid, rig)(volume)[0, 0].double().cpu(), blob.integrals(*rig.rays())
+        seen, expected = (
+            subject.projector(grid, rig)(volume)[0, 0].double().cpu(),
+            blob.integrals(*rig.rays()),
+        )
         lost = (seen.amax(dim=(1, 2)) == 0).sum()
         worst = greatest([worst, float(lost), float((seen.mean() / expected.mean() - 1).abs())])
     return worst
@@ -127,12 +159,16 @@ def thin(subject: ProjectorSubject) -> float:
         grid = Grid.centred(shape, (0.9, 1.2, 1.0), (3.0, -2.0, 4.0))
         volume = subject.random(*shape)
         start, end, sums = rows(grid, volume)
-        worst = greatest([worst, gap(subject.values(grid, start, end, volume), sums), _chords(subject, grid)])
+        worst = greatest(
+            [worst, gap(subject.values(grid, start, end, volume), sums), _chords(subject, grid)]
+        )
     return worst
 
 
 def letter(subject: ProjectorSubject) -> float:
-    """The letter F in a volume, seen from all six sides, each way up: how many pixels do not show it upright."""
+    """The letter F in a volume, seen from all six sides, each way up: how many pixels do not show
+    it upright.
+    """
     wrong = 0.0
     for right, down in itertools.permutations(torch.cat([torch.eye(3), -torch.eye(3)]).double(), 2):
         if (right * down).any():
@@ -140,12 +176,16 @@ def letter(subject: ProjectorSubject) -> float:
         look = torch.linalg.cross(right, down)
         way = torch.stack([look, down, right])
         axes, signs = way.abs().argmax(dim=1).tolist(), way.sum(dim=1).tolist()
-        held = torch.stack([torch.zeros_like(LETTER), LETTER]).flip([i for i in range(3) if signs[i] < 0])
+        held = torch.stack([torch.zeros_like(LETTER), LETTER]).flip(
+            [i for i in range(3) if signs[i] < 0]
+        )
         volume = held.permute([axes.index(axis) for axis in (2, 1, 0)])
         grid = Grid.centred(volume.shape, (0.9, 1.2, 1.0), (3.0, -2.0, 4.0))
         u, v = grid.spacing[axes[2]] * right, grid.spacing[axes[1]] * down
         rig = _facing(subject, (grid.centre - u - 2 * v, u, v), (5, 3), 1e5, 1.5)
-        seen = subject.projector(grid, rig)(volume.to(subject.device, subject.dtype)[None, None])[0, 0, 0].cpu()
+        seen = subject.projector(grid, rig)(volume.to(subject.device, subject.dtype)[None, None])[
+            0, 0, 0
+        ].cpu()
         wrong += float((~((seen / seen.max() - LETTER).abs() <= 1e-3)).sum())
     return wrong
 
@@ -174,12 +214,17 @@ def _steps(shape: Sequence[int]) -> Tensor:
 
 
 def _facing(
-    subject: ProjectorSubject, plane: tuple[Tensor, Tensor, Tensor], shape: tuple[int, int], distance: float, k: float
+    subject: ProjectorSubject,
+    plane: tuple[Tensor, Tensor, Tensor],
+    shape: tuple[int, int],
+    distance: float,
+    k: float,
 ) -> Cameras:
-    """A camera upright before a plane: its pixel (row, column) sees the point corner + column u + row v.
+    """A camera upright before a plane: its pixel (row, column) sees the point corner + column u +
+    row v.
 
-    Central ones stand at this distance from the plane's middle, their detectors at k times that, or as far behind a
-    pinhole; parallel rays begin and end 8 mm before and behind the plane.
+    Central ones stand at this distance from the plane's middle, their detectors at k times that, or
+    as far behind a pinhole; parallel rays begin and end 8 mm before and behind the plane.
     """
     (corner, u, v), (parallel, extent) = plane, subject.beam
     look = torch.nn.functional.normalize(torch.linalg.cross(u, v), dim=0)
@@ -195,11 +240,43 @@ def _facing(
 CASES = (
     Case(12, "voxels of 1e-6 to 1e6 mm", "views in proportion", "projector", scaled, DIGITS),
     Case(13, "a world 1 to 1e6 mm away", "the same views", "projector", far_away, FAR),
-    Case(14, "a source 1e2 to 1e7 mm away", "parallel rays in the limit", "projector", far_source, DIGITS),
-    Case(14, "magnification of 1.0001 to 50", "what rays one by one see", "projector", magnified, FAR),
+    Case(
+        14,
+        "a source 1e2 to 1e7 mm away",
+        "parallel rays in the limit",
+        "projector",
+        far_source,
+        DIGITS,
+    ),
+    Case(
+        14, "magnification of 1.0001 to 50", "what rays one by one see", "projector", magnified, FAR
+    ),
     Case(14, "a detector 1e-10 mm from its source", "refused", "mvrecon", flat),
-    Case(15, "voxels 7 and 1e4 times as long as wide", "the chord of a box of ones", "projector", anisotropic, PRECISE),
-    Case(16, "pixels of 9 and of 1/40 voxels", "a blob's mean; no view is lost", "projector", coarse_and_fine, 1e-2),
-    Case(17, "volumes of one voxel, slice or row", "chords, and sums of rows", "projector", thin, DIGITS),
-    Case(20, "the letter F from six sides, each way up", "upright in every view", "projector", letter),
+    Case(
+        15,
+        "voxels 7 and 1e4 times as long as wide",
+        "the chord of a box of ones",
+        "projector",
+        anisotropic,
+        PRECISE,
+    ),
+    Case(
+        16,
+        "pixels of 9 and of 1/40 voxels",
+        "a blob's mean; no view is lost",
+        "projector",
+        coarse_and_fine,
+        1e-2,
+    ),
+    Case(
+        17,
+        "volumes of one voxel, slice or row",
+        "chords, and sums of rows",
+        "projector",
+        thin,
+        DIGITS,
+    ),
+    Case(
+        20, "the letter F from six sides, each way up", "upright in every view", "projector", letter
+    ),
 )

@@ -1,4 +1,6 @@
-"""Sizes: nothing at all, sizes that could be taken for each other, many cameras, large detectors, more than 2^31."""
+"""Sizes: nothing at all, sizes that could be taken for each other, many cameras, large detectors,
+more than 2^31.
+"""
 
 import math
 import mmap
@@ -56,10 +58,14 @@ def no_volumes(subject: ProjectorSubject) -> float:
 
 
 def no_geometry(subject: Subject) -> float:
-    """No voxels, views, rows, rays, samples or subsets: a ValueError, before anything is computed."""
+    """No voxels, views, rows, rays, samples or subsets: a ValueError, before anything is
+    computed.
+    """
     rig, none = rig_about(GRID), torch.zeros(0, 3)
     A = PROJECTORS.build("drr", grid=GRID, cameras=rig)
-    calls: list[Callable[[], object]] = [lambda n=n: Grid.centred(n, 1.0) for n in ((0, 2, 3), (2, 0, 3), (2, 3, 0))]
+    calls: list[Callable[[], object]] = [
+        lambda n=n: Grid.centred(n, 1.0) for n in ((0, 2, 3), (2, 0, 3), (2, 3, 0))
+    ]
     calls += [lambda n=n: replace(rig, shape=n) for n in ((0, 4), (4, 0))]
     calls += [
         lambda: Cameras(none, none, none, none, (2, 3)),
@@ -77,11 +83,16 @@ def no_geometry(subject: Subject) -> float:
 
 
 def three_of_all(subject: ProjectorSubject) -> float:
-    """Three cases, channels, views, rows, columns and voxels each way: as each case, channel and view by itself."""
+    """Three cases, channels, views, rows, columns and voxels each way: as each case, channel and
+    view by itself.
+    """
     grid = Grid.centred((3, 3, 3), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
     rig = subject.rig(grid, {"pixels": [3, 3], "pixel_mm": 3.0, "offset_mm": [0.4, -0.3]})
     x, y = subject.random(3, 3, 3, 3, 3), subject.random(3, 3, 3, 3, 3, seed=1)
-    A, single = subject.projector(grid, rig), [subject.projector(grid, rig[m : m + 1]) for m in range(3)]
+    A, single = (
+        subject.projector(grid, rig),
+        [subject.projector(grid, rig[m : m + 1]) for m in range(3)],
+    )
     views, volume = torch.empty_like(y), torch.zeros_like(x)
     for b in range(3):
         for c in range(3):
@@ -111,21 +122,33 @@ def three_cameras(subject: Subject) -> float:
 
 def many_cameras(subject: ProjectorSubject) -> float:
     """200 cameras of one pixel: as a few at a time, each some in a rig of their own."""
-    rig = subject.rig(detector={"pixels": [1, 1], "pixel_mm": 2.0, "offset_mm": [1.1, 0.7]}, views=200)
-    x, chunks = subject.random(1, 1, *GRID.shape), [rig[first : first + 67] for first in range(0, 200, 67)]
+    rig = subject.rig(
+        detector={"pixels": [1, 1], "pixel_mm": 2.0, "offset_mm": [1.1, 0.7]}, views=200
+    )
+    x, chunks = (
+        subject.random(1, 1, *GRID.shape),
+        [rig[first : first + 67] for first in range(0, 200, 67)],
+    )
     A, parts = subject.projector(GRID, rig), [subject.projector(GRID, chunk) for chunk in chunks]
     views = A(x)
     pieces = views.split([len(chunk) for chunk in chunks], dim=2)
     volume = sum((B.T(piece) for B, piece in zip(parts, pieces, strict=True)), torch.zeros_like(x))
-    return bits(torch.cat([B(x) for B in parts], dim=2), views) + (gap(volume, A.T(views)) > ROUNDING[x.dtype])
+    return bits(torch.cat([B(x) for B in parts], dim=2), views) + (
+        gap(volume, A.T(views)) > ROUNDING[x.dtype]
+    )
 
 
 def large_detector(subject: ProjectorSubject) -> float:
     """One camera of 200 x 190 pixels: as bands of its rows, each a detector of its own."""
-    rig = subject.rig(detector={"pixels": [200, 190], "pixel_mm": 0.09, "offset_mm": [0.04, -0.03]}, views=1)
+    rig = subject.rig(
+        detector={"pixels": [200, 190], "pixel_mm": 0.09, "offset_mm": [0.04, -0.03]}, views=1
+    )
     x, (rows, columns), height = subject.random(1, 1, *GRID.shape), rig.shape, 63
     views = subject.projector(GRID, rig)(x)
-    bands = [band(rig, 0, first, (min(height, rows - first), columns)) for first in range(0, rows, height)]
+    bands = [
+        band(rig, 0, first, (min(height, rows - first), columns))
+        for first in range(0, rows, height)
+    ]
     return gap(torch.cat([subject.projector(GRID, part)(x) for part in bands], dim=3), views)
 
 
@@ -153,7 +176,9 @@ def subsets(subject: ProjectorSubject) -> float:
 
 
 def long_strides(subject: ProjectorSubject) -> float:
-    """A volume whose voxels lie beyond 2^31 from its first in memory, which is a file of nothing but holes."""
+    """A volume whose voxels lie beyond 2^31 from its first in memory, which is a file of nothing
+    but holes.
+    """
     if subject.device != "cpu":
         raise DoesNotApply("a file is in main memory")
     strides = (0, 0, 2**29, 2**23 + 5, 3)
@@ -171,15 +196,23 @@ def long_strides(subject: ProjectorSubject) -> float:
 
 
 def last_voxels(subject: Subject) -> float:
-    """The last voxels of a volume of 1300^3 (more than 2^31), the only ones held: as a volume of their own."""
+    """The last voxels of a volume of 1300^3 (more than 2^31), the only ones held: as a volume of
+    their own.
+    """
     side, errors = 1300, []
-    grid, box = Grid.centred((side, side, side), 1.0), Box((side - 5, side - 6, side - 7), (side, side, side))
+    grid, box = (
+        Grid.centred((side, side, side), 1.0),
+        Box((side - 5, side - 6, side - 7), (side, side, side)),
+    )
     alone = grid.cropped(box)
     held, x = Occupancy(grid.shape, box).encoded(), subject.random(1, 1, *box.shape)
     for name, is_parallel in (("drr", False), ("radon", True)):
         rig = rig_about(alone, is_parallel)
         for method in ("joseph", "siddon"):
-            A, B = (PROJECTORS.build(name, grid=each, cameras=rig, method=method) for each in (grid, alone))
+            A, B = (
+                PROJECTORS.build(name, grid=each, cameras=rig, method=method)
+                for each in (grid, alone)
+            )
             rays = A.lines, A.window
             views = ops.project(x[0], *rays, A.detector, method, held)
             volume = ops.backproject(views, *rays, list(box.shape), method, held)
@@ -188,11 +221,17 @@ def last_voxels(subject: Subject) -> float:
 
 
 def last_pixels(subject: Subject) -> float:
-    """The last pixels of more than 2^31, the only ones that see anything: as a detector of their own."""
+    """The last pixels of more than 2^31, the only ones that see anything: as a detector of their
+    own.
+    """
     inside = torch.zeros(GRID.shape, dtype=torch.bool)
     inside[1:-1, 1:-1, 1:-1] = True
     x, errors = subject.random(1, 1, *GRID.shape), []
-    detector = {"pixels": [LONG, LONG], "pixel_mm": 1.0, "offset_mm": [3.0 - (LONG - 1) / 2, 2.5 - (LONG - 1) / 2]}
+    detector = {
+        "pixels": [LONG, LONG],
+        "pixel_mm": 1.0,
+        "offset_mm": [3.0 - (LONG - 1) / 2, 2.5 - (LONG - 1) / 2],
+    }
     for name, is_parallel in (("drr", False), ("radon", True)):
         rig = rig_about(GRID, is_parallel, detector=detector, views=1)
         few = band(rig, LONG - FEW, LONG - FEW, (FEW, FEW))
@@ -203,23 +242,58 @@ def last_pixels(subject: Subject) -> float:
                 last = A(x)[..., -FEW:, -FEW:].clone()
                 views = torch.from_numpy(np.zeros((1, 1, 1, LONG, LONG), np.float32))
             except MemoryError as error:
-                raise DoesNotApply(f"this machine promises no {4 * LONG**2 / 2**30:.0f} GB") from error
+                raise DoesNotApply(
+                    f"this machine promises no {4 * LONG**2 / 2**30:.0f} GB"
+                ) from error
             views[..., -FEW:, -FEW:] = last
-            errors += [gap(last, B(x)), gap(A.T(views), B.T(last)), math.nan if not last.any() else 0.0]
+            errors += [
+                gap(last, B(x)),
+                gap(A.T(views), B.T(last)),
+                math.nan if not last.any() else 0.0,
+            ]
     return greatest(errors)
 
 
 CASES = (
     Case(
-        18, "no cases, no channels", "nothing of the right shape, and a gradient; or refused", "projector", no_volumes
+        18,
+        "no cases, no channels",
+        "nothing of the right shape, and a gradient; or refused",
+        "projector",
+        no_volumes,
     ),
     Case(18, "no voxels, views, rows", "refused", "mvrecon", no_geometry, dtypes=SPARSE),
     Case(21, "three of everything", "as one by one", "projector", three_of_all, ROUNDING),
-    Case(21, "three cameras, three points", "as one by one", "mvrecon", three_cameras, 1e-12, (torch.float64,)),
-    Case(28, "200 cameras of one pixel", "as in parts, views to the bit", "projector", many_cameras),
+    Case(
+        21,
+        "three cameras, three points",
+        "as one by one",
+        "mvrecon",
+        three_cameras,
+        1e-12,
+        (torch.float64,),
+    ),
+    Case(
+        28, "200 cameras of one pixel", "as in parts, views to the bit", "projector", many_cameras
+    ),
     Case(28, "a large detector", "as in bands of rows", "projector", large_detector, ROUNDING),
-    Case(28, "subsets of cameras and of pixels", "together what the operator does", "projector", subsets, ROUNDING),
+    Case(
+        28,
+        "subsets of cameras and of pixels",
+        "together what the operator does",
+        "projector",
+        subsets,
+        ROUNDING,
+    ),
     Case(46, "strides beyond 2^31", "the bits of contiguous memory", "projector", long_strides),
-    Case(46, "the last of 2^31 voxels", "as by themselves", "mvrecon", last_voxels, 1e-11, (torch.float64,)),
+    Case(
+        46,
+        "the last of 2^31 voxels",
+        "as by themselves",
+        "mvrecon",
+        last_voxels,
+        1e-11,
+        (torch.float64,),
+    ),
     Case(46, "the last of 2^31 pixels", "as by themselves", "mvrecon", last_pixels, 1e-6, SPARSE),
 )

@@ -33,7 +33,9 @@ def layouts(values: Tensor) -> Iterator[Tensor]:
     yield values.permute(4, 3, 2, 1, 0).contiguous().permute(4, 3, 2, 1, 0)
     yield values.contiguous(memory_format=torch.channels_last_3d)
     yield torch.stack([values.new_full((), torch.nan).expand_as(values), values], dim=-1)[..., 1]
-    yield torch.cat([values.new_full((1,), torch.nan), values.flatten()])[1:].view_as(values)  # off any boundary
+    yield torch.cat([values.new_full((1,), torch.nan), values.flatten()])[1:].view_as(
+        values
+    )  # off any boundary
     yield torch.nn.functional.pad(values, (2, 1, 1, 2), value=torch.nan)[..., 1:-2, 2:-1]
 
 
@@ -54,7 +56,10 @@ def backwards(subject: Subject) -> float:
     takes: list[tuple[Callable[[Any], Tensor], np.ndarray]] = [
         (lambda array: Grid.centred((2, 3, 4), array).affine, points[1]),
         (lambda array: Grid((2, 3, 4), array).affine, np.diag([4.0, 3.0, 2.0, 1.0])[::-1]),
-        (lambda array: ExplicitRays(array, array + 1.0).source, np.stack([points, points + 2.0])[:, None]),
+        (
+            lambda array: ExplicitRays(array, array + 1.0).source,
+            np.stack([points, points + 2.0])[:, None],
+        ),
     ]
     wrong = 0.0
     for take, array in takes:
@@ -74,7 +79,9 @@ def incoming(subject: ProjectorSubject) -> float:
         spread = [out.new_ones(()).expand_as(out), whole[:1, :, :, :1].expand_as(out)]
         for gradient in [*spread, *layouts(whole)]:
             plain = gradient.clone(memory_format=torch.contiguous_format)
-            found, expected = (torch.autograd.grad(act(given), given, each)[0] for each in (gradient, plain))
+            found, expected = (
+                torch.autograd.grad(act(given), given, each)[0] for each in (gradient, plain)
+            )
             wrong += bits(found, expected)
     return wrong
 
@@ -98,7 +105,9 @@ def edited(subject: ProjectorSubject) -> float:
 
 
 def edited_pose(subject: ProjectorSubject) -> float:
-    """The volume is written over before the derivative by the cameras is asked for, which needs it."""
+    """The volume is written over before the derivative by the cameras is asked for, which needs
+    it.
+    """
     views, vectors = subject.posed(GRID, subject.rig())
     volume = subject.random(1, 1, *GRID.shape)
     (expected,) = torch.autograd.grad(views(volume, *vectors).sum(), vectors[:1])
@@ -118,7 +127,9 @@ def _unless_refused(out: Tensor, given: Tensor, weight: Tensor, expected: Tensor
 
 
 def halves(subject: ProjectorSubject) -> float:
-    """Halves are storage: read as they are, summed and given back in float32; gradients in the input's dtype."""
+    """Halves are storage: read as they are, summed and given back in float32; gradients in the
+    input's dtype.
+    """
     wrong = 0.0
     for dtype in HALVES:
         for act, given in both(subject):
@@ -143,19 +154,30 @@ def no_numbers(subject: ProjectorSubject) -> float:
     wrong = 0.0
     for act, given in both(subject):
         ones = given.round()
-        for other in (ones.int(), ones.bool(), torch.complex(ones.float(), ones.float()), ones.cpu().numpy()):
+        for other in (
+            ones.int(),
+            ones.bool(),
+            torch.complex(ones.float(), ones.float()),
+            ones.cpu().numpy(),
+        ):
             try:
                 found = act(other)  # type: ignore[arg-type]
             except (ValueError, TypeError):
                 continue
-            numbers = other.to(found.dtype) if isinstance(other, Tensor) and not other.is_complex() else None
+            numbers = (
+                other.to(found.dtype)
+                if isinstance(other, Tensor) and not other.is_complex()
+                else None
+            )
             ours = isinstance(getattr(act, "__self__", act), RayTransform)
             wrong += ours or numbers is None or bits(found, act(numbers)) > 0
     return wrong
 
 
 def cast(subject: ProjectorSubject) -> float:
-    """The whole module cast to another dtype, as a trainer does: geometry stays as exact as it was."""
+    """The whole module cast to another dtype, as a trainer does: geometry stays as exact as it
+    was.
+    """
     wrong = 0.0
     for dtype in EVERY:
         (A, x), (_, y) = both(subject)
@@ -168,17 +190,24 @@ def cast(subject: ProjectorSubject) -> float:
 
 
 def half_geometry(subject: Subject) -> float:
-    """Cameras, grids and rays given in half or single precision: held in float64, as exact as what was given."""
+    """Cameras, grids and rays given in half or single precision: held in float64, as exact as what
+    was given.
+    """
     wrong = 0.0
     vectors = {"source": [0, 0, 9], "origin": [-1.5, 1, -7], "u": [1, 0, 0], "v": [0, -1, 0]}
     for dtype in (*HALVES, torch.float32):
         given = {name: torch.tensor([each], dtype=dtype) for name, each in vectors.items()}
         source, origin, u, v = given.values()
-        rig, rays = Cameras(source, origin, u, v, (2, 3)), ExplicitRays(source[None, None], origin[None, None])
+        rig, rays = (
+            Cameras(source, origin, u, v, (2, 3)),
+            ExplicitRays(source[None, None], origin[None, None]),
+        )
         affine = torch.diag(torch.tensor([1.1, 0.7, 3.3, 1.0])).to(dtype)
         pairs = [(getattr(rig, name), given[name]) for name in VECTORS]
         pairs += [(rays.source[0, 0], given["source"]), (Grid((2, 3, 4), affine).affine, affine)]
-        wrong += sum(held.dtype != torch.float64 or bits(held, each.double()) for held, each in pairs)
+        wrong += sum(
+            held.dtype != torch.float64 or bits(held, each.double()) for held, each in pairs
+        )
     return wrong
 
 
@@ -197,17 +226,76 @@ def autocast(subject: ProjectorSubject) -> float:
 
 
 CASES = (
-    Case(38, "memory of any layout", "the same bits as contiguous memory", "projector", memory, dtypes=EVERY),
-    Case(38, "arrays that run backwards", "refused, or read as their copy", "mvrecon", backwards, dtypes=EVERY[:1]),
-    Case(39, "gradients of any layout", "the same bits as contiguous memory", "projector", incoming, dtypes=EVERY),
-    Case(40, "edits between forward and backward", "refused, or the right gradient", "projector", edited),
-    Case(40, "edits before a pose's gradient", "refused, or the right gradient", "projector", edited_pose),
-    Case(41, "half volumes", "the bits of the same values in float32", "projector", halves, dtypes=EVERY[1:2]),
     Case(
-        41, "rounding to halves", "off by 4e-3 in bf16 and 5e-4 in fp16 at most", "projector", rounded, 1.0, EVERY[1:2]
+        38,
+        "memory of any layout",
+        "the same bits as contiguous memory",
+        "projector",
+        memory,
+        dtypes=EVERY,
     ),
-    Case(41, "what holds no numbers", "refused; a plugin may read integers rightly", "projector", no_numbers),
+    Case(
+        38,
+        "arrays that run backwards",
+        "refused, or read as their copy",
+        "mvrecon",
+        backwards,
+        dtypes=EVERY[:1],
+    ),
+    Case(
+        39,
+        "gradients of any layout",
+        "the same bits as contiguous memory",
+        "projector",
+        incoming,
+        dtypes=EVERY,
+    ),
+    Case(
+        40,
+        "edits between forward and backward",
+        "refused, or the right gradient",
+        "projector",
+        edited,
+    ),
+    Case(
+        40,
+        "edits before a pose's gradient",
+        "refused, or the right gradient",
+        "projector",
+        edited_pose,
+    ),
+    Case(
+        41,
+        "half volumes",
+        "the bits of the same values in float32",
+        "projector",
+        halves,
+        dtypes=EVERY[1:2],
+    ),
+    Case(
+        41,
+        "rounding to halves",
+        "off by 4e-3 in bf16 and 5e-4 in fp16 at most",
+        "projector",
+        rounded,
+        1.0,
+        EVERY[1:2],
+    ),
+    Case(
+        41,
+        "what holds no numbers",
+        "refused; a plugin may read integers rightly",
+        "projector",
+        no_numbers,
+    ),
     Case(41, "a module cast to a half", "its geometry is as exact as before", "projector", cast),
-    Case(41, "geometry in halves", "held in float64, as exact as given", "mvrecon", half_geometry, dtypes=EVERY[:1]),
+    Case(
+        41,
+        "geometry in halves",
+        "held in float64, as exact as given",
+        "mvrecon",
+        half_geometry,
+        dtypes=EVERY[:1],
+    ),
     Case(42, "autocast", "the same bits and dtypes as without", "projector", autocast),
 )

@@ -33,8 +33,16 @@ def zeros(subject: ProjectorSubject) -> float:
     rig = subject.rig()
     A, wrong = subject.projector(GRID, rig), 0.0
     for zero in (0.0, -0.0):
-        x = torch.full((1, 1, *GRID.shape), zero, dtype=subject.dtype, device=subject.device, requires_grad=True)
-        y = torch.full((1, 1, len(rig), *rig.shape), zero, dtype=subject.dtype, device=subject.device)
+        x = torch.full(
+            (1, 1, *GRID.shape),
+            zero,
+            dtype=subject.dtype,
+            device=subject.device,
+            requires_grad=True,
+        )
+        y = torch.full(
+            (1, 1, len(rig), *rig.shape), zero, dtype=subject.dtype, device=subject.device
+        )
         wrong += float((A.T(y) != 0).sum())
         for _ in skips(A):
             (gradient,) = torch.autograd.grad((views := A(x)).sum(), x)
@@ -54,7 +62,9 @@ def negative(subject: ProjectorSubject) -> float:
 
 
 def bad_voxels(subject: ProjectorSubject) -> float:
-    """One NaN or infinity, among values and alone: where most rays meet it, where few do, and unseen."""
+    """One NaN or infinity, among values and alone: where most rays meet it, where few do, and
+    unseen.
+    """
     subject.need("local")
     A = subject.projector(BRICKS, rig := subject.rig(BRICKS, NARROW))
     x, wrong = subject.random(1, 1, *BRICKS.shape), 0.0
@@ -63,7 +73,9 @@ def bad_voxels(subject: ProjectorSubject) -> float:
         chosen = torch.zeros_like(x).flatten().index_fill(0, voxel, 1).view_as(x)
         seen = A(chosen) != 0
         if bool(seen.any()) != bool(met[voxel] > 0):
-            raise AssertionError(f"the adjoint tells of {met[voxel]} at voxel {int(voxel)}, the views do not")
+            raise AssertionError(
+                f"the adjoint tells of {met[voxel]} at voxel {int(voxel)}, the views do not"
+            )
         for bad in (torch.nan, torch.inf):
             for held in (x, torch.zeros_like(x)):
                 spoilt = torch.where(chosen > 0, bad, held)
@@ -99,14 +111,20 @@ def beyond_support(subject: ProjectorSubject) -> float:
 
 
 def touched(subject: ProjectorSubject) -> float:
-    """Rays through corners and edges of voxels, and along their faces: a NaN is met where a ray has a length in it.
+    """Rays through corners and edges of voxels, and along their faces: a NaN is met where a ray has
+    a length in it.
 
-    Where the ray touches what it could read and no more, at a weight of exactly zero, it may be met or not: 0 * NaN.
+    Where the ray touches what it could read and no more, at a weight of exactly zero, it may be met
+    or not: 0 * NaN.
     """
     subject.need_exact()
     grid = Grid.centred((4, 4, 4), 1.0)
-    way = torch.tensor([[1.0, 1, 0], [1, -1, 0], [0, 1, 1], [2, 1, 0], [1, 1, 1]], dtype=torch.float64)
-    middle = torch.tensor([[0, 0, 0.3], [0, 0, 0.3], [0.3, 0, 0], [0, 0, 0.3], [0, 0, 0]], dtype=torch.float64)
+    way = torch.tensor(
+        [[1.0, 1, 0], [1, -1, 0], [0, 1, 1], [2, 1, 0], [1, 1, 1]], dtype=torch.float64
+    )
+    middle = torch.tensor(
+        [[0, 0, 0.3], [0, 0, 0.3], [0.3, 0, 0], [0, 0, 0.3], [0, 0, 0]], dtype=torch.float64
+    )
     rig = subject.rays(middle - 20 * way, middle + 20 * way)
     A = subject.projector(grid, rig)
     voxels = torch.eye(64, dtype=subject.dtype, device=subject.device).reshape(64, 1, 4, 4, 4)
@@ -114,7 +132,9 @@ def touched(subject: ProjectorSubject) -> float:
     spoilt = ~A(torch.where(voxels > 0, torch.nan, alone)).isfinite().flatten(1).cpu()
     weighed = (A(voxels) != 0).flatten(1).cpu()
     reach = 1e-9 + (0.0 if subject.of_cells else 0.5)
-    each = [Box((z, y, x), (z + 1, y + 1, x + 1)) for z in range(4) for y in range(4) for x in range(4)]
+    each = [
+        Box((z, y, x), (z + 1, y + 1, x + 1)) for z in range(4) for y in range(4) for x in range(4)
+    ]
     near = torch.stack([box_lengths(rig, grid.cropped(box), reach).flatten() > 0 for box in each])
     return float(((weighed & ~spoilt) | (spoilt & ~near)).sum())
 
@@ -129,10 +149,37 @@ CASES = (
         dtypes=EVERY,
     ),
     Case(
-        47, "a voxel that is no number", "exactly the rays that meet it are none", "projector", bad_voxels, dtypes=EVERY
+        47,
+        "a voxel that is no number",
+        "exactly the rays that meet it are none",
+        "projector",
+        bad_voxels,
+        dtypes=EVERY,
     ),
-    Case(47, "a pixel that is no number", "exactly the voxels on its ray are none", "projector", bad_pixel),
-    Case(47, "no numbers outside of a support", "not met", "projector", beyond_support, dtypes=EVERY),
-    Case(47, "no number at a corner", "rays with a length in it are none, others not", "projector", touched),
-    Case(49, "negative values", "mirrored to the bit, and linear", "projector", negative, PRECISE, EVERY),
+    Case(
+        47,
+        "a pixel that is no number",
+        "exactly the voxels on its ray are none",
+        "projector",
+        bad_pixel,
+    ),
+    Case(
+        47, "no numbers outside of a support", "not met", "projector", beyond_support, dtypes=EVERY
+    ),
+    Case(
+        47,
+        "no number at a corner",
+        "rays with a length in it are none, others not",
+        "projector",
+        touched,
+    ),
+    Case(
+        49,
+        "negative values",
+        "mirrored to the bit, and linear",
+        "projector",
+        negative,
+        PRECISE,
+        EVERY,
+    ),
 )
