@@ -1,14 +1,9 @@
 """Some of the rays: the entries of the whole, adjoint to them, and cheaper."""
 
-import time
-
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import dome
-from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import cpu
-from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.subset import RaySubset, ViewSubset, ordered_subsets
 from tests.projectors.cases import CASES, DIFFERENTIABLE, OPTIONS, Case, gap, noise
@@ -178,25 +173,6 @@ def test_no_other_ray_is_computed(monkeypatch):
             computed.clear()
             B(x), B.T(B.pick(y))
             assert computed == [count * rays**2] * 2
-
-
-def test_a_twentieth_of_the_rays_costs_far_less_than_all():
-    """Seconds of the CPU; a tenth to a fifth is usual, the rest is slack."""
-    size, detector = 48, {"pixels": [48, 48], "pixel_mm": 1.6}
-    rig = dome(64, 80.0, 80.0, 150.0, detector)
-    A = PROJECTORS.build("drr", grid=Grid.centred((size,) * 3, 1.0), cameras=rig)
-    B = RaySubset(A, torch.rand(64, size, size, generator=torch.Generator().manual_seed(1)) < 0.05)
-    x, y = torch.rand(1, 1, size, size, size), torch.rand(1, 1, 64, size, size)
-
-    def seconds(operator, values) -> float:
-        spent = []
-        for _ in range(6):
-            start = time.process_time()
-            operator(x), operator.T(values)
-            spent.append(time.process_time() - start)
-        return min(spent)
-
-    assert seconds(B, B.pick(y)) < 0.35 * seconds(A, y)
 
 
 @pytest.mark.parametrize(

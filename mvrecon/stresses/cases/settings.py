@@ -72,7 +72,7 @@ def typing_mistakes(subject: Subject) -> float:
     wrong = dict(composed()["misspelt"])
     for kind, registry in REGISTRIES.items():
         name = registry.names()[0]
-        near = name[:-2] + name[:-3:-1]  # the last two letters swapped
+        near = name + name[-1]  # the last letter twice: two that are swapped may be the same
         wrong[f"{kind} {near}"] = refusal(lambda r=registry, n=near: r.build(n), f"did you mean '{name}'", LookupError)
     calls: dict[str, tuple[Any, str]] = {
         "projector": (lambda: PROJECTORS.build("drr", methd="joseph"), "'methd'; did you mean 'method'"),
