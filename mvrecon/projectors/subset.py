@@ -46,7 +46,8 @@ class Subset(ABC):
     @property
     def lines(self) -> Float[Tensor, "n 4 3 k"]:
         """The rays in voxel space; made anew, with their graph, where the cameras want a gradient."""
-        return self._choose(self.A.lines) if self._fixed is None else self._fixed.to(self.A.fixed_lines.device)
+        lines = self.A.lines
+        return self._choose(lines) if self.A.poses or self._fixed is None else self._fixed.to(lines.device)
 
     def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *shape"]:
         """The chosen entries of A x.
