@@ -6,9 +6,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-#: Bytes: the most that are read of a text file, of a YAML file (whose parser is slow), and that one volume or one chunk
-#: of a file may unfold to.
-TEXT, YAML, VOLUME = 16 * 2**20, 64 * 2**10, 8 * 2**30
+#: Bytes: the most that are read of a text file, of a YAML file (whose parser is slow), and that one volume, and one
+#: chunk, of a file may unfold to.
+TEXT, YAML, VOLUME, CHUNK = 16 * 2**20, 64 * 2**10, 8 * 2**30, 2**28
+#: Voxels that a volume from a file may have along an axis.
+EDGE = 2**14
 #: Bytes that a name may have; values of a YAML file.
 NAME, NODES = 200, 100_000
 #: A deflate stream yields at most this many bytes for each of its own: 258 for two bits (RFC 1951).
