@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -63,25 +63,36 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
         grid = Grid(turned[::-1], affine)  # type: ignore[arg-type]
         if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
             raise Refused(f"{path}: has voxels of {grid.spacing} mm, expected {SPACING[0]} to {SPACING[1]}")
-        return Slabs(grid.shape, 2 - int(axes[2, 0]), lambda: _slabs(path, header, shape, axes)), grid
+        slope, intercept = header.get_slope_inter()
+        scale = (1.0, 0.0) if slope is None else (slope, intercept)
+        stored = Stored(shape, header.get_data_dtype(), int(header["vox_offset"]), *scale)
+        return Slabs(grid.shape, 2 - int(axes[2, 0]), lambda: _slabs(path, stored, axes)), grid
 
 
-def _slabs(path: Path, header: Any, shape: tuple[int, ...], axes: np.ndarray) -> Iterator[Slab]:
+class Stored(NamedTuple):
+    """How values lie in a file, as nibabel wants it: voxels along i, j, k, type, first byte, slope and intercept."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    offset: int
+    slope: float
+    intercept: float
+
+
+def _slabs(path: Path, stored: Stored, axes: np.ndarray) -> Iterator[Slab]:
     """One pass over a file, whose last axis varies slowest: planes of equal place along it."""
     from nibabel.arrayproxy import ArrayProxy
     from nibabel.orientations import apply_orientation
 
-    dtype, offset = header.get_data_dtype(), int(header["vox_offset"])
-    plane, scale = math.prod(shape[:2]), header.get_slope_inter()
-    step = planes(plane)
+    i, j, k = stored.shape
+    step = planes(i * j)
     with blaming(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"), _opened(path) as file:
-        for first in range(0, shape[2], step):
-            count = min(step, shape[2] - first)
-            place = offset + first * plane * dtype.itemsize
-            stored = ArrayProxy(file, ((*shape[:2], count), dtype, place, *scale), mmap=False)
+        for first in range(0, k, step):
+            count, place = min(step, k - first), stored.offset + first * i * j * stored.dtype.itemsize
+            part = ArrayProxy(file, stored._replace(shape=(i, j, count), offset=place), mmap=False)
             # reversed axes are strides backwards, which torch does not take
-            values = apply_orientation(np.asanyarray(stored, dtype="float32"), axes).T.copy()
-            yield (shape[2] - first - count if axes[2, 1] < 0 else first), torch.from_numpy(values)
+            values = apply_orientation(np.asanyarray(part, dtype="float32"), axes).T.copy()
+            yield (k - first - count if axes[2, 1] < 0 else first), torch.from_numpy(values)
         _finish(path, file)
 
 

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-#: Voxels of a slab, unless one plane has more: 16 MiB in float32.
-VOXELS = 2**22
+#: Voxels of a slab, unless one plane has more: 8 MiB in float32.
+VOXELS = 2**21
 Slab = tuple[int, Float[Tensor, "d h w"]]
 
 

@@ -192,7 +192,9 @@ class Hdf5Volumes(FileScene):
         """Name, Hounsfield units and grid of a volume, centred on the origin, its axes running to RAS."""
         name, hu, spacing = self._file.slabs(index)
         axes = reversed_axes(self.orientation or self._file.orientation or "RAS")
-        return name, hu.flipped(axes), Grid.centred(hu.shape, spacing[::-1])
+        affine = torch.diag(torch.tensor([*spacing[::-1], 1.0], dtype=torch.float64))
+        affine[:3, 3] = -affine[:3, :3] @ (torch.tensor(hu.shape[::-1], dtype=torch.float64) - 1) / 2
+        return name, hu.flipped(axes), Grid(hu.shape, affine)
 
 
 def reversed_axes(orientation: str) -> list[int]:

@@ -141,3 +141,13 @@ def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
     weights = {**kept["state_dict"], first: torch.zeros(3, 3)}
     with pytest.raises(Refused, match=rf"a\.ckpt: does not fit (.|\n)*{first}"):
         load(written(tmp_path / "a.ckpt", saved({**kept, "state_dict": weights})))
+
+
+@pytest.mark.door
+def test_weights_are_those_that_were_saved_or_none(kept: dict, tmp_path: Path):
+    """A checkpoint without mvrecon's own checksum, as `torch.save` writes it, with a bit flipped in a weight is refused."""
+    raw = bytearray(saved(kept))
+    weight = next(value for value in kept["state_dict"].values() if value.numel() > 8)
+    raw[raw.index(weight.numpy().tobytes()) + 1] ^= 1
+    with pytest.raises(Refused, match=r"a\.ckpt: its '.*/data/\d+' is damaged: the checksum does not fit"):
+        load(written(tmp_path / "a.ckpt", bytes(raw)))
