@@ -99,7 +99,7 @@ def box_means(slabs: Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"
 def _averaged(values: Volume, overlap: Float[Tensor, "n m"], axis: int) -> Volume:
     low, high = ends(overlap.any(dim=0))
     part = values.narrow(axis, low, high - low)
-    return torch.tensordot(overlap[:, low:high], part, dims=([1], [axis])).movedim(0, axis)
+    return torch.tensordot(overlap[:, low:high], part.movedim(axis, 0), dims=1).movedim(0, axis)
 
 
 def _overlaps(source: Grid, target: Grid, axis: int) -> Float[Tensor, "n m"]:

@@ -145,7 +145,7 @@ def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
 
 @pytest.mark.door
 def test_weights_are_those_that_were_saved_or_none(kept: dict, tmp_path: Path):
-    """A checkpoint without mvrecon's own checksum, as `torch.save` writes it, with a bit flipped in a weight is refused."""
+    """A checkpoint without mvrecon's own checksum, with a bit flipped in a weight is refused."""
     raw = bytearray(saved(kept))
     weight = next(value for value in kept["state_dict"].values() if value.numel() > 8)
     raw[raw.index(weight.numpy().tobytes()) + 1] ^= 1
