@@ -5,6 +5,7 @@ indices are integer at centres: pixel (0, 0) is centred at (0, 0), so the princi
 columns is (W - 1) / 2.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.box import Box
+from mvrecon.limits import check_memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +63,11 @@ class Grid:
             centre: world position of the grid's centre in mm (x, y, z).
 
         Raises:
-            ValueError: a shape that is not three positive sizes, a spacing that is not positive and
-                finite, or a centre that is not finite.
+            ValueError: a shape that is not three positive sizes, or whose volume does not fit into
+                memory; a spacing that is not positive and finite, or a centre that is not finite.
         """
         _check_shape(shape)
+        _check_room(shape)
         steps = torch.as_tensor(spacing, dtype=torch.float64).expand(3).clone()
         if not ((steps > 0) & steps.isfinite()).all():
             raise ValueError(f"A grid's spacing must be positive, finite mm, got {spacing}")
@@ -127,12 +130,18 @@ class Grid:
         return Grid(box.shape, affine)
 
     def refined(self, factor: int) -> "Grid":
-        """The same box cut into `factor` times as many voxels along each axis."""
+        """The same box cut into `factor` times as many voxels along each axis.
+
+        Raises:
+            ValueError: their volume does not fit into memory.
+        """
+        shape = tuple(n * factor for n in self.shape)
+        _check_room(shape)
         affine = self.affine.clone()
         affine[:3, :3] /= factor
         first = torch.full((3,), (1 - factor) / (2 * factor), dtype=torch.float64)
         affine[:3, 3] = self.to_world(first)
-        return Grid(tuple(n * factor for n in self.shape), affine)  # type: ignore[arg-type]
+        return Grid(shape, affine)  # type: ignore[arg-type]
 
 
 def _check_shape(shape: Sequence[int]) -> None:
@@ -140,6 +149,10 @@ def _check_shape(shape: Sequence[int]) -> None:
         raise ValueError(
             f"A grid's shape must be three positive sizes (z, y, x), got {tuple(shape)}"
         )
+
+
+def _check_room(shape: Sequence[int]) -> None:
+    check_memory(4 * math.prod(map(int, shape)), f"One volume of {tuple(shape)} voxels in float32")
 
 
 def voxel_centres(grid: Grid, dtype: torch.dtype = torch.float64) -> Float[Tensor, "d h w 3"]:

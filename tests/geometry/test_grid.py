@@ -87,3 +87,26 @@ def test_half_precision_volumes_are_sampled_with_float32_coordinates():
     points = normalised(torch.tensor([[[[[0.25, 0.5, 40.37]]]]]), (64, 2, 2))
     exact = sample(volume.bfloat16().float(), points)
     assert sample(volume.bfloat16(), points).item() == exact.bfloat16().item()
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    "make", [lambda n: Grid.centred((n, n, n), 1.0), Grid.centred((100,) * 3, 1.0).refined]
+)
+def test_a_grid_that_memory_cannot_take_is_refused_with_both_sizes(make):
+    """A grid of 100000^3 voxels is refused before anything is made, with the GiB that it needs and
+    that are at hand.
+    """
+    with pytest.raises(ValueError, match=r"needs [\d,.]+ GiB of memory; [\d,.]+ GiB are at hand"):
+        make(100_000)
+
+
+def test_memory_at_hand_is_no_more_than_a_limit_leaves(run_python):
+    code = (
+        "import resource, mvrecon.limits as m; resource.setrlimit(resource.RLIMIT_AS, (2**32, "
+        "2**32));"
+        "assert 0 < m.memory_at_hand() < 2**32; m.check_memory(2**30, 'a');"
+        "m.check_memory(3 * 2**31, 'This')"
+    )
+    done = run_python("-c", code)
+    assert done.returncode == 1 and "ValueError: This needs 6.0 GiB of memory; " in done.stderr
