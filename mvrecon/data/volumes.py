@@ -25,7 +25,7 @@ from mvrecon.data.resample import resample
 from mvrecon.data.slabs import Slabs
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.scenes.analytic import generator, uniform
 from mvrecon.scenes.sample import Sample
 
@@ -163,13 +163,8 @@ class FileScene(ABC):
             or self._operator[0] is not grid
             or self._operator[1] is not cameras
         ):
-            geometry = {
-                "grid": grid.refined(self.factor(grid)),
-                "cameras": split_pixels(cameras, self.rays),
-            }
-            A = PROJECTORS.build(
-                "radon" if cameras.parallel else "drr", **geometry, method="siddon"
-            )
+            fine_grid = grid.refined(self.factor(grid))
+            A = RayTransform(fine_grid, split_pixels(cameras, self.rays), method="siddon")
             self._operator = (grid, cameras, A)
         return F.avg_pool2d(self._operator[2](fine[None, None])[0], self.rays)
 

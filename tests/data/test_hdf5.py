@@ -224,16 +224,18 @@ def test_volumes_are_those_that_were_written_or_none(volume_file):
     values written.
     """
     whole, rng = volume_file.read_bytes(), Random(2)
-    names = lambda: [
-        (v.name, v.spacing, v.ct.tobytes()) for v in map(VolumeFile(volume_file).read, range(7))
-    ]  # noqa: E731
-    written, refused = names(), 0
+
+    def contents() -> list[tuple]:
+        volumes = map(VolumeFile(volume_file).read, range(7))
+        return [(v.name, v.spacing, v.ct.tobytes()) for v in volumes]
+
+    written, refused = contents(), 0
     for _ in range(200):
         damaged = bytearray(whole)
         damaged[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
         volume_file.write_bytes(damaged)
         try:
-            assert names() == written
+            assert contents() == written
         except ValueError as error:
             refused += "heads.h5" in str(error)
     assert refused > 100

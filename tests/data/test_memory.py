@@ -8,10 +8,10 @@ import h5py
 import nibabel
 import numpy as np
 import pytest
-from mvrecon.testing.damage import instead
 
 from mvrecon.data.hdf5 import VolumeFile, write_volumes
 from tests.data.conftest import stored
+from tests.faults.damage import instead
 
 #: Voxels along z, y, x: 384 MiB as they are stored, 768 in float32.
 SHAPE = (768, 512, 512)
@@ -20,7 +20,8 @@ import resource, sys
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 from mvrecon.limits import Refused
-cameras = CAMERAS.build("circular", views=1, sid=300.0, sdd=450.0, detector={"pixels": [4, 4], "pixel_mm": 9.0})
+detector = {"pixels": [4, 4], "pixel_mm": 9.0}
+cameras = CAMERAS.build("circular", views=1, sid=300.0, sdd=450.0, detector=detector)
 scene = SCENES.build(sys.argv[1], path=sys.argv[2], vary=True)
 grid = Grid.centred((8, 8, 8), 30.0)
 # what is loaded at first use
