@@ -59,7 +59,7 @@ class Spect(Scaled):
 
 
 def sensitivity(cameras: Cameras, diameter_mm: float) -> Float[Tensor, "m v u"]:
-    """Sensitivity of each pixel, d^2 cos^4(phi) du dv / (16 l^2), in mm^2: counts per line integral."""
+    """Sensitivity of each pixel, d^2 cos^4(phi) du dv / (16 l^2) in mm^2: counts per integral."""
     start, end = cameras.rays()
     distance = cameras.distance[:, None, None]
     cosine = distance / (end - start).norm(dim=-1)
