@@ -1,17 +1,10 @@
 """Rigs in the volume's frame, and what libraries cannot take: pure geometry, no library needed."""
 
-import sys
-import tomllib
 from dataclasses import replace
-from importlib import import_module
-from inspect import signature
-from pathlib import Path
 
 import pytest
 import torch
-import yaml
 
-from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
@@ -39,12 +32,6 @@ RIGS = {
     "beam": BEAM,
     "line": replace(BEAM, extent="line"),
     "half lines": replace(BEAM, extent="ahead"),
-}
-PLUGIN = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-PARTS = {
-    k.partition(".")[2]: v
-    for k, v in PLUGIN["entry-points"]["mvrecon.plugins"].items()
-    if k[:9] == "projector"
 }
 
 
@@ -289,49 +276,3 @@ def test_what_a_library_cannot_take_is_refused_with_the_reason(why: str):
     part, grid, rig, options, message = REFUSED[why]
     with pytest.raises(ValueError, match=message):
         part(grid, rig, **options)
-
-
-LIBRARIES: dict[str, tuple[str, str, Grid, Cameras]] = {
-    "rtk": ("itk", "itk-rtk", GRID, CONE),
-    "nanodrr": ("nanodrr.data", "nanodrr", GRID, CONE),
-    "diffdrr": ("diffdrr.renderers", "diffdrr", GRID, CONE),
-    "astra": ("astra", "astra-toolbox", FLAT, STACK),
-    "mbirtorch": ("mbirtorch", "mbirtorch", GRID, CONE),
-    "skimage": ("skimage.transform", "scikit-image", FLAT, STACK),
-}
-
-
-@pytest.mark.parametrize("name", LIBRARIES)
-def test_a_library_that_is_absent_is_named_with_what_installs_it(
-    name: str, monkeypatch: pytest.MonkeyPatch
-):
-    module, package, grid, rig = LIBRARIES[name]
-    monkeypatch.setitem(sys.modules, module, None)
-    where, _, attribute = PARTS[name].partition(":")
-    with pytest.raises(ImportError, match=f"pip install {package}"):
-        getattr(import_module(where), attribute)(grid, rig)
-
-
-def test_every_part_is_configured_by_its_own_defaults():
-    folder = Path(__file__).parents[1] / "mvrecon_peers" / "conf" / "projector"
-    assert {file.stem for file in folder.glob("*.yaml")} == set(PARTS) == set(LIBRARIES)
-    for name, where in PARTS.items():
-        module, _, attribute = where.partition(":")
-        parameters = signature(getattr(import_module(module), attribute)).parameters
-        options = {
-            key: p.default for key, p in parameters.items() if key not in ("grid", "cameras")
-        }
-        assert yaml.safe_load((folder / f"{name}.yaml").read_text()) == {"name": name} | options
-
-
-def test_importing_the_parts_imports_no_library():
-    import subprocess
-
-    code = f"import sys\nfor m in {[w.partition(':')[0] for w in PARTS.values()]}: __import__(m)\n"
-    code += (
-        "print({'itk', 'nanodrr', 'diffdrr', 'astra', 'mbirtorch', 'skimage'} & set(sys.modules))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=True
-    )
-    assert done.stdout == "set()\n"

@@ -13,19 +13,9 @@ from mvrecon_bench.stresses.subject import Subject, subject_of
 
 #: The files of cases, in the plan's order.
 FILES = (
-    "rays",
-    "scales",
-    "algebra",
-    "cameras",
-    "poses",
-    "heads",
-    "models",
-    "counts",
-    "tensors",
-    "values",
-    "sizes",
-    "repeats",
-    "gpu",
+    *("rays", "segments", "scales", "algebra", "accuracy", "derivatives"),
+    *("cameras", "images", "poses", "heads", "models", "counts", "line_integrals"),
+    *("tensors", "dtypes", "values", "sizes", "repeats", "gpu"),
 )
 
 

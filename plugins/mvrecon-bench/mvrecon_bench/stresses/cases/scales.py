@@ -16,7 +16,7 @@ from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
 from mvrecon_bench.stresses.truths import Blob, rows, through
 
-#: Of the plan: what float32 loses where geometry is formed in float64, relative to the volume,
+#: What float32 loses where geometry is formed in float64, relative to the volume,
 #: before it is cast.
 DIGITS = {torch.float64: 1e-12, torch.float32: 2e-6}
 #: 1e6 mm away, float64 knows a place to 1e-10 mm.
