@@ -212,7 +212,11 @@ class Hdf5Volumes(FileScene):
         stored = self._file.read(index)
         hu = torch.from_numpy(stored.ct.astype("float32"))
         axes = reversed_axes(self.orientation or self._file.orientation or "RAS")
-        return stored.name, hu.flip(axes), Grid.centred(hu.shape, stored.spacing[::-1])
+        return (
+            stored.name,
+            hu.flip(axes),
+            Grid.centred(size=hu.shape[::-1], spacing=stored.spacing[::-1]),
+        )
 
 
 def reversed_axes(orientation: str) -> list[int]:

@@ -8,7 +8,7 @@ from mvrecon.data.resample import pooled, resample
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 
-SOURCE = Grid.centred((30, 40, 44), (2.0, 2.2, 3.0), centre=(5.0, 0.0, -4.0))
+SOURCE = Grid.centred(size=(44, 40, 30), spacing=(2.0, 2.2, 3.0), centre=(5.0, 0.0, -4.0))
 
 
 def plane(grid):
@@ -54,7 +54,7 @@ def test_there_is_nothing_outside():
 
 
 def test_slabs_change_nothing(monkeypatch):
-    target = Grid.centred((10, 11, 12), 5.0)
+    target = Grid.centred(size=(12, 11, 10), spacing=5.0)
     whole = resample(plane(SOURCE), SOURCE, target)
     monkeypatch.setattr(module, "POINTS", 1)
     assert torch.equal(resample(plane(SOURCE), SOURCE, target), whole)

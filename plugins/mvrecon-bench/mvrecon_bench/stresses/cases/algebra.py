@@ -27,7 +27,7 @@ DOUBLE = (torch.float64,)
 GRIDS = (16, 32, 64)
 #: Few rays, in a pose where none lies on a kink.
 FEW = {"pixels": [3, 2], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
-SMALL = Grid.centred((3, 4, 3), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+SMALL = Grid.centred(size=(3, 4, 3), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 #: Projectors of other libraries that take any rig, by the plugin mvrecon-peers: Joseph's, Siddon's,
 #: and samples.
 ORACLES = ("rtk", "diffdrr", "nanodrr")
@@ -45,7 +45,9 @@ def adjoint(subject: ProjectorSubject) -> float:
         centre = 20 * torch.rand(3, generator=rng, dtype=torch.float64) - 10
         pixels = torch.randint(1, 8, (2,), generator=rng).tolist()
         pitch, offset = (0.5 + 3 * torch.rand(2, 2, generator=rng)).tolist()
-        grid = _turned(Grid.centred(shape, spacing.tolist(), centre.tolist()), rng)
+        grid = _turned(
+            Grid.centred(size=shape[::-1], spacing=spacing.tolist(), centre=centre.tolist()), rng
+        )
         rig = subject.rig(
             grid, {"pixels": pixels, "pixel_mm": pitch, "offset_mm": offset}, views=1 + seed % 3
         )
