@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.durable import written_whole
 from mvrecon.geometry.grid import Grid
 from mvrecon.limits import DEFLATE, SPACING, VOLUME, Refused, blaming
 
@@ -34,11 +35,9 @@ def read_nifti(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
         ValueError: not NIfTI, cut short, not three axes, more than the file can hold, or an affine
             that is no grid.
     """
-    try:
-        import nibabel
-        from nibabel.arrayproxy import ArrayProxy
-    except ImportError as error:
-        raise ImportError(f"{path}: NIfTI needs nibabel: pip install 'mvrecon[io]'") from error
+    nibabel = _nibabel(path)
+    from nibabel.arrayproxy import ArrayProxy
+
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
@@ -61,6 +60,32 @@ def read_nifti(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
                 f"{path}: has voxels of {grid.spacing} mm, expected {SPACING[0]} to {SPACING[1]}"
             )
         return values, grid
+
+
+def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
+    """Write a volume as NIfTI, float32, whose first axis is x: the grid's affine goes with it
+    unchanged.
+
+    Compressed where the name ends in .gz (the same bytes for the same volume), and replaced whole
+    or not at all.
+
+    Raises:
+        ImportError: nibabel is not installed.
+    """
+    nibabel = _nibabel(path)
+    values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
+    raw = nibabel.Nifti1Image(values, grid.affine.numpy()).to_bytes()
+    packed = gzip.compress(raw, 1, mtime=0) if str(path).endswith(".gz") else raw
+    with written_whole(path) as part:
+        part.write_bytes(packed)
+
+
+def _nibabel(path: str | Path) -> Any:
+    try:
+        import nibabel
+    except ImportError as error:
+        raise ImportError(f"{path}: NIfTI needs nibabel: pip install 'mvrecon[io]'") from error
+    return nibabel
 
 
 def _header(path: Path) -> Any:
