@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.data.slabs import Slab, Slabs, planes
+from mvrecon.durable import written_whole
 from mvrecon.geometry.grid import Grid
 from mvrecon.limits import DEFLATE, EDGE, SPACING, TEXT, VOLUME, Refused, blaming
 
@@ -49,11 +50,9 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
             out), more than the file can hold, or an affine that is no grid. What lies behind the
             header is told by the passes of the slabs.
     """
-    try:
-        import nibabel
-        from nibabel.orientations import inv_ornt_aff, io_orientation
-    except ImportError as error:
-        raise ImportError(f"{path}: NIfTI needs nibabel: pip install 'mvrecon[io]'") from error
+    nibabel = _nibabel(path)
+    from nibabel.orientations import inv_ornt_aff, io_orientation
+
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
@@ -130,6 +129,32 @@ def _opened(path: Path) -> IO[bytes]:
 
 def _packed(path: Path) -> bool:
     return path.suffix.lower() == ".gz"
+
+
+def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
+    """Write a volume as NIfTI, float32, whose first axis is x: the grid's affine goes with it
+    unchanged.
+
+    Compressed where the name ends in .gz (the same bytes for the same volume), and replaced whole
+    or not at all.
+
+    Raises:
+        ImportError: nibabel is not installed.
+    """
+    nibabel = _nibabel(path)
+    values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
+    raw = nibabel.Nifti1Image(values, grid.affine.numpy()).to_bytes()
+    packed = gzip.compress(raw, 1, mtime=0) if str(path).endswith(".gz") else raw
+    with written_whole(path) as part:
+        part.write_bytes(packed)
+
+
+def _nibabel(path: str | Path) -> Any:
+    try:
+        import nibabel
+    except ImportError as error:
+        raise ImportError(f"{path}: NIfTI needs nibabel: pip install 'mvrecon[io]'") from error
+    return nibabel
 
 
 def _header(path: Path, nibabel: Any) -> Any:

@@ -231,11 +231,8 @@ class Hdf5Volumes(FileScene):
         """
         name, hu, spacing = self._file.slabs(index)
         axes = reversed_axes(self.orientation or self._file.orientation or "RAS")
-        affine = torch.diag(torch.tensor([*spacing[::-1], 1.0], dtype=torch.float64))
-        affine[:3, 3] = (
-            -affine[:3, :3] @ (torch.tensor(hu.shape[::-1], dtype=torch.float64) - 1) / 2
-        )
-        return name, hu.flipped(axes), Grid(hu.shape, affine)
+        grid = Grid.centred(size=hu.shape[::-1], spacing=spacing[::-1])
+        return name, hu.flipped(axes), grid
 
 
 def reversed_axes(orientation: str) -> list[int]:

@@ -48,7 +48,7 @@ def test_a_winding_part_is_one():
 def test_the_centre_is_that_of_the_box_in_mm():
     mask = torch.zeros(10, 12, 14, dtype=torch.bool)
     mask[2:5, 3:4, 7:13] = True
-    grid = Grid.centred((10, 12, 14), (1.0, 2.0, 3.0), centre=(100.0, 0.0, 0.0))
+    grid = Grid.centred(size=(14, 12, 10), spacing=(1.0, 2.0, 3.0), centre=(100.0, 0.0, 0.0))
     patient = body_box(Slabs.of(mask.float()), 0.5)
     assert patient == Box.around(mask)
     assert torch.allclose(

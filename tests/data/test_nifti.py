@@ -69,7 +69,7 @@ def test_an_object_lands_at_its_world_place(tmp_path, name):
     save(path, centred(AFFINES[name]))
     values, grid = read_nifti(path)
     assert torch.allclose(values.double(), blobs(voxel_centres(grid)), atol=1e-6)
-    target = Grid.centred((8, 11, 12), 3.0, centre=(2.0, 1.0, -1.0))
+    target = Grid.centred(size=(12, 11, 8), spacing=3.0, centre=(2.0, 1.0, -1.0))
     expected = (
         blobs(voxel_centres(target.refined(4))).reshape(8, 4, 11, 4, 12, 4).mean(dim=(1, 3, 5))
     )

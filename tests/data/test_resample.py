@@ -13,7 +13,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 
-SOURCE = Grid.centred((30, 40, 44), (2.0, 2.2, 3.0), centre=(5.0, 0.0, -4.0))
+SOURCE = Grid.centred(size=(44, 40, 30), spacing=(2.0, 2.2, 3.0), centre=(5.0, 0.0, -4.0))
 
 
 def plane(grid):
@@ -68,7 +68,7 @@ def cut(volume, source, target):
 )
 def test_the_mean_over_each_voxel_is_exact_whatever_the_slabs(spacing, axis):
     volume = torch.rand(SOURCE.shape, generator=torch.Generator().manual_seed(3))
-    target = Grid.centred((11, 9, 7), spacing, centre=(8.0, -3.0, -20.0))
+    target = Grid.centred(size=(7, 9, 11), spacing=spacing, centre=(8.0, -3.0, -20.0))
     down = [
         (k, volume.narrow(axis, k, min(7, SOURCE.shape[axis] - k)))
         for k in range(0, SOURCE.shape[axis], 7)
@@ -79,7 +79,7 @@ def test_the_mean_over_each_voxel_is_exact_whatever_the_slabs(spacing, axis):
 
 def test_the_means_over_finer_voxels_have_the_mean_of_the_coarse_one():
     volume = torch.rand(SOURCE.shape, generator=torch.Generator().manual_seed(4))
-    target = Grid.centred((6, 7, 5), 9.3, centre=(2.0, 0.0, -3.0))
+    target = Grid.centred(size=(5, 7, 6), spacing=9.3, centre=(2.0, 0.0, -3.0))
     coarse = resample(volume, SOURCE, target)
     for factor in (2, 3, 4):
         finer = resample(volume, SOURCE, target.refined(factor))
@@ -124,7 +124,7 @@ def test_there_is_nothing_outside():
 
 
 def test_slabs_change_nothing(monkeypatch):
-    target = Grid.centred((10, 11, 12), 5.0)
+    target = Grid.centred(size=(12, 11, 10), spacing=5.0)
     whole = resample(plane(SOURCE), SOURCE, target)
     monkeypatch.setattr(module, "POINTS", 1)
     assert torch.equal(resample(plane(SOURCE), SOURCE, target), whole)

@@ -211,7 +211,9 @@ def test_views_come_from_a_grid_four_times_finer_where_it_is_not_too_large():
         (171, 171, 170): 3,
         (171, 171, 171): 2,
     }
-    assert {shape: scene.factor(Grid.centred(shape, 1.0)) for shape in factors} == factors
+    assert {
+        shape: scene.factor(Grid.centred(shape=shape, spacing=1.0)) for shape in factors
+    } == factors
     assert NiftiVolume(path="a.nii", fine=8).factor(Grid.centred((171, 171, 171), 1.0)) == 8
 
 
@@ -226,6 +228,6 @@ def test_the_truth_does_not_depend_on_how_fine_the_views_are(volume_file, grid, 
 
 def test_the_truth_on_the_files_own_voxels_is_the_file(tmp_path, cameras):
     hu = head()
-    grid = Grid.centred(hu.shape, SPACING[::-1])
+    grid = Grid.centred(size=hu.shape[::-1], spacing=SPACING[::-1])
     sample = Hdf5Volumes(path=one(tmp_path, hu), crop="none").sample(0, 0, grid, cameras)
     assert torch.allclose(sample.volume[0], attenuation(torch.from_numpy(hu).float()), atol=1e-8)

@@ -20,7 +20,7 @@ from mvrecon.kernels.warps import ops as warp_ops
 from mvrecon.kernels.warps.warp import warp
 from tests.projectors.rigs import CONE, GRID, PARALLEL, PINHOLES
 
-BODY = Grid.centred((9, 8, 10), 22.0)
+BODY = Grid.centred(size=(10, 8, 9), spacing=22.0)
 RIGS = {
     "cone": (GRID, CONE),
     "pinholes": (GRID, PINHOLES),
@@ -241,7 +241,7 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(spacing, sid, offset, 
     torch.manual_seed(0)
     detector = {"pixels": [20, 21], "pixel_mm": 1.3 * (1 + 30 / sid)}
     grid, cameras = (
-        Grid.centred((18, 20, 22), (1.0, 1.1, 0.9)),
+        Grid.centred(size=(22, 20, 18), spacing=(1.0, 1.1, 0.9)),
         circular(3, sid, sid + 30, detector, start_degrees=7.0),
     )
     shift = torch.full((3,), offset, dtype=torch.float64)

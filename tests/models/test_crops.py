@@ -96,7 +96,7 @@ def test_touched_bins_are_those_that_hold_part_of_the_mask_and_no_others(project
 
 def helix() -> tuple[Grid, Cameras]:
     """A tall grid, and a detector that climbs along it: no camera sees all of it."""
-    grid = Grid.centred((40, 16, 16), 1.0)
+    grid = Grid.centred(size=(16, 16, 40), spacing=1.0)
     detector = {"pixels": [12, 24], "pixel_mm": 2.4}
     turns = [circular(1, 60.0, 100.0, detector, start_degrees=50.0 * k) for k in range(8)]
     lifted = [

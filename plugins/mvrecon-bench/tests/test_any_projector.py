@@ -21,7 +21,7 @@ from mvrecon_bench.stresses.subject import gap
 
 peers = pytest.importorskip("mvrecon_peers.base")
 
-GRID = Grid.centred((9, 11, 13), 2.0)
+GRID = Grid.centred(size=(13, 11, 9), spacing=2.0)
 SQUARE = {"pixels": [9, 12], "pixel_mm": 4.0}
 #: One of them each projector takes: a cone, parallel beams in slices, pinholes.
 RIGS = {

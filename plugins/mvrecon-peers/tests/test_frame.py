@@ -18,7 +18,7 @@ from mvrecon_peers.nanodrr import Nanodrr
 from mvrecon_peers.rtk import Rtk, view_arguments
 from mvrecon_peers.skimage import Skimage, turns
 
-GRID = Grid.centred((10, 12, 14), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+GRID = Grid.centred(size=(14, 12, 10), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 DETECTOR = {"pixels": [5, 7], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 CONE = circular(4, 40.0, 70.0, DETECTOR, start_degrees=13.0).moved(torch.eye(3), GRID.centre)
 NORMAL = torch.linalg.cross(CONE.u, CONE.v)
@@ -110,7 +110,10 @@ def test_rtk_gets_depths_offsets_and_angles_that_make_the_rays(kind: str):
 
 
 def test_rays_are_cut_off_near_the_box_and_stay_on_their_lines():
-    box, rng = Grid.centred((4, 5, 6), (1.0, 1.2, 0.9)), torch.Generator().manual_seed(0)
+    box, rng = (
+        Grid.centred(size=(6, 5, 4), spacing=(1.0, 1.2, 0.9)),
+        torch.Generator().manual_seed(0),
+    )
     first, way = torch.rand(2, 200, 3, generator=rng, dtype=torch.float64) * 12 - 6
     first[:20], way[:60:7, 0] = 0.0, 0.0
     last = first + 1e5 * way
@@ -162,7 +165,8 @@ def test_mbirtorch_gets_a_scan_that_makes_the_rig(upright: bool):
 def test_rows_know_their_slices_and_the_axis_its_column():
     detector = {"pixels": [6, 9], "pixel_mm": [1.0, 1.5], "offset_mm": [0.0, 3.0]}
     box, rig = framed(
-        Grid.centred((4, 7, 7), (1.5, 1.5, 1.0)), parallel(3, detector, 60.0, start_degrees=20.0)
+        Grid.centred(size=(7, 7, 4), spacing=(1.5, 1.5, 1.0)),
+        parallel(3, detector, 60.0, start_degrees=20.0),
     )
     assert plane_of_rows(box, rig, "it") == [(1, 3), (2, 2), (3, 1), (4, 0)]
     angles, columns = turns(box, rig)
@@ -171,7 +175,7 @@ def test_rows_know_their_slices_and_the_axis_its_column():
 
 
 TILTED = CONE.moved(random_rotation(torch.Generator().manual_seed(0)), torch.zeros(3))
-FLAT = Grid.centred((5, 7, 7), 2.0)
+FLAT = Grid.centred(size=(7, 7, 5), spacing=2.0)
 STACK = parallel(3, {"pixels": [5, 7], "pixel_mm": 2.0}, 60.0)
 SHEARED = Grid(GRID.shape, GRID.affine + torch.tensor([[0.0, 0.3, 0.0, 0.0]] + [[0.0] * 4] * 3))
 REFUSED = {
@@ -201,7 +205,7 @@ REFUSED = {
     ),
     "needles": (
         Rtk,
-        Grid.centred((5, 7, 7), (1.0, 1e-4, 1.0)),
+        Grid.centred(size=(7, 7, 5), spacing=(1.0, 1e-4, 1.0)),
         CONE,
         {},
         "at most 1000 times as long as wide",
@@ -231,7 +235,7 @@ REFUSED = {
     "cone in 2-D": (Astra, GRID, CONE, {}, "stay in the middle of a slice"),
     "oblong voxels": (
         Astra,
-        Grid.centred((5, 7, 7), (2.0, 1.5, 2.0)),
+        Grid.centred(size=(7, 7, 5), spacing=(2.0, 1.5, 2.0)),
         STACK,
         {},
         "square voxels, got 2 by 1.5 mm",
@@ -262,12 +266,12 @@ REFUSED = {
     "cone to radon": (Skimage, FLAT, CONE, {}, "takes parallel beams, got central"),
     "wide columns": (
         Skimage,
-        Grid.centred((5, 7, 7), 1.9),
+        Grid.centred(size=(7, 7, 5), spacing=1.9),
         STACK,
         {},
         "as wide as the detector's columns",
     ),
-    "even size": (Skimage, Grid.centred((5, 8, 8), 2.0), STACK, {}, "take odd sizes"),
+    "even size": (Skimage, Grid.centred(size=(8, 8, 5), spacing=2.0), STACK, {}, "take odd sizes"),
 }
 
 

@@ -13,7 +13,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
 
-GRID = Grid.centred((5, 7, 7), 2.0)
+GRID = Grid.centred(size=(7, 7, 5), spacing=2.0)
 CONE = circular(4, 40.0, 70.0, {"pixels": [5, 7], "pixel_mm": [2.1, 2.3]}, start_degrees=13.0)
 STACK = parallel(3, {"pixels": [5, 7], "pixel_mm": 2.0}, 60.0)
 PLUGIN = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]

@@ -12,7 +12,7 @@ from mvrecon.reconstruct.mlem import mlem
 from mvrecon.reconstruct.poisson import PoissonLikelihood
 from mvrecon_spect.projector import Spect
 
-GRID = Grid.centred((10, 12, 8), 12.0)
+GRID = Grid.centred(size=(8, 12, 10), spacing=12.0)
 
 
 @pytest.fixture(scope="module")

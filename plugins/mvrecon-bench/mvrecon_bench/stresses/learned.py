@@ -18,7 +18,7 @@ from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject, gap
 
 #: No two sizes alike; the detectors see beside it.
-GRID = Grid.centred((8, 9, 10), 2.0)
+GRID = Grid.centred(size=(10, 9, 8), spacing=2.0)
 #: What a model is given that needs it, or has a dearer default, and was not given it.
 NEEDED = {"head": {"name": "softmax_depth"}}
 CHEAPER = {"iterations": 8, "start": 4}

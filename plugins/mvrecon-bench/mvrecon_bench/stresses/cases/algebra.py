@@ -24,7 +24,9 @@ def adjoint(subject: ProjectorSubject) -> float:
         centre = 20 * torch.rand(3, generator=rng, dtype=torch.float64) - 10
         pixels = torch.randint(1, 8, (2,), generator=rng).tolist()
         pitch, offset = (0.5 + 3 * torch.rand(2, 2, generator=rng)).tolist()
-        grid = _turned(Grid.centred(shape, spacing.tolist(), centre.tolist()), rng)
+        grid = _turned(
+            Grid.centred(size=shape[::-1], spacing=spacing.tolist(), centre=centre.tolist()), rng
+        )
         rig = subject.rig(
             grid, {"pixels": pixels, "pixel_mm": pitch, "offset_mm": offset}, views=1 + seed % 3
         )

@@ -17,7 +17,7 @@ from mvrecon_bench.stresses.truths import ends, ways
 DOUBLE = (torch.float64,)
 #: Few rays, in a pose where none lies on a kink.
 FEW = {"pixels": [3, 2], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
-SMALL = Grid.centred((3, 4, 3), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+SMALL = Grid.centred(size=(3, 4, 3), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 
 
 def differences(subject: ProjectorSubject) -> float:

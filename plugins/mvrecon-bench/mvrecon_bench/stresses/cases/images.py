@@ -104,9 +104,9 @@ def source_in_the_volume(subject: CameraSubject) -> float:
     """Lifts and warps of frusta whose source is in the middle of the grid."""
     rig = subject.few
     step = float(rig.distance[0]) / 10
-    frusta = Frusta(Grid.centred((4, 5, 6), step, rig.source[0].tolist()), rig, depth=6).to(
-        rig.source.device
-    )
+    frusta = Frusta(
+        Grid.centred(size=(6, 5, 4), spacing=step, centre=rig.source[0].tolist()), rig, depth=6
+    ).to(rig.source.device)
     views = torch.ones(1, 1, len(rig), *rig.shape, device=rig.source.device, requires_grad=True)
     lifted = frusta.spread(views)
     world = frusta.to_world(lifted)

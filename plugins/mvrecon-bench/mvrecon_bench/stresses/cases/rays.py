@@ -25,7 +25,9 @@ def axis_aligned(subject: ProjectorSubject) -> float:
     subject.need_exact()
     worst = 0.0
     for n in (4, 5):
-        grid = Grid.centred((n, n + 1, n + 2), (0.9, 1.2, 1.0), (3.0, -2.0, 4.0))
+        grid = Grid.centred(
+            size=(n + 2, n + 1, n), spacing=(0.9, 1.2, 1.0), centre=(3.0, -2.0, 4.0)
+        )
         volume = subject.random(*grid.shape)
         start, end, sums = rows(grid, volume)
         for a, b in ((start, end), (end, start)):
@@ -124,7 +126,7 @@ def grazing(subject: ProjectorSubject) -> float:
     Wrong is what is not finite, what is not zero though the ray misses, and nothing where it does
     not.
     """
-    grid = Grid.centred((5, 6, 7), (1.0, 1.2, 0.9))
+    grid = Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9))
     half = torch.tensor([3.15, 3.6, 2.5], dtype=torch.float64)
     steps = torch.tensor(
         [0.0, 0.9, 1 - 1e-9, 1.0, 1 + 1e-12, 1 + 1e-9, 1.0001, 1.5, 4.0, 1e3], dtype=torch.float64
@@ -152,7 +154,7 @@ def nearly_aligned(subject: ProjectorSubject) -> float:
     """Rays that leave a row of voxel centres bit by bit, both ways: how much more than the tilt
     tells it changes.
     """
-    grid, worst = Grid.centred((5, 7, 9), (0.9, 1.2, 1.0)), 0.0
+    grid, worst = Grid.centred(size=(9, 7, 5), spacing=(0.9, 1.2, 1.0)), 0.0
     volume = subject.random(*grid.shape)
     for axis in range(3):
         tilts, way = _tilted(axis)

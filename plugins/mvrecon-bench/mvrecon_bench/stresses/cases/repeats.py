@@ -23,7 +23,7 @@ from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits
 from mvrecon_bench.stresses.subprocess_run import LIMIT, python
 
 #: Work for several threads.
-WORK = Grid.centred((28, 29, 30), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+WORK = Grid.centred(size=(30, 29, 28), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 PIXELS = {"pixels": [70, 70], "pixel_mm": 0.19, "offset_mm": [0.04, -0.03]}
 #: Loops over which memory must stay as it is, after as many as fill what is kept.
 LOOPS, FIRST = 500, 50
@@ -157,7 +157,7 @@ def evaluation_draws_nothing(subject: Subject) -> float:
     from mvrecon.engine.loggers import Board
     from mvrecon.viz import montage
 
-    grid = Grid.centred((7, 8, 9), 1.0)
+    grid = Grid.centred(size=(9, 8, 7), spacing=1.0)
     rig = rig_about(grid)
     A = PROJECTORS.build("drr", grid=grid, cameras=rig)
     model = MODELS.build("backprojection", projector=A)
@@ -180,7 +180,7 @@ def evaluation_draws_nothing(subject: Subject) -> float:
 
 def loops(subject: ProjectorSubject) -> float:
     """Forward and backward again and again: by how many volumes memory grows in a loop."""
-    grid = Grid.centred((32, 33, 34), 1.0)
+    grid = Grid.centred(size=(34, 33, 32), spacing=1.0)
     A = subject.projector(grid, subject.rig(grid, {"pixels": [4, 4], "pixel_mm": 6.0}, views=2))
     x = subject.random(1, 1, *grid.shape).requires_grad_()
 

@@ -21,7 +21,7 @@ def short(subject: ProjectorSubject) -> float:
     """
     subject.need_segment()
     subject.need_lines()
-    grid, volume = Grid.centred((5, 7, 9), (0.9, 1.2, 1.0)), subject.random(5, 7, 9)
+    grid, volume = Grid.centred(size=(9, 7, 5), spacing=(0.9, 1.2, 1.0)), subject.random(5, 7, 9)
     volume[1:4, 2:5, 3:6] = 1.75
     lengths = 10.0 ** -torch.arange(3.0, 19.0, 3.0, dtype=torch.float64)
     way = torch.nn.functional.normalize(torch.tensor([0.8, -0.5, 0.3], dtype=torch.float64), dim=0)
@@ -97,7 +97,7 @@ def tiled(subject: ProjectorSubject) -> float:
 def out_of_reach(subject: ProjectorSubject) -> float:
     """A volume wholly behind the source, or beyond the detector: how many rays see anything."""
     grid, rng = (
-        Grid.centred((5, 6, 7), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0)),
+        Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0)),
         torch.Generator().manual_seed(0),
     )
     way = torch.nn.functional.normalize(

@@ -52,7 +52,7 @@ def backwards(subject: Subject) -> float:
     """Arrays of numpy that run backwards: refused, or read as their copy."""
     points = np.arange(1.0, 7.0).reshape(2, 3) ** 2
     takes: list[tuple[Callable[[Any], Tensor], np.ndarray]] = [
-        (lambda array: Grid.centred((2, 3, 4), array).affine, points[1]),
+        (lambda array: Grid.centred(size=(4, 3, 2), spacing=array).affine, points[1]),
         (lambda array: Grid((2, 3, 4), array).affine, np.diag([4.0, 3.0, 2.0, 1.0])[::-1]),
         (
             lambda array: ExplicitRays(array, array + 1.0).source,
