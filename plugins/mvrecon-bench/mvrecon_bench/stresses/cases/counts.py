@@ -13,8 +13,8 @@ from mvrecon.reconstruct.iterative import sirt, sirt_weights
 from mvrecon.reconstruct.mlem import mlem
 from mvrecon.reconstruct.poisson import PoissonLikelihood
 from mvrecon.scenes.derenzo import derenzo
-from mvrecon.support.hull import visual_hull
-from mvrecon.support.noise import noise_threshold
+from mvrecon.visual_hull.hull import visual_hull
+from mvrecon.visual_hull.noise import noise_threshold
 from mvrecon_bench.stresses.case import PRECISE, Case
 from mvrecon_bench.stresses.refusals import none_of, refusal
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
