@@ -98,7 +98,7 @@ class RayTransform(nn.Module, Projector):
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
         self.last_backend: str | None = None
-        self.window = list(cameras.limits)
+        self.ray_extent = list(cameras.ray_extent)
         lines = self._lines()
         self.poses = lines.requires_grad or backends.forwards(lines)
         self.register_buffer("fixed_lines", lines.detach(), persistent=False)
@@ -257,7 +257,7 @@ class RayTransform(nn.Module, Projector):
         check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(volume, "a volume")
         x, kernels = volume.flatten(0, 1), self._kernels(volume, lines)
-        rays = lines, self.window, list(detector), self.kernel
+        rays = lines, self.ray_extent, list(detector), self.kernel
         if kernels is reference:
             self._last = None
             return kernels.project(
@@ -284,13 +284,15 @@ class RayTransform(nn.Module, Projector):
         """The transpose of `project_along`; views in the precision of arithmetic."""
         kernels, shape = self._kernels(views[:, None], lines), list(self.grid.shape)
         if self.support is None:
-            return kernels.backproject(views, lines, self.window, shape, self.kernel)
+            return kernels.backproject(views, lines, self.ray_extent, shape, self.kernel)
         if kernels is reference:
             return within(
-                kernels.backproject(views, lines, self.window, shape, self.kernel), self.support
+                kernels.backproject(views, lines, self.ray_extent, shape, self.kernel), self.support
             )
         self._last, box = held = self._held
-        part = kernels.backproject(views, lines, self.window, list(box.shape), self.kernel, held[0])
+        part = kernels.backproject(
+            views, lines, self.ray_extent, list(box.shape), self.kernel, held[0]
+        )
         return placed(within(part, self.support[box.slices]), box, self.grid.shape)
 
     def _hold(self) -> tuple[Tensor, Box]:
@@ -300,7 +302,7 @@ class RayTransform(nn.Module, Projector):
             mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
             how = self.skip if self.skip in ("box", "brick") else "once"
             held = Occupancy.decoded(
-                ops.occupied(mask, rays, self.window, self.detector, self.kernel, how)
+                ops.occupied(mask, rays, self.ray_extent, self.detector, self.kernel, how)
             )
         return held.encoded(), held.box
 

@@ -68,7 +68,7 @@ def stretches(cameras: Cameras, grid: Grid, across: int = 41):
     start, end = (grid.to_index(cameras.unproject(uvz)) for uvz in ends)
     sizes = torch.tensor(grid.shape[::-1], dtype=torch.float64)
     faces = torch.stack([-0.5 - start, sizes - 0.5 - start]) / (end - start)
-    least, most = cameras.limits
+    least, most = cameras.ray_extent
     enter = faces.amin(dim=0).amax(dim=-1).clamp_min(least)
     leave = faces.amax(dim=0).amin(dim=-1).clamp_max(most)
     return enter, leave

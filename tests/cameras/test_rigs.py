@@ -218,5 +218,5 @@ def test_the_shipped_settings_see_a_ball_of_50_mm_about_the_origin(name):
     uvz = cameras.project(50 * torch.nn.functional.normalize(directions, dim=-1))
     rows, columns = cameras.shape
     assert (uvz[..., :2] > -0.5).all() and (uvz[..., :2] < doubles(columns, rows) - 0.5).all()
-    least, most = (w * cameras.distance[:, None] for w in cameras.limits)
+    least, most = (w * cameras.distance[:, None] for w in cameras.ray_extent)
     assert (uvz[..., 2] > least).all() and (uvz[..., 2] < most).all()

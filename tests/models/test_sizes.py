@@ -4,7 +4,7 @@ door.
 
 import pytest
 import torch
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.masks import halved

@@ -302,6 +302,6 @@ def test_compiled_and_mapped_calls_skip_too():
 def test_the_reference_needs_no_skipping():
     A = CASES["cone"].build(backend="reference", skip="brick")
     x = volumes("blob", torch.float64)
-    expected = reference.project(x[0], A.lines, A.window, A.detector, A.kernel)
+    expected = reference.project(x[0], A.lines, A.ray_extent, A.detector, A.kernel)
     assert torch.equal(A(x)[0], expected) and A.skipped.mode == "off"
     assert replace(A.skipped, why="") == replace(A.with_support(None).skipped, why="")

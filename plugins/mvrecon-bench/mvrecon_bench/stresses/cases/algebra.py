@@ -107,7 +107,7 @@ def sharp(subject: ProjectorSubject) -> float:
     """
     solids = _solids()
     return 0.9 - _order(
-        subject, _voxels, lambda rig: solids.integrals(*rig.rays(), extent=rig.limits)
+        subject, _voxels, lambda rig: solids.integrals(*rig.rays(), ray_extent=rig.ray_extent)
     )
 
 

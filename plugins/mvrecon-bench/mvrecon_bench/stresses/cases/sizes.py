@@ -213,7 +213,7 @@ def last_voxels(subject: Subject) -> float:
                 PROJECTORS.build(name, grid=each, cameras=rig, method=method)
                 for each in (grid, alone)
             )
-            rays = A.lines, A.window
+            rays = A.lines, A.ray_extent
             views = ops.project(x[0], *rays, A.detector, method, held)
             volume = ops.backproject(views, *rays, list(box.shape), method, held)
             errors += [gap(views, B(x)[0]), gap(volume, B.T(views[None])[0])]
