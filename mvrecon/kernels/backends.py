@@ -5,7 +5,6 @@ from types import ModuleType
 
 import torch
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
 
 from mvrecon.kernels.rays import ops, reference
 
@@ -18,28 +17,17 @@ def wide(tensor: Tensor) -> Tensor:
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
-def forwards(*tensors: Tensor) -> bool:
-    """Whether a derivative forwards is asked for, by `torch.func.jvp`: compiled operators would
-    drop it in silence.
-    """
-    return any(unpack_dual(tensor).tangent is not None for tensor in tensors)
-
-
-def kernels_for(
-    tensor: Tensor, backend: str, method: str | None = None, *geometry: Tensor
-) -> tuple[str, ModuleType]:
+def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tuple[str, ModuleType]:
     """The back end's name and its functions along rays, for volumes or views [b c ..].
 
     Args:
         tensor: what is to be projected or back-projected.
         backend: "auto" takes the compiled one of the tensor's device where that can be had, else
-            the reference, which alone has derivatives forwards.
+            the reference.
         method: of the rays; without it, the name alone tells, and a GPU has none but the reference.
-        geometry: what else may carry a derivative.
 
     Raises:
         ValueError: an unknown back end, or a compiled one for a tensor elsewhere.
-        NotImplementedError: a compiled one was asked for, and a derivative forwards.
         RuntimeError: "cuda" was asked for, and its kernels cannot be used; the reason is told.
     """
     if backend not in BACKENDS:
@@ -52,12 +40,6 @@ def kernels_for(
             f"'reference'"
         )
     if backend == "reference" or not COMPILED:
-        return "reference", reference
-    if forwards(tensor, *geometry):
-        if backend != "auto":
-            raise NotImplementedError(
-                f"backend {backend!r} has no derivatives forwards; use 'auto' or 'reference'"
-            )
         return "reference", reference
     if here == "cuda":
         from mvrecon.kernels.rays import (

@@ -2,12 +2,17 @@
 the next process.
 """
 
+import logging
 from collections.abc import Callable
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from numba import njit
+from numba.core.caching import FunctionCache
+
+logger = logging.getLogger(__name__)
 
 #: What may be reordered: sums and products, but NaN and infinity keep their meaning.
 FASTMATH = {"reassoc", "contract", "nsz"}
@@ -41,16 +46,51 @@ def digest(folder: Path) -> str:
 SOURCES = digest(Path(__file__).parent)
 
 
+class Kept(FunctionCache):
+    """numba's files of machine code, whose failures cost time alone: what cannot be read or written
+    is compiled.
+    """
+
+    warned = False
+
+    def __init__(self, loop: Callable[..., Any]):
+        super().__init__(loop)
+        # numba's own stamp sees edits of the loop's file only, not of the functions that the loops
+        # call
+        self._cache_file._source_stamp = SOURCES
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The machine code on disk, or None."""
+        return self._tried(super().load_overload, sig, target_context)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Machine code to disk, where there is room."""
+        self._tried(super().save_overload, sig, data)
+
+    def _tried(self, act: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return act(*arguments)
+        except Exception as problem:  # damaged pickles raise anything
+            index = Path(self._cache_file._index_path)
+            if not Kept.warned:
+                Kept.warned = True
+                why = f"{type(problem).__name__}: {problem}"
+                logger.warning(
+                    "Compiled kernels in %s cannot be used or kept, so they are made anew: %s",
+                    index,
+                    why,
+                )
+            # it may be damaged, or name a file of older machine code that could not be overwritten
+            with suppress(OSError):
+                index.unlink(missing_ok=True)
+            return None
+
+
 def compiled(loop: Callable[..., Any]) -> Any:
     """The loop in machine code; threads may run it side by side."""
-    options = {"nogil": True, **OPTIONS}
-    try:
-        dispatcher: Any = njit(cache=True, **options)(loop)
-    except RuntimeError:  # numba finds no folder to write to
-        return njit(**options)(loop)
-    if (
-        dispatcher is not loop
-    ):  # numba may be told to compile nothing, as under its simulator of CUDA
-        # numba's own stamp sees edits of this file only, not of the functions that the loops call
-        dispatcher._cache._cache_file._source_stamp = SOURCES
+    dispatcher: Any = njit(nogil=True, **OPTIONS)(loop)
+    if dispatcher is loop:  # numba may be told to compile nothing, as under its simulator of CUDA
+        return loop
+    with suppress(RuntimeError):  # numba finds no folder to write to
+        dispatcher._cache = Kept(loop)
     return dispatcher

@@ -186,7 +186,7 @@ class Scaled(Wrapped):
     Args:
         A: the operator.
         pixels: factors that broadcast to [*range_shape], or a function that gives them, called at
-            every use: for factors that depend on cameras which want a gradient. None: one.
+            every use where the cameras want a gradient. None: one.
         voxels: factors or a mask [*domain_shape]; a mask leaves out what is not finite, too. None:
             one.
     """
@@ -196,7 +196,7 @@ class Scaled(Wrapped):
     def __init__(self, A: LinearOperator, pixels: Weight = None, voxels: Tensor | None = None):
         super().__init__(A)
         self.factors = pixels if callable(pixels) else None
-        self.register_buffer("kept", None if callable(pixels) else pixels, persistent=False)
+        self.register_buffer("kept", pixels() if callable(pixels) else pixels, persistent=False)
         self.register_buffer("voxels", voxels, persistent=False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Scaled":
@@ -208,7 +208,7 @@ class Scaled(Wrapped):
     @property
     def pixels(self) -> Tensor | None:
         """The pixels' factors."""
-        return self.factors() if self.factors else self.kept
+        return self.factors() if self.factors and self.pose_gradient else self.kept
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
         y, factors = self.A(self._weighted(x)), self.pixels

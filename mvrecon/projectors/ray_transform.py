@@ -20,7 +20,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
 from mvrecon.kernels.backends import wide
 from mvrecon.kernels.rays import ops, reference
-from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
+from mvrecon.kernels.rays.lines import lines_of, lines_of_rays, tensors_of, writes
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
@@ -34,10 +34,12 @@ METHODS = ("joseph", "siddon", "trilinear")
 class RayTransform(nn.Module, Projector):
     """y = A x: the integrals of volumes along the rays of a rig, in (unit of x) * mm.
 
-    Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; twice in
-    volume and views. Half and bfloat16 volumes are read as they are and summed in float32, which
-    views and adjoints are given back in. Geometry stays in float64 whatever the module is cast to.
-    Grid and cameras stay where they were made; `.to(device)` moves the operator. `last_backend`
+    Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; second
+    derivatives in these are the reference's.
+    Half and bfloat16 volumes are read as they are and summed in float32, which views and adjoints
+    are given back in. Geometry stays in float64 whatever the module is cast to. Grid and cameras
+    stay where they were made; `.to(device)` moves the operator. Cameras that want a gradient are
+    followed wherever they move; others must stay as they were when it was built. `last_backend`
     tells which back end did the last call, `skipped` what it left out.
 
     Args:
@@ -100,8 +102,11 @@ class RayTransform(nn.Module, Projector):
         self.last_backend: str | None = None
         self.ray_extent = list(cameras.ray_extent)
         lines = self._lines()
-        self.poses = lines.requires_grad or backends.forwards(lines)
-        self.register_buffer("fixed_lines", lines.detach(), persistent=False)
+        # without a graph, but with what torch.func knows of them
+        self.register_buffer(
+            "fixed_lines", lines.detach() if lines.requires_grad else lines, persistent=False
+        )
+        self._written = writes(cameras)
         self.register_buffer("support", check_support(support, grid), persistent=False)
         self._held = self._hold()
         self._last: Tensor | None = None
@@ -118,11 +123,6 @@ class RayTransform(nn.Module, Projector):
     def device(self) -> torch.device:
         """Where the operator computes."""
         return self.fixed_lines.device
-
-    @property
-    def pose_gradient(self) -> bool:
-        """Whether the cameras want a gradient: the rays are then made anew in every call."""
-        return self.poses
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
         """The rays of some views or pixels alone."""
@@ -206,11 +206,36 @@ class RayTransform(nn.Module, Projector):
         return self
 
     @property
+    def pose_gradient(self) -> bool:
+        """Whether the cameras want a gradient: the rays are then made anew in every call."""
+        return any(tensor.requires_grad for tensor in tensors_of(self.rays))
+
+    @property
     def lines(self) -> Float[Tensor, "m 4 3 k"]:
-        """The rays in voxel space; made anew, with their graph, where the cameras want a
-        gradient.
+        """The rays in voxel space; made anew, with their graph, where the cameras want a gradient.
+
+        Raises:
+            RuntimeError: cameras that want none were changed in place; graphs of `torch.compile`
+                cannot look.
         """
-        return self._lines().to(self.fixed_lines.device) if self.poses else self.fixed_lines
+        if self.pose_gradient:
+            return self._lines().to(self.fixed_lines.device)
+        if not torch.compiler.is_compiling() and writes(self.rays) != self._written:
+            raise RuntimeError(
+                "The cameras' tensors were changed in place after the projector was built; build "
+                "another one, or let "
+                "them want a gradient before"
+            )
+        return self.fixed_lines
+
+    def __reduce_ex__(self, protocol):
+        """What copies and pickles are made of; raises as `lines` does."""
+        _ = self.lines
+        return super().__reduce_ex__(protocol)
+
+    def __setstate__(self, state):
+        super().__setstate__(state)
+        self._written = writes(self.rays)  # a copied tensor counts from zero
 
     @property
     def detector(self) -> list[int]:
@@ -256,7 +281,7 @@ class RayTransform(nn.Module, Projector):
         """
         check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(volume, "a volume")
-        x, kernels = volume.flatten(0, 1), self._kernels(volume, lines)
+        x, kernels = volume.flatten(0, 1), self._kernels(volume)
         rays = lines, self.ray_extent, list(detector), self.kernel
         if kernels is reference:
             self._last = None
@@ -282,7 +307,7 @@ class RayTransform(nn.Module, Projector):
         self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]
     ) -> Float[Tensor, "n d h w"]:
         """The transpose of `project_along`; views in the precision of arithmetic."""
-        kernels, shape = self._kernels(views[:, None], lines), list(self.grid.shape)
+        kernels, shape = self._kernels(views[:, None]), list(self.grid.shape)
         if self.support is None:
             return kernels.backproject(views, lines, self.ray_extent, shape, self.kernel)
         if kernels is reference:
@@ -301,13 +326,12 @@ class RayTransform(nn.Module, Projector):
         if self.support is not None and self.skip != "off" and backends.COMPILED:
             mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
             how = self.skip if self.skip in ("box", "brick") else "once"
-            held = Occupancy.decoded(
-                ops.occupied(mask, rays, self.ray_extent, self.detector, self.kernel, how)
-            )
+            code = ops.occupied(mask, rays, self.ray_extent, self.detector, self.kernel, how)
+            held = Occupancy.unwrapped(code)
         return held.encoded(), held.box
 
-    def _kernels(self, tensor: Tensor, lines: Tensor) -> ModuleType:
-        chosen, kernels = backends.kernels_for(tensor, self.backend, self.kernel, lines)
+    def _kernels(self, tensor: Tensor) -> ModuleType:
+        chosen, kernels = backends.kernels_for(tensor, self.backend, self.kernel)
         self.last_backend = chosen
         return kernels
 

@@ -62,7 +62,10 @@ class SomeRays(LinearOperator):
         """The rays in voxel space; made anew, with their graph, where the cameras want a
         gradient.
         """
-        return self._choose(self.A.lines) if self._fixed is None else self._fixed.to(self.device)
+        lines = self.A.lines
+        if self.A.pose_gradient or self._fixed is None:
+            return self._choose(lines)
+        return self._fixed.to(lines.device)
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
         """The chosen entries of A x.

@@ -33,9 +33,9 @@ def backproject(
     Bilinear in the view; beyond the outermost pixel centres values fade to zero over one pixel. A
     voxel counts where its ray does: on the right side of the source, and for a segment before the
     detector. Order of accuracy: second in the pixel size. It is no projector's adjoint;
-    `LinearOperator.T` is. Differentiable in the views by its exact transpose; in the cameras with
-    "reference", which "auto" takes for cameras that want a gradient. Half and bfloat16 views are
-    summed, and given back, in float32.
+    `LinearOperator.T` is. Differentiable in the views by its exact transpose; derivatives in the
+    cameras are the reference's, whatever the back end. Half and bfloat16 views are summed, and
+    given back, in float32.
 
     Args:
         views: values on the detectors.
@@ -56,10 +56,7 @@ def backproject(
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     maps = image_maps(cameras, grid).to(views.device)
     values = wide(views).flatten(0, 1)
-    compiled = kernels_for(views, backend, None, maps)[0] == "cpu" and not (
-        backend == "auto" and maps.requires_grad
-    )
-    kernels = voxel_ops if compiled else voxel_reference
+    kernels = voxel_ops if kernels_for(views, backend)[0] == "cpu" else voxel_reference
     volumes = kernels.look(
         values, maps, list(cameras.ray_extent), weight == "distance", list(grid.shape)
     )

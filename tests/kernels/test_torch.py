@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.library import opcheck
 
 from mvrecon.kernels.rays import ops
 from tests.projectors.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, noise
@@ -41,9 +42,19 @@ def test_torch_accepts_the_operators(kind, option, dtype):
     volume, views, rays = (each.clone().requires_grad_() for each in (x, y, lines))
     # the derivative by a half volume is rounded twice on one way and once on the other
     checks = CHECKS if dtype.itemsize > 2 else CHECKS[:3]
-    torch.library.opcheck(ops.project, (volume, rays, window, detector, method), test_utils=checks)
-    torch.library.opcheck(ops.backproject, (views, rays, window, shape, method), test_utils=checks)
-    torch.library.opcheck(ops.lines_vjp, (x, y, lines, window, method), test_utils=CHECKS[:3])
+    opcheck(
+        torch.ops.mvrecon.project.default,
+        (volume, rays, window, detector, method),
+        test_utils=checks,
+    )
+    opcheck(
+        torch.ops.mvrecon.backproject.default,
+        (views, rays, window, shape, method),
+        test_utils=checks,
+    )
+    opcheck(
+        torch.ops.mvrecon.lines_vjp.default, (x, y, lines, window, method), test_utils=CHECKS[:3]
+    )
 
 
 @pytest.mark.parametrize("option", OPTIONS)

@@ -2,6 +2,8 @@
 definitions.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -89,12 +91,18 @@ def test_the_parts_of_a_weighted_operator_are_parts_of_the_whole_and_cost_no_mor
 
 
 def test_weights_that_depend_on_the_cameras_are_made_anew_with_their_graph(A):
-    factor = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    vectors = [
+        vector.clone().requires_grad_() for vector in (CONE.source, CONE.origin, CONE.u, CONE.v)
+    ]
+    moving = replace(CONE, **dict(zip(("source", "origin", "u", "v"), vectors, strict=True)))
+    B = PROJECTORS.build("drr", grid=GRID, cameras=moving, backend="reference")
     x, _ = pair(A)
-    part = Scaled(A, lambda: factor.expand(A.range_shape)).subset(ViewSelection(A.range_shape, [1]))
+    lengths = Scaled(B, lambda: moving.u.norm(dim=-1)[:, None, None])
+    part, weight = lengths.subset(ViewSelection(A.range_shape, [1])), CONE.u[1].norm()
     for _ in range(2):
-        (slope,) = torch.autograd.grad(part(x).sum(), factor)
-        torch.testing.assert_close(slope, A(x)[:, :, 1].sum())
+        (slope,) = torch.autograd.grad(part(x).sum(), vectors[2], retain_graph=True)
+        assert slope[1].any() and not slope[0].any()
+    torch.testing.assert_close(part(x), weight * A(x)[:, :, [1]])
 
 
 def test_an_operator_that_knows_no_parts_has_them_by_way_of_the_whole(A):

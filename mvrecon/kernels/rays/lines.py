@@ -65,6 +65,16 @@ def lines_of_rays(rays: ExplicitRays, grid: Grid) -> Float[Tensor, "r 4 3 1"]:
     return torch.stack(maps, dim=1)[..., None]
 
 
+def tensors_of(rays: Cameras | ExplicitRays) -> list[Tensor]:
+    """The tensors that make rays."""
+    return [value for value in vars(rays).values() if isinstance(value, Tensor)]
+
+
+def writes(rays: Cameras | ExplicitRays) -> list[int]:
+    """How often the rays' tensors were written to; those of inference mode do not count it."""
+    return [tensor._version for tensor in tensors_of(rays) if not tensor.is_inference()]
+
+
 def shifted(lines: Float[np.ndarray, "m 4 3 k"], y: float) -> Float[np.ndarray, "m 4 3 k"]:
     """The same rays about a point that lies y voxels beyond the centre along the y axis."""
     if y == 0:

@@ -80,7 +80,17 @@ class Occupancy:
     @classmethod
     def decoded(cls, code: Tensor) -> "Occupancy":
         """The inverse of `encoded`."""
-        numbers = code.numpy()
+        return cls._of(code.numpy())
+
+    @classmethod
+    def unwrapped(cls, code: Tensor) -> "Occupancy":
+        """The same, slower, where `torch.func` may have wrapped the code: such tensors show nobody
+        their memory.
+        """
+        return cls._of(np.array(code.tolist()))
+
+    @classmethod
+    def _of(cls, numbers: np.ndarray) -> "Occupancy":
         d, h, w, z0, y0, x0, z1, y1, x1, one, two, told_apart = numbers[:HEAD].tolist()
         bricks = (
             numbers[HEAD:].astype(np.uint8).reshape(bricks_along((d, h, w), EDGE))

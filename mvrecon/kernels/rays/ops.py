@@ -3,8 +3,8 @@ the others.
 
 `held` says that a volume is the part of a larger one that alone may be there, see `occupancy.py`:
 the operators are then those of this part. `occupied` says where a volume is not zero: only that is
-read, and derivatives stay dense. Second derivatives in volume and views are exact. A second
-derivative in the geometry raises: the reference has it.
+read, and derivatives stay dense. Second derivatives in volume and views are made of the same
+operators; those in the geometry are the reference's.
 """
 
 from collections.abc import Sequence
@@ -12,15 +12,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
-from mvrecon.kernels.mapping import batched, joined, looped
+from mvrecon.geometry.box import Box, placed
+from mvrecon.kernels.derivatives import bent, curved, linear, transposed
+from mvrecon.kernels.mapping import joined
+from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.occupancy import Occupancy, code_size
 
 # numba is heavy, so the kernels are imported at their first call
 
 
 @torch.library.custom_op("mvrecon::project", mutates_args=(), device_types="cpu")
-def project(
+def _project(
     volume: Tensor,
     lines: Tensor,
     window: Sequence[float],
@@ -39,7 +41,7 @@ def project(
 
 
 @torch.library.custom_op("mvrecon::backproject", mutates_args=(), device_types="cpu")
-def backproject(
+def _backproject(
     views: Tensor,
     lines: Tensor,
     window: Sequence[float],
@@ -55,7 +57,7 @@ def backproject(
 
 
 @torch.library.custom_op("mvrecon::lines_vjp", mutates_args=(), device_types="cpu")
-def lines_vjp(
+def _lines_vjp(
     volume: Tensor,
     views: Tensor,
     lines: Tensor,
@@ -107,7 +109,7 @@ def _read(volume: Tensor, held: Tensor | None, occupied: Tensor | None) -> tuple
     return volume[:, *there.box.slices], there
 
 
-@project.register_kernel("cuda")
+@_project.register_kernel("cuda")
 def _(volume, lines, window, detector, method, held=None, occupied=None):
     from mvrecon.kernels.rays import cuda
 
@@ -115,7 +117,7 @@ def _(volume, lines, window, detector, method, held=None, occupied=None):
     return cuda.project(part, lines, window, there, detector, method)
 
 
-@backproject.register_kernel("cuda")
+@_backproject.register_kernel("cuda")
 def _(views, lines, window, shape, method, held=None):
     from mvrecon.kernels.rays import cuda
 
@@ -123,7 +125,7 @@ def _(views, lines, window, shape, method, held=None):
     return cuda.backproject(views, lines, window, there, method)
 
 
-@lines_vjp.register_kernel("cuda")
+@_lines_vjp.register_kernel("cuda")
 def _(volume, views, lines, window, method, held=None, occupied=None):
     from mvrecon.kernels.rays import cuda
 
@@ -131,25 +133,25 @@ def _(volume, views, lines, window, method, held=None, occupied=None):
     return cuda.lines_vjp(part, views, lines, window, there, method)
 
 
-@project.register_fake
+@_project.register_fake
 def _(volume, lines, window, detector, method, held=None, occupied=None):
     wide = torch.float64 if volume.dtype == torch.float64 else torch.float32
     return volume.new_empty(volume.shape[0], lines.shape[0], *detector, dtype=wide)
 
 
-@backproject.register_fake
+@_backproject.register_fake
 def _(views, lines, window, shape, method, held=None):
     return views.new_empty(views.shape[0], *shape)
 
 
-@lines_vjp.register_fake
+@_lines_vjp.register_fake
 def _(volume, views, lines, window, method, held=None, occupied=None):
     return lines.new_empty(lines.shape)
 
 
 def _keep(ctx, inputs, output):
-    first, lines, ctx.window, ctx.size, ctx.method, ctx.held, *occupied = inputs
-    ctx.occupied = occupied[0] if occupied else None
+    first, lines, ctx.window, ctx.size, ctx.method, *there = inputs
+    ctx.held, ctx.occupied = (*there, None, None)[:2]
     ctx.save_for_backward(first if ctx.needs_input_grad[1] else None, lines)
     ctx.shape, ctx.dtype = first.shape, first.dtype
 
@@ -178,14 +180,28 @@ def _backproject_back(ctx, volume):
     return by_views, by_lines, None, None, None, None
 
 
-def _no_second_order(ctx, grad):
-    raise NotImplementedError("Second derivatives in the geometry need backend='reference'")
+def _in_torch(volume, lines, window, detector, method, held=None, occupied=None):
+    there = None if held is None else Occupancy.unwrapped(held)
+
+    def act(volume, lines):
+        values = volume if volume.dtype == torch.float64 else volume.float()
+        whole = values if there is None else placed(values, there.box, there.shape)
+        return reference.project(whole, lines, window, detector, method)
+
+    return act
 
 
-project.register_autograd(_project_back, setup_context=_keep)
-backproject.register_autograd(_backproject_back, setup_context=_keep)
-lines_vjp.register_autograd(_no_second_order)
-project.register_vmap(batched(project))
-backproject.register_vmap(batched(backproject))
-lines_vjp.register_vmap(looped(lines_vjp, 3))
+def _back_in_torch(views, lines, window, shape, method, held=None):
+    return transposed(
+        _in_torch(None, lines, window, views.shape[2:], method, held), (len(views), *shape)
+    )
+
+
+def _vjp_in_torch(volume, views, lines, window, method, held=None, occupied=None):
+    return bent(_in_torch(volume, lines, window, views.shape[2:], method, held))
+
+
+project = linear(_project, _in_torch, _keep, _project_back, lasting=6)
+backproject = linear(_backproject, _back_in_torch, _keep, _backproject_back)
+lines_vjp = curved(_lines_vjp, _vjp_in_torch)
 occupied.register_vmap(joined(occupied))

@@ -23,9 +23,9 @@ def warp(
     source.
 
     Values fade to zero over one voxel outside the outermost centres. Order of accuracy: second in
-    the voxel size. Differentiable in the volumes, twice, and in the maps, once ("reference": to any
-    order). Half and bfloat16 volumes are computed in float32 and given back as they came; places
-    are float64.
+    the voxel size. Differentiable in the volumes, twice, and in the maps; second derivatives in
+    these are the reference's. Half and bfloat16 volumes are computed in float32 and given back as
+    they came; places are float64.
 
     Args:
         volumes: values on s lattices; batch and channels share the work of finding the places.
@@ -49,5 +49,5 @@ def warp(
         )
     if volumes.dtype not in (torch.float32, torch.float64):
         return warp(volumes.float(), maps, shape, backend).to(volumes.dtype)
-    kernels = warp_ops if kernels_for(volumes, backend, None, maps)[0] == "cpu" else warp_reference
+    kernels = warp_ops if kernels_for(volumes, backend)[0] == "cpu" else warp_reference
     return kernels.warp(volumes, maps, list(shape))

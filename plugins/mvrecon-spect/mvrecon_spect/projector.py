@@ -50,7 +50,7 @@ class Spect(Scaled):
             raise ValueError(f"A pinhole's diameter must be positive mm, got {diameter_mm}")
         A = Drr(grid, cameras, **options)
         weight = partial(sensitivity, cameras, float(diameter_mm))
-        super().__init__(A, weight if A.pose_gradient else weight())
+        super().__init__(A, weight)
         self.diameter_mm = float(diameter_mm)
 
 
