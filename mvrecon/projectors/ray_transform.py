@@ -65,8 +65,8 @@ class RayTransform(nn.Module, Projector):
             it is neither read nor written.
 
     Raises:
-        ValueError: an unknown method, back end or way to skip, counts below one, a support that
-            does not fit, or grid and cameras on different devices.
+        ValueError: an unknown method, back end or way to skip, counts below one, or a support that
+            does not fit.
     """
 
     capabilities = frozenset({"subset", "crop", "support"})
@@ -91,11 +91,6 @@ class RayTransform(nn.Module, Projector):
         ):
             if name not in known[what]:
                 raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(known[what])}")
-        if cameras.source.device != grid.affine.device:
-            raise ValueError(
-                f"Grid and cameras must be on one device, got {grid.affine.device} and "
-                f"{cameras.source.device}"
-            )
         self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
@@ -107,7 +102,9 @@ class RayTransform(nn.Module, Projector):
             "fixed_lines", lines.detach() if lines.requires_grad else lines, persistent=False
         )
         self._written = writes(cameras)
-        self.register_buffer("support", check_support(support, grid), persistent=False)
+        mask = check_support(support, grid)
+        mask = None if mask is None else mask.to(lines.device)
+        self.register_buffer("support", mask, persistent=False)
         self._held = self._hold()
         self._last: Tensor | None = None
 
