@@ -146,7 +146,7 @@ def test_a_dome_puts_its_detector_on_the_side_that_the_extent_says(extent, side)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"views": 0}, "views must be positive, got 0"),
+        ({"n_views": 0}, "n_views must be positive, got 0"),
         ({"sid": -1.0}, "sid must be positive, got -1.0"),
         ({"sdd": math.nan}, "sdd must be positive, got nan"),
         ({"sdd": 300.0}, "sdd > sid, got sdd 300.0 and sid 400.0"),
