@@ -19,7 +19,7 @@ from mvrecon.parts import CAMERAS, SCENES
 GRID = ("grid.size=[16,16,16]", "grid.spacing=8")
 PARALLEL = (
     "camera=parallel",
-    "camera.views=3",
+    "camera.n_views=3",
     "camera.detector.pixels=[40,44]",
     "camera.detector.pixel_mm=3.2",
 )
@@ -142,7 +142,7 @@ def test_the_app_works_in_foreign_places(root, tmp_path):
     here, out, home = tmp_path / "où ça", tmp_path / "ausgabe für 目录", tmp_path / "home"
     here.mkdir()
     home.touch()
-    options = ("grid.size=[4,4,4]", "camera.views=1", "camera.detector.pixels=[4,4]", "cases=[0]")
+    options = ("grid.size=[4,4,4]", "camera.n_views=1", "camera.detector.pixels=[4,4]", "cases=[0]")
     place = {
         "PYTHONPATH": str(root),
         "HOME": str(home),

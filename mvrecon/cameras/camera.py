@@ -133,7 +133,7 @@ class Cameras:
         return self._map(lambda vector: vector.to(device))
 
     @property
-    def limits(self) -> tuple[float, float]:
+    def ray_extent(self) -> tuple[float, float]:
         """The fractions w of a ray between which it counts."""
         return EXTENTS[self.extent]
 
@@ -184,7 +184,7 @@ class Cameras:
 
         They may lie beside the detector.
         """
-        least, most = self.limits
+        least, most = self.ray_extent
         w = uvz[..., 2] / self.distance.to(uvz).reshape(-1, *[1] * (uvz.ndim - 2))
         return uvz.isfinite().all(dim=-1) & (least <= w) & (w <= most)
 

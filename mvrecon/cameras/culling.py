@@ -87,7 +87,7 @@ def _views(frame: Float[Tensor, "m 3 4"], cameras: Cameras) -> Iterator[Float[Te
     """
     u, v, w = frame.unbind(dim=1)
     one = w.new_tensor([0, 0, 0, 1]).expand_as(w)
-    (least, most), (rows, columns) = cameras.limits, cameras.shape
+    (least, most), (rows, columns) = cameras.ray_extent, cameras.shape
     ends = [
         plane
         for plane, end in ((w - least * one, least), (most * one - w, most))

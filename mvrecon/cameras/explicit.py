@@ -30,7 +30,7 @@ class ExplicitRays:
 
     #: What it shares with `Cameras`.
     parallel = None
-    limits = (0.0, 1.0)
+    ray_extent = (0.0, 1.0)
 
     def __post_init__(self) -> None:
         for name in ("source", "target"):

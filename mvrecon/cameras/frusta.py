@@ -27,7 +27,7 @@ def frusta_lattice(
     t = edges if spacing == "z" else 1 / edges
     count = edges.shape[1] - 1
     middle, step = (t[:, -1] + t[:, 0]) / 2, (t[:, -1] - t[:, 0]) / count
-    central = torch.full_like(middle, 1.0 if cameras.limits[1] > 0 else -1.0)
+    central = torch.full_like(middle, 1.0 if cameras.ray_extent[1] > 0 else -1.0)
     side = middle.sign() if cameras.parallel else central
     if spacing == "k":
         H = H * (side / edges.abs().amax(dim=1))[:, None, None]  # its denominator is z

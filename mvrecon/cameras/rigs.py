@@ -17,7 +17,7 @@ from mvrecon.geometry.rigid import look_at
 
 
 def circular(
-    views: int,
+    n_views: int,
     sid: float,
     sdd: float,
     detector: Mapping[str, Any],
@@ -28,24 +28,24 @@ def circular(
     """Cone beam on a circle about the z axis, the source at (sid cos a, sid sin a, 0).
 
     Args:
-        views: number of cameras; their angles are start + arc k / views, so that a full circle
+        n_views: number of cameras; their angles are start + arc k / n_views, so that a full circle
             repeats none.
         sid: mm from the source to the axis.
         sdd: mm from the source to the detector, which stands across the axis.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
         arc_degrees: the range of angles, its end excluded; negative turns clockwise seen from +z.
         start_degrees: the first angle.
-        angles: explicit angles in place of equal steps, as many as `views`.
+        angles: explicit angles in place of equal steps, as many as `n_views`.
 
     Raises:
         ValueError: lengths that are not positive, a detector in front of the axis, a wrong number
             of angles.
     """
-    return _cone(_angles(views, arc_degrees, start_degrees, angles), sid, sdd, detector)
+    return _cone(_angles(n_views, arc_degrees, start_degrees, angles), sid, sdd, detector)
 
 
 def arc(
-    views: int,
+    n_views: int,
     sid: float,
     sdd: float,
     detector: Mapping[str, Any],
@@ -58,16 +58,16 @@ def arc(
     Raises:
         ValueError: as `circular`, or an arc that closes, so that its ends would be one camera.
     """
-    if views > 1 and arc_degrees % 360 == 0:
+    if n_views > 1 and arc_degrees % 360 == 0:
         raise ValueError(
             f"The ends of an arc of {arc_degrees} degrees are one camera; use the camera 'circular'"
         )
-    step = arc_degrees / max(views - 1, 1)
-    return _cone(_angles(views, step * views, start_degrees, None), sid, sdd, detector)
+    step = arc_degrees / max(n_views - 1, 1)
+    return _cone(_angles(n_views, step * n_views, start_degrees, None), sid, sdd, detector)
 
 
 def parallel(
-    views: int,
+    n_views: int,
     detector: Mapping[str, Any],
     depth_mm: float = 1000.0,
     arc_degrees: float = 180.0,
@@ -77,13 +77,13 @@ def parallel(
     """Parallel beams across the z axis, coming from (cos a, sin a, 0).
 
     Args:
-        views: number of views; their angles are start + arc k / views.
+        n_views: number of views; their angles are start + arc k / n_views.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
         depth_mm: a ray starts depth / 2 before the axis and ends depth / 2 behind it; only that
             range counts.
         arc_degrees: the range of angles, its end excluded.
         start_degrees: the first angle.
-        angles: explicit angles in place of equal steps, as many as `views`.
+        angles: explicit angles in place of equal steps, as many as `n_views`.
 
     Convention: column u measures s along (-sin a, cos a). The Radon transform's theta, whose s runs
     along (cos theta, sin theta), is a + 90 degrees.
@@ -92,12 +92,12 @@ def parallel(
         ValueError: a depth that is not positive, a wrong number of angles.
     """
     _check_positive(depth_mm=depth_mm)
-    degrees = _angles(views, arc_degrees, start_degrees, angles)
+    degrees = _angles(n_views, arc_degrees, start_degrees, angles)
     return _about_z(degrees, depth_mm / 2, depth_mm / 2, detector, parallel=True)
 
 
 def dome(
-    views: int,
+    n_views: int,
     radius: float,
     focal: float,
     aperture_degrees: float,
@@ -112,7 +112,7 @@ def dome(
     golden angle further round than the last (Fibonacci lattice; Gonzalez, Math. Geosci. 42, 2010).
 
     Args:
-        views: number of cameras.
+        n_views: number of cameras.
         radius: mm from the target to every source or pinhole.
         focal: mm from the source or pinhole to its detector.
         aperture_degrees: full opening of the cap seen from the target: 180 a half sphere, 360 all
@@ -125,17 +125,17 @@ def dome(
     Raises:
         ValueError: lengths or numbers that are not positive, an aperture beyond 360 degrees.
     """
-    _check_positive(views=views, radius=radius, focal=focal, aperture_degrees=aperture_degrees)
+    _check_positive(n_views=n_views, radius=radius, focal=focal, aperture_degrees=aperture_degrees)
     if aperture_degrees > 360:
         raise ValueError(
             f"A dome's aperture_degrees must be at most 360, a whole sphere, got {aperture_degrees}"
         )
-    k = torch.arange(views, dtype=torch.float64)
-    height = 1 - (k + 0.5) / views * (1 - math.cos(math.radians(aperture_degrees / 2)))
+    k = torch.arange(n_views, dtype=torch.float64)
+    height = 1 - (k + 0.5) / n_views * (1 - math.cos(math.radians(aperture_degrees / 2)))
     azimuth = k * math.pi * (3 - math.sqrt(5))
     across = (1 - height**2).sqrt()
     outwards = torch.stack([across * azimuth.cos(), across * azimuth.sin(), height], dim=-1)
-    centre = torch.as_tensor(target, dtype=torch.float64).expand(views, 3)
+    centre = torch.as_tensor(target, dtype=torch.float64).expand(n_views, 3)
     source = centre + radius * outwards
     reach = focal if extent == "behind" else -focal
     R = look_at(source, centre)
@@ -166,9 +166,9 @@ def _about_z(
 
 
 def _angles(
-    views: int, arc: float, start: float, angles: Sequence[float] | None
+    n_views: int, arc: float, start: float, angles: Sequence[float] | None
 ) -> Sequence[float]:
-    _check_positive(views=views)
+    _check_positive(n_views=n_views)
     given = {
         "arc_degrees": [arc],
         "start_degrees": [start],
@@ -178,9 +178,9 @@ def _angles(
         if not all(math.isfinite(each) for each in degrees):
             raise ValueError(f"A rig's {name} must be finite degrees, got {degrees}")
     if angles is None:
-        return [start + arc * k / views for k in range(views)]
-    if len(angles) != views:
-        raise ValueError(f"A rig of {views} views needs {views} angles, got {len(angles)}")
+        return [start + arc * k / n_views for k in range(n_views)]
+    if len(angles) != n_views:
+        raise ValueError(f"A rig of {n_views} views needs {n_views} angles, got {len(angles)}")
     return angles
 
 

@@ -12,7 +12,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import generator, mixed
 from mvrecon.scenes.sample import Sample, Scene, Thin
-from mvrecon.support.support import warn_of_gaps
+from mvrecon.visual_hull.support import warn_of_gaps
 
 TENSORS = ("views", "volume", "inside")
 

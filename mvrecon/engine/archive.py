@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mvrecon.engine.old_names import current
 from mvrecon.limits import TEXT, Refused, blaming, shown
 
 #: The files that `torch.save` puts into an archive, below one folder.
@@ -61,7 +62,7 @@ def check_archive(path: Path) -> None:
 
 def check_settings(path: Path, settings: Any) -> dict[str, Any]:
     """The hyper-parameters of a checkpoint: names and numbers under the keys of a method, and
-    nothing else.
+    nothing else; by the option names of this version.
 
     Raises:
         Refused: other keys or other values.
@@ -71,7 +72,7 @@ def check_settings(path: Path, settings: Any) -> dict[str, Any]:
             f"{path}: has the settings {shown(settings)}; expected names and numbers for "
             f"{sorted(KEYS)}"
         )
-    return settings
+    return {**settings, "geometry": current(settings["geometry"])}
 
 
 def _plain(value: Any, depth: int = 0) -> bool:

@@ -14,6 +14,7 @@ import yaml
 
 from mvrecon import __version__
 from mvrecon.durable import written_whole
+from mvrecon.engine.old_names import current
 from mvrecon.limits import yaml_of
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
@@ -49,7 +50,7 @@ def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """The settings that a run was started with.
+    """The settings that a run was started with, by the option names of this version.
 
     Raises:
         FileNotFoundError: the folder is no run folder.
@@ -57,7 +58,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     path = folder / SETTINGS
     if not path.is_file():
         raise FileNotFoundError(f"Expected a run folder with {SETTINGS} in it, got {folder}")
-    return yaml_of(path)
+    return current(yaml_of(path))
 
 
 def anchored(value: Any) -> Any:

@@ -15,6 +15,7 @@ from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.durable import claimed
 from mvrecon.engine import record
+from mvrecon.engine.old_names import current
 from mvrecon.limits import Refused, blaming, shown, text_of, yaml_of
 
 DIGESTS, RIG = "digests.json", "rig.json"
@@ -52,7 +53,8 @@ def check(folder: Path, settings: Mapping[str, Any], file: str = record.SETTINGS
                 f"{folder} holds {', '.join(work)} of another run without its {file}; {remedy}"
             )
         return
-    kept, plain = yaml_of(folder / file), yaml.safe_load(yaml.safe_dump(dict(settings)))
+    kept = current(yaml_of(folder / file))
+    plain = yaml.safe_load(yaml.safe_dump(dict(settings)))
     if changed := differences(plain, kept):
         raise ValueError(
             f"{folder} is the folder of a run with other settings: {'; '.join(changed)}; {remedy}"

@@ -23,7 +23,7 @@ class Grid:
 
     Args:
         shape: voxels along (z, y, x).
-        affine: maps a voxel index (x, y, z, 1) to world mm, as in NIfTI; float64.
+        affine: maps a voxel index (x, y, z, 1) to world mm, as in NIfTI; float64, on the CPU.
 
     Raises:
         ValueError: an empty shape, or an affine that is not finite, not 4x4, left-handed or

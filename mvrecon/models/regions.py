@@ -15,7 +15,7 @@ from mvrecon.models.skip import Skip
 from mvrecon.models.window import held_bricks
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import inverse_sums
-from mvrecon.support.support import WORTH, support_from_views
+from mvrecon.visual_hull.support import WORTH, support_from_views
 
 #: Crops whose geometry is kept; a fixed rig's scenes share few.
 KEPT = 8

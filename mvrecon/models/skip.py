@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 from mvrecon.registry import hint
-from mvrecon.support.support import KINDS
+from mvrecon.visual_hull.support import KINDS
 
 #: Voxels that networks which do not know of the mask see around it.
 HALO = 4

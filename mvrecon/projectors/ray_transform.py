@@ -65,8 +65,8 @@ class RayTransform(nn.Module, Projector):
             it is neither read nor written.
 
     Raises:
-        ValueError: an unknown method, back end or way to skip, counts below one, a support that
-            does not fit, or grid and cameras on different devices.
+        ValueError: an unknown method, back end or way to skip, counts below one, or a support that
+            does not fit.
     """
 
     capabilities = frozenset({"subset", "crop", "support"})
@@ -91,23 +91,20 @@ class RayTransform(nn.Module, Projector):
         ):
             if name not in known[what]:
                 raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(known[what])}")
-        if cameras.source.device != grid.affine.device:
-            raise ValueError(
-                f"Grid and cameras must be on one device, got {grid.affine.device} and "
-                f"{cameras.source.device}"
-            )
         self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
         self.last_backend: str | None = None
-        self.window = list(cameras.limits)
+        self.ray_extent = list(cameras.ray_extent)
         lines = self._lines()
         # without a graph, but with what torch.func knows of them
         self.register_buffer(
             "fixed_lines", lines.detach() if lines.requires_grad else lines, persistent=False
         )
         self._written = writes(cameras)
-        self.register_buffer("support", check_support(support, grid), persistent=False)
+        mask = check_support(support, grid)
+        mask = None if mask is None else mask.to(lines.device)
+        self.register_buffer("support", mask, persistent=False)
         self._held = self._hold()
         self._last: Tensor | None = None
 
@@ -282,7 +279,7 @@ class RayTransform(nn.Module, Projector):
         check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(volume, "a volume")
         x, kernels = volume.flatten(0, 1), self._kernels(volume)
-        rays = lines, self.window, list(detector), self.kernel
+        rays = lines, self.ray_extent, list(detector), self.kernel
         if kernels is reference:
             self._last = None
             return kernels.project(
@@ -309,13 +306,15 @@ class RayTransform(nn.Module, Projector):
         """The transpose of `project_along`; views in the precision of arithmetic."""
         kernels, shape = self._kernels(views[:, None]), list(self.grid.shape)
         if self.support is None:
-            return kernels.backproject(views, lines, self.window, shape, self.kernel)
+            return kernels.backproject(views, lines, self.ray_extent, shape, self.kernel)
         if kernels is reference:
             return within(
-                kernels.backproject(views, lines, self.window, shape, self.kernel), self.support
+                kernels.backproject(views, lines, self.ray_extent, shape, self.kernel), self.support
             )
         self._last, box = held = self._held
-        part = kernels.backproject(views, lines, self.window, list(box.shape), self.kernel, held[0])
+        part = kernels.backproject(
+            views, lines, self.ray_extent, list(box.shape), self.kernel, held[0]
+        )
         return placed(within(part, self.support[box.slices]), box, self.grid.shape)
 
     def _hold(self) -> tuple[Tensor, Box]:
@@ -324,7 +323,7 @@ class RayTransform(nn.Module, Projector):
         if self.support is not None and self.skip != "off" and backends.COMPILED:
             mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
             how = self.skip if self.skip in ("box", "brick") else "once"
-            code = ops.occupied(mask, rays, self.window, self.detector, self.kernel, how)
+            code = ops.occupied(mask, rays, self.ray_extent, self.detector, self.kernel, how)
             held = Occupancy.unwrapped(code)
         return held.encoded(), held.box
 

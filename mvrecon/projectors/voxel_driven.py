@@ -58,7 +58,7 @@ def backproject(
     values = wide(views).flatten(0, 1)
     kernels = voxel_ops if kernels_for(views, backend)[0] == "cpu" else voxel_reference
     volumes = kernels.look(
-        values, maps, list(cameras.limits), weight == "distance", list(grid.shape)
+        values, maps, list(cameras.ray_extent), weight == "distance", list(grid.shape)
     )
     return volumes.unflatten(0, views.shape[:2])
 
@@ -72,7 +72,7 @@ def image_maps(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 2 3"]:
     affine = centred_affine(grid).to(cameras.source)
     P = cameras.matrix @ affine
     fraction = replace(cameras, parallel=False).matrix[:, 2:] @ affine
-    side = 1.0 if cameras.parallel or cameras.limits[1] > 0 else -1.0
+    side = 1.0 if cameras.parallel or cameras.ray_extent[1] > 0 else -1.0
     centre = P.new_tensor([(n - 1) / 2 for n in cameras.shape[::-1]])[:, None]
     rows = torch.cat([side * (P[:, :2] - centre * P[:, 2:]), side * P[:, 2:], fraction], dim=1)
     growing = torch.cat([torch.zeros_like(rows[..., :2]), rows[..., 2:3]], dim=-1)

@@ -77,7 +77,7 @@ class AnalyticScene(ABC):
 def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int = 4) -> Sample:
     """Exact views of a phantom, and its truth as the mean over factor^3 points of each voxel."""
     start, end = cameras.rays()
-    views = phantom.integrals(start.detach().cpu(), end.detach().cpu(), cameras.limits)
+    views = phantom.integrals(start.detach().cpu(), end.detach().cpu(), cameras.ray_extent)
     volume = voxelise(phantom, grid, factor)
     inside = volume > 0
     if any(

@@ -13,7 +13,7 @@ class Rays(Protocol):
     """The part of a camera rig that a scene looks at."""
 
     @property
-    def limits(self) -> tuple[float, float]:
+    def ray_extent(self) -> tuple[float, float]:
         """The fractions w of a ray between which it counts."""
         ...
 

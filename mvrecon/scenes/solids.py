@@ -79,15 +79,18 @@ class Solids:
         return self.rotations.mT / self.semi_axes[..., None]
 
     def integrals(
-        self, start: Float[Tensor, "r 3"], step: Float[Tensor, "r 3"], extent: tuple[float, float]
+        self,
+        start: Float[Tensor, "r 3"],
+        step: Float[Tensor, "r 3"],
+        ray_extent: tuple[float, float],
     ) -> Float[Tensor, " r"]:
-        """Integral of the values over X = start + t step, t in `extent`, in value * mm; float64."""
+        """Integrals over X = start + t step with t in `ray_extent`, in value * mm; float64."""
         A = self.to_unit.to(start.device)
         offset = (A @ self.centres.to(start.device)[..., None])[..., 0]
         k = self.round_axes
         o = A[:, :k].transpose(0, 1) @ start.T - offset.T[:k, :, None]
         q = A[:, :k].transpose(0, 1) @ step.T
-        solid, ray, enter, leave = _ball(o, q, extent)
+        solid, ray, enter, leave = _ball(o, q, ray_extent)
         o = (A[solid, k:] @ start[ray, :, None])[..., 0] - offset[solid, k:]
         q = (A[solid, k:] @ step[ray, :, None])[..., 0]
         enter, leave = _slabs(o, q, enter, leave)
@@ -114,10 +117,10 @@ def contains(p: Float[Tensor, "3 ..."], round_axes: int) -> Bool[Tensor, "..."]:
 
 
 def _ball(
-    o: Float[Tensor, "k n r"], q: Float[Tensor, "k n r"], extent: tuple[float, float]
+    o: Float[Tensor, "k n r"], q: Float[Tensor, "k n r"], ray_extent: tuple[float, float]
 ) -> tuple[Int[Tensor, " h"], Int[Tensor, " h"], Float[Tensor, " h"], Float[Tensor, " h"]]:
-    """Solid and ray of every pair that meets in the round axes, and where in `extent` it enters and
-    leaves the ball.
+    """Solid and ray of every pair that meets in the round axes, and the t in `ray_extent` at which
+    the ray enters and leaves the ball.
     """
     qq = q.square().sum(dim=0)
     crosses = (o[i] * q[j] - o[j] * q[i] for i, j in combinations(range(len(o)), 2))
@@ -130,7 +133,7 @@ def _ball(
     o, q, qq, disc, along = o[:, hit], q[:, hit], qq[hit], disc[hit], along[hit]
     middle = torch.where(along, 0.0, -(o * q).sum(dim=0) / qq)
     half = torch.where(along, torch.inf, disc.sqrt() / qq)
-    low, high = extent
+    low, high = ray_extent
     return solid, ray, (middle - half).clamp(min=low), (middle + half).clamp(max=high)
 
 
@@ -165,10 +168,10 @@ class Phantom:
         self,
         start: Float[Tensor, "*n 3"],
         end: Float[Tensor, "*n 3"],
-        extent: tuple[float, float] = (0.0, 1.0),
+        ray_extent: tuple[float, float] = (0.0, 1.0),
     ) -> Float[Tensor, "*n"]:
-        """Exact line integrals in value * mm over X = start + w (end - start), w in `extent` (which
-        may be infinite).
+        """Exact line integrals in value * mm over X = start + w (end - start), w in `ray_extent`
+        (which may be infinite).
 
         Computed in float64, returned in the dtype of `start`. A ray that only touches a solid has
         none of it.
@@ -178,7 +181,7 @@ class Phantom:
         )
         total = first.new_zeros(len(first))
         for part, rays in self._chunks(len(first)):
-            total[rays] += part.integrals(first[rays], last[rays] - first[rays], extent)
+            total[rays] += part.integrals(first[rays], last[rays] - first[rays], ray_extent)
         return total.reshape(torch.broadcast_shapes(start.shape, end.shape)[:-1]).to(start.dtype)
 
     def values(self, xyz: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:

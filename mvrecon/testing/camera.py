@@ -66,7 +66,7 @@ def _check_pixels(cameras: Cameras) -> None:
 
 def _somewhere(cameras: Cameras, count: int = 50) -> Float[Tensor, "m n 3"]:
     """Random pixel coordinates and depths on the side of each camera that counts."""
-    least, most = (max(min(w, 3.0), -3.0) for w in cameras.limits)
+    least, most = (max(min(w, 3.0), -3.0) for w in cameras.ray_extent)
     t = torch.rand(
         len(cameras), count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )

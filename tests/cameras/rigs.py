@@ -13,16 +13,16 @@ OFFSET = {**DETECTOR, "offset_mm": [5.0, -7.0]}
 #: Options of each built-in camera but `from_file`; the detectors are oblong, so that a swap of axes
 #: shows.
 OPTIONS: dict[str, dict[str, Any]] = {
-    "circular": {"views": 5, "sid": 400.0, "sdd": 800.0, "detector": OFFSET},
-    "arc": {"views": 4, "sid": 400.0, "sdd": 700.0, "detector": OFFSET, "arc_degrees": 120.0},
+    "circular": {"n_views": 5, "sid": 400.0, "sdd": 800.0, "detector": OFFSET},
+    "arc": {"n_views": 4, "sid": 400.0, "sdd": 700.0, "detector": OFFSET, "arc_degrees": 120.0},
     "dome": {
-        "views": 7,
+        "n_views": 7,
         "radius": 200.0,
         "focal": 70.0,
         "aperture_degrees": 180.0,
         "detector": OFFSET,
     },
-    "parallel": {"views": 5, "detector": OFFSET, "depth_mm": 300.0},
+    "parallel": {"n_views": 5, "detector": OFFSET, "depth_mm": 300.0},
     "dcspect80": {"pixels": [6, 9]},
 }
 

@@ -191,8 +191,8 @@ def test_the_depth_range_holds_the_grid_tightly():
 
 
 def test_the_limits_are_those_of_the_extent():
-    assert record().limits == (0.0, 1.0)
-    assert random_cameras(extent="behind").limits == (-math.inf, 0.0)
+    assert record().ray_extent == (0.0, 1.0)
+    assert random_cameras(extent="behind").ray_extent == (-math.inf, 0.0)
 
 
 def test_pixel_centres_of_a_parallel_beam_project_to_themselves_at_any_depth():

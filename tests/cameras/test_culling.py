@@ -68,7 +68,7 @@ def stretches(cameras: Cameras, grid: Grid, across: int = 41):
     start, end = (grid.to_index(cameras.unproject(uvz)) for uvz in ends)
     sizes = torch.tensor(grid.shape[::-1], dtype=torch.float64)
     faces = torch.stack([-0.5 - start, sizes - 0.5 - start]) / (end - start)
-    least, most = cameras.limits
+    least, most = cameras.ray_extent
     enter = faces.amin(dim=0).amax(dim=-1).clamp_min(least)
     leave = faces.amax(dim=0).amin(dim=-1).clamp_max(most)
     return enter, leave
@@ -192,7 +192,7 @@ def test_the_margin_is_as_far_as_interpolation_reaches():
 def test_a_view_that_holds_the_whole_box_has_its_whole_depth(name):
     cameras = CAMERAS.build(
         name,
-        views=7,
+        n_views=7,
         detector={"pixels": 40, "pixel_mm": 6.0},
         **({"sid": 400.0, "sdd": 800.0} if name == "circular" else {}),
     )
@@ -207,7 +207,7 @@ def test_a_narrow_view_has_the_depth_of_its_field_alone():
     # the field's width
     grid = Grid.centred((40, 40, 40), 2.0)
     camera = CAMERAS.build(
-        "parallel", views=1, detector={"pixels": [4, 10], "pixel_mm": 2.0}, start_degrees=45.0
+        "parallel", n_views=1, detector={"pixels": [4, 10], "pixel_mm": 2.0}, start_degrees=45.0
     )
     middle, half = 500.0, 80.0 / 2**0.5
     torch.testing.assert_close(

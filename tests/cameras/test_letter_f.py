@@ -74,7 +74,7 @@ def test_the_letter_on_the_wall_x_is_zero_read_from_plus_x_and_mirrored_from_min
     """
     stem, bar = torch.tensor([[0.0, -4, 8], [0, 6, 8]], dtype=torch.float64)
     for name in ("circular", "parallel"):
-        options = OPTIONS[name] | {"views": 2, "arc_degrees": 360.0}
+        options = OPTIONS[name] | {"n_views": 2, "arc_degrees": 360.0}
         cameras = CAMERAS.build(name, **options)
         across = cameras.project(bar)[:, 0] - cameras.project(stem)[:, 0]
         assert across[0] > 0 > across[1]
@@ -86,7 +86,7 @@ def test_of_two_points_the_nearer_has_the_smaller_depth_before_it_and_the_larger
     assert front.project(near)[0, 2] == pytest.approx(350) and front.project(far)[
         0, 2
     ] == pytest.approx(450)
-    top = CAMERAS.build("dome", **(OPTIONS["dome"] | {"views": 1, "aperture_degrees": 1e-3}))
+    top = CAMERAS.build("dome", **(OPTIONS["dome"] | {"n_views": 1, "aperture_degrees": 1e-3}))
     above, below = torch.tensor([[0.0, 0, 50], [0, 0, -50]], dtype=torch.float64)
     assert top.project(above)[0, 2] == pytest.approx(-150) and top.project(below)[
         0, 2

@@ -146,7 +146,7 @@ def test_a_dome_puts_its_detector_on_the_side_that_the_extent_says(extent, side)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"views": 0}, "views must be positive, got 0"),
+        ({"n_views": 0}, "n_views must be positive, got 0"),
         ({"sid": -1.0}, "sid must be positive, got -1.0"),
         ({"sdd": math.nan}, "sdd must be positive, got nan"),
         ({"sdd": 300.0}, "sdd > sid, got sdd 300.0 and sid 400.0"),
@@ -218,5 +218,5 @@ def test_the_shipped_settings_see_a_ball_of_50_mm_about_the_origin(name):
     uvz = cameras.project(50 * torch.nn.functional.normalize(directions, dim=-1))
     rows, columns = cameras.shape
     assert (uvz[..., :2] > -0.5).all() and (uvz[..., :2] < doubles(columns, rows) - 0.5).all()
-    least, most = (w * cameras.distance[:, None] for w in cameras.limits)
+    least, most = (w * cameras.distance[:, None] for w in cameras.ray_extent)
     assert (uvz[..., 2] > least).all() and (uvz[..., 2] < most).all()

@@ -10,7 +10,7 @@ from mvrecon.geometry.grid import Grid, voxel_centres
 SPACING = (3.0, 2.0, 2.0)  # z, y, x
 RIG = {
     "name": "circular",
-    "views": 3,
+    "n_views": 3,
     "sid": 300.0,
     "sdd": 450.0,
     "detector": {"pixels": [10, 12], "pixel_mm": 9.0},

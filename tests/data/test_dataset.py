@@ -72,7 +72,7 @@ from mvrecon.parts import CAMERAS, SCENES
 if __name__ == "__main__":
     start, cache, workers = sys.argv[1], sys.argv[2] == "cache", int(sys.argv[4])
     detector = {"pixels": [6, 6], "pixel_mm": 9.0}
-    cameras = CAMERAS.build("circular", views=2, sid=300.0, sdd=450.0, detector=detector)
+    cameras = CAMERAS.build("circular", n_views=2, sid=300.0, sdd=450.0, detector=detector)
     scene = SCENES.build("hdf5", path=sys.argv[3])
     data = SceneDataset(scene, Grid.centred((6, 6, 6), 8.0), cameras, range(4), 1, cache)
     here = list(DataLoader(data, 2))

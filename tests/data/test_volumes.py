@@ -61,7 +61,7 @@ def test_a_ball_of_water_measures_its_chord(tmp_path, cameras):
 
 def test_views_of_a_parallel_rig_count_the_same_attenuation(volume_file, grid):
     detector = {"pixels": [20, 30], "pixel_mm": 2.0}
-    parallel = CAMERAS.build("parallel", views=4, detector=detector, depth_mm=200.0)
+    parallel = CAMERAS.build("parallel", n_views=4, detector=detector, depth_mm=200.0)
     sample = Hdf5Volumes(path=str(volume_file)).sample(0, 0, grid, parallel)
     seen = sample.views.sum(dim=(-1, -2)) * 2.0**2
     assert torch.allclose(seen, sample.volume.sum() * 6.0**3, rtol=2e-3)
@@ -168,7 +168,7 @@ def test_varied_copies_are_pure_differ_and_keep_their_mass_and_views(volume_file
 def test_split_pixels_join_again(name, factor):
     detector = {"pixels": [4, 6], "pixel_mm": [2.0, 3.0], "offset_mm": [1.0, -2.0]}
     cone = {"sid": 300.0, "sdd": 450.0} if name == "circular" else {}
-    cameras = CAMERAS.build(name, views=3, detector=detector, **cone)
+    cameras = CAMERAS.build(name, n_views=3, detector=detector, **cone)
     again = split_pixels(cameras, factor).binned(factor)
     assert again.shape == cameras.shape
     for key in ("source", "origin", "u", "v"):

@@ -77,7 +77,7 @@ def taken_for_a_gpu(strict, monkeypatch):
 SMALL = (
     "grid.size=[11,10,12]",
     "grid.spacing=10.0",
-    "camera.views=4",
+    "camera.n_views=4",
     "camera.detector.pixels=[12,12]",
     "camera.detector.pixel_mm=22.0",
     "data.sizes={train: 2, val: 1, test: 1}",

@@ -31,7 +31,7 @@ from tests.engine.lives import METHOD, OPTIONS
 pytestmark = pytest.mark.door
 RIG = {
     "name": "circular",
-    "views": 3,
+    "n_views": 3,
     "sid": 400.0,
     "sdd": 800.0,
     "detector": {"pixels": [12, 12], "pixel_mm": 22.0},

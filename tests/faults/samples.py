@@ -28,7 +28,7 @@ CHECKED = ("HDF5 volumes", "NIfTI, packed", "checkpoint")
 HU = np.arange(6 * 7 * 8, dtype=np.int16).reshape(6, 7, 8)
 RIG = {
     "name": "circular",
-    "views": 3,
+    "n_views": 3,
     "sid": 300.0,
     "sdd": 450.0,
     "detector": {"pixels": [10, 12], "pixel_mm": 9.0},
@@ -37,7 +37,7 @@ RIG = {
 METHOD = {
     "geometry": {
         "grid": {"shape": [6, 6, 6], "spacing": 4.0},
-        "camera": {**RIG, "views": 2, "detector": {"pixels": [6, 6], "pixel_mm": 9.0}},
+        "camera": {**RIG, "n_views": 2, "detector": {"pixels": [6, 6], "pixel_mm": 9.0}},
         "projector": {"name": "drr"},
     },
     "model": {"name": "backprojection_unet", "width": 2},

@@ -37,9 +37,9 @@ def errors(request) -> tuple[str, dict[str, float], dict[str, float]]:
     """
     rig, solids = RIGS[request.param], ellipsoids()
     x = voxelise(solids, GRID)[None, None].double()
-    fine = solids.integrals(*rig.refined(4).rays(), extent=rig.limits)
+    fine = solids.integrals(*rig.refined(4).rays(), ray_extent=rig.ray_extent)
     pixel = fine.unflatten(2, (-1, 4)).unflatten(1, (-1, 4)).mean(dim=(2, 4))
-    thin = solids.integrals(*rig.rays(), extent=rig.limits)
+    thin = solids.integrals(*rig.rays(), ray_extent=rig.ray_extent)
     of_pixel, of_thin = {}, {}
     for method in METHODS:
         for rays in (1, 4):

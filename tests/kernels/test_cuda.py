@@ -60,7 +60,7 @@ def scene(kind: str, dtype: torch.dtype = torch.float64, count: int = 1):
     grid, cameras = RIGS[kind]
     x = torch.randn(count, *grid.shape, dtype=dtype, device=DEVICE)
     y = torch.randn(count, len(cameras), *cameras.shape, dtype=dtype, device=DEVICE)
-    return x, y, lines_of(cameras, grid).to(DEVICE), list(cameras.limits), list(cameras.shape)
+    return x, y, lines_of(cameras, grid).to(DEVICE), list(cameras.ray_extent), list(cameras.shape)
 
 
 def close(one: torch.Tensor, two: torch.Tensor, tolerance: float = 1e-11) -> bool:
@@ -251,7 +251,7 @@ def test_rays_given_one_by_one(method):
     x, *_ = scene("dome")
     lines = rays_as_views(grid, cameras)
     y = torch.randn(1, len(lines), 1, 1, dtype=torch.float64, device=DEVICE)
-    window, shape = list(cameras.limits), list(x.shape[1:])
+    window, shape = list(cameras.ray_extent), list(x.shape[1:])
     views = cuda.project(x, lines, window, whole(x.shape[1:]), [1, 1], method)
     expected = reference.project(
         x, lines_of(cameras, grid).to(DEVICE), window, list(cameras.shape), method

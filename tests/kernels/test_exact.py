@@ -46,7 +46,7 @@ def box(grid: Grid) -> Phantom:
 )
 def test_a_box_of_ones_gives_the_chords(rig, backend):
     grid = Grid.centred(size=(11, 10, 9), spacing=(1.5, 2.0, 1.0))
-    expected = box(grid).integrals(*rig.rays(), extent=rig.limits)
+    expected = box(grid).integrals(*rig.rays(), ray_extent=rig.ray_extent)
     ones = torch.ones(1, 1, *grid.shape, dtype=torch.float64)
     views = PROJECTORS.build("drr", grid=grid, cameras=rig, method="siddon", backend=backend)(ones)[
         0, 0
@@ -60,7 +60,7 @@ def test_both_methods_are_exact_from_face_to_face(method, backend):
     """Rays through a plate of ones, from its upper face to its lower."""
     grid = Grid.centred(size=(44, 40, 5), spacing=(1.5, 1.0, 1.2))
     rig = dome(5, 40.0, 20.0, 50.0, {"pixels": [9, 9], "pixel_mm": 0.5})
-    expected = box(grid).integrals(*rig.rays(), extent=rig.limits)
+    expected = box(grid).integrals(*rig.rays(), ray_extent=rig.ray_extent)
     ones = torch.ones(1, 1, *grid.shape, dtype=torch.float64)
     views = PROJECTORS.build("drr", grid=grid, cameras=rig, method=method, backend=backend)(ones)[
         0, 0
@@ -76,7 +76,7 @@ def test_rays_that_miss_give_exactly_nothing(method):
         torch.rand(1, 1, 6, 6, 6)
     )[0, 0]
     grown = Grid.centred((8, 8, 8), 1.0) if method != "siddon" else grid
-    misses = box(grown).integrals(*rig.rays(), extent=rig.limits) == 0
+    misses = box(grown).integrals(*rig.rays(), ray_extent=rig.ray_extent) == 0
     assert misses.any() and not misses.all() and not views[misses].any()
     behind = Cameras(rig.source, rig.origin, rig.u, -rig.v, rig.shape, extent="behind")
     assert not PROJECTORS.build("drr", grid=grid, cameras=behind, method=method)(
@@ -98,7 +98,7 @@ def test_ellipsoids_converge_at_first_order(method, order):
     """Across a sharp edge the voxels themselves are first-order truth."""
     rig = circular(3, 100.0, 160.0, DETECTOR, start_degrees=17.0)
     solid = phantom("ellipsoid", 14.0, 17.0, 11.0)
-    expected = solid.integrals(*rig.rays(), extent=rig.limits)
+    expected = solid.integrals(*rig.rays(), ray_extent=rig.ray_extent)
     errors = [
         error(method, lambda grid: voxelise(solid, grid), expected, n, "drr", rig)
         for n in (16, 32, 64)

@@ -74,7 +74,7 @@ def gathered(views, lines, window, shape):
 def test_voxels_gather_what_rays_spread(kind):
     torch.manual_seed(0)
     grid, cameras = RIGS[kind]
-    lines, window = lines_of(cameras, grid), list(cameras.limits)
+    lines, window = lines_of(cameras, grid), list(cameras.ray_extent)
     views = torch.randn(2, len(cameras), *cameras.shape, dtype=torch.float64)
     volume, _ = gathered(views, lines, window, grid.shape)
     x = torch.randn(2, *grid.shape, dtype=torch.float64)
@@ -90,9 +90,9 @@ def test_the_rigs_have_views_of_several_main_axes(kind):
     """What the test above is for: without such views it would say nothing of them."""
     grid, cameras = RIGS[kind]
     views = torch.ones(1, len(cameras), *cameras.shape, dtype=torch.float64)
-    axes = gathered(views, lines_of(cameras, grid), list(cameras.limits), grid.shape)[1][7].reshape(
-        len(cameras), -1
-    )
+    axes = gathered(views, lines_of(cameras, grid), list(cameras.ray_extent), grid.shape)[1][
+        7
+    ].reshape(len(cameras), -1)
     assert any(len(set(row[row >= 0])) > 1 for row in axes)
 
 

@@ -87,14 +87,14 @@ def test_little_memory_is_taken_beyond_input_and_output(kind, dtype, n):
         A, warm = case.build(method=method), small.build(method=method)
         little = torch.rand(1, 16, 16, 16).to(dtype)
         ops.lines_vjp(
-            little, warm(little[None])[0], warm.lines, warm.window, warm.kernel
+            little, warm(little[None])[0], warm.lines, warm.ray_extent, warm.kernel
         )  # compiles
         x = torch.rand(1, 1, n, n, n).to(dtype)
         views, forward = least(lambda A=A, x=x: A(x))
         assert forward < views.nbytes / 2**20 + 64
         volume, back = least(lambda A=A, views=views: A.T(views))
         assert back < volume.nbytes / 2**20 + 64
-        arguments = (x[:, 0], views[:, 0], A.lines, A.window, A.kernel)
+        arguments = (x[:, 0], views[:, 0], A.lines, A.ray_extent, A.kernel)
         _, vjp = least(lambda arguments=arguments: ops.lines_vjp(*arguments))
         assert vjp < 64
 
@@ -108,10 +108,10 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
     y = y.reshape(2, len(A.lines), *A.detector)
 
     def results() -> list[torch.Tensor]:
-        back = ops.backproject(y, A.lines, A.window, list(case.grid.shape), A.kernel)
+        back = ops.backproject(y, A.lines, A.ray_extent, list(case.grid.shape), A.kernel)
         return [
-            ops.project(x, A.lines, A.window, A.detector, A.kernel),
-            ops.lines_vjp(x, y, A.lines, A.window, A.kernel),
+            ops.project(x, A.lines, A.ray_extent, A.detector, A.kernel),
+            ops.lines_vjp(x, y, A.lines, A.ray_extent, A.kernel),
             back,
         ]
 
@@ -135,7 +135,7 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
         torch.eye(3), torch.tensor([0, 3599.5, 3499.5])
     )
     A = Case(grid, rig).build()
-    held = plan.rig_of(A.lines, A.window, Occupancy.whole(grid.shape), [1, 1], method)
+    held = plan.rig_of(A.lines, A.ray_extent, Occupancy.whole(grid.shape), [1, 1], method)
     file = np.memmap(tmp_path / "holes", np.float32, "w+", shape=(1, 7203, 43, 7003, 1))
     volume = stores.store(file.view(np.ndarray), near=2)
     assert volume.size > 2**31 and volume.strides.dtype == np.int64

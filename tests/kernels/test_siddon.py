@@ -13,7 +13,7 @@ from tests.projectors.rigs import GRID, RIGS
 
 
 def slow_sum(
-    volume: torch.Tensor, grid: Grid, start: torch.Tensor, end: torch.Tensor, limits
+    volume: torch.Tensor, grid: Grid, start: torch.Tensor, end: torch.Tensor, ray_extent
 ) -> float:
     """The integral along one ray: every crossing with every plane, sorted; each piece in the voxel
     of its middle.
@@ -22,7 +22,7 @@ def slow_sum(
     step = [q - p for p, q in zip(a, b, strict=True)]
     sizes = grid.shape[::-1]
     w = sorted((k - 0.5 - a[i]) / step[i] for i in range(3) if step[i] for k in range(sizes[i] + 1))
-    w = sorted([min(max(each, limits[0]), limits[1]) for each in w])
+    w = sorted([min(max(point, ray_extent[0]), ray_extent[1]) for point in w])
     total = 0.0
     for one, two in itertools.pairwise(w):
         x, y, z = (round(a[i] + (one + two) / 2 * step[i]) for i in range(3))
@@ -40,7 +40,9 @@ def test_it_equals_the_slow_exact_sum(name, kind, rig, backend):
         0, 0
     ]
     start, end = (points.flatten(0, 2) for points in rig.rays())
-    expected = [slow_sum(x[0, 0], GRID, a, b, rig.limits) for a, b in zip(start, end, strict=True)]
+    expected = [
+        slow_sum(x[0, 0], GRID, a, b, rig.ray_extent) for a, b in zip(start, end, strict=True)
+    ]
     assert views.abs().max() > 1
     assert torch.allclose(
         views.flatten(), torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-12
@@ -52,7 +54,7 @@ def test_it_equals_the_slow_exact_sum_in_single_precision(kind):
     case = CASES[kind]
     x = noise(case)[0][:1].abs()
     rays = zip(*(points.flatten(0, 2) for points in case.rays.rays()), strict=True)
-    sums = [slow_sum(x[0, 0], case.grid, start, end, case.rays.limits) for start, end in rays]
+    sums = [slow_sum(x[0, 0], case.grid, start, end, case.rays.ray_extent) for start, end in rays]
     expected, A = torch.tensor(sums, dtype=torch.float64), case.build(method="siddon")
     # neighbours here differ by as much as they are; where a ray passes between them is known to
     # single precision

@@ -30,7 +30,7 @@ def arguments(kind: str, option: str, dtype: torch.dtype):
     A = case.build(**OPTIONS[option])
     x, y = (each[:, 0].to(dtype) for each in noise(case))
     y = y.reshape(2, len(A.lines), *A.detector)
-    return x, y, A.lines, A.window, A.detector, list(case.grid.shape), A.kernel
+    return x, y, A.lines, A.ray_extent, A.detector, list(case.grid.shape), A.kernel
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16, torch.bfloat16])

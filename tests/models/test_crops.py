@@ -52,10 +52,10 @@ def test_the_windows_of_a_crop_hold_all_that_its_inner_voxels_read(rig):
     detector = {"pixels": [36, 36], "pixel_mm": 1.0}
     if rig == "dome":
         cameras = CAMERAS.build(
-            "dome", views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector
+            "dome", n_views=3, radius=90.0, focal=40.0, aperture_degrees=60.0, detector=detector
         )
     if rig == "parallel":
-        cameras = CAMERAS.build("parallel", views=3, detector=detector)
+        cameras = CAMERAS.build("parallel", n_views=3, detector=detector)
     A = RayTransform(grid, cameras)
     whole, box = whole_geometry(A, 3), Box((8, 4, 12), (16, 12, 20))
     crop, inner = cropped_geometry(whole, box), (..., *[slice(1, -1)] * 3)

@@ -36,7 +36,7 @@ def test_lift_conserves_every_ray_integral(spacing):
 
 
 def test_frustum_chord_is_the_length_of_the_ray_in_the_box():
-    grid, cameras = small_rig(views=1, size=12, pixels=13)
+    grid, cameras = small_rig(n_views=1, size=12, pixels=13)
     chord = Frusta(grid, cameras, 240).chord[0, 0, 0]
     assert chord[6, 6].item() == pytest.approx(
         24.0, rel=1e-3
@@ -64,7 +64,7 @@ def test_warp_of_a_linear_field_is_exact_where_seen():
 def test_world_to_frustum_to_world_converges_to_second_order():
     errors = []
     for size in (12, 24, 48):
-        grid, cameras = small_rig(views=3, size=size, pixels=2 * size)
+        grid, cameras = small_rig(n_views=3, size=size, pixels=2 * size)
         frusta = Frusta(grid, cameras, 2 * size)
         r2 = voxel_centres(grid).float().square().sum(-1)
         blob = torch.exp(-r2 / (2 * (0.3 * size) ** 2))[None, None, None]
@@ -77,7 +77,7 @@ def test_pinholes_behind_their_detectors_lift_like_any_other():
     grid, _ = small_rig()
     cameras = CAMERAS.build(
         "dome",
-        views=3,
+        n_views=3,
         radius=100.0,
         focal=40.0,
         aperture_degrees=60.0,
@@ -115,7 +115,7 @@ def test_one_volume_for_all_cameras_is_one_for_each():
 
 
 def test_nothing_behind_a_source_inside_the_grid_is_occupied_or_visible():
-    grid, cameras = small_rig(views=1)
+    grid, cameras = small_rig(n_views=1)
     inner = replace(cameras, source=0.05 * cameras.source)
     frusta = Frusta(grid, inner, 12)
     z = depth_centres(depth_edges(inner.depth_range(grid), 12))[0]

@@ -27,7 +27,7 @@ NETWORKS = ("cross_view", "mean_fusion", "backprojection_unet", "geometry_free")
 def _projector(shape: tuple[int, int, int] = (12, 12, 12), pixels: int = 12) -> Projector:
     grid = Grid.centred(shape=shape, spacing=24 / max(shape))
     detector = {"pixels": [pixels, pixels], "pixel_mm": 60 / pixels}
-    cameras = CAMERAS.build("circular", views=4, sid=100.0, sdd=200.0, detector=detector)
+    cameras = CAMERAS.build("circular", n_views=4, sid=100.0, sdd=200.0, detector=detector)
     return PROJECTORS.build("drr", grid=grid, cameras=cameras)
 
 

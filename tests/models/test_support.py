@@ -9,7 +9,7 @@ from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import regions
 from mvrecon.models.model import disagreement
 from mvrecon.parts import MODELS
-from mvrecon.support.support import Support
+from mvrecon.visual_hull.support import Support
 
 HEAD = {"name": "softmax_depth"}
 MODEL_OPTIONS = {

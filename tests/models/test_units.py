@@ -23,7 +23,9 @@ def _answer(name: str, mm: float, dtype: torch.dtype, skip: dict) -> Reconstruct
     """
     grid = Grid.centred((12, 12, 12), 2.0 * mm, centre=(mm, 0.0, 0.0))
     detector = {"pixels": [12, 12], "pixel_mm": 5.0 * mm}
-    cameras = CAMERAS.build("circular", views=4, sid=100.0 * mm, sdd=200.0 * mm, detector=detector)
+    cameras = CAMERAS.build(
+        "circular", n_views=4, sid=100.0 * mm, sdd=200.0 * mm, detector=detector
+    )
     projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
     torch.manual_seed(0)
     model = _stirred(name, projector, **skip).to(dtype).eval()

@@ -68,9 +68,9 @@ def skewed(rig: Cameras) -> Cameras:
     return replace(rig, u=rig.u + 0.313 * rig.v)
 
 
-def curved(columns: int = 6, rows: int = 5, views: int = 2) -> ExplicitRays:
+def curved(columns: int = 6, rows: int = 5, n_views: int = 2) -> ExplicitRays:
     """A detector on a cylinder about each source."""
-    turn = torch.arange(views, dtype=torch.float64)[:, None, None] * 1.9 + 0.3
+    turn = torch.arange(n_views, dtype=torch.float64)[:, None, None] * 1.9 + 0.3
     fan = (torch.arange(columns, dtype=torch.float64) - (columns - 1) / 2) * 0.045 + 0.01
     height = (torch.arange(rows, dtype=torch.float64)[:, None] - (rows - 1) / 2) * 2.2 + 0.3
     source = 40 * torch.stack([turn.cos(), turn.sin(), 0 * turn], dim=-1)

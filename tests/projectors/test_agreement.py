@@ -24,7 +24,9 @@ def oblique(monkeypatch):
 def test_the_cases_stand_upright_where_they_say_so():
     for kind, case in CASES.items():
         A = case.build()
-        rig = plan.rig_of(A.lines, A.window, Occupancy.whole(case.grid.shape), A.detector, "joseph")
+        rig = plan.rig_of(
+            A.lines, A.ray_extent, Occupancy.whole(case.grid.shape), A.detector, "joseph"
+        )
         assert upright.columnar(rig).tolist() == [case.upright] * len(A.lines), kind
 
 
@@ -86,7 +88,7 @@ def test_pieces_of_the_volume_add_up(kind, option, monkeypatch):
     for budget in (1, 4 * 8 * (whole[1][:1, :1].numel() + 300) // 2):
         monkeypatch.setattr(plan, "BUDGET", budget)
         held = Occupancy.whole(case.grid.shape)
-        rig = plan.rig_of(A.lines, A.window, held, A.detector, A.kernel)
+        rig = plan.rig_of(A.lines, A.ray_extent, held, A.detector, A.kernel)
         assert len(list(plan.pieces(rig, held, 4, 8))) > 1 or "trilinear" in A.kernel
         assert gap(A(x), whole[0]) < 1e-12 and gap(A.T(y), whole[1]) < 1e-12
 

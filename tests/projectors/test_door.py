@@ -1,13 +1,17 @@
 """What a projector refuses, and what it does with unusual input."""
 
 import re
+from copy import copy
 
 import pytest
 import torch
 
+from mvrecon.cameras.camera import VECTORS
+from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.selection import view_subset
+from tests.projectors.cases import curved
 from tests.projectors.rigs import CONE, GRID, PARALLEL
 
 
@@ -65,11 +69,26 @@ def test_another_device_is_refused(A):
         A(torch.zeros(1, 1, *GRID.shape, device="meta"))
 
 
-def test_a_grid_and_a_rig_on_different_devices_are_refused():
-    elsewhere = CONE[:]
-    object.__setattr__(elsewhere, "source", elsewhere.source.to("meta"))
-    with pytest.raises(ValueError, match="one device, got cpu and meta"):
-        PROJECTORS.build("drr", grid=GRID, cameras=elsewhere)
+def elsewhere(rays, names: tuple[str, ...]):
+    """The same rays without their numbers, as if on another device."""
+    moved = copy(rays)
+    for name in names:
+        object.__setattr__(moved, name, getattr(rays, name).to("meta"))
+    return moved
+
+
+@pytest.mark.parametrize("rig", [CONE, PARALLEL], ids=["cone", "parallel"])
+def test_lines_lie_on_the_device_of_their_cameras(rig):
+    lines = lines_of(elsewhere(rig, VECTORS), GRID)
+    assert lines.is_meta and lines.shape == (len(rig), 4, 3, 3)
+
+
+def test_an_operator_computes_where_its_rays_are():
+    """A grid is a few numbers on the CPU, and ties no operator to it."""
+    rays = elsewhere(curved(), ("source", "target"))
+    support = torch.ones(GRID.shape, dtype=torch.bool)
+    A = PROJECTORS.build("drr", grid=GRID, cameras=rays, support=support, skip="off")
+    assert GRID.affine.device.type == "cpu" and A.device.type == "meta" and A.support.is_meta
 
 
 def test_a_rig_of_the_other_kind_names_the_projector_for_it():

@@ -90,7 +90,7 @@ def test_a_curved_detector_sees_the_chords_of_a_box(backend):
     half = torch.tensor([[n * mm / 2 for n, mm in sizes]], dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64)[None]
     box = Phantom((Solids("box", GRID.centre[None], eye, half, torch.ones(1)),))
-    rays = curved(columns=14, rows=9, views=5)
+    rays = curved(columns=14, rows=9, n_views=5)
     chords = box.integrals(rays.source, rays.target)
     A = PROJECTORS.build("drr", grid=GRID, cameras=rays, method="siddon", backend=backend)
     assert chords.max() > 6 and (chords == 0).any()

@@ -304,7 +304,9 @@ def test_of_a_full_volume_few_voxels_are_looked_at(monkeypatch):
     case = CASES["cone"]
     A = replace(case, grid=Grid.centred((64, 64, 64), 1.0)).build(skip="auto")
     full = torch.rand(1, 64, 64, 64) + 0.1
-    held = choice.occupancy_of(full, choice.Scene(A.lines, A.window, A.detector, A.kernel), "auto")
+    held = choice.occupancy_of(
+        full, choice.Scene(A.lines, A.ray_extent, A.detector, A.kernel), "auto"
+    )
     assert held.box == Box.whole((64, 64, 64)) and held.bricks is None
     assert 0 < Counted.reads < full.numel() / 200
 
@@ -319,6 +321,6 @@ def test_compiled_and_mapped_calls_skip_too():
 def test_the_reference_needs_no_skipping():
     A = CASES["cone"].build(backend="reference", skip="brick")
     x = volumes("blob", torch.float64)
-    expected = reference.project(x[0], A.lines, A.window, A.detector, A.kernel)
+    expected = reference.project(x[0], A.lines, A.ray_extent, A.detector, A.kernel)
     assert torch.equal(A(x)[0], expected) and A.skipped.mode == "off"
     assert replace(A.skipped, why="") == replace(A.with_support(None).skipped, why="")

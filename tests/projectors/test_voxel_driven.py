@@ -20,7 +20,7 @@ EVERY = {**CENTRAL, "parallel": PARALLEL, "line": replace(PARALLEL, extent="line
 def test_compiled_equals_the_reference_and_its_transpose_is_exact(kind, weight):
     torch.manual_seed(0)
     rig = EVERY[kind]
-    maps, window, weighted = image_maps(rig, GRID), list(rig.limits), weight == "distance"
+    maps, window, weighted = image_maps(rig, GRID), list(rig.ray_extent), weight == "distance"
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-5)):
         y = torch.randn(2, 2, len(rig), *rig.shape, dtype=dtype)
         seen = backproject(y, rig, GRID, weight, "cpu")
@@ -130,7 +130,7 @@ def test_gradients_in_views_and_cameras():
 
 
 def test_torch_accepts_the_operators_and_compiles_and_maps_them():
-    maps, window, shape = image_maps(CONE, GRID), list(CONE.limits), list(GRID.shape)
+    maps, window, shape = image_maps(CONE, GRID), list(CONE.ray_extent), list(GRID.shape)
     y = torch.randn(2, 4, *CONE.shape, dtype=torch.float64, requires_grad=True)
     x = torch.randn(2, *GRID.shape, dtype=torch.float64, requires_grad=True)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
@@ -159,7 +159,7 @@ def test_threads_change_no_bit(monkeypatch):
         torch.randn(2, *GRID.shape),
         torch.get_num_threads(),
     )
-    maps, window, results = image_maps(CONE, GRID), list(CONE.limits), []
+    maps, window, results = image_maps(CONE, GRID), list(CONE.ray_extent), []
     for count in (1, 2, 3, 7):
         torch.set_num_threads(count)
         back = voxel_ops.show(x, maps, window, True, list(CONE.shape))

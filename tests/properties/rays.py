@@ -55,7 +55,7 @@ def course(case: Case, grown: float = 0.0, inner: bool = False) -> Course:
     safe = torch.where(moves, way, 1.0)
     near, far = (-margin - one) / safe, (high - one) / safe
     within = (one >= -margin) & (one <= high)
-    none, least, most = torch.tensor(torch.inf).double(), *case.rays.limits
+    none, least, most = torch.tensor(torch.inf).double(), *case.rays.ray_extent
     enter = (
         torch.where(moves, torch.minimum(near, far), torch.where(within, -none, none))
         .amax(dim=-1)
@@ -82,7 +82,7 @@ def faded(case: Case) -> Float[Tensor, "m v u"]:
     the middle the ray may be half a voxel further out still, as its slope is at most one. All of it
     is said in voxels, so a sheared grid is like any other.
     """
-    (one, way), (least, most) = _indexed(case), case.rays.limits
+    (one, way), (least, most) = _indexed(case), case.rays.ray_extent
     sizes = torch.tensor(case.grid.shape[::-1], dtype=torch.float64)
     main = way.abs().argmax(dim=-1, keepdim=True)
     begin, pace, count = one.gather(-1, main), way.gather(-1, main), sizes[main]

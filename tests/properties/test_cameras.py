@@ -19,7 +19,7 @@ CENTRAL = {"case": cases(parallel=False)}
 
 def some_pixels(cameras: Cameras, seed: int, count: int = 20) -> Tensor:
     """Pixel coordinates and depths on the side of each camera that counts, [m n 3]."""
-    least, most = (max(min(w, 3.0), -3.0) for w in cameras.limits)
+    least, most = (max(min(w, 3.0), -3.0) for w in cameras.ray_extent)
     t = torch.rand(
         len(cameras), count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
     )

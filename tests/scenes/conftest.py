@@ -9,7 +9,7 @@ class ParallelRig:
     them.
     """
 
-    limits = (0.0, 1.0)
+    ray_extent = (0.0, 1.0)
 
     def rays(self):
         across = (torch.arange(72, dtype=torch.float64) - 35.5) * 5 / 3

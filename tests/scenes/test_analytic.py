@@ -99,9 +99,9 @@ def test_inside_holds_what_cancels(grid, rig):
 def test_views_follow_the_limits_of_the_rig(grid, rig):
     scene = SCENES.build("ellipsoids")
     whole = scene.sample(0, 0, grid, rig).views
-    rig.limits = (-math.inf, 0.5)
+    rig.ray_extent = (-math.inf, 0.5)
     first = scene.sample(0, 0, grid, rig).views
-    rig.limits = (0.5, math.inf)
+    rig.ray_extent = (0.5, math.inf)
     second = scene.sample(0, 0, grid, rig).views
     torch.testing.assert_close(first + second, whole, atol=1e-4, rtol=1e-5)
     assert first.sum() > 0 and second.sum() > 0

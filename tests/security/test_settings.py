@@ -18,7 +18,7 @@ APPS = {
     "stress": "mvrecon_bench.stress",
 }
 UNUSED = [
-    ("eval", "+camera.views=12"),
+    ("eval", "+camera.n_views=12"),
     ("eval", "+camera=circular"),
     ("eval", "+grid.spacing=2.0"),
     ("eval", "+projector.name=drr"),
@@ -28,7 +28,7 @@ UNUSED = [
     ("train", "+checkpoint=x"),
     ("train", "+device=cpu"),
     ("train", "+save=true"),
-    ("train", "+camra.views=12"),
+    ("train", "+camra.n_views=12"),
     ("simulate", "+projector.name=drr"),
     ("simulate", "+model.name=sirt"),
     ("bench", "+device=cpu"),
@@ -52,7 +52,7 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
 
 @pytest.mark.door
 @pytest.mark.parametrize(
-    "option", ["seed=5", "camera.views=12", "grid.spacing=2.0", "projector=drr"]
+    "option", ["seed=5", "camera.n_views=12", "grid.spacing=2.0", "projector=drr"]
 )
 def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
     """The seed, the rig, the grid and the projector of an evaluation are those of the run, and

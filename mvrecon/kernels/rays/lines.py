@@ -32,14 +32,14 @@ def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
     """The rays of every view: the matrices that take p to (direction, moment, start, direction in
     world mm).
 
-    The first three are in voxel indices (x, y, z) about the volume's centre; float64,
-    differentiable in the cameras.
+    The first three are in voxel indices (x, y, z) about the volume's centre; float64, on the
+    cameras' device, differentiable in the cameras.
     """
     rows, columns = cameras.shape
-    voxel = torch.linalg.inv(grid.affine[:3, :3])
+    centre, voxel = _voxels(grid, cameras.source)
     middle = cameras.u * ((columns - 1) / 2) + cameras.v * ((rows - 1) / 2)
     look = cameras.origin - cameras.source + (0 if cameras.parallel else middle)
-    source = (cameras.source - grid.centre + (middle if cameras.parallel else 0)) @ voxel.T
+    source = (cameras.source - centre + (middle if cameras.parallel else 0)) @ voxel.T
     U, V, axis = cameras.u @ voxel.T, cameras.v @ voxel.T, look @ voxel.T
     none = torch.zeros_like(U)
     if cameras.parallel:
@@ -47,7 +47,7 @@ def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
         moment = tuple(torch.linalg.cross(each, axis) for each in start)
     else:
         # source x (detector - source) = source x detector
-        detector = (cameras.origin - grid.centre + middle) @ voxel.T
+        detector = (cameras.origin - centre + middle) @ voxel.T
         world, direction, start = (cameras.u, cameras.v, look), (U, V, axis), (none, none, source)
         moment = tuple(torch.linalg.cross(source, each) for each in (U, V, detector))
     maps = [torch.stack(columns, dim=-1) for columns in (direction, moment, start, world)]
@@ -58,11 +58,16 @@ def lines_of_rays(rays: ExplicitRays, grid: Grid) -> Float[Tensor, "r 4 3 1"]:
     """Rays given one by one, each as a view of one pixel: maps of the constant alone, as in
     `lines_of`.
     """
-    voxel = torch.linalg.inv(grid.affine[:3, :3])
+    centre, voxel = _voxels(grid, rays.source)
     source, target = rays.source.flatten(0, 2), rays.target.flatten(0, 2)
-    start, end = ((points - grid.centre) @ voxel.T for points in (source, target))
+    start, end = ((points - centre) @ voxel.T for points in (source, target))
     maps = (end - start, torch.linalg.cross(start, end), start, target - source)
     return torch.stack(maps, dim=1)[..., None]
+
+
+def _voxels(grid: Grid, like: Tensor) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+    """The grid's centre in world mm, and what takes mm to voxels (x, y, z); where `like` is."""
+    return grid.centre.to(like), torch.linalg.inv(grid.affine[:3, :3]).to(like)
 
 
 def tensors_of(rays: Cameras | ExplicitRays) -> list[Tensor]:

@@ -57,7 +57,7 @@ def segments(box: Grid, cameras: Cameras) -> Cameras:
     )  # beyond what a kernel reaches
     depth = cameras.depth_range(box).detach() + torch.tensor([-margin, margin]).to(cameras.source)
     w = depth / cameras.distance.detach()[:, None]
-    low, high = w.clamp(*cameras.limits).unbind(dim=-1)
+    low, high = w.clamp(*cameras.ray_extent).unbind(dim=-1)
     axis = cameras.origin - cameras.source
     if cameras.parallel:
         high = torch.maximum(

@@ -107,7 +107,7 @@ def seen(case: str) -> tuple[Tensor, Tensor]:
     """The phantom's voxels and its exact views."""
     grid, rig = CASES[case]
     return voxelise(phantom(), grid)[None, None], phantom().integrals(
-        *rig.rays(), extent=rig.limits
+        *rig.rays(), ray_extent=rig.ray_extent
     )[None, None]
 
 
@@ -164,9 +164,9 @@ def test_half_a_voxel_or_pixel_a_flip_or_a_turn_would_exceed_the_tolerance(case:
             moved = replace(
                 rig, origin=rig.origin + shift, source=rig.source + (shift if rig.parallel else 0)
             )
-            wrong[f"half a pixel {axis}"] = phantom().integrals(*moved.rays(), extent=rig.limits)[
-                None, None
-            ]
+            wrong[f"half a pixel {axis}"] = phantom().integrals(
+                *moved.rays(), ray_extent=rig.ray_extent
+            )[None, None]
     for name, views in wrong.items():
         assert error(views, exact) > TOLERANCE, name
     assert error(right, exact) < TOLERANCE

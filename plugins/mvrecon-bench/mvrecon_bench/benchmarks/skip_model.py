@@ -18,7 +18,7 @@ from mvrecon.metrics import volume_metrics
 from mvrecon.models.geometry import MULTIPLE
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
-from mvrecon.support.support import Support, support_from_views
+from mvrecon.visual_hull.support import Support, support_from_views
 from mvrecon_bench.benchmarks.skip_scenes import Seen, cube, edge, rig, seen
 from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial, pasted
 

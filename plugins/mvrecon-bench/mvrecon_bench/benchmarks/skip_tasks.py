@@ -19,7 +19,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.reconstruct.iterative import sirt
-from mvrecon.support.support import support_from_views
+from mvrecon.visual_hull.support import support_from_views
 from mvrecon_bench.benchmarks.skip_scenes import Filled
 
 OFF, CROPPED = "off", "cropped"

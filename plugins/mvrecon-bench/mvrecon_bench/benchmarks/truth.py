@@ -50,7 +50,7 @@ def truth_of(case: Case, rays: int) -> Truth:
     """
     grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
     volume = voxelise(phantom, grid)
-    thin = phantom.integrals(*rig.rays(), extent=rig.limits)
+    thin = phantom.integrals(*rig.rays(), ray_extent=rig.ray_extent)
     pixel = pixel_mean(phantom, rig, rays)
     watched = torch.linspace(0, len(rig) - 1, min(WATCHED, len(rig))).long()
     cotangent = torch.randn(thin.shape, generator=torch.Generator().manual_seed(0))
@@ -89,7 +89,7 @@ def pixel_mean(phantom: Phantom, cameras: Cameras, rays: int) -> Float[Tensor, "
     """Mean of the exact integrals over rays x rays rays that fill each pixel evenly, in float64."""
     fine = split(cameras, rays)
     return torch.cat(
-        [binned(phantom.integrals(*one.rays(), extent=one.limits), rays) for one in fine]
+        [binned(phantom.integrals(*one.rays(), ray_extent=one.ray_extent), rays) for one in fine]
     )
 
 

@@ -24,12 +24,12 @@ NEEDED = {"head": {"name": "softmax_depth"}}
 CHEAPER = {"iterations": 8, "start": 4}
 
 
-def small_rig(views: int = 3) -> Cameras:
+def small_rig(n_views: int = 3) -> Cameras:
     """Cone beams that miss the grid at the detectors' edges; the detectors' sizes are multiples of
     3.
     """
     return circular(
-        views, 60.0, 120.0, {"pixels": [12, 15], "pixel_mm": [5.0, 4.5]}, start_degrees=13.0
+        n_views, 60.0, 120.0, {"pixels": [12, 15], "pixel_mm": [5.0, 4.5]}, start_degrees=13.0
     )
 
 

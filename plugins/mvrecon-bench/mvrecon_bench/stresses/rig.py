@@ -23,7 +23,7 @@ from mvrecon_bench.stresses.subject import DETECTOR, Subject
 
 #: What a camera gets that asks for it by this name, has no default for it and was not given it.
 SMALL = {
-    "views": 3,
+    "n_views": 3,
     "sid": 40.0,
     "sdd": 70.0,
     "radius": 30.0,

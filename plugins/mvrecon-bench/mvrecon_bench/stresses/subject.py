@@ -162,10 +162,10 @@ class ProjectorSubject(Subject):
             raise DoesNotApply(f"its rays are of extent {self.beam[1]!r}")
 
     def rig(
-        self, grid: Grid = GRID, detector: Mapping[str, Any] | None = None, views: int = 3
+        self, grid: Grid = GRID, detector: Mapping[str, Any] | None = None, n_views: int = 3
     ) -> Cameras:
         """A rig in a generic pose that sees the grid, in units of its size."""
-        return rig_about(grid, *self.beam, detector=detector, views=views)
+        return rig_about(grid, *self.beam, detector=detector, n_views=n_views)
 
     def rays(self, start: Float[Tensor, "m 3"], end: Float[Tensor, "m 3"]) -> Cameras:
         """One camera of one pixel for each ray from `start` to `end` (mm); a pinhole's ray goes on
@@ -215,7 +215,7 @@ def rig_about(
     is_parallel: bool = False,
     extent: Extent = "segment",
     detector: Mapping[str, Any] | None = None,
-    views: int = 3,
+    n_views: int = 3,
 ) -> Cameras:
     """A rig in a generic pose about a grid's centre, sized for `GRID` and scaled to the given
     one.
@@ -228,11 +228,11 @@ def rig_about(
             [each * scale for each in value] if isinstance(value, list) else value * scale
         )
     if is_parallel:
-        rig = parallel(views, given, 60.0 * scale, start_degrees=11.0)
+        rig = parallel(n_views, given, 60.0 * scale, start_degrees=11.0)
     elif extent == "behind":
-        return dome(views, 30.0 * scale, 20.0 * scale, 120.0, given, target=grid.centre.tolist())
+        return dome(n_views, 30.0 * scale, 20.0 * scale, 120.0, given, target=grid.centre.tolist())
     else:
-        rig = circular(views, 40.0 * scale, 70.0 * scale, given, start_degrees=13.0)
+        rig = circular(n_views, 40.0 * scale, 70.0 * scale, given, start_degrees=13.0)
     return rig.moved(torch.eye(3), grid.centre)
 
 

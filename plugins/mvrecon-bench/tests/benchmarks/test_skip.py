@@ -14,7 +14,8 @@ pytest.importorskip("matplotlib")
 
 N = 16
 MODEL = (
-    "{n: 16, rig: {name: circular, views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, pixels: 12}, "
+    "{n: 16, rig: {name: circular, n_views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, "
+    "pixels: 12}, "
     "cases: 2,"
     " modes: [auto, hull], checkpoints: {heart: null}, model: {name: cross_view, head: {name: "
     "softmax_depth},"
@@ -23,8 +24,8 @@ MODEL = (
 SMALL = (
     "bench=skip",
     f"bench.base={{n: {N}, device: cpu, threads: 1}}",
-    "bench.rigs.cone.views=2",
-    "bench.rigs.dome.views=2",
+    "bench.rigs.cone.n_views=2",
+    "bench.rigs.dome.n_views=2",
     "bench.rigs.dcspect80.pixels=6",
     "+bench.rigs.dcspect80.rows=[1]",
     "+bench.rigs.dcspect80.columns=[3, 12]",
@@ -159,7 +160,7 @@ def trained(tmp_path):
         "grid": {"shape": [8, 12, 12], "spacing": 12.0},
         "camera": {
             "name": "circular",
-            "views": 3,
+            "n_views": 3,
             "sid": 600.0,
             "sdd": 900.0,
             "detector": {"pixels": 12, "pixel_mm": 18.0},

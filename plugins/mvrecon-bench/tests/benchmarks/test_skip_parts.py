@@ -114,7 +114,7 @@ def test_head_and_neck_are_a_patient_where_a_file_is_given(tmp_path):
 def test_cameras_cover_the_cube():
     grid = cube({}, 8)
     cameras = rig(
-        {"name": "circular", "views": 3, "sid": 500.0, "sdd": 1000.0, "cover": 2.0}, edge(grid), 8
+        {"name": "circular", "n_views": 3, "sid": 500.0, "sdd": 1000.0, "cover": 2.0}, edge(grid), 8
     )
     assert len(cameras) == 3 and cameras.shape == (8, 8)
     assert cameras.u.norm(dim=1).tolist() == pytest.approx([2 * 256 / 8] * 3)
@@ -124,7 +124,7 @@ def test_cameras_cover_the_cube():
 def test_the_hull_holds_what_is_there_and_the_crop_is_the_same_operator():
     scene = {"volume": {"name": "ventricle", "field": 0.3}}
     cameras = rig(
-        {"name": "circular", "views": 4, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N
+        {"name": "circular", "n_views": 4, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N
     )
     bed = Bed(filled(scene, cube(scene, N)), cameras, "siddon")
     assert (bed.within_hull.mask | ~bed.mask).all() and not bed.within_hull.mask.all()
@@ -141,7 +141,7 @@ def test_the_hull_holds_what_is_there_and_the_crop_is_the_same_operator():
 def test_views_of_a_scene_are_its_own():
     scene = {"volume": {"name": "ventricle", "field": 0.3}}
     cameras = rig(
-        {"name": "circular", "views": 2, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N
+        {"name": "circular", "n_views": 2, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N
     )
     A = PROJECTORS.build("drr", grid=cube(scene, N), cameras=cameras)
     case, other = seen(scene, A), seen(scene, A, 1)

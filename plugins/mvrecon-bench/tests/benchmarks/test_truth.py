@@ -25,7 +25,7 @@ def test_the_pixel_average_of_a_box_that_half_covers_a_pixel():
         (Solids("box", torch.zeros(1, 3), torch.eye(3)[None], half, torch.tensor([0.5])),)
     )
     rig = RIGS["axis_parallel"](Case(n=64, camera="axis_parallel"))[0]
-    thin = phantom.integrals(*rig.rays(), extent=rig.limits)
+    thin = phantom.integrals(*rig.rays(), ray_extent=rig.ray_extent)
     mean = truth.pixel_mean(phantom, rig, 4)
     row = mean[0, 32]  # inside the box along z
     assert sorted(set(row.tolist())) == pytest.approx(
@@ -72,7 +72,9 @@ def test_the_boxes_are_exact_in_voxels_and_so_is_siddon():
         volume[None, None]
     )
     assert (
-        truth.relative_error(views[0, 0], case.phantom().integrals(*rig.rays(), extent=rig.limits))
+        truth.relative_error(
+            views[0, 0], case.phantom().integrals(*rig.rays(), ray_extent=rig.ray_extent)
+        )
         < 1e-6
     )
 

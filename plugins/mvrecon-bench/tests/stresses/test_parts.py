@@ -16,21 +16,21 @@ from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, judge
 DETECTOR = {"pixels": 4, "pixel_mm": 2.0}
 
 
-def helix(pitch_mm: float, views: int):
+def helix(pitch_mm: float, n_views: int):
     """A camera with an option of a name of its own."""
-    return circular(views, 40.0 + pitch_mm, 70.0, DETECTOR)
+    return circular(n_views, 40.0 + pitch_mm, 70.0, DETECTOR)
 
 
-def many(views: int, detector):
+def many(n_views: int, detector):
     """A camera that refuses a small number of views."""
-    if views < 5:
-        raise ValueError(f"views must be at least 5, got {views}")
-    return circular(views, 40.0, 70.0, detector)
+    if n_views < 5:
+        raise ValueError(f"n_views must be at least 5, got {n_views}")
+    return circular(n_views, 40.0, 70.0, detector)
 
 
-def unsteady(views: int):
+def unsteady(n_views: int):
     """A camera that breaks its contract."""
-    return circular(views, 40.0 + float(torch.rand(())), 70.0, DETECTOR)
+    return circular(n_views, 40.0 + float(torch.rand(())), 70.0, DETECTOR)
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_a_camera_that_needs_other_options_is_left_out_and_told_why(plugin, name
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("helix", {"pitch_mm": 2.0}), ("many", {"views": 6})]
+    ("name", "options"), [("helix", {"pitch_mm": 2.0}), ("many", {"n_views": 6})]
 )
 def test_a_camera_with_options_of_its_own_is_measured(plugin, name, options):
     assert all(row["verdict"] != LEFT_OUT for row in verdicts(name, **options).values())
@@ -62,7 +62,7 @@ def test_a_camera_that_breaks_its_contract_fails(plugin):
 
 
 def test_wrong_options_of_a_user_are_a_failure_and_no_excuse(plugin):
-    assert verdicts("many", views=3, detector=DETECTOR)["cameras far away"]["verdict"] == FAIL
+    assert verdicts("many", n_views=3, detector=DETECTOR)["cameras far away"]["verdict"] == FAIL
 
 
 def test_a_model_that_needs_other_options_is_left_out(monkeypatch):

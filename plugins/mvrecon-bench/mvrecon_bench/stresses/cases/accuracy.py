@@ -40,7 +40,7 @@ def sharp(subject: ProjectorSubject) -> float:
     """
     solids = _solids()
     return 0.9 - _order(
-        subject, _voxels, lambda rig: solids.integrals(*rig.rays(), extent=rig.limits)
+        subject, _voxels, lambda rig: solids.integrals(*rig.rays(), ray_extent=rig.ray_extent)
     )
 
 
@@ -81,7 +81,7 @@ def _order(
     rig = subject.rig(
         _box(GRIDS[0]),
         {"pixels": [20, 21], "pixel_mm": [0.31, 0.33], "offset_mm": [0.03, 0.05]},
-        views=4,
+        n_views=4,
     )
     rig = rig.moved(
         random_rotation(torch.Generator().manual_seed(0)), torch.zeros(3)

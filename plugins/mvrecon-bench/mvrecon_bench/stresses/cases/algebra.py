@@ -28,7 +28,7 @@ def adjoint(subject: ProjectorSubject) -> float:
             Grid.centred(size=shape[::-1], spacing=spacing.tolist(), centre=centre.tolist()), rng
         )
         rig = subject.rig(
-            grid, {"pixels": pixels, "pixel_mm": pitch, "offset_mm": offset}, views=1 + seed % 3
+            grid, {"pixels": pixels, "pixel_mm": pitch, "offset_mm": offset}, n_views=1 + seed % 3
         )
         R = random_rotation(rng)
         A = subject.projector(grid, rig.moved(R, grid.centre - R @ grid.centre))

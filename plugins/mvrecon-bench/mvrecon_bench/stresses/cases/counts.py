@@ -27,7 +27,7 @@ def single_precision(subject: ProjectorSubject) -> float:
     """
     grid = Grid.centred((32, 32, 32), 2.0)
     A = operator(
-        subject, grid, detector={"pixels": [20, 20], "pixel_mm": 0.65, "offset_mm": 0.0}, views=5
+        subject, grid, detector={"pixels": [20, 20], "pixel_mm": 0.65, "offset_mm": 0.0}, n_views=5
     )
     phantom = derenzo(radius=30.0, height=40.0, background=0.1)
     truth = phantom.values(voxel_centres(grid)).to(subject.device)[None, None]

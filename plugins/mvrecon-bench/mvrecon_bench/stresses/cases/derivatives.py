@@ -24,7 +24,7 @@ def differences(subject: ProjectorSubject) -> float:
     """Derivatives by the volume and by every vector of the cameras, against central differences
     along four ways.
     """
-    views, vectors = subject.posed(SMALL, subject.rig(SMALL, FEW, views=2))
+    views, vectors = subject.posed(SMALL, subject.rig(SMALL, FEW, n_views=2))
     inputs = [subject.random(1, 1, *SMALL.shape).requires_grad_(), *vectors]
     rng, worst = torch.Generator().manual_seed(0), 0.0
     weights = subject.random(1, 1, 2, 3, 2, seed=1)
@@ -62,7 +62,7 @@ def twice(subject: ProjectorSubject) -> float:
     """Second derivatives: by views and volume the operator itself; by the pose right, or
     NotImplementedError.
     """
-    rig = subject.rig(SMALL, FEW, views=2)
+    rig = subject.rig(SMALL, FEW, n_views=2)
     A, x, y = (
         subject.projector(SMALL, rig),
         subject.random(1, 1, *SMALL.shape),
@@ -80,7 +80,7 @@ def twice_by_pose(subject: ProjectorSubject) -> float:
     """A second derivative by the source, against differences of the first, unless
     NotImplementedError tells of none.
     """
-    views, (source, *others) = subject.posed(SMALL, subject.rig(SMALL, FEW, views=2))
+    views, (source, *others) = subject.posed(SMALL, subject.rig(SMALL, FEW, n_views=2))
     volume, way = subject.random(1, 1, *SMALL.shape), torch.randn(source.shape, dtype=torch.float64)
 
     def slope(at: Tensor, graph: bool = False) -> Tensor:
@@ -99,7 +99,7 @@ def twice_by_pose(subject: ProjectorSubject) -> float:
 
 def mapped(subject: ProjectorSubject) -> float:
     """vmap over volumes and over views, and maps in maps: what a loop gives."""
-    A = subject.projector(SMALL, subject.rig(SMALL, FEW, views=2))
+    A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2))
     x, y = subject.random(3, 2, 1, 1, *SMALL.shape), subject.random(3, 2, 1, 1, 2, 3, 2)
     worst = 0.0
     for act, given in ((A, x), (A.T, y)):
@@ -115,7 +115,7 @@ def mapped(subject: ProjectorSubject) -> float:
 def jacobian(subject: ProjectorSubject, act: Callable[..., Tensor]) -> float:
     """The Jacobian, its rows or columns mapped over: the views of every voxel alone."""
     A, x = (
-        subject.projector(SMALL, subject.rig(SMALL, FEW, views=2)),
+        subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2)),
         subject.random(1, 1, *SMALL.shape),
     )
     columns = torch.stack(
@@ -133,7 +133,7 @@ def pushed(subject: ProjectorSubject) -> float:
     """Derivatives forwards, by volume and by views: the operator, or its adjoint, on the
     tangent.
     """
-    A, worst = subject.projector(SMALL, subject.rig(SMALL, FEW, views=2)), 0.0
+    A, worst = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2)), 0.0
     for act, shape in ((A, (1, 1, *SMALL.shape)), (A.T, (1, 1, 2, 3, 2))):
         given, tangent = subject.random(*shape), subject.random(*shape, seed=1)
         worst = greatest([worst, gap(torch.func.jvp(act, (given,), (tangent,))[1], act(tangent))])
@@ -144,7 +144,7 @@ def compiled(subject: ProjectorSubject) -> float:
     """Operator, adjoint and pointwise functions in one graph, then of another size: values and
     gradients the same.
     """
-    A = subject.projector(SMALL, subject.rig(SMALL, FEW, views=2))
+    A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2))
     x = subject.random(1, 1, *SMALL.shape).requires_grad_()
 
     def step(x: Tensor) -> Tensor:

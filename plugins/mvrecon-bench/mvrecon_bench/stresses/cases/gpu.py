@@ -64,7 +64,7 @@ def huge_views(subject: ProjectorSubject) -> float:
     need_gpu(subject, 48)
     middle = (LONG - 1) / 2
     detector = {"pixels": [LONG, LONG], "pixel_mm": 1.0, "offset_mm": [3.0 - middle, 2.5 - middle]}
-    rig = subject.rig(detector=detector, views=1)
+    rig = subject.rig(detector=detector, n_views=1)
     A, B = (
         subject.projector(GRID, each)
         for each in (rig, band(rig, LONG - FEW, LONG - FEW, (FEW, FEW)))

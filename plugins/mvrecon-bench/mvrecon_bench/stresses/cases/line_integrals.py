@@ -9,8 +9,8 @@ import torch
 
 from mvrecon.reconstruct.iterative import sirt, sirt_weights
 from mvrecon.reconstruct.mlem import mlem
-from mvrecon.support.hull import visual_hull
-from mvrecon.support.noise import noise_threshold
+from mvrecon.visual_hull.hull import visual_hull
+from mvrecon.visual_hull.noise import noise_threshold
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.counts import ASIDE, operator
 from mvrecon_bench.stresses.refusals import none_of, refusal

@@ -36,7 +36,7 @@ OF_APPS = ("hydra", "lightning", "tensorboard", "matplotlib", "kornia", "scipy")
 
 def both(subject: ProjectorSubject) -> list[Tensor]:
     """Views and adjoint of some noise, in main memory."""
-    A = subject.projector(WORK, rig := subject.rig(WORK, PIXELS, views=2))
+    A = subject.projector(WORK, rig := subject.rig(WORK, PIXELS, n_views=2))
     x, y = subject.random(1, 1, *WORK.shape), subject.random(1, 1, len(rig), *rig.shape, seed=1)
     return [A(x).cpu(), A.T(y).cpu()]
 
@@ -181,7 +181,7 @@ def evaluation_draws_nothing(subject: Subject) -> float:
 def loops(subject: ProjectorSubject) -> float:
     """Forward and backward again and again: by how many volumes memory grows in a loop."""
     grid = Grid.centred(size=(34, 33, 32), spacing=1.0)
-    A = subject.projector(grid, subject.rig(grid, {"pixels": [4, 4], "pixel_mm": 6.0}, views=2))
+    A = subject.projector(grid, subject.rig(grid, {"pixels": [4, 4], "pixel_mm": 6.0}, n_views=2))
     x = subject.random(1, 1, *grid.shape).requires_grad_()
 
     def run(count: int) -> None:

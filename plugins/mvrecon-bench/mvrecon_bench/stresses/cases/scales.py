@@ -142,7 +142,7 @@ def coarse_and_fine(subject: ProjectorSubject) -> float:
     blob, worst = Blob(grid.centre + torch.tensor([0.3, -0.2, 0.4]), 7.0), 0.0
     volume = blob.values(grid).to(subject.device, subject.dtype)[None, None]
     for mm in (1.2, 0.003):
-        rig = subject.rig(grid, {"pixels": [6, 5], "pixel_mm": mm}, views=7)
+        rig = subject.rig(grid, {"pixels": [6, 5], "pixel_mm": mm}, n_views=7)
         seen, expected = (
             subject.projector(grid, rig)(volume)[0, 0].double().cpu(),
             blob.integrals(*rig.rays()),

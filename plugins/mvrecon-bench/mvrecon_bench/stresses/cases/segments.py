@@ -70,7 +70,7 @@ def tiled(subject: ProjectorSubject) -> float:
     grid = Grid.centred((16, 16, 16), 1.0, (3.0, -2.0, 4.0))
     rig = _cut(
         subject.rig(
-            grid, {"pixels": [5, 9], "pixel_mm": [2.2, 1.3], "offset_mm": [0.4, -0.3]}, views=2
+            grid, {"pixels": [5, 9], "pixel_mm": [2.2, 1.3], "offset_mm": [0.4, -0.3]}, n_views=2
         ),
         grid,
     )

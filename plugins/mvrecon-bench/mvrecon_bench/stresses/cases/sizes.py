@@ -123,7 +123,7 @@ def three_cameras(subject: Subject) -> float:
 def many_cameras(subject: ProjectorSubject) -> float:
     """200 cameras of one pixel: as a few at a time, each some in a rig of their own."""
     rig = subject.rig(
-        detector={"pixels": [1, 1], "pixel_mm": 2.0, "offset_mm": [1.1, 0.7]}, views=200
+        detector={"pixels": [1, 1], "pixel_mm": 2.0, "offset_mm": [1.1, 0.7]}, n_views=200
     )
     x, chunks = (
         subject.random(1, 1, *GRID.shape),
@@ -141,7 +141,7 @@ def many_cameras(subject: ProjectorSubject) -> float:
 def large_detector(subject: ProjectorSubject) -> float:
     """One camera of 200 x 190 pixels: as bands of its rows, each a detector of its own."""
     rig = subject.rig(
-        detector={"pixels": [200, 190], "pixel_mm": 0.09, "offset_mm": [0.04, -0.03]}, views=1
+        detector={"pixels": [200, 190], "pixel_mm": 0.09, "offset_mm": [0.04, -0.03]}, n_views=1
     )
     x, (rows, columns), height = subject.random(1, 1, *GRID.shape), rig.shape, 63
     views = subject.projector(GRID, rig)(x)
@@ -161,7 +161,7 @@ def band(rig: Cameras, column: int, row: int, shape: tuple[int, int]) -> Cameras
 
 def subsets(subject: ProjectorSubject) -> float:
     """Cameras and pixels in parts: together what the operator and its adjoint make of all."""
-    A = subject.projector(GRID, rig := subject.rig(views=7))
+    A = subject.projector(GRID, rig := subject.rig(n_views=7))
     x, y = subject.random(1, 2, *GRID.shape), subject.random(1, 2, len(rig), *rig.shape)
     chosen, shape = torch.rand(len(rig), *rig.shape) < 0.4, A.range_shape
     errors = []
@@ -213,7 +213,7 @@ def last_voxels(subject: Subject) -> float:
                 PROJECTORS.build(name, grid=each, cameras=rig, method=method)
                 for each in (grid, alone)
             )
-            rays = A.lines, A.window
+            rays = A.lines, A.ray_extent
             views = ops.project(x[0], *rays, A.detector, method, held)
             volume = ops.backproject(views, *rays, list(box.shape), method, held)
             errors += [gap(views, B(x)[0]), gap(volume, B.T(views[None])[0])]
@@ -233,7 +233,7 @@ def last_pixels(subject: Subject) -> float:
         "offset_mm": [3.0 - (LONG - 1) / 2, 2.5 - (LONG - 1) / 2],
     }
     for name, is_parallel in (("drr", False), ("radon", True)):
-        rig = rig_about(GRID, is_parallel, detector=detector, views=1)
+        rig = rig_about(GRID, is_parallel, detector=detector, n_views=1)
         few = band(rig, LONG - FEW, LONG - FEW, (FEW, FEW))
         for method in ("joseph", "siddon", "trilinear"):
             options = {"grid": GRID, "method": method, "support": inside}

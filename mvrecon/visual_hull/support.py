@@ -12,9 +12,9 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.support.footprints import ray_gap
-from mvrecon.support.hull import expand, thin_witnesses, visual_hull
-from mvrecon.support.noise import WITNESSES, Evidence, bounded_hull, noise_threshold
+from mvrecon.visual_hull.footprints import ray_gap
+from mvrecon.visual_hull.hull import expand, thin_witnesses, visual_hull
+from mvrecon.visual_hull.noise import WITNESSES, Evidence, bounded_hull, noise_threshold
 
 KINDS = ("auto", "hull", "box", "none")
 #: Share of the grid from which on a hull's box is not worth the work on it: "auto" then takes all

@@ -11,9 +11,9 @@ from mvrecon.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
-from mvrecon.support import noise
-from mvrecon.support.hull import expand, visual_hull
-from mvrecon.support.noise import (
+from mvrecon.visual_hull import noise
+from mvrecon.visual_hull.hull import expand, visual_hull
+from mvrecon.visual_hull.noise import (
     WITNESSES,
     activity_bound,
     bounded_hull,
@@ -22,7 +22,7 @@ from mvrecon.support.noise import (
     poisson_bound,
     view_sets,
 )
-from tests.support.cases import World, operator
+from tests.visual_hull.cases import World, operator
 
 #: Half the 1 - delta quantiles of chi^2 with 2 n + 2 degrees of freedom, by another implementation.
 KNOWN = {

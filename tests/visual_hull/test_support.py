@@ -15,10 +15,10 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.parts import SCENES
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
-from mvrecon.support.hull import expand, thin_witnesses, visual_hull
-from mvrecon.support.noise import noise_threshold
-from mvrecon.support.support import brick_edge, support_from_views
-from tests.support.cases import World, random_world
+from mvrecon.visual_hull.hull import expand, thin_witnesses, visual_hull
+from mvrecon.visual_hull.noise import noise_threshold
+from mvrecon.visual_hull.support import brick_edge, support_from_views
+from tests.visual_hull.cases import World, random_world
 
 SMALL, LARGE = (
     random_world("pinholes", 4),

@@ -9,8 +9,8 @@ from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.solids import Phantom
-from mvrecon.support.footprints import Bricks, Footprints, footprints, ray_gap, sums, tables
-from tests.support.cases import KINDS, World, operator, random_world
+from mvrecon.visual_hull.footprints import Bricks, Footprints, footprints, ray_gap, sums, tables
+from tests.visual_hull.cases import KINDS, World, operator, random_world
 
 DETECTOR = {"pixels": [9, 12], "pixel_mm": 1.0}
 

@@ -28,7 +28,7 @@ class World:
     def views(self) -> torch.Tensor:
         """Exact views [1 1 m v u] by closed-form integrals."""
         start, end = self.cameras.rays()
-        return self.phantom.integrals(start, end, self.cameras.limits)[None, None]
+        return self.phantom.integrals(start, end, self.cameras.ray_extent)[None, None]
 
 
 def operator(world: World, method: str = "joseph") -> RayTransform:
@@ -85,7 +85,7 @@ def _widest_pixel(cameras: Cameras, grid: Grid) -> float:
     if cameras.parallel:
         return diagonal
     w = cameras.project(grid.corners())[..., 2] / cameras.distance[:, None]
-    first, last = cameras.limits
+    first, last = cameras.ray_extent
     return diagonal * w.clamp(first, last).abs().amax().item()
 
 

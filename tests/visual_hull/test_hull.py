@@ -13,10 +13,10 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.scenes.derenzo import derenzo
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
-from mvrecon.support import hull
-from mvrecon.support.footprints import Bricks, footprints
-from mvrecon.support.hull import expand, visual_hull
-from tests.support.cases import KINDS, World, moved, operator, random_world
+from mvrecon.visual_hull import hull
+from mvrecon.visual_hull.footprints import Bricks, footprints
+from mvrecon.visual_hull.hull import expand, visual_hull
+from tests.visual_hull.cases import KINDS, World, moved, operator, random_world
 
 BRICKS = (1, 3, 4)
 EDGE = 3

@@ -9,7 +9,7 @@ import yaml
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.support.support import support_from_views
+from mvrecon.visual_hull.support import support_from_views
 
 CONF = Path(__file__).parents[2] / "conf"
 

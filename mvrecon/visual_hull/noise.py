@@ -19,8 +19,8 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.support.footprints import Bricks, footprints, sums, tables
-from mvrecon.support.hull import AT_ONCE, check_measured
+from mvrecon.visual_hull.footprints import Bricks, footprints, sums, tables
+from mvrecon.visual_hull.hull import AT_ONCE, check_measured
 
 #: Views in a group whose counts are added.
 GROUP = 10

@@ -12,7 +12,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.views import check_finite
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.support.footprints import Bricks, footprints, sums, tables
+from mvrecon.visual_hull.footprints import Bricks, footprints, sums, tables
 
 #: Views at a time, of all items of a batch: what some of them saw to be empty is not looked at in
 #: the next.

@@ -84,7 +84,7 @@ def footprints(
     margin, slack = _gaps(cameras) if gaps else (w.new_zeros(2, len(w), 1), w.new_zeros(len(w), 1))
     more = max(0.0, gaps - 1) * (margin - 0.5)
     near, far = w.amin(dim=1), w.amax(dim=1)
-    first, last = cameras.limits
+    first, last = cameras.ray_extent
     across = (
         (near <= 0) & (far >= 0) & (not cameras.parallel)
     )  # such a brick may have an image anywhere
@@ -133,7 +133,7 @@ def ray_gap(cameras: Cameras, grid: Grid) -> float:
     if cameras.parallel:
         return diagonal.amax().item()
     w = cameras.depth_range(grid).detach() / cameras.distance.detach()[:, None]
-    first, last = cameras.limits
+    first, last = cameras.ray_extent
     return (diagonal * w.clamp(first, last).abs().amax(dim=-1)).amax().item()
 
 

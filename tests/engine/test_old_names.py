@@ -1,0 +1,38 @@
+"""Runs and checkpoints of earlier versions are read by the names of this one."""
+
+from pathlib import Path
+
+import pytest
+
+from mvrecon.cameras import rigs
+from mvrecon.engine import record, run_folder
+from mvrecon.engine.archive import check_settings
+from mvrecon.engine.old_names import RIGS, current
+
+OLD = {"seed": 3, "camera": {"name": "circular", "views": 8, "sid": 400.0}}
+NEW = {"seed": 3, "camera": {"name": "circular", "n_views": 8, "sid": 400.0}}
+
+
+def test_a_run_that_counts_its_views_by_the_old_name_is_read(tmp_path):
+    record.start(tmp_path, OLD)
+    assert record.read_settings(tmp_path) == NEW
+    run_folder.check(tmp_path, NEW)
+    with pytest.raises(ValueError, match="got camera.n_views=9, expected 8"):
+        run_folder.check(tmp_path, {**NEW, "camera": {**NEW["camera"], "n_views": 9}})
+
+
+def test_a_checkpoint_that_counts_its_views_by_the_old_name_is_read():
+    method = {"geometry": OLD, "model": {}, "loss": {}, "optimizer": {}, "data_range": 1.0}
+    assert check_settings(Path("a.ckpt"), method) == {**method, "geometry": NEW}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [NEW, {"camera": {"name": "helix", "views": 3}}, {"camera": None}, {"camera": "a"}, [], None],
+)
+def test_other_settings_stay_as_they_are(settings):
+    assert current(settings) == settings
+
+
+def test_every_rig_of_the_table_counts_its_views_now():
+    assert all("n_views" in getattr(rigs, name).__annotations__ for name in RIGS)
