@@ -85,7 +85,7 @@ def test_a_shape_of_a_tensor_takes_one_spacing_for_all_axes():
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: Grid.centred(size=(8, 6, 4), spacing=2.0),
+        lambda: Grid.centred((4, 6, 8), 2.0),
         lambda: Grid.centred(shape=(4, 6, 8), spacing=(1.0, 2.0, 3.0)),
         lambda: Grid.centred(**{"shape": [4, 6, 8], "spacing": [1.0, 1.0, 3.0]}),
     ],

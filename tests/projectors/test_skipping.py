@@ -16,7 +16,7 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.kernels.rays import choice, plan, reference, scan
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy
 from mvrecon.kernels.rays.scan import bricks_of
-from mvrecon.projectors import ray_transform
+from mvrecon.projectors import integrals
 from tests.projectors.cases import Case, curved
 
 pytestmark = pytest.mark.usefixtures("nothing_is_too_little")
@@ -178,7 +178,7 @@ def test_verify_finds_a_kernel_that_skips_too_much(monkeypatch):
     x = volumes("blob")
     A(x)
     wrong = Occupancy(Box.whole(GRID.shape).high, Box((6, 12, 9), (7, 14, 12))).encoded()
-    monkeypatch.setattr(ray_transform.ops, "occupied", lambda *arguments: wrong)
+    monkeypatch.setattr(integrals.ops, "occupied", lambda *arguments: wrong)
     with pytest.raises(RuntimeError, match="skip='verify': [0-9]+ of 1190 pixels differ"):
         A(x)
 

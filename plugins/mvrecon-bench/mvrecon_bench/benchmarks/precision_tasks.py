@@ -14,7 +14,7 @@ from mvrecon.engine.checkpoints import load
 from mvrecon.metrics import volume_metrics
 from mvrecon.models.unet3d import UNet3d
 from mvrecon.parts import MODELS, PROJECTORS, SCENES
-from mvrecon.projectors.ray_transform import METHODS
+from mvrecon.projectors.integrals import METHODS
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig

@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import Any
 
 from mvrecon.parts import REGISTRIES
-from mvrecon.projectors.ray_transform import METHODS
+from mvrecon.projectors.integrals import METHODS
 from mvrecon.registry import hint
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.stresses.case import KINDS, Case

@@ -10,7 +10,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.ray_transform import METHODS
+from mvrecon.projectors.integrals import METHODS
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.stresses.case import Case, DoesNotApply
