@@ -12,7 +12,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import geometry, regions
 from mvrecon.models.geometry import cropped_geometry, whole_geometry
-from mvrecon.models.model import CrossView
+from mvrecon.models.cross_view import CrossView
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.ray_transform import RayTransform
 from tests.models.rig import small_rig

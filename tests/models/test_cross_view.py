@@ -1,6 +1,6 @@
 import torch
 
-from mvrecon.models.cross_view import leave_one_out, pooled
+from mvrecon.models.pooling import leave_one_out, pooled
 from mvrecon.models.weighting import fuse
 
 

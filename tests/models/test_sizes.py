@@ -7,7 +7,7 @@ import torch
 from mvrecon.projectors.base import Projector
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.masks import halved
+from mvrecon.models.networks import halved
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from tests.models.rig import small_projector
 from tests.models.test_model import HEAD

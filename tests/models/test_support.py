@@ -7,7 +7,7 @@ from torch.nn.functional import max_pool3d
 from mvrecon.geometry.box import Box
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import regions
-from mvrecon.models.model import disagreement
+from mvrecon.models.pooling import disagreement
 from mvrecon.parts import MODELS
 from mvrecon.support.support import Support
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from mvrecon.geometry.lattice import enclosed
 from mvrecon.kernels.warps.reference import normalised_places
-from mvrecon.models.cross_view import leave_one_out, pooled
-from mvrecon.models.lift import Frusta
+from mvrecon.models.pooling import leave_one_out, pooled
+from mvrecon.models.frusta import Frusta
 from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from tests.projectors.cases import Case
@@ -24,7 +24,7 @@ SHAPES = st.tuples(st.integers(1, 4), *[st.integers(1, 5)] * 3)
 def frusta_of(case: Case, depth: int, spacing: str) -> Frusta:
     """Bins in z where a source in the grid allows no others."""
     z = case.rays.depth_range(case.grid)
-    return Frusta(case.grid, case.rays, depth, "z" if (z[:, 0] * z[:, 1] <= 0).any() else spacing)
+    return Frusta.of(case.grid, case.rays, depth, "z" if (z[:, 0] * z[:, 1] <= 0).any() else spacing)
 
 
 FRUSTA = st.builds(frusta_of, cases(), st.integers(1, 12), st.sampled_from(["z", "k"]))

@@ -18,7 +18,7 @@ from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.cameras.files import from_file, save
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import inverse, random_rotation
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
 from mvrecon.parts import CAMERAS
 from mvrecon.testing import check_camera
 from mvrecon_bench.stresses.case import Case, DoesNotApply
@@ -125,7 +125,7 @@ def source_in_the_volume(subject: CameraSubject) -> float:
     """Lifts and warps of frusta whose source is in the middle of the grid."""
     rig = subject.few
     step = float(rig.distance[0]) / 10
-    frusta = Frusta(Grid.centred((4, 5, 6), step, rig.source[0].tolist()), rig, depth=6).to(
+    frusta = Frusta.of(Grid.centred((4, 5, 6), step, rig.source[0].tolist()), rig, depth=6).to(
         rig.source.device
     )
     views = torch.ones(1, 1, len(rig), *rig.shape, device=rig.source.device, requires_grad=True)

@@ -1,8 +1,8 @@
-"""The part of each camera's frustum that a part of the grid needs: some depths, rows and columns,
-as many for all.
+"""The geometry of a crop: its operator, the cameras that see it, and the part of each camera's
+frustum that it needs.
 
-Its bins are bins of the whole frustum, so what is worked out in a window is what would be worked
-out without it.
+Bins of a part are bins of the whole frustum, so what is worked out in it is what would be worked
+out without it; all that is known of them is taken over.
 """
 
 from collections.abc import Sequence
@@ -14,13 +14,81 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.geometry.box import Box, three
+from mvrecon.cameras.culling import views_that_see
+from mvrecon.geometry.box import Box
 from mvrecon.geometry.frustum import depth_index
 from mvrecon.geometry.grid import Grid
+from mvrecon.models.frusta import Frusta, maps_between
+from mvrecon.models.geometry import Geometry
+from mvrecon.models.networks import MULTIPLE
 
 #: Bricks along the longest side of a mask, at most: enough to follow a body, few enough to be
 #: projected at once.
 BRICKS = 16
+
+
+def cropped_geometry(
+    whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | None = None
+) -> Geometry:
+    """The geometry of the voxels in a box, and of the cameras that see any of it.
+
+    What is equal to the whole's is taken over, the rest made anew.
+
+    Args:
+        whole: of the grid.
+        box: the voxels.
+        bricks: of the box, those that may be other than zero, from `occupied_bricks`: the frusta
+            have no bins for others. None: all.
+    """
+    grid = whole.A.grid.cropped(box)
+    index = _seeing(whole.A.cameras, grid).to(whole.row.device)
+    A = whole.A.cropped(box, index.tolist())
+    crop = Geometry(A, whole.row[:, :, index], whole.column[..., *box.slices], index)
+    if whole.frusta is None:
+        return crop
+    fine, coarse = whole.frusta
+    binning = fine.shape[1] // coarse.shape[1]
+    binned = A.cameras.binned(binning)
+    window = window_of(brick_corners(grid, bricks), binned, coarse.edges[index], MULTIPLE)
+    finer = window.scaled(2, binning)
+    if fine.shape[0] % 2:  # coarse bins are no pairs of fine ones: both keep all of them
+        window, finer = window.deep(coarse.shape[0]), finer.deep(fine.shape[0])
+    parts = (
+        _part(fine, index, box, finer, grid, A.cameras),
+        _part(coarse, index, box, window, grid, binned),
+    )
+    return replace(crop, frusta=parts)
+
+
+def _seeing(cameras: Cameras, grid: Grid) -> Int[Tensor, " k"]:
+    """Which cameras see any of a grid; all of them, where none does."""
+    seeing = views_that_see(cameras, grid)
+    return (seeing if seeing.any() else ~seeing).nonzero()[:, 0]
+
+
+def _part(
+    whole: Frusta,
+    index: Int[Tensor, " k"],
+    box: Box,
+    window: "Window",
+    grid: Grid,
+    cameras: Cameras,
+) -> Frusta:
+    """A window of the frusta of some cameras; `grid` and `cameras` are the crop's."""
+    cut = window.cameras(cameras)
+    edges = window.edges(whole.edges[index]).to(cut.source)
+    frusta_from_world, world_from_frusta = maps_between(grid, cut, edges)
+    part = Frusta(
+        frusta_from_world,
+        world_from_frusta,
+        edges,
+        visible=whole.visible[index][..., *box.slices],
+        occupied=window.bins(whole.occupied[index]),
+        step=window.bins(whole.step[index]),
+        n_depths=whole.n_depths,
+        first=window.first,
+    )
+    return part.to(whole.step.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,31 +128,12 @@ class Window:
         kept = self.first[:, :1] + torch.arange(self.shape[0] + 1)
         return edges.gather(1, kept.to(edges.device))
 
-    def views(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:
-        """The part of every view that falls on the cut detectors."""
-        return torch.stack(
-            [
-                view[..., v, u]
-                for view, (_, v, u) in zip(views.unbind(2), self._parts(), strict=True)
-            ],
-            2,
-        )
-
     def bins(self, values: Shaped[Tensor, "m 1 D v u"]) -> Shaped[Tensor, "m 1 E r s"]:
         """Values of all bins at those that are kept."""
-        return torch.stack(
-            [each[:, *part] for each, part in zip(values, self._parts(), strict=True)]
-        )
-
-    def _parts(self) -> list[tuple[slice, slice, slice]]:
-        """What cuts each camera's bins out of all; slices, since an index for each bin takes ten
-        times as long.
-        """
-        first = self.first.tolist()
-        return [
-            Box(three(low), three(a + n for a, n in zip(low, self.shape, strict=True))).slices
-            for low in first
-        ]
+        # slices, since an index for each bin takes ten times as long
+        d, v, u = self.shape
+        low = zip(values, self.first.tolist(), strict=True)
+        return torch.stack([x[:, k : k + d, j : j + v, i : i + u] for x, (k, j, i) in low])
 
 
 def window_of(
@@ -121,9 +170,9 @@ def window_of(
     return Window(first, (d, v, u))
 
 
-def held_bricks(mask: Bool[Tensor, "b 1 d h w"]) -> Bool[Tensor, "z y x"]:
-    """The bricks, at most 16 along each axis, in which any of the masks holds a voxel."""
-    edge = _edge(mask.shape[2:])
+def occupied_bricks(mask: Bool[Tensor, "b 1 d h w"]) -> Bool[Tensor, "z y x"]:
+    """The bricks, at most 16 along each axis, in which any of the masks has a voxel."""
+    edge = edge_of(mask.shape[2:])
     return max_pool3d(mask.any(dim=0).float(), edge, ceil_mode=True)[0] > 0
 
 
@@ -134,11 +183,11 @@ def brick_corners(grid: Grid, bricks: Bool[Tensor, "z y x"] | None = None) -> Fl
     if bricks is None or not bricks.any():
         return grid.corners()
     around = pad(bricks.float(), (1, 1, 1, 1, 1, 1))[None]
-    index = (max_pool3d(around, 2, stride=1)[0] > 0).nonzero().cpu() * _edge(grid.shape)
+    index = (max_pool3d(around, 2, stride=1)[0] > 0).nonzero().cpu() * edge_of(grid.shape)
     index = index.minimum(torch.tensor(grid.shape))
     return grid.to_world(index.flip(1).double() - 0.5)
 
 
-def _edge(shape: Sequence[int]) -> int:
+def edge_of(shape: Sequence[int]) -> int:
     """Of a brick, in voxels."""
     return -(-max(shape) // BRICKS)
