@@ -29,7 +29,7 @@ def comparison(
     start: Float[Tensor, "b 1 d h w"],
     residual: Float[Tensor, "b m m v u"],
 ) -> Float[Tensor, "b m 5 d h w"]:
-    """What `Weighting` gets of each camera: its opinion and the back-projected residual of that, the
+    """What `Weighting` gets of each camera: its opinion, that one's back-projected residual, the
     mean and the deviation of all opinions, and the start.
 
     Args:

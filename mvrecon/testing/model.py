@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
-from mvrecon.projectors.base import Projector
+from mvrecon.projectors.operator import Projector
 from mvrecon.testing.projector import close
 
 #: Relative, of float32 sums of some thousand products a voxel.

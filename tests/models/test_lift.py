@@ -4,31 +4,25 @@ import pytest
 import torch
 
 from mvrecon.cameras.culling import seen_depth_range
-from mvrecon.geometry.frustum import depth_centres, depth_edges, depth_index
+from mvrecon.geometry.frustum import depth_edges, depth_index
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon.models.frusta import Frusta
 from mvrecon.parts import CAMERAS
 from tests.models.rig import small_rig
 
 
-@pytest.mark.parametrize("spacing", ["z", "k"])
-def test_depth_bins_tile_the_range_and_index_is_its_inverse(spacing):
+def test_depth_bins_tile_the_range_and_index_is_its_inverse():
     z_range = torch.tensor([[80.0, 120.0], [-120.0, -80.0]], dtype=torch.float64)
-    edges = depth_edges(z_range, 10, spacing)
+    edges = depth_edges(z_range, 10)
     assert torch.allclose(edges[:, [0, -1]], z_range)
     expected = torch.arange(10, dtype=torch.float64).expand(2, 10)
-    assert torch.allclose(depth_index(depth_centres(edges, spacing), edges, spacing), expected)
+    centres = (edges[:, 1:] + edges[:, :-1]) / 2
+    assert torch.allclose(depth_index(centres, edges), expected)
 
 
-def test_uniform_k_is_refused_across_the_source():
-    with pytest.raises(ValueError, match="without z = 0"):
-        depth_edges(torch.tensor([[-1.0, 1.0]]), 4, "k")
-
-
-@pytest.mark.parametrize("spacing", ["z", "k"])
-def test_lift_conserves_every_ray_integral(spacing):
+def test_lift_conserves_every_ray_integral():
     grid, cameras = small_rig()
-    frusta = Frusta.of(grid, cameras, 12, spacing)
+    frusta = Frusta.of(grid, cameras, 12)
     views = torch.rand(2, 3, len(cameras), *cameras.shape)
     sees = frusta.chord.reshape(1, 1, len(cameras), *cameras.shape) > 0
     assert torch.allclose(frusta.integrate(frusta.spread(views)), views * sees, rtol=1e-5)
@@ -118,7 +112,8 @@ def test_nothing_behind_a_source_inside_the_grid_is_occupied_or_visible():
     grid, cameras = small_rig(views=1)
     inner = replace(cameras, source=0.05 * cameras.source)
     frusta = Frusta.of(grid, inner, 12)
-    z = depth_centres(depth_edges(inner.depth_range(grid), 12))[0]
+    planes = depth_edges(inner.depth_range(grid), 12)[0]
+    z = (planes[1:] + planes[:-1]) / 2
     assert (
         (z < 0).any()
         and (depth_edges(seen_depth_range(inner, grid), 12) >= 0).all()

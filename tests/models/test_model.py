@@ -42,9 +42,9 @@ def test_opinions_reproduce_their_own_views():
     seen: list[torch.Tensor] = []
     model.opinions.head.register_forward_hook(lambda _module, _given, density: seen.append(density))
     model.opinions(
-        model.regions(views), views, torch.rand(2, 1, 12, 12, 12), torch.zeros_like(views)
+        model.cropping.whole, views, torch.rand(2, 1, 12, 12, 12), torch.zeros_like(views)
     )
-    fine = model.regions.whole.fine
+    fine = model.cropping.whole.fine
     sees = fine.chord.reshape(1, 1, 4, 12, 12) > 0
     assert _close(fine.integrate(seen[0]), views * sees, 1e-5)
 
@@ -61,7 +61,7 @@ def test_what_the_cameras_do_not_change_is_not_blurred_by_their_warps():
     model = _build("cross_view", projector)
     model.opinions.head = _Unmoved()
     volume, views = _blob_views(projector)
-    said, _ = model.opinions(model.regions(views), views, volume, torch.zeros_like(views))
+    said, _ = model.opinions(model.cropping.whole, views, volume, torch.zeros_like(views))
     assert torch.equal(said, volume[:, None].expand_as(said))
 
 
@@ -90,7 +90,7 @@ def test_consistency_steps_bring_the_volume_towards_the_views():
     volume, views = _blob_views(projector)
     model = _build("backprojection_unet", projector, consistency=5)
     before = volume * 0.5
-    after = model.consistency(model.regions(views), before, views)
+    after = model.consistency(model.cropping.whole, before, views)
     misfit = [(projector(x) - views).norm() for x in (before, after)]
     assert misfit[1] < 0.5 * misfit[0]
 
@@ -108,7 +108,7 @@ def test_without_a_depth_network_every_depth_is_equally_likely():
     projector = small_projector()
     model = _build("cross_view", projector, opinion={"prior": "uniform"})
     _, views = _blob_views(projector)
-    frusta = model.regions.whole.fine
+    frusta = model.cropping.whole.fine
     out = model(views)
     assert _close(out.opinions, frusta.to_world(frusta.spread(views)), 1e-4)
     assert not list(model.opinions.parameters())

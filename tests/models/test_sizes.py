@@ -4,11 +4,11 @@ door.
 
 import pytest
 import torch
-from mvrecon.projectors.base import Projector
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.networks import halved
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
+from mvrecon.projectors.operator import Projector
 from tests.models.rig import small_projector
 from tests.models.test_model import HEAD
 
