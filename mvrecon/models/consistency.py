@@ -40,14 +40,14 @@ class Consistency(nn.Module):
         sample takes every step.
         """
         for length in self.lengths:
-            wrong = views - geometry.A(volume)
+            residual = views - geometry.A(volume)
             if sigma is None or self.training:
-                volume = volume + length * geometry.back(wrong)
+                volume = volume + length * geometry.back(residual)
                 continue
-            unmet = (wrong / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
+            unmet = (residual / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
             if not unmet.any():
                 break
-            volume = volume + length * unmet * geometry.back(wrong)
+            volume = volume + length * unmet * geometry.back(residual)
         return volume
 
 

@@ -78,11 +78,13 @@ class Weighting(nn.Module):
         rows = sparse.halved(
             fine.pick(features.flatten(1, 2)), fine, coarse
         )  # of all cameras, side by side
-        each = [
+        per_camera = [
             part.unflatten(1, (m, -1)).transpose(0, 1).flatten(0, 1)
             for part in rows.split(coarse.counts)
         ]
         levels = pyramid(coarse.mask.repeat_interleave(m, dim=0), len(self.net.down))
-        logits = self.net.on(levels, torch.cat(each)).split([m * count for count in coarse.counts])
+        logits = self.net.on(levels, torch.cat(per_camera)).split(
+            [m * count for count in coarse.counts]
+        )
         side_by_side = torch.cat([part.view(m, -1).T for part in logits])
         return fine.put(sparse.doubled(side_by_side, coarse, fine))[:, :, None]

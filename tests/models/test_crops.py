@@ -1,5 +1,6 @@
 """What is made for a crop of the grid: its operator, its frusta, and how long they are kept."""
 
+import copy
 from dataclasses import replace
 
 import pytest
@@ -33,6 +34,17 @@ def test_few_crops_are_kept_and_made_once(projector, monkeypatch):
     kept.crop(boxes[0])
     kept.crop(boxes[2])
     assert [key[0] for key in kept.crops] == [boxes[0], boxes[2]]
+
+
+def test_the_geometry_moves_with_its_module_and_its_maps_keep_their_digits(projector):
+    whole = Cropping(projector, Options(), 3).double().whole
+    assert whole.row.dtype == whole.column.dtype == whole.fine.step.dtype == torch.float64
+    plain = Cropping(projector, Options(), 3).bfloat16().whole.coarse
+    assert plain.step.dtype == torch.bfloat16 and plain.occupied.dtype == torch.bool
+    assert torch.equal(plain.world_from_frusta, whole.coarse.world_from_frusta)
+    gone = Cropping(copy.deepcopy(projector), Options(), 3).to("meta").whole
+    tensors = (gone.row, gone.column, gone.cameras, gone.fine.edges, gone.coarse.occupied)
+    assert all(tensor.is_meta for tensor in tensors)
 
 
 def test_a_crop_is_the_operator_on_it(projector):

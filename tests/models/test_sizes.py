@@ -10,7 +10,7 @@ from mvrecon.models.networks import halved
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from tests.models.rig import small_projector
-from tests.models.test_model import HEAD
+from tests.models.test_cross_view import HEAD
 
 NAMES = tuple(MODELS.names())
 SKIPS = ({}, {"support": "hull"}, {"support": "hull", "masked": False})
