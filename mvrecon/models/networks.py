@@ -21,6 +21,9 @@ from mvrecon.models.sparse import Voxels, pyramid
 LEVELS = 3
 MULTIPLE = 2 ** (LEVELS - 1)
 
+#: Groups of channels in group normalisation; fewer where a width is no multiple of it.
+GROUPS = 4
+
 #: PyTorch leaves 3x3x3 convolutions of one CPU volume with at most so many (channels x depth x
 #: rows) to a kernel that was measured to be 5 to 12 times slower than the one (oneDNN's) that it
 #: takes for two.
@@ -102,9 +105,9 @@ class ConvBlock(nn.Module):
     On some voxels: features are their rows [k c], and all others are taken for zero.
     """
 
-    def __init__(self, inputs: int, outputs: int, groups: int = 4):
+    def __init__(self, inputs: int, outputs: int):
         super().__init__()
-        groups = gcd(groups, outputs)
+        groups = gcd(GROUPS, outputs)
         self.first = nn.Sequential(
             nn.Conv3d(inputs, outputs, 3, padding=1, bias=False),
             nn.GroupNorm(groups, outputs),
