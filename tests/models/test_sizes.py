@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.masks import halved
+from mvrecon.models.networks import halved
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from tests.models.rig import small_projector
-from tests.models.test_model import HEAD
+from tests.models.test_cross_view import HEAD
 
 NAMES = tuple(MODELS.names())
 SKIPS = ({}, {"support": "hull"}, {"support": "hull", "masked": False})

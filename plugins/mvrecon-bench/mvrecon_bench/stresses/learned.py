@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon_bench.stresses.case import DoesNotApply
@@ -39,7 +39,7 @@ class HeadSubject(Subject):
     @cached_property
     def frusta(self) -> Frusta:
         """Small ones, some of whose rays miss the grid."""
-        return Frusta(GRID, small_rig(), depth=10).to(self.device, self.dtype)
+        return Frusta.of(GRID, small_rig(), depth=10).to(self.device, self.dtype)
 
     @cached_property
     def head(self) -> nn.Module:

@@ -11,7 +11,7 @@ from torch import Tensor
 from mvrecon.cameras import convert
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.cameras import EXACT
 from mvrecon_bench.stresses.refusals import none_of
@@ -104,7 +104,7 @@ def source_in_the_volume(subject: CameraSubject) -> float:
     """Lifts and warps of frusta whose source is in the middle of the grid."""
     rig = subject.few
     step = float(rig.distance[0]) / 10
-    frusta = Frusta(
+    frusta = Frusta.of(
         Grid.centred(size=(6, 5, 4), spacing=step, centre=rig.source[0].tolist()), rig, depth=6
     ).to(rig.source.device)
     views = torch.ones(1, 1, len(rig), *rig.shape, device=rig.source.device, requires_grad=True)
