@@ -28,7 +28,7 @@ PEERS = (
 def describe(peers: Sequence[str] = PEERS) -> dict[str, str]:
     """Name -> version or description."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
-    found = {
+    facts = {
         "processor": processor(),
         "cores": str(os.cpu_count()),
         "threads": str(torch.get_num_threads()),
@@ -36,10 +36,10 @@ def describe(peers: Sequence[str] = PEERS) -> dict[str, str]:
     }
     for name in peers:
         try:
-            found[name] = metadata.version(name)
+            facts[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return {**versions(), **found}
+            facts[name] = "not installed"
+    return {**versions(), **facts}
 
 
 def processor() -> str:

@@ -58,10 +58,10 @@ def _operator(case: Case, method: str, direction: str) -> Task:
     A = PROJECTORS.build("drr", grid=case.grid(), cameras=case.cameras(), method=method).to(
         case.device
     )
-    given = x if direction == "forward" else A(x)
+    argument = x if direction == "forward" else A(x)
 
     def call(precision: str) -> Callable[[], Tensor]:
-        operand = given.to(PRECISIONS[precision][0])
+        operand = argument.to(PRECISIONS[precision][0])
         return (lambda: A(operand)) if direction == "forward" else (lambda: A.T(operand))
 
     return Task(call)

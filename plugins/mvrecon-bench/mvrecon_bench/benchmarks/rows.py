@@ -92,8 +92,8 @@ def value(text: str) -> Any:
 
 def number(row: Mapping[str, Any], name: str) -> float:
     """A figure of a row; NaN where there is none."""
-    found = row.get(name)
-    return found if isinstance(found, float) else math.nan
+    figure = row.get(name)
+    return figure if isinstance(figure, float) else math.nan
 
 
 def _line(cells: Sequence[str]) -> str:

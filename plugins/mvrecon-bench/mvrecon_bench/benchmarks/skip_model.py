@@ -146,5 +146,5 @@ class Learned:
         return volume_metrics(volume, case.volume, case.inside, self.data_range)["psnr"]
 
 
-def _told(found: Support) -> tuple[str, str]:
-    return found.kind, f"{found.fraction:.1%} of the grid"
+def _told(support: Support) -> tuple[str, str]:
+    return support.kind, f"{support.fraction:.1%} of the grid"

@@ -53,7 +53,7 @@ class CameraSubject(Subject):
         if self.name == "from_file":
             save(circular(3, SMALL["sid"], SMALL["sdd"], DETECTOR), folder / "rig.json")
             return {"path": folder / "rig.json"}
-        found = (
+        options = (
             {"pixels": PIXELS}
             if "pixels" in parameters and isinstance(parameters["pixels"].default, int)
             else {}
@@ -67,8 +67,8 @@ class CameraSubject(Subject):
                         f"it needs {name}; stress it as "
                         f"{{kind: camera, name: {self.name}, {name}: ..}}"
                     )
-                found[name] = SMALL[name]
-        return found
+                options[name] = SMALL[name]
+        return options
 
     @cached_property
     def cameras(self) -> Cameras:

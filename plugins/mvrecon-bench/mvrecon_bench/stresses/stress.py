@@ -92,8 +92,8 @@ class Stress:
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
     """How many rows have each verdict."""
-    found = Counter(str(row["verdict"]) for row in rows)
-    return {verdict: found[verdict] for verdict in (PASS, FAIL, LEFT_OUT)}
+    numbers = Counter(str(row["verdict"]) for row in rows)
+    return {verdict: numbers[verdict] for verdict in (PASS, FAIL, LEFT_OUT)}
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -113,6 +113,6 @@ def table(rows: Sequence[Row]) -> str:
 
 def _cells(row: Row) -> list[str]:
     return [
-        format(found, ".3g") if isinstance(found := row.get(name, ""), float) else found
+        format(value, ".3g") if isinstance(value := row.get(name, ""), float) else value
         for name in SHOWN
     ]

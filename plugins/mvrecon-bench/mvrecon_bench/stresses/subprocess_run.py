@@ -19,8 +19,8 @@ def python(*arguments: str) -> subprocess.CompletedProcess[str]:
     Raises:
         TimeoutExpired: it takes longer than `LIMIT`; it is ended.
     """
-    here = str(Path(mvrecon.__file__).parents[1])
-    path = os.pathsep.join([here, *filter(None, [os.environ.get("PYTHONPATH")])])
+    checkout = str(Path(mvrecon.__file__).parents[1])
+    path = os.pathsep.join([checkout, *filter(None, [os.environ.get("PYTHONPATH")])])
     return subprocess.run(
         [sys.executable, *arguments],
         env={**os.environ, "PYTHONPATH": path},
