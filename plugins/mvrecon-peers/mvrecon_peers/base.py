@@ -1,4 +1,6 @@
-"""What all peers share: the door, the adjoint's two ways, and how their libraries are loaded."""
+"""Base classes of the peers: checks of the input, adjoint by a pair of calls or by autograd,
+loading of libraries.
+"""
 
 import warnings
 from collections.abc import Iterator

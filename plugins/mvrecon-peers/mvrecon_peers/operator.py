@@ -1,6 +1,4 @@
-"""Any peer as an operator of torch's: opaque to `torch.compile` and to autocast, mapped by vmap,
-its own derivative.
-"""
+"""A peer as a custom operator of torch: for `torch.compile`, autocast, vmap and derivatives."""
 
 from collections.abc import Callable
 from itertools import count

@@ -1,4 +1,4 @@
-"""What is projected, and by which rig: scenes, cameras and sizes of one benchmark."""
+"""Cases of a benchmark: scene, rig, sizes, device and precision."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

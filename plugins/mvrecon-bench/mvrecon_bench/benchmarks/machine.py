@@ -1,6 +1,4 @@
-"""What a benchmark ran on: processor, threads, GPU, and the versions of everything that is
-compared.
-"""
+"""The machine of a benchmark: processor, threads, GPU, versions of the libraries compared."""
 
 import os
 import platform

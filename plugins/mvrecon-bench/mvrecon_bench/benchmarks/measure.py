@@ -1,6 +1,4 @@
-"""How long a call takes and how much memory it needs, launch and waiting for the device
-included.
-"""
+"""Run time in ms and memory in MB of a call, its launch and the wait for the device included."""
 
 import ctypes
 import os

@@ -1,4 +1,4 @@
-"""What `bench=precision` does in each precision: operators, a U-Net, the cross-view model."""
+"""Tasks of `bench=precision`: operators, a U-Net and the cross-view model, in each precision."""
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy

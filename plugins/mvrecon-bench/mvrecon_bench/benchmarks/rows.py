@@ -1,6 +1,4 @@
-"""A table that grows by a row at a time and outlives a crash: what is in it need not be measured
-again.
-"""
+"""A table on the disk, written row by row, so that a benchmark goes on where it was stopped."""
 
 import csv
 import io

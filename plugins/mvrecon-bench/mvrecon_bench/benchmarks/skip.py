@@ -1,6 +1,4 @@
-"""`bench=skip`: what skipping gains, against the full cube and against the cropped volume, and what
-it changes.
-"""
+"""`bench=skip`: gain of skipping over the full cube and the cropped volume, and its error."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass

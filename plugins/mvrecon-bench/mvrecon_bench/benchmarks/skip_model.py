@@ -1,6 +1,4 @@
-"""The cross-view model in `bench=skip`, end to end: on the grid, on one cropped by hand, with
-supports from views.
-"""
+"""The cross-view model in `bench=skip`: on the whole grid, a cropped one, a visual hull."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,6 +1,4 @@
-"""The rows of `bench=skip` as Markdown and as points of a plot, the cases in which skipping loses
-among them.
-"""
+"""Report of `bench=skip`: Markdown tables and plots, with the cases in which skipping loses."""
 
 from collections.abc import Iterable, Mapping, Sequence
 

@@ -1,6 +1,4 @@
-"""What `bench=skip` looks at: volumes that fill from a part in three hundred of their cube to all
-of it.
-"""
+"""Scenes of `bench=skip`: objects that fill from 1/300 of their cube to all of it."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,4 @@
-"""What the operators should reach, computed from the rows of a benchmark: met, missed, or not
-measured.
-"""
+"""Targets of the operators, from the rows of a benchmark: met, missed, or not measured."""
 
 import json
 import math

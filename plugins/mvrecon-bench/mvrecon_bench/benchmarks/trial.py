@@ -1,6 +1,4 @@
-"""One part at work on one geometry: its four calls, and what each of them gave and took the first
-time.
-"""
+"""A projector on one geometry: result and time of its forward, adjoint and both gradients."""
 
 from collections.abc import Mapping
 from dataclasses import replace

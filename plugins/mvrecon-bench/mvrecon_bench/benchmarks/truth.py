@@ -1,5 +1,4 @@
-"""What the views ought to be: closed-form integrals along thin rays, their mean over each pixel,
-and their derivative.
+"""True views: closed-form integrals along thin rays, their mean over a pixel, their derivative.
 
 The mean over a pixel is what a detector measures; a thin ray is what most projectors compute. Their
 rankings differ, so a benchmark shows both.

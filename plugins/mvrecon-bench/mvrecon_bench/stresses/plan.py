@@ -1,4 +1,4 @@
-"""Which cases are done to which subjects."""
+"""The stress plan as a list: every case with every part that it is meant for."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
@@ -14,8 +14,8 @@ from mvrecon_bench.stresses.subject import Subject, subject_of
 #: The files of cases, in the plan's order.
 FILES = (
     *("rays", "segments", "scales", "algebra", "accuracy", "derivatives"),
-    *("cameras", "images", "poses", "heads", "models", "counts", "line_integrals"),
-    *("tensors", "dtypes", "values", "sizes", "repeats", "gpu"),
+    *("cameras", "images", "poses", "heads", "models", "model_state", "counts", "line_integrals"),
+    *("tensors", "dtypes", "values", "sizes", "repeatability", "gpu"),
 )
 
 

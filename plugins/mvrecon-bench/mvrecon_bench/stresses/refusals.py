@@ -1,6 +1,4 @@
-"""What must be refused, and how: by an error of the right kind whose message tells what was
-wrong.
-"""
+"""Refusals: the right type of exception, with a message that names the fault."""
 
 import re
 from collections.abc import Callable, Mapping

@@ -1,6 +1,4 @@
-"""The stress plan as something that the runner of benchmarks can run: rows that outlive a crash,
-report and board.
-"""
+"""The stress plan as a benchmark, run row by row, with its report and board."""
 
 import json
 from collections import Counter

@@ -1,4 +1,4 @@
-"""What is put under stress: a part by name, with its options, on a device and in a dtype."""
+"""A part under stress: its name and options, on a device and in a dtype."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -241,9 +241,9 @@ def _radius(grid: Grid) -> float:
 #: The subjects that are more than a part, as strings, since their files import this one.
 SUBJECTS = {
     "projector": "mvrecon_bench.stresses.subject:ProjectorSubject",
-    "camera": "mvrecon_bench.stresses.rig:CameraSubject",
-    "head": "mvrecon_bench.stresses.learned:HeadSubject",
-    "model": "mvrecon_bench.stresses.learned:ModelSubject",
+    "camera": "mvrecon_bench.stresses.camera_subject:CameraSubject",
+    "head": "mvrecon_bench.stresses.learned_subjects:HeadSubject",
+    "model": "mvrecon_bench.stresses.learned_subjects:ModelSubject",
 }
 
 

@@ -17,9 +17,9 @@ from mvrecon.cameras.files import from_file, save
 from mvrecon.geometry.rigid import inverse, random_rotation
 from mvrecon.parts import CAMERAS
 from mvrecon.testing import check_camera
+from mvrecon_bench.stresses.camera_subject import CameraSubject
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.refusals import none_of, refusal
-from mvrecon_bench.stresses.rig import CameraSubject
 from mvrecon_bench.stresses.subject import gap, greatest
 
 #: Geometry is worked out in float64, whatever the dtype of volumes and views.
@@ -95,7 +95,7 @@ def moved_back(subject: CameraSubject) -> float:
     """A rigid motion and its inverse, the transpose: the same rig."""
     rig, R = subject.few, random_rotation(torch.Generator().manual_seed(6)).to(subject.few.source)
     t = rig.source.new_tensor([30.0, -50.0, 70.0])
-    return apart(rig.moved(R, t).moved(*inverse(R, t)), rig)
+    return rig_error(rig.moved(R, t).moved(*inverse(R, t)), rig)
 
 
 def bad_motions(subject: CameraSubject) -> float:
@@ -123,7 +123,7 @@ NO_ROTATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 def conversions(subject: CameraSubject) -> float:
     """To the terms of other libraries, to a file, and back: the same rig."""
-    return greatest(apart(other, subject.few) for other in _there_and_back(subject.few))
+    return greatest(rig_error(other, subject.few) for other in _there_and_back(subject.few))
 
 
 def _there_and_back(rig: Cameras) -> Iterator[Cameras]:
@@ -138,7 +138,7 @@ def _there_and_back(rig: Cameras) -> Iterator[Cameras]:
         yield convert.from_kornia(*convert.to_kornia(rig)[:2], shape, rig.distance, extent)
 
 
-def apart(rig: Cameras, expected: Cameras) -> float:
+def rig_error(rig: Cameras, expected: Cameras) -> float:
     """How far two rigs are apart, of the size of each vector."""
     alike = [(cameras.shape, cameras.parallel, cameras.extent) for cameras in (rig, expected)]
     assert alike[0] == alike[1], f"expected (shape, parallel, extent) {alike[1]}, got {alike[0]}"

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
+from mvrecon_bench.stresses.analytic import ends, ways
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.cases.algebra import DIGITS, LINEAR
 from mvrecon_bench.stresses.subject import ProjectorSubject, gap, greatest
-from mvrecon_bench.stresses.truths import ends, ways
 
 DOUBLE = (torch.float64,)
 #: Few rays, in a pose where none lies on a kink.

@@ -1,6 +1,4 @@
-"""What only a GPU can be asked: more than 2^31 voxels and pixels in its memory, and convolutions in
-bfloat16.
-"""
+"""GPU: more than 2^31 voxels and pixels in its memory, and convolutions in bfloat16."""
 
 import torch
 from torch.nn.functional import conv3d

@@ -10,7 +10,7 @@ from mvrecon.models.lift import Frusta
 from mvrecon.models.weighting import fuse
 from mvrecon.testing import check_head
 from mvrecon_bench.stresses.case import Case
-from mvrecon_bench.stresses.learned import GRID, HeadSubject, small_rig
+from mvrecon_bench.stresses.learned_subjects import GRID, HeadSubject, small_rig
 from mvrecon_bench.stresses.refusals import none_of
 from mvrecon_bench.stresses.subject import Subject, gap, greatest
 

@@ -1,6 +1,4 @@
-"""Points in the plane of a camera's source and behind it, which have no image; a source in the
-volume.
-"""
+"""Points without an image, in the plane of a source and behind it; a source in the volume."""
 
 import math
 from dataclasses import replace
@@ -12,10 +10,10 @@ from mvrecon.cameras import convert
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.lift import Frusta
+from mvrecon_bench.stresses.camera_subject import CameraSubject
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.cameras import EXACT
 from mvrecon_bench.stresses.refusals import none_of
-from mvrecon_bench.stresses.rig import CameraSubject
 
 #: Depths in mm at and about the plane of the source, and behind it.
 NOUGHT = (0.0, -0.0, 1e-12, -1e-12, 1e-8, -1e-8, -7.0)

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.grid import Grid
+from mvrecon_bench.stresses.analytic import DIRECTIONS, box_lengths, ends, rows, ways
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.subject import ProjectorSubject, greatest
-from mvrecon_bench.stresses.truths import DIRECTIONS, box_lengths, ends, rows, ways
 
 #: Exact in float64 but for the rotation of a ray into voxels; float32 rounds each of about ten
 #: sums.

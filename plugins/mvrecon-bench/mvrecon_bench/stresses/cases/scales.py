@@ -12,9 +12,9 @@ from torch import Tensor
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
+from mvrecon_bench.stresses.analytic import Blob, rows, through
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
-from mvrecon_bench.stresses.truths import Blob, rows, through
 
 #: What float32 loses where geometry is formed in float64, relative to the volume,
 #: before it is cast.

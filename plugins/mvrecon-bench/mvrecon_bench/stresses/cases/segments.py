@@ -1,4 +1,4 @@
-"""Where rays start and end: short ones, in the volume, beyond it, and detectors that cut it."""
+"""Ends of rays: short rays, sources and pixels inside the volume and beyond it, tiled detectors."""
 
 import itertools
 from dataclasses import replace
@@ -9,10 +9,10 @@ import torch
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
+from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.rays import EXACT
 from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, gap, greatest
-from mvrecon_bench.stresses.truths import box_lengths
 
 
 def short(subject: ProjectorSubject) -> float:

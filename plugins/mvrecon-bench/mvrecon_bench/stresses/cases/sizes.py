@@ -1,5 +1,5 @@
-"""Sizes: nothing at all, sizes that could be taken for each other, many cameras, large detectors,
-more than 2^31.
+"""Sizes: empty batches, equal and very different axes, many cameras, large detectors, 2^31
+values.
 """
 
 import math

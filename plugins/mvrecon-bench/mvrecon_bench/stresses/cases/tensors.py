@@ -1,4 +1,4 @@
-"""Tensors of any layout, dtype and history: what counts are the numbers that they hold."""
+"""Memory layout and history of tensors: only the numbers that they hold count."""
 
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,4 +1,4 @@
-"""Values of any kind: zeros of either sign, NaN, infinity, negative ones."""
+"""Values: zeros of either sign, NaN, infinity, negative ones."""
 
 from collections.abc import Callable, Iterator
 
@@ -9,9 +9,9 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.projectors.skipping import SKIPS
+from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, bits, gap
-from mvrecon_bench.stresses.truths import box_lengths
 
 EVERY = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 #: More than one brick along each axis, under a detector that does not see all of them.

@@ -1,4 +1,4 @@
-"""Heads and models under stress: small frusta, a small rig, and weights that are all in use."""
+"""Heads and models under stress, on small frusta and a small rig, with random weights."""
 
 import inspect
 from functools import cached_property

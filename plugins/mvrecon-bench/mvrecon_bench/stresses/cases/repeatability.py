@@ -1,5 +1,5 @@
-"""Again: twice, on more threads, in other threads and processes, many times over; and what a call
-leaves behind.
+"""Repeatability: the same bits twice, on more threads, in other threads and processes, over many
+calls; and what a call leaves behind.
 """
 
 import multiprocessing
@@ -19,8 +19,8 @@ from mvrecon.parts import MODELS, PROJECTORS, SCENES
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from mvrecon_bench.stresses.case import Case, DoesNotApply
+from mvrecon_bench.stresses.fresh_process import LIMIT, python
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits, rig_about
-from mvrecon_bench.stresses.subprocess_run import LIMIT, python
 
 #: Work for several threads.
 WORK = Grid.centred((28, 29, 30), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))

@@ -1,6 +1,4 @@
-"""Python in a process of its own: what must not run in this one, because it ends it or needs a
-fresh one.
-"""
+"""Python in a fresh process, for what would end this one or needs its imports undone."""
 
 import os
 import subprocess

@@ -1,6 +1,4 @@
-"""What rays ought to see, known without a projector: rows of voxels, chords of a box, a Gaussian
-blob.
-"""
+"""Closed-form views: sums over rows of voxels, chords of a box, integrals of a Gaussian blob."""
 
 import itertools
 from dataclasses import dataclass

@@ -1,6 +1,4 @@
-"""A camera under stress: a registered rig, with small options for all that it needs and was not
-given.
-"""
+"""A registered camera under stress, built with small options for all that it needs."""
 
 import inspect
 from collections.abc import Iterator
