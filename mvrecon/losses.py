@@ -1,5 +1,6 @@
-"""Training losses, all relative to the data's value range so that one set of weights serves every
-unit.
+"""Training losses, relative to the volumes' value range, so that the same weights serve every unit.
+
+The weights of a training run are those of `conf/train.yaml`.
 """
 
 import torch
@@ -19,11 +20,11 @@ def edge_difference(
 
     With a support only differences between two of its voxels count.
     """
-    error, each = a - b, []
+    error, terms = a - b, []
     for axis in (2, 3, 4):
         pairs = None if support is None else _neighbours(support, axis)
-        each.append(mean_where(error.diff(dim=axis).square(), pairs))
-    return torch.stack(each).mean()
+        terms.append(mean_where(error.diff(dim=axis).square(), pairs))
+    return torch.stack(terms).mean()
 
 
 def mean_where(values: Float[Tensor, "*n"], where: Bool[Tensor, "*n"] | None) -> Float[Tensor, ""]:
@@ -40,19 +41,19 @@ def _neighbours(support: Bool[Tensor, "b 1 d h w"], axis: int) -> Tensor:
 
 
 class ReconstructionLoss(nn.Module):
-    """Error of the volume, of each camera's own volume, and of what each predicts for the others.
+    """Weighted sum of the errors of the volume, of each camera's own volume (its opinion), and of
+    the views that opinions predict for the other cameras.
 
     Where a model works on a support, the means of the volumes' errors are over its voxels: all
-    others are 0 by definition, and nothing could be learnt there. The figures of merit see the
-    whole grid.
+    others are 0 by definition, and have no gradient. The figures of merit cover the whole grid.
 
     Args:
-        data_range: value range of the volumes, in their unit.
+        data_range: value range of the volumes, in their unit. A weight of 0 leaves its term out.
         volume: weight of the mean squared error.
         edges: weight of the squared error of first differences.
         opinions: weight of the mean squared error of the opinions, where the cameras see.
-        cross_view: weight of the squared error of opinions seen by the other cameras, relative to
-            the views.
+        cross_view: weight of the squared error of opinions projected to the other cameras,
+            relative to the views.
     """
 
     def __init__(
@@ -60,8 +61,8 @@ class ReconstructionLoss(nn.Module):
         data_range: float,
         volume: float = 1.0,
         edges: float = 0.0,
-        opinions: float = 0.1,
-        cross_view: float = 0.01,
+        opinions: float = 0.0,
+        cross_view: float = 0.0,
     ):
         super().__init__()
         if not data_range > 0:

@@ -1,8 +1,7 @@
-"""How far a reconstruction is from the truth: error of one volume, and of the views that it
-predicts.
+"""Figures of merit: PSNR (dB), SSIM and NRMSE of a volume against the truth, NRMSE of its views.
 
 PSNR and SSIM are torchmetrics' (imported late: it is slow); SSIM has a Gaussian window of 1.5
-voxels and reflected borders (Wang et al. 2004, IEEE TIP 13(4)). The data range is always given,
+voxels and reflected borders (Wang et al. 2004, IEEE TIP 13(4)). The data range is an argument,
 never taken from the data, so that numbers of different volumes compare.
 """
 

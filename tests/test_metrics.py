@@ -17,9 +17,9 @@ def case(shape=(1, 8, 9, 10)):
 
 def test_psnr_of_a_constant_offset_is_twenty_decibels_per_decade():
     truth, inside = case()
-    found = volume_metrics(truth + 0.2, truth, inside, data_range=2.0)
-    assert found["psnr"] == pytest.approx(20.0, abs=1e-4)
-    assert found["psnr_inside"] == pytest.approx(20.0, abs=1e-4)
+    figures = volume_metrics(truth + 0.2, truth, inside, data_range=2.0)
+    assert figures["psnr"] == pytest.approx(20.0, abs=1e-4)
+    assert figures["psnr_inside"] == pytest.approx(20.0, abs=1e-4)
 
 
 def test_the_data_range_is_the_given_one():
@@ -39,25 +39,25 @@ def test_nrmse_is_the_relative_norm_of_the_error():
 def test_inside_figures_see_the_object_only():
     truth, inside = case()
     outside = torch.where(inside, truth, truth + 10)
-    found = volume_metrics(outside, truth, inside, 1.0)
-    assert found["nrmse_inside"] == 0 and math.isinf(found["psnr_inside"])
-    assert found["nrmse"] > 1
+    figures = volume_metrics(outside, truth, inside, 1.0)
+    assert figures["nrmse_inside"] == 0 and math.isinf(figures["psnr_inside"])
+    assert figures["nrmse"] > 1
     within = torch.where(inside, truth + 0.1, truth)
     share = inside.float().mean().item()
-    found = volume_metrics(within, truth, inside, 1.0)
-    assert found["psnr_inside"] == pytest.approx(20, abs=1e-4)
-    assert found["psnr"] == pytest.approx(20 - 10 * math.log10(share), abs=1e-4)
+    figures = volume_metrics(within, truth, inside, 1.0)
+    assert figures["psnr_inside"] == pytest.approx(20, abs=1e-4)
+    assert figures["psnr"] == pytest.approx(20 - 10 * math.log10(share), abs=1e-4)
 
 
 def test_ssim_of_two_constants_is_its_luminance_term():
     a, b, c1 = 0.3, 0.7, 0.01**2
     shape = (1, 12, 12, 12)
     expected = (2 * a * b + c1) / (a * a + b * b + c1)
-    found = volume_metrics(
+    figures = volume_metrics(
         torch.full(shape, a), torch.full(shape, b), torch.ones(shape, dtype=torch.bool), 1.0
     )
-    assert found["ssim"] == pytest.approx(expected, abs=1e-6)
-    assert found["ssim_inside"] == pytest.approx(expected, abs=1e-6)
+    assert figures["ssim"] == pytest.approx(expected, abs=1e-6)
+    assert figures["ssim_inside"] == pytest.approx(expected, abs=1e-6)
 
 
 def test_ssim_inside_is_the_mean_of_the_map_over_the_object():
@@ -66,17 +66,21 @@ def test_ssim_inside_is_the_mean_of_the_map_over_the_object():
     near[:, :6] = True
     changed = truth.clone()
     changed[:, 18:] = 0  # farther from `near` than the window reaches
-    found = volume_metrics(changed, truth, near, 1.0)
-    assert found["ssim_inside"] == pytest.approx(1.0, abs=1e-9)
-    assert found["ssim"] < 0.9
+    figures = volume_metrics(changed, truth, near, 1.0)
+    assert figures["ssim_inside"] == pytest.approx(1.0, abs=1e-9)
+    assert figures["ssim"] < 0.9
     halves = [volume_metrics(changed, truth, mask, 1.0)["ssim_inside"] for mask in (near, ~near)]
-    assert 0.25 * halves[0] + 0.75 * halves[1] == pytest.approx(found["ssim"], abs=1e-9)
+    assert 0.25 * halves[0] + 0.75 * halves[1] == pytest.approx(figures["ssim"], abs=1e-9)
 
 
 def test_equal_volumes_are_perfect():
     truth, inside = case()
-    found = volume_metrics(truth, truth, inside, 1.0)
-    assert found["psnr"] == math.inf and found["nrmse"] == 0 and found["ssim"] == pytest.approx(1.0)
+    figures = volume_metrics(truth, truth, inside, 1.0)
+    assert (
+        figures["psnr"] == math.inf
+        and figures["nrmse"] == 0
+        and figures["ssim"] == pytest.approx(1.0)
+    )
 
 
 def test_an_empty_truth_and_an_empty_mask_are_no_accident():
@@ -105,9 +109,9 @@ def test_view_error_is_relative_over_all_cameras():
 )
 def test_bad_input_says_what_was_got(change, message):
     truth, inside = case()
-    given = {"volume": truth, "truth": truth, "inside": inside, "data_range": 1.0} | change
+    arguments = {"volume": truth, "truth": truth, "inside": inside, "data_range": 1.0} | change
     with pytest.raises(ValueError, match=message):
-        volume_metrics(**given)
+        volume_metrics(**arguments)
 
 
 def test_small_volumes_and_unequal_views_are_refused():

@@ -8,6 +8,7 @@ axis, where a description has no detector of its own.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -17,7 +18,31 @@ from mvrecon.cameras.camera import Cameras, Extent
 from mvrecon.geometry.frustum import homography_jacobian
 from mvrecon.geometry.rigid import check_rotation, unit
 
-KRt = tuple[Float[Tensor, "m 3 3"], Float[Tensor, "m 3 3"], Float[Tensor, "m 3"]]
+
+class KRt(NamedTuple):
+    """Intrinsics and pose of cameras, as of `to_krt`."""
+
+    K: Float[Tensor, "m 3 3"]
+    R: Float[Tensor, "m 3 3"]
+    t: Float[Tensor, "m 3"]
+
+
+class KorniaCameras(NamedTuple):
+    """What kornia's `PinholeCamera` is made from, in its order."""
+
+    intrinsics: Float[Tensor, "m 4 4"]
+    extrinsics: Float[Tensor, "m 4 4"]
+    height: Float[Tensor, " m"]
+    width: Float[Tensor, " m"]
+
+
+class PyTorch3DCameras(NamedTuple):
+    """What PyTorch3D's `PerspectiveCameras` is made from, in NDC."""
+
+    R: Float[Tensor, "m 3 3"]
+    T: Float[Tensor, "m 3"]
+    focal_length: Float[Tensor, "m 2"]
+    principal_point: Float[Tensor, "m 2"]
 
 
 def to_krt(cameras: Cameras) -> KRt:
@@ -36,7 +61,7 @@ def to_krt(cameras: Cameras) -> KRt:
     forward = unit(torch.linalg.cross(frame[..., 0], frame[..., 1]))
     R = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-2)
     K = torch.linalg.inv((R @ frame).triu()) * cameras.distance[:, None, None]
-    return K, R, -(R @ cameras.source[..., None])[..., 0]
+    return KRt(K, R, -(R @ cameras.source[..., None])[..., 0])
 
 
 def from_krt(
@@ -173,11 +198,7 @@ def from_astra(
     )
 
 
-def to_kornia(
-    cameras: Cameras,
-) -> tuple[
-    Float[Tensor, "m 4 4"], Float[Tensor, "m 4 4"], Float[Tensor, " m"], Float[Tensor, " m"]
-]:
+def to_kornia(cameras: Cameras) -> KorniaCameras:
     """Intrinsics, extrinsics, height and width for kornia's `PinholeCamera`.
 
     Convention: kornia, which is OpenCV's: extrinsics take the world to the camera, pixel centres
@@ -192,7 +213,7 @@ def to_kornia(
     intrinsics[:, :3, :3] = K
     extrinsics[:, :3, :3], extrinsics[:, :3, 3] = R, t
     height, width = (K.new_full((len(K),), n) for n in cameras.shape)
-    return intrinsics, extrinsics, height, width
+    return KorniaCameras(intrinsics, extrinsics, height, width)
 
 
 def from_kornia(
@@ -216,11 +237,7 @@ def from_kornia(
     return from_krt(K[:, :3, :3], E[:, :3, :3], E[:, :3, 3], shape, distance, extent)
 
 
-def to_pytorch3d(
-    cameras: Cameras,
-) -> tuple[
-    Float[Tensor, "m 3 3"], Float[Tensor, "m 3"], Float[Tensor, "m 2"], Float[Tensor, "m 2"]
-]:
+def to_pytorch3d(cameras: Cameras) -> PyTorch3DCameras:
     """R, T, focal_length and principal_point for PyTorch3D's `PerspectiveCameras` in NDC.
 
     Convention: PyTorch3D: row vectors X R + T, axes left, up, forward; NDC spans [-1, 1] over the
@@ -240,7 +257,8 @@ def to_pytorch3d(
     turned = K.new_tensor([-1, -1, 1])
     focal = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=-1) / half
     centre = K.new_tensor(cameras.shape[::-1]) / 2
-    return R.mT * turned, t * turned, focal, (centre - K[:, :2, 2] - 0.5) / half
+    point = (centre - K[:, :2, 2] - 0.5) / half
+    return PyTorch3DCameras(R.mT * turned, t * turned, focal, point)
 
 
 def _from_frame(
@@ -262,8 +280,8 @@ def _distances(distance: float | Tensor, like: Tensor) -> Float[Tensor, "m 1 1"]
     return distances[:, None, None]
 
 
-def _checked(name: str, given: Tensor, *shape: int) -> Tensor:
-    tensor = torch.as_tensor(given, dtype=torch.float64)
+def _checked(name: str, values: Tensor, *shape: int) -> Tensor:
+    tensor = torch.as_tensor(values, dtype=torch.float64)
     if tensor.ndim != len(shape) + 1 or tensor.shape[1:] != shape:
         raise ValueError(
             f"{name} must be [m {' '.join(map(str, shape))}], got {list(tensor.shape)}"

@@ -1,5 +1,5 @@
-"""Which cameras see a grid's box, and how deep: each view's pyramid cut with the box, both being
-half-spaces.
+"""Which cameras see a grid's box, and at which depths in mm: every view's pyramid cut with the box,
+both intersections of half-spaces.
 
 The cut is convex and bounded, so it is empty where it has no corner, and its depths are those of
 its corners. Every corner is the meeting point of three of the (at most twelve) planes; it is kept
@@ -55,9 +55,9 @@ def seen_depth_range(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 2"]:
     z, kept = _cut(cameras, grid, 0.0)
     nearest = torch.where(kept, z, torch.inf).amin(dim=1).clamp(*whole.T)
     farthest = torch.where(kept, z, -torch.inf).amax(dim=1).clamp(*whole.T)
-    seen = torch.stack([nearest, farthest], dim=1)
-    less = (seen - whole).abs() > SLACK * (whole[:, 1:] - whole[:, :1])
-    return torch.where(kept.any(dim=1)[:, None] & less, seen, whole)
+    visible = torch.stack([nearest, farthest], dim=1)
+    less = (visible - whole).abs() > SLACK * (whole[:, 1:] - whole[:, :1])
+    return torch.where(kept.any(dim=1)[:, None] & less, visible, whole)
 
 
 def _cut(
@@ -73,8 +73,8 @@ def _cut(
     frame = replace(cameras, parallel=False).matrix @ world.to(cameras.source)
     cube = torch.cat([torch.eye(3), -torch.eye(3)]).to(frame)
     cube = torch.cat([cube, cube.new_ones(6, 1)], dim=1).expand(len(frame), 6, 4)
-    found = [_corners(torch.cat([view, cube], dim=1)) for view in _views(frame, cameras)]
-    corners, kept = (torch.cat(parts, dim=1) for parts in zip(*found, strict=True))
+    cuts = [_corners(torch.cat([view, cube], dim=1)) for view in _views(frame, cameras)]
+    corners, kept = (torch.cat(parts, dim=1) for parts in zip(*cuts, strict=True))
     w = (corners * frame[:, 2:, :3]).sum(-1) + frame[:, 2:, 3]
     return w * cameras.distance[:, None], kept
 

@@ -1,4 +1,4 @@
-"""A flat detector, and the record of cameras that carry it."""
+"""A flat detector, its pixels and pitch in mm, and the record of cameras that have it."""
 
 import math
 from collections.abc import Mapping
@@ -33,11 +33,11 @@ class Detector:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            given = getattr(self, field.name)
-            pair = tuple(given) if isinstance(given, list | tuple) else (given, given)
+            value = getattr(self, field.name)
+            pair = tuple(value) if isinstance(value, list | tuple) else (value, value)
             if len(pair) != 2 or not all(isinstance(x, Real) and math.isfinite(x) for x in pair):
                 raise ValueError(
-                    f"A detector's {field.name} must be one number or two (v, u), got {given!r}"
+                    f"A detector's {field.name} must be one number or two (v, u), got {value!r}"
                 )
             object.__setattr__(self, field.name, pair)
         if not (all(x == int(x) and x >= 1 for x in self.pixels) and min(self.pixel_mm) > 0):

@@ -1,5 +1,5 @@
-"""Rays given one by one, for detectors that are no plane: curved ones, converging collimators,
-lines of response.
+"""Explicit rays: two points in mm for every pixel, for detectors that are not flat (curved
+detectors, converging collimators, lines of response).
 """
 
 from dataclasses import dataclass

@@ -38,7 +38,7 @@ def from_file(path: str | Path) -> Cameras:
 
     Layout: {"format": "mvrecon.cameras", "version": 1, "unit": "mm", "shape": [rows, columns],
     "parallel": false, "extent": "segment", "cameras": [{"source": [x, y, z], "origin": [..], "u":
-    [..], "v": [..]}, ..]}; the meaning of each is that of `Cameras`.
+    [..], "v": [..]}, ..]}; the meanings are those of `Cameras`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -64,9 +64,9 @@ def from_file(path: str | Path) -> Cameras:
 
 
 def _cameras(record: Any) -> Cameras:
-    found = record.get("format") if isinstance(record, dict) else type(record).__name__
-    if found != FORMAT:
-        raise ValueError(f"expected the format {FORMAT!r}, got {shown(found)}")
+    layout = record.get("format") if isinstance(record, dict) else type(record).__name__
+    if layout != FORMAT:
+        raise ValueError(f"expected the format {FORMAT!r}, got {shown(layout)}")
     for key, value in {"version": VERSION, "unit": "mm"}.items():
         if record.get(key) != value:
             raise ValueError(f"expected the {key} {value!r}, got {shown(record.get(key))}")
@@ -75,7 +75,7 @@ def _cameras(record: Any) -> Cameras:
     )
     if not (isinstance(shape, list) and all(type(n) is int and n <= PIXELS for n in shape)):
         raise ValueError(
-            f"expected 'shape' as [rows, columns], each up to {PIXELS}, got {shown(shape)}"
+            f"expected 'shape' as [rows, columns], both up to {PIXELS}, got {shown(shape)}"
         )
     if not isinstance(extent, str):
         raise ValueError(f"expected 'extent' as text, got {shown(extent)}")

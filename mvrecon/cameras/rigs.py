@@ -1,4 +1,4 @@
-"""Rigs by formula: cameras on a circle, on an arc, on a dome, and parallel beams.
+"""Rigs from a few mm and degrees: cameras on a circle, on an arc, on a dome, and parallel beams.
 
 Convention: angles in degrees turn counter-clockwise seen from +z, from the x axis: a camera at the
 angle a stands at (cos a, sin a, 0) and looks at the z axis; its rows are horizontal, u running to
@@ -169,13 +169,13 @@ def _angles(
     n_views: int, arc: float, start: float, angles: Sequence[float] | None
 ) -> Sequence[float]:
     _check_positive(n_views=n_views)
-    given = {
+    numbers = {
         "arc_degrees": [arc],
         "start_degrees": [start],
         "angles": [] if angles is None else angles,
     }
-    for name, degrees in given.items():
-        if not all(math.isfinite(each) for each in degrees):
+    for name, degrees in numbers.items():
+        if not all(math.isfinite(angle) for angle in degrees):
             raise ValueError(f"A rig's {name} must be finite degrees, got {degrees}")
     if angles is None:
         return [start + arc * k / n_views for k in range(n_views)]

@@ -1,5 +1,5 @@
-"""Rigs that are their own mirror image: what half of their rays tell, the other half need not be
-asked again.
+"""Mirror symmetry of a rig: half of its rays determine the matrix elements of the other half, which
+need not be computed.
 
 A mirror image of a camera is left-handed. Read from its other end, along rows or along columns, its
 detector is that of a right-handed camera again; if that camera is in the rig, each of the two sees
@@ -40,7 +40,7 @@ class Mirror:
         return volume.flip(self.axis)
 
     def views(self, views: Float[Tensor, "*b m v u"]) -> Float[Tensor, "*b m v u"]:
-        """The views G y of the mirror image of what was seen as y."""
+        """The views G y of the mirrored object, from the views y of the object."""
         other = views[..., self.partner.to(views.device), :, :]
         return torch.where(
             self.rows[:, None, None].to(views.device), other.flip(ROWS), other.flip(COLUMNS)
@@ -68,12 +68,12 @@ def mirror_pairs(cameras: Cameras, grid: Grid, tolerance: float = 1e-9) -> Mirro
     places = _places(cameras, grid)
     axes = unit(grid.affine[:3, :3], dim=0).T
     oblique = (axes @ axes.T).fill_diagonal_(0).abs().amax(dim=1) > tolerance
-    found = [
+    mirrors = [
         Mirror(-1 - column, *matched)
         for column in (2, 1, 0)
         if not oblique[column] and (matched := _partners(places, axes[column], tolerance))
     ]
-    return min(found, key=lambda mirror: mirror.share.count_nonzero().item(), default=None)
+    return min(mirrors, key=lambda mirror: mirror.share.count_nonzero().item(), default=None)
 
 
 def _places(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 2 2 2 3"]:
@@ -110,5 +110,5 @@ def _partners(
             if free is None:
                 return None
             partner[m], partner[free] = free, m
-    found = torch.tensor(partner)
-    return found, by_rows.cpu()[torch.arange(len(found)), found]
+    partners = torch.tensor(partner)
+    return partners, by_rows.cpu()[torch.arange(len(partners)), partners]

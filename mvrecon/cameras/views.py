@@ -1,11 +1,11 @@
-"""Views as they come from a measurement."""
+"""Checks of measured views."""
 
 from jaxtyping import Float
 from torch import Tensor
 
 
 def check_finite(views: Float[Tensor, "b c m v u"]) -> None:
-    """The door for measured values.
+    """Refuse measured views with NaN or infinite values.
 
     Raises:
         ValueError: values that are not finite.

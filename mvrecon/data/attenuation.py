@@ -1,4 +1,4 @@
-"""Between Hounsfield units and linear attenuation in 1/mm, at about 70 keV.
+"""Linear attenuation in 1/mm from Hounsfield units, at about 70 keV.
 
 By definition HU = 1000 (mu - mu_water) / mu_water; that line serves up to water. Above, a second
 line leads to bone, whose photoelectric share is larger: the bilinear form of CT-based attenuation
@@ -23,12 +23,3 @@ def attenuation(hu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     outside of their field of view (-1024, -2048) becomes air, 0.
     """
     return WATER * (1 + hu.clamp(-1000, 0) / 1000) + (BONE - WATER) * hu.clamp(min=0) / 1000
-
-
-def hounsfield(mu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Hounsfield units of a linear attenuation in 1/mm: the inverse of `attenuation` from -1000 HU
-    upwards.
-    """
-    return 1000 * (mu.clamp(max=WATER) / WATER - 1) + 1000 * (mu - WATER).clamp(min=0) / (
-        BONE - WATER
-    )

@@ -1,4 +1,4 @@
-"""Boxes of voxels: the part of a volume that has anything in it.
+"""Boxes of voxels: the least box around the non-zero voxels of a volume, crops and pastes by it.
 
 Convention: bounds are in the order of the tensor's axes (z, y, x), the upper ones one behind the
 last voxel.
@@ -36,11 +36,11 @@ class Box:
         """The least box that holds every true voxel of any of the masks; empty for none."""
         mask = mask.flatten(0, -4).any(dim=0) if mask.ndim > 3 else mask
         lines = mask.any(dim=2).any(dim=1), mask.any(dim=2).any(dim=0), mask.any(dim=1).any(dim=0)
-        found = [line.nonzero()[:, 0].tolist() for line in lines]
-        if not found[0]:
+        indices = [line.nonzero()[:, 0].tolist() for line in lines]
+        if not indices[0]:
             return cls((0, 0, 0), (0, 0, 0))
         return cls(
-            three([places[0] for places in found]), three([places[-1] + 1 for places in found])
+            three([along[0] for along in indices]), three([along[-1] + 1 for along in indices])
         )
 
     @property
@@ -82,15 +82,16 @@ class Box:
         """
         if not self.size:
             return self
-        low = [max(0, each - voxels) for each in self.low]
-        high = [min(int(n), each + voxels) for each, n in zip(self.high, shape, strict=True)]
+        low = [max(0, bound - voxels) for bound in self.low]
+        high = [min(int(n), bound + voxels) for bound, n in zip(self.high, shape, strict=True)]
         return Box(three(low), three(high))
 
     def aligned(self, multiple: int, shape: Sequence[int]) -> "Box":
         """Grown to bounds that are multiples of a number, or the volume's own."""
-        low = [each - each % multiple for each in self.low]
+        low = [bound - bound % multiple for bound in self.low]
         high = [
-            min(int(n), each + -each % multiple) for each, n in zip(self.high, shape, strict=True)
+            min(int(n), bound + -bound % multiple)
+            for bound, n in zip(self.high, shape, strict=True)
         ]
         return Box(three(low), three(high))
 
@@ -117,5 +118,5 @@ def bricks_along(shape: Sequence[int], edge: int) -> Three:
 
 def three(values: Iterable[int]) -> Three:
     """Three integers (z, y, x)."""
-    d, h, w = (int(each) for each in values)
+    d, h, w = (int(value) for value in values)
     return d, h, w

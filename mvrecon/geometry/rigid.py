@@ -77,7 +77,7 @@ def unit(vectors: Float[Tensor, "*n"], dim: int = -1) -> Float[Tensor, "*n"]:
 
 
 def check_rotation(R: Float[Tensor, "*n 3 3"]) -> None:
-    """The door for rotations.
+    """Refuse matrices that are no rotations.
 
     Raises:
         ValueError: R R^T is further than 1e-5 from 1 (float32's rounding is not), or det R is not

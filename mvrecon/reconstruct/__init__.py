@@ -1,1 +1,1 @@
-"""Classical reconstruction."""
+"""Classical iterative reconstruction with any linear operator: SIRT, MLEM, OSEM."""

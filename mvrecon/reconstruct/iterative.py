@@ -1,6 +1,7 @@
-"""Iterative reconstruction that needs a linear operator and nothing else."""
+"""SIRT, the simultaneous iterative reconstruction technique, with any linear operator."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,9 +12,20 @@ from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import ViewSelection
 
 
-def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-    """Inverse row sums R [1 1 *range] and column sums C [1 1 *domain] of A, zero where a ray or
-    voxel is empty.
+class SirtWeights(NamedTuple):
+    """The diagonal matrices of SIRT, zero where a ray meets no voxel or a voxel no ray.
+
+    Args:
+        row: R, the inverse row sums of A.
+        column: C, the inverse column sums of A.
+    """
+
+    row: Float[Tensor, "1 1 *range"]
+    column: Float[Tensor, "1 1 *domain"]
+
+
+def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> SirtWeights:
+    """SIRT's weights: the inverse sums of the rows and of the columns of A.
 
     A rig that is its own mirror image is projected by half; the numbers are the same up to
     rounding.
@@ -23,15 +35,14 @@ def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> tuple
         mirror = A.mirror()
         if mirror is None:
             rows = A(ones)
-            return inverse_sums(rows), inverse_sums(A.T(torch.ones_like(rows)))
+            return SirtWeights(inverse_sums(rows), inverse_sums(A.T(torch.ones_like(rows))))
         share = mirror.share.to(ones)[:, None, None]
         selection = ViewSelection(A.range_shape, share.flatten().nonzero()[:, 0].tolist())
         half = A.subset(selection)
         rows = share * selection.T(half(ones))
         columns = half.T(selection(share.expand_as(rows)))
-        return inverse_sums(rows + mirror.views(rows)), inverse_sums(
-            columns + mirror.volume(columns)
-        )
+        rows, columns = rows + mirror.views(rows), columns + mirror.volume(columns)
+        return SirtWeights(inverse_sums(rows), inverse_sums(columns))
 
 
 def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -44,9 +55,7 @@ def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 def correction(
     A: LinearOperator, residual: Float[Tensor, "b c m v u"], weights: tuple[Tensor, Tensor]
 ) -> Float[Tensor, "b c d h w"]:
-    """What residual views ask of each voxel, C A^T R r, in the unit of the volume; `weights` are
-    (R, C).
-    """
+    """The SIRT step C A^T R r of residual views r, in the unit of the volume; weights (R, C)."""
     row, column = weights
     return column * A.T(row * residual)
 

@@ -1,5 +1,5 @@
-"""The iterations that raise the Poisson likelihood of counts: MLEM, and OSEM over subsets of the
-cameras.
+"""MLEM, which maximises the Poisson likelihood of counts, and OSEM, the same over ordered subsets
+of the cameras.
 """
 
 import torch

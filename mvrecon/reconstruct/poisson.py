@@ -1,4 +1,4 @@
-"""The Poisson likelihood of counts, at a cost that falls with the number of bins that hold any."""
+"""The Poisson likelihood of counts, computed from the non-zero bins alone where that is faster."""
 
 from collections.abc import Sequence
 
@@ -133,9 +133,9 @@ class PoissonLikelihood:
             ValueError: as `expected`.
         """
         expected = self.expected(volume)
-        held = self.counts > 0
+        counted = self.counts > 0
         # an unexpected bin without counts has part 0, but would have the derivative 0 / 0
-        logs = self.counts * torch.where(held, expected, 1).double().log()
+        logs = self.counts * torch.where(counted, expected, 1).double().log()
         total = (
             (self.sensitivity(expected.dtype) * volume).flatten(1).sum(dim=1, dtype=torch.float64)
         )
@@ -173,8 +173,8 @@ class PoissonLikelihood:
 
 def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
     """y / ybar, and 0 where either is."""
-    held = (counts > 0) & (expected > 0)
-    return torch.where(held, counts / torch.where(held, expected, 1), 0)
+    counted = (counts > 0) & (expected > 0)
+    return torch.where(counted, counts / torch.where(counted, expected, 1), 0)
 
 
 def _spread(background: float | Tensor, counts: Tensor) -> Tensor:

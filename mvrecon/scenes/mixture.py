@@ -1,4 +1,4 @@
-"""Several scenes taken in turn."""
+"""A mixture of scenes: their cases in turn."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What a scene is, and what it gives: the measured views of a case and the truth behind them."""
+"""Scenes, and the samples that they make: the measured views of a case and the true volume."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -10,7 +10,7 @@ from mvrecon.geometry.grid import Grid
 
 
 class Rays(Protocol):
-    """The part of a camera rig that a scene looks at."""
+    """The rays of a rig, as far as a scene needs them."""
 
     @property
     def ray_extent(self) -> tuple[float, float]:
@@ -66,8 +66,8 @@ class Scene(Protocol):
 
 @runtime_checkable
 class Thin(Protocol):
-    """A scene that knows how thin what is in it can be."""
+    """A scene that states the least width of the bodies in it."""
 
     def thinnest(self, grid: Grid) -> float:
-        """The least width in mm of anything in any case on `grid`."""
+        """The least width in mm of any body in any case on `grid`."""
         ...

@@ -1,1 +1,1 @@
-"""Where a scene can have anything in it, told from its views."""
+"""The visual hull: the voxels that may be non-zero, computed from the views."""

@@ -1,5 +1,5 @@
-"""Where bricks of voxels are seen: rectangles of pixels, and sums of views over them in constant
-time.
+"""Footprints: the rectangles of pixels onto which bricks of voxels project, and sums of views over
+them in constant time.
 
 A brick is convex, so where all of it lies on one side of a camera's source its image lies between
 those of its corners. Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH
@@ -19,16 +19,16 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 
-#: Part of a pixel by which a ray that was computed in float32 may be beside its place.
+#: Part of a pixel by which rounding to float32 may shift a ray.
 ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Bricks:
-    """N boxes of voxels.
+    """N boxes of voxels, all cubes of one edge but where the grid ends.
 
     Args:
-        low: first voxel of each along (z, y, x).
+        low: first voxel of every brick along (z, y, x).
         high: one behind the last.
     """
 
@@ -37,8 +37,8 @@ class Bricks:
 
     @classmethod
     def at(cls, places: Int[Tensor, "n 3"], edge: int, shape: Sequence[int]) -> "Bricks":
-        """The bricks of that edge in these places (z, y, x) of the lattice of bricks; the grid's
-        end cuts the last.
+        """The bricks at indices (z, y, x) of the lattice of bricks with that edge in voxels; the
+        grid's end cuts the last.
         """
         low = places * edge
         return cls(low, torch.minimum(low + edge, low.new_tensor(list(shape))))
@@ -49,11 +49,11 @@ class Bricks:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """The pixels of every camera whose rays may meet a brick.
+    """The footprint of every brick in every view: the pixels whose rays may meet the brick.
 
     Args:
         low: first column and row (u, v), within the detector.
-        high: one behind the last; equal to `low` where the brick is not seen.
+        high: one behind the last; equal to `low` where the camera does not see the brick.
         whole: the camera sees all of the brick: its footprint, grown by a diagonal of a pixel at
             most, ends within the detector, and it lies in the part of the rays that counts.
     """
@@ -160,17 +160,17 @@ def _gaps(cameras: Cameras) -> tuple[Float[Tensor, "2 m 1"], Float[Tensor, "m 1"
     ]
 
 
-def tables(images: Shaped[Tensor, "*n v u"]) -> Int[Tensor, "*n v1 u1"]:
-    """Summed-area tables of whole numbers: the sum of all pixels above and left of a corner;
-    exact.
+def summed_area_tables(images: Shaped[Tensor, "*n v u"]) -> Int[Tensor, "*n v1 u1"]:
+    """The summed-area tables of images of whole numbers: at every pixel corner the sum of all
+    pixels above and to the left; exact.
     """
     dtype = torch.int32 if images.dtype == torch.bool else torch.int64
     sums = images.cumsum(dim=-1, dtype=dtype).cumsum(dim=-2, dtype=dtype)
     return torch.nn.functional.pad(sums, (1, 0, 1, 0))
 
 
-def sums(table: Int[Tensor, "*b m v1 u1"], prints: Footprints) -> Int[Tensor, "*b m n"]:
-    """Sums of the views behind the tables over every footprint."""
+def footprint_sums(table: Int[Tensor, "*b m v1 u1"], prints: Footprints) -> Int[Tensor, "*b m n"]:
+    """Sums of views over every footprint, from the views' summed-area tables."""
     width = table.shape[-1]
     flat = table.flatten(-2)
     (u0, v0), (u1, v1) = prints.low, prints.high

@@ -1,5 +1,5 @@
-"""The visual hull: what may hold something, told from where views are empty (Laurentini, IEEE PAMI
-16, 1994).
+"""The visual hull: the bricks of voxels that may be non-zero, computed from the background pixels
+of the views (Laurentini, IEEE PAMI 16, 1994).
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,12 +12,17 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.views import check_finite
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.visual_hull.footprints import Bricks, footprints, sums, tables
+from mvrecon.visual_hull.footprints import (
+    Bricks,
+    footprint_sums,
+    footprints,
+    summed_area_tables,
+)
 
-#: Views at a time, of all items of a batch: what some of them saw to be empty is not looked at in
+#: Views at a time, of all items of a batch: a brick that some of them prove empty is skipped in
 #: the next.
 VIEWS = 8
-#: Footprints at a time, which bounds the memory (500 bytes each).
+#: Footprints at a time, which bounds the memory (500 bytes a footprint).
 AT_ONCE = 2**15
 #: Diagonals of a pixel by which footprints are grown: 1 proves bodies absent that are nowhere
 #: thinner than that, and 2 takes in twice the length of what is half as wide, which so covers as
@@ -26,7 +31,7 @@ GAPS = 2.0
 #: One view in so many must see a brick to be empty, where bodies may be thinner than rays are
 #: apart.
 SHARE = 10
-#: Bricks of so many times the edge are tried first; what is empty of them has only empty ones in
+#: Bricks of so many times the edge are tried first; an empty one of them has only empty bricks in
 #: it.
 COARSER = 4
 
@@ -40,10 +45,11 @@ def visual_hull(
     witnesses: int = 1,
     keep_unseen: bool = True,
 ) -> Bool[Tensor, "b z y x"]:
-    """The bricks that may hold something, of a volume without negative values.
+    """The visual hull: the bricks of a non-negative volume that may hold non-zero voxels.
 
     A brick is empty where at least `witnesses` views that see all of it have no pixel above the
-    threshold in its footprint. What is seen in part only, or not at all, stays. With exact views,
+    background threshold in its footprint. A brick seen in part only, or not at all, stays. With
+    exact views,
     threshold 0 and one witness no occupied brick is lost, as long as the object is nowhere thinner
     than `ray_gap`; else see `thin_witnesses`.
 
@@ -52,11 +58,11 @@ def visual_hull(
         cameras: the rig.
         grid, brick: where the voxels lie, and how many make a brick's edge; the last bricks may be
             cut.
-        threshold: pixels up to it count as empty; one for all, or one for each.
-        witnesses: how many views must agree.
-        keep_unseen: else those also go that no view sees whole and none has a pixel above the
-            threshold for. The data know nothing of them: with threshold 0, MLEM and SIRT without
-            negative values make them zero themselves.
+        threshold: pixels up to it are background; one number, or one a pixel.
+        witnesses: how many views must agree that a brick is empty.
+        keep_unseen: False also drops the bricks that no view sees whole and that have no pixel
+            above the threshold in any view. The data know nothing of them: with threshold 0, MLEM
+            and non-negative SIRT make them zero themselves.
 
     Raises:
         ValueError: views of another size than the rig's or not finite, a NaN threshold, an edge or
@@ -67,38 +73,39 @@ def visual_hull(
         raise ValueError(
             f"Need a brick's edge and witnesses of at least 1, got {brick} and {witnesses}"
         )
-    cameras, limit = cameras.to(views.device), _limit(threshold, views)
+    cameras, background = cameras.to(views.device), _background(threshold, views)
+    foreground = views[:, 0] > background[:, 0]
     kept = views.new_ones((len(views), 1, 1, 1), dtype=torch.bool)
     for edge in _edges(brick, grid.shape):
         counts = bricks_along(grid.shape, edge)
         kept = _repeated(kept, COARSER, counts) if kept[0].numel() > 1 else kept.expand(-1, *counts)
         places = kept.any(dim=0).nonzero()
-        empty, dark = _witnesses(views[:, 0], limit[:, 0], cameras, grid, (places, edge, witnesses))
+        empty, dark = _witnesses(foreground, cameras, grid, places, edge, witnesses)
         kept = kept.clone()
         kept[:, *places.T] &= (empty < witnesses) & (~dark | keep_unseen)
     return kept
 
 
-def thin_witnesses(views: int) -> int:
-    """How many of a rig's views must agree, so that what is thinner than rays are apart is not
-    lost: a tenth.
+def thin_witnesses(n_views: int) -> int:
+    """How many of a rig's views must agree that a brick is empty, so that bodies thinner than the
+    gap between rays are not lost: a tenth.
 
-    If a view misses such a thing with a probability q, a fixed number of views that all miss it
-    turns up in a rig of enough views; a share of them above q hardly does, and the less, the more
+    If a view misses such a body with probability q, a rig of enough views has any fixed number that
+    all miss it. That a share of the views above q all miss it is improbable, the more so the more
     views there are.
     """
-    return max(1, views // SHARE)
+    return max(1, n_views // SHARE)
 
 
 def expand(
     bricks: Bool[Tensor, "b z y x"], brick: int, shape: Sequence[int]
 ) -> Bool[Tensor, "b 1 d h w"]:
-    """The voxels of a volume of `shape` that lie in the true bricks."""
+    """The mask of voxels, of a volume of `shape`, that lie in the true bricks."""
     return _repeated(bricks, brick, shape)[:, None]
 
 
 def check_measured(views: Float[Tensor, "b 1 m v u"], cameras: Cameras) -> None:
-    """The door for views from which a support is told.
+    """Refuse views from which no hull can be computed.
 
     Raises:
         ValueError: a wrong rank or size, or values that are not finite.
@@ -111,15 +118,15 @@ def check_measured(views: Float[Tensor, "b 1 m v u"], cameras: Cameras) -> None:
     check_finite(views)
 
 
-def _limit(
+def _background(
     threshold: float | Float[Tensor, "b 1 m v u"], views: Float[Tensor, "b 1 m v u"]
 ) -> Tensor:
-    limit = torch.as_tensor(threshold).to(views)
-    if limit.isnan().any():
+    background = torch.as_tensor(threshold).to(views)
+    if background.isnan().any():
         raise ValueError(
-            f"Expected a threshold, got {int(limit.isnan().sum())} values that are NaN"
+            f"Expected a threshold, got {int(background.isnan().sum())} values that are NaN"
         )
-    return limit.expand_as(views)
+    return background.expand_as(views)
 
 
 def _edges(brick: int, shape: Sequence[int]) -> Iterator[int]:
@@ -138,33 +145,31 @@ def _repeated(
 
 
 def _witnesses(
-    views: Float[Tensor, "b m v u"],
-    limit: Float[Tensor, "b m v u"],
+    foreground: Bool[Tensor, "b m v u"],
     cameras: Cameras,
     grid: Grid,
-    task: tuple[Int[Tensor, "n 3"], int, int],
+    places: Int[Tensor, "n 3"],
+    edge: int,
+    enough: int,
 ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
-    """How many views see each brick to be empty, counted as far as it takes; and which ones lit no
-    pixel of a view.
+    """The number of views that prove a brick empty, counted up to `enough`; and whether no view
+    looked at has a foreground pixel in the brick's footprint.
     """
-    places, edge, enough = task
-    batch = len(views)
-    empty = torch.zeros(batch, len(places), dtype=torch.int32, device=views.device)
-    dark, undecided = (
-        torch.ones_like(empty, dtype=torch.bool),
-        torch.arange(len(places), device=views.device),
-    )
+    batch, device = len(foreground), foreground.device
+    empty = torch.zeros(batch, len(places), dtype=torch.int32, device=device)
+    dark = torch.ones_like(empty, dtype=torch.bool)
+    undecided = torch.arange(len(places), device=device)
     rounds = -(-len(cameras) // max(1, VIEWS // batch))
     for turn in range(rounds):
         chosen = list(
             range(turn, len(cameras), rounds)
         )  # far apart on most rigs, so that they differ in what they see
-        table = tables(views[:, chosen] > limit[:, chosen])
+        table = summed_area_tables(foreground[:, chosen])
         for some in undecided.split(max(1, AT_ONCE // (batch * len(chosen)))):
             prints = footprints(
                 cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), gaps=GAPS
             )
-            none = sums(table, prints) == 0
+            none = footprint_sums(table, prints) == 0
             empty[:, some] += (none & prints.whole).sum(dim=1, dtype=torch.int32)
             dark[:, some] &= none.all(dim=1)
         undecided = undecided[(empty[:, undecided] < enough).any(dim=0)]

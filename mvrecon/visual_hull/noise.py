@@ -1,5 +1,5 @@
-"""Emptiness told from noisy views: of X-rays by their noise, of counts by a bound that holds with a
-stated probability.
+"""Empty bricks from noisy views: for X-rays by a threshold above the noise, for counts by an upper
+bound of the activity that holds with a stated probability.
 
 Counts prove nothing empty: a brick can be shown to hold less than a tolerance. Whatever else is in
 the scene only adds counts, so a brick of activity a, from which a set of pixels is to expect S
@@ -19,18 +19,23 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.visual_hull.footprints import Bricks, footprints, sums, tables
+from mvrecon.visual_hull.footprints import (
+    Bricks,
+    footprint_sums,
+    footprints,
+    summed_area_tables,
+)
 from mvrecon.visual_hull.hull import AT_ONCE, check_measured
 
 #: Views in a group whose counts are added.
 GROUP = 10
-#: Noisy views that must agree that a brick is empty.
+#: Witness views: how many noisy views must agree that a brick is empty.
 WITNESSES = 3
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What "empty" means where counts were bounded.
+    """How sure it is that the bricks left out are empty, where counts were bounded.
 
     Args:
         tolerance: mean activity of a brick, weighted by its sensitivity, that an empty one is
@@ -47,8 +52,8 @@ class Evidence:
 def noise_threshold(
     views: Float[Tensor, "b 1 m v u"], photons: float, sigmas: float = 4.0
 ) -> Float[Tensor, "b 1 m v u"]:
-    """So many standard deviations of the photon noise of X-ray line integrals, exp(p / 2) /
-    sqrt(photons) each.
+    """The background threshold of X-ray line integrals p: `sigmas` standard deviations of the
+    photon noise, which is exp(p / 2) / sqrt(photons).
 
     A `visual_hull` of noisy views takes it as its threshold, with several witnesses. What gives no
     ray more may then be lost: at 1e5 photons and 4 sigma that is p = 0.013, or 0.6 mm of water.
@@ -78,7 +83,7 @@ def bounded_hull(
     tolerance: float,
     delta: float = 1e-3,
 ) -> tuple[Bool[Tensor, "b z y x"], Evidence]:
-    """The bricks whose activity may reach a tolerance, from Poisson counts, and what that means.
+    """The bricks whose activity may reach a tolerance, from Poisson counts, and how sure that is.
 
     Args:
         counts: raw counts, whole numbers; nothing subtracted.
@@ -104,8 +109,8 @@ def activity_bound(
     sensitivity: Float[Tensor, "m z y x"],
     delta: float = 1e-3,
 ) -> Float[Tensor, "b z y x"]:
-    """What the activity of every brick is below, all at once with a probability of at least 1 -
-    delta.
+    """Upper bounds of the activity of every brick, which all hold at once with a probability of at
+    least 1 - delta.
 
     The activity bounded is the brick's mean, weighted with the sensitivity of its voxels. It is the
     least bound of a family of sets of views that does not depend on the data (`view_sets`);
@@ -131,13 +136,15 @@ def activity_bound(
         delta / (len(places) * len(sets)),
         sensitivity.to(counts.device, torch.float64).flatten(1),
     )
-    cameras, table = cameras.to(counts.device), tables(counts[:, 0])
+    cameras, table = cameras.to(counts.device), summed_area_tables(counts[:, 0])
     bounds = []
     for some in torch.arange(len(places), device=counts.device).split(
         max(1, AT_ONCE // (len(cameras) * len(counts)))
     ):
         prints = footprints(cameras, grid, Bricks.at(places[some], brick, grid.shape))
-        n, back = (sets @ sums(table, prints).to(torch.float64)).unique(return_inverse=True)
+        n, back = (sets @ footprint_sums(table, prints).to(torch.float64)).unique(
+            return_inverse=True
+        )
         bound = poisson_bound(n, share)[back] / (sets @ expected[:, some])
         bounds.append(bound.amin(dim=1))
     return torch.cat(bounds, dim=-1).reshape(len(counts), *lattice)

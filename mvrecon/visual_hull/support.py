@@ -1,4 +1,6 @@
-"""The part of a grid that is worked on, told from the views of a case."""
+"""The support of a volume: the voxels that may be non-zero, as a box and a mask, computed from the
+views of a case.
+"""
 
 import warnings
 from collections.abc import Mapping
@@ -24,17 +26,17 @@ WORTH = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Where a volume may be other than zero.
+    """The voxels of a volume that may be non-zero.
 
     Args:
-        box: the least box of voxels that holds it in every item of the batch; never empty, so that
-            a grid can always be cropped to it.
-        mask: its voxels on the full grid; none where all of the box counts.
+        box: the least box of voxels around the support of every item of the batch; never empty, so
+            that a grid can always be cropped to it.
+        mask: the support's voxels on the full grid; None where all of the box counts.
         kind: "hull", "box" or "none", as asked for or as "auto" chose.
         fraction: of the grid's voxels, those in the mask (the mean over the batch), or else in the
             box.
-        evidence: with what tolerance and probability the rest is empty; none where the hull is
-            exact, or told by sigma.
+        evidence: with what tolerance and probability the rest is empty; None where the hull is
+            exact, or comes from a threshold of some sigma.
     """
 
     box: Box
@@ -53,10 +55,10 @@ def support_from_views(
     brick: int | None = None,
     keep_unseen: bool = True,
 ) -> Support:
-    """The support of the volumes that views show.
+    """The support of the volumes behind views, from the views' visual hull.
 
-    Views in which nothing is seen leave no brick: the mask is then empty, and the box is the brick
-    at the centre.
+    Views of background alone leave no brick: the mask is then empty, and the box is the brick at
+    the centre.
 
     Args:
         views: line integrals, or counts.
@@ -70,11 +72,11 @@ def support_from_views(
                 least 3.
         brick: edge in voxels; by default `brick_edge`.
         keep_unseen: as of `visual_hull`; of counts, whether to keep bricks to which no view is
-            sensitive. Without, the support is of what the views show, and not of all that may be
-            there.
+            sensitive. False gives the support of what the views show, not of all that may exist.
 
     Warns:
-        UserWarning: voxels are smaller than rays are apart, so that what is no larger can be lost.
+        UserWarning: voxels are smaller than the gap between rays, so that bodies of that size can
+            be lost.
 
     Raises:
         ValueError: an unknown kind or noise, explicit rays with a kind but "none", views of a wrong
@@ -86,17 +88,17 @@ def support_from_views(
         return Support(Box.whole(grid.shape), None, "none", 1.0)
     if isinstance(cameras, ExplicitRays):
         raise ValueError(
-            f"A support is told from cameras with frusta, got explicit rays and kind {kind!r}; "
+            f"A support is computed from cameras with frusta, got explicit rays and kind {kind!r}; "
             f"use 'none'"
         )
     brick = brick_edge(grid) if brick is None else brick
-    bricks, evidence = _bricks((views, cameras, grid, brick), dict(noise or {}), keep_unseen)
+    bricks, evidence = _bricks(views, cameras, grid, brick, dict(noise or {}), keep_unseen)
     return _chosen(kind, expand(bricks, brick, grid.shape), _middle(grid, brick), evidence)
 
 
 def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stacklevel: int = 3) -> None:
-    """A UserWarning where a size in mm is below `ray_gap`: such things can pass between rays, and
-    be cut off a hull.
+    """Warn where a size in mm is below `ray_gap`: bodies of that size can lie between rays, and be
+    missing from a hull.
     """
     gap = ray_gap(cameras, grid)
     if size < gap * (1 - 1e-9):
@@ -113,10 +115,10 @@ def _chosen(
     kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None
 ) -> Support:
     whole, box = Box.whole(mask.shape[2:]), Box.around(mask) if mask.any() else middle
-    held = box.size / whole.size
+    fraction = box.size / whole.size
     if kind == "box":
-        return Support(box, None, "box", held, evidence)
-    if kind == "auto" and held >= WORTH:
+        return Support(box, None, "box", fraction, evidence)
+    if kind == "auto" and fraction >= WORTH:
         return Support(whole, None, "none", 1.0)
     return Support(box, mask, "hull", int(mask.sum()) / mask.numel(), evidence)
 
@@ -138,11 +140,14 @@ def _middle(grid: Grid, brick: int) -> Box:
 
 
 def _bricks(
-    case: tuple[Float[Tensor, "b 1 m v u"], Cameras, Grid, int],
+    views: Float[Tensor, "b 1 m v u"],
+    cameras: Cameras,
+    grid: Grid,
+    brick: int,
     noise: dict[str, Any],
     keep_unseen: bool,
 ) -> tuple[Bool[Tensor, "b z y x"], Evidence | None]:
-    _, cameras, grid, _ = case
+    case = views, cameras, grid, brick
     if "sensitivity" not in noise:
         warn_of_gaps(min(grid.spacing), "voxels", cameras, grid, stacklevel=4)
     enough = thin_witnesses(len(cameras))
@@ -152,7 +157,7 @@ def _bricks(
         ), None
     if "photons" in noise and noise.keys() <= {"photons", "sigmas", "witnesses"}:
         witnesses = noise.pop("witnesses", max(WITNESSES, enough))
-        return visual_hull(*case, noise_threshold(case[0], **noise), witnesses, keep_unseen), None
+        return visual_hull(*case, noise_threshold(views, **noise), witnesses, keep_unseen), None
     if {"sensitivity", "tolerance"} <= noise.keys() <= {"sensitivity", "tolerance", "delta"}:
         bricks, evidence = bounded_hull(*case, **noise)
         return bricks & (

@@ -1,1 +1,1 @@
-"""Pictures of volumes and views, as arrays."""
+"""Images of volumes and views for review, as arrays of 8-bit colours."""

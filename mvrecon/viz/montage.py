@@ -1,5 +1,5 @@
-"""Pictures for review: labelled tiles of planes, views, opinions and weights, with one fixed window
-of values each.
+"""Montages for review: labelled tiles of planes, views, opinions and weights, every kind of image
+with one fixed window of grey values.
 """
 
 from collections.abc import Mapping, Sequence
@@ -113,42 +113,44 @@ def views(measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"]) -
     return _captioned(columns, ("measured", "predicted", "difference"))
 
 
-def radiographs(each: Float[Tensor, "m v u"]) -> list[Image]:
-    """The views of all cameras as they are, bright where a ray met much; values from 0 to the
-    greatest of all.
+def radiographs(views: Float[Tensor, "m v u"]) -> list[Image]:
+    """The views of all cameras in grey, bright where the line integral is large; values from 0 to
+    the greatest of all.
     """
-    top = max(each.amax().item(), torch.finfo(torch.float32).tiny)
-    return [grey(view, (0, top)) for view in each]
+    top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
+    return [grey(view, (0, top)) for view in views]
 
 
-def gallery(each: Float[Tensor, "m v u"], edge: int = 256) -> Image:
+def gallery(views: Float[Tensor, "m v u"], edge: int = 256) -> Image:
     """The views of all cameras in rows of at most four; values from 0 to the greatest."""
     images = [
-        labelled(image, f"camera {m}") for m, image in enumerate(enlarged(radiographs(each), edge))
+        labelled(image, f"camera {m}") for m, image in enumerate(enlarged(radiographs(views), edge))
     ]
     images += [np.zeros_like(images[0])] * (-len(images) % min(4, len(images)))
     return tiled([images[i : i + 4] for i in range(0, len(images), 4)])
 
 
-def opinions(each: Float[Tensor, "m d h w"], data_range: float, spacing: Spacing = CUBES) -> Image:
+def opinions(
+    volumes: Float[Tensor, "m d h w"], data_range: float, spacing: Spacing = CUBES
+) -> Image:
     """Three middle planes (rows) of every camera's own volume (columns), to scale; values from 0 to
     data_range.
     """
-    return _per_camera(each, data_range, spacing)
+    return _per_camera(volumes, data_range, spacing)
 
 
-def weights(each: Float[Tensor, "m d h w"], spacing: Spacing = CUBES) -> Image:
+def weights(volumes: Float[Tensor, "m d h w"], spacing: Spacing = CUBES) -> Image:
     """Three middle planes (rows) of every camera's weight (columns), to scale.
 
     Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
     """
-    return _per_camera(each, 3 / len(each), spacing)
+    return _per_camera(volumes, 3 / len(volumes), spacing)
 
 
-def _per_camera(each: Float[Tensor, "m d h w"], top: float, spacing: Spacing) -> Image:
+def _per_camera(volumes: Float[Tensor, "m d h w"], top: float, spacing: Spacing) -> Image:
     columns = {
         f"camera {m}": [grey(p, (0, top)) for p in middle_planes(v, spacing)]
-        for m, v in enumerate(each)
+        for m, v in enumerate(volumes)
     }
     return _captioned(columns, PLANES)
 
@@ -157,8 +159,8 @@ def _captioned(columns: Mapping[str, Sequence[Image]], rows: Sequence[str]) -> I
     """Columns of images with their names above and the rows' names on the left, all at one
     scale.
     """
-    each = iter(enlarged([image for images in columns.values() for image in images]))
-    large = {name: [next(each) for _ in images] for name, images in columns.items()}
+    enlargements = iter(enlarged([image for images in columns.values() for image in images]))
+    large = {name: [next(enlargements) for _ in images] for name, images in columns.items()}
     heights = [
         max(0, image.shape[0] - LABEL) for image in next(iter(large.values()))
     ]  # a flat image has less

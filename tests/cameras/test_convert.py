@@ -38,9 +38,9 @@ def test_krt_projects_as_the_record_does_with_objects_in_front(extent):
     cameras = random_cameras(extent=extent)
     K, R, t = convert.to_krt(cameras)
     xyz, uvz = points(cameras)
-    seen = (xyz @ R.mT + t[:, None]) @ K.mT
-    close(seen[..., :2] / seen[..., 2:], uvz[..., :2])
-    close(seen[..., 2], uvz[..., 2].abs())
+    projected = (xyz @ R.mT + t[:, None]) @ K.mT
+    close(projected[..., :2] / projected[..., 2:], uvz[..., :2])
+    close(projected[..., 2], uvz[..., 2].abs())
 
 
 @CENTRAL

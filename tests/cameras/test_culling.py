@@ -78,18 +78,18 @@ def stretches(cameras: Cameras, grid: Grid, across: int = 41):
 def test_a_camera_is_left_out_only_if_no_ray_meets_the_box_and_hardly_one_else_is_kept(
     extent, parallel
 ):
-    seen, hit = [], []
+    visible, hit = [], []
     for seed in range(40):
         cameras = random_rig(seed, extent, parallel)
         grid = random_grid(seed, cameras)
         enter, leave = stretches(cameras, grid)
-        seen.append(views_that_see(cameras, grid, margin=0))
+        visible.append(views_that_see(cameras, grid, margin=0))
         hit.append((enter <= leave).any(dim=1))
-    seen, hit = torch.cat(seen), torch.cat(hit)
+    visible, hit = torch.cat(visible), torch.cat(hit)
     assert hit.any() and not hit.all()
-    assert seen[hit].all()
-    assert (seen & ~hit).sum() <= 0.02 * len(
-        seen
+    assert visible[hit].all()
+    assert (visible & ~hit).sum() <= 0.02 * len(
+        visible
     )  # the box's corner between two of the rays that were tried
 
 
@@ -170,11 +170,11 @@ def test_a_rig_sees_every_grid_it_was_made_for_and_only_a_part_of_it_sees_a_corn
     grid = Grid.centred((32, 32, 32), 4.0)
     assert views_that_see(cameras, grid).all()
     corner = grid.cropped(Box((0, 0, 0), (8, 8, 8)))
-    seen = views_that_see(cameras, corner)
-    assert not seen.all()
+    visible = views_that_see(cameras, corner)
+    assert not visible.all()
     A = PROJECTORS.build("drr", grid=corner, cameras=cameras, backend="reference")
     views = A(torch.ones(1, 1, 8, 8, 8))[0, 0]
-    assert torch.equal(seen, views.flatten(1).any(dim=1))
+    assert torch.equal(visible, views.flatten(1).any(dim=1))
 
 
 def test_the_margin_is_as_far_as_interpolation_reaches():

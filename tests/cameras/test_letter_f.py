@@ -45,7 +45,7 @@ def test_the_letter_lands_where_a_viewer_sees_it(name, magnification, turned, tm
         options = OPTIONS[name] | ({} if name == "dcspect80" else {"detector": DETECTOR})
     for camera in CAMERAS.build(name, **options):
         scale = magnification or (camera.distance / camera.source.norm()).item()
-        seen = camera.project(written_for(camera))[0]
+        images = camera.project(written_for(camera))[0]
         image = (
             torch.tensor([(a, -b) for a, b in F.values()], dtype=torch.float64)
             * scale
@@ -53,8 +53,8 @@ def test_the_letter_lands_where_a_viewer_sees_it(name, magnification, turned, tm
             / pitch(camera)
         )
         middle = torch.tensor([4.0, 2.5], dtype=torch.float64)
-        torch.testing.assert_close(seen[:, :2], middle + image, rtol=0, atol=1e-9)
-        assert (seen[:, 2] * turned > 0).all()
+        torch.testing.assert_close(images[:, :2], middle + image, rtol=0, atol=1e-9)
+        assert (images[:, 2] * turned > 0).all()
 
 
 @pytest.mark.parametrize(

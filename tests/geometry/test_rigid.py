@@ -85,9 +85,11 @@ def test_a_camera_looks_at_its_target_with_up_upwards():
     target = torch.tensor([3.0, -1.0, 2.0], dtype=torch.float64).expand_as(source)
     R = look_at(source, target)
     assert_rotations(R)
-    seen = (R @ (target - source)[..., None])[..., 0]
-    torch.testing.assert_close(seen[:, :2], torch.zeros_like(seen[:, :2]), atol=1e-10, rtol=0)
-    torch.testing.assert_close(seen[:, 2], (target - source).norm(dim=1))
+    in_camera = (R @ (target - source)[..., None])[..., 0]
+    torch.testing.assert_close(
+        in_camera[:, :2], torch.zeros_like(in_camera[:, :2]), atol=1e-10, rtol=0
+    )
+    torch.testing.assert_close(in_camera[:, 2], (target - source).norm(dim=1))
     up = R @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     assert up[:, 0].abs().max() < 1e-12 and (up[:, 1] < 0).all()  # image y points downwards
 

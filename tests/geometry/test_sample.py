@@ -14,11 +14,11 @@ def test_gathered_values_and_derivatives_are_those_of_grid_sample(shape):
     points = (3 * torch.rand(2, 3, 5, 7, 3, dtype=torch.float64) - 1.5).requires_grad_()
     points.data[0, 0, 0] = 4.0  # where `normalised` puts what does not count
     expected = F.grid_sample(volume, points, align_corners=False)
-    found = gathered(volume, points)
-    assert torch.allclose(found, expected, rtol=0, atol=1e-14)
-    onto = torch.randn_like(found)
+    samples = gathered(volume, points)
+    assert torch.allclose(samples, expected, rtol=0, atol=1e-14)
+    onto = torch.randn_like(samples)
     for ours, theirs in zip(
-        torch.autograd.grad(found, (volume, points), onto),
+        torch.autograd.grad(samples, (volume, points), onto),
         torch.autograd.grad(expected, (volume, points), onto),
         strict=True,
     ):

@@ -151,7 +151,7 @@ def test_cameras_that_see_nothing_of_the_crop_are_left_out_and_change_nothing(sh
     def done():
         model.zero_grad()
         crop, out = model.cropping.region(views)[0], model(views)
-        ReconstructionLoss(1.0)(out, batch)["total"].backward()
+        ReconstructionLoss(1.0, opinions=0.1, cross_view=0.01)(out, batch)["total"].backward()
         return (
             crop,
             out,

@@ -177,7 +177,9 @@ def test_every_parameter_learns_on_a_support_met_first_in_evaluation(
     with torch.inference_mode():
         model(views)
     out = model.train()(views)
-    ReconstructionLoss(1.0, edges=0.1)(out, {"volume": volume, "views": views})["total"].backward()
+    ReconstructionLoss(1.0, edges=0.1, opinions=0.1, cross_view=0.01)(
+        out, {"volume": volume, "views": views}
+    )["total"].backward()
     assert not [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
     assert len(model.cropping.crops) == 1
 
@@ -237,7 +239,7 @@ def test_losses_count_what_is_in_the_support(projector, scenes, monkeypatch):
     _with_mask(monkeypatch, mask)
     with torch.no_grad():
         out = _build("cross_view", projector, support="hull")(views)
-    loss = ReconstructionLoss(1.0, edges=1.0)
+    loss = ReconstructionLoss(1.0, edges=1.0, opinions=0.1, cross_view=0.01)
     terms = loss(out, {"volume": volume, "views": views})
     error = (out.volume - volume)[mask]
     assert terms["volume"].item() == pytest.approx(error.square().mean().item(), rel=1e-4)

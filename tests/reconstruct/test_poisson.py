@@ -58,8 +58,8 @@ def test_value_and_gradient_are_those_of_all_bins(kind, background, skip):
     expected, value = naive(A, counts, x, added), L(x)
     assert value.shape == (2,) and ((value - expected) / expected).abs().max() < 1e-12
     (exact,) = torch.autograd.grad(expected.sum(), x)
-    (found,) = torch.autograd.grad(value.sum(), x)
-    assert gap(found, exact) < 1e-10 and gap(L.gradient(x), exact) < 1e-10
+    (slope,) = torch.autograd.grad(value.sum(), x)
+    assert gap(slope, exact) < 1e-10 and gap(L.gradient(x), exact) < 1e-10
 
 
 @pytest.mark.parametrize("moving", ["source", "origin"])
@@ -163,8 +163,8 @@ def test_the_truth_stays_where_it_is():
     truth = torch.rand(1, 1, *GRID.shape, dtype=torch.float64)
     for subsets in (1, 3):
         x = mlem(A, A(truth) + 0.3, 3, 0.3, start=truth, subsets=subsets)
-        seen = PoissonLikelihood(A, A(truth)).sensitivity(torch.float64) > 0
-        assert torch.allclose(x[seen], truth[seen], rtol=1e-12, atol=0)
+        sensitive = PoissonLikelihood(A, A(truth)).sensitivity(torch.float64) > 0
+        assert torch.allclose(x[sensitive], truth[sensitive], rtol=1e-12, atol=0)
         assert PoissonLikelihood(A, A(truth) + 0.3, 0.3).gradient(truth).abs().max() < 1e-12
 
 

@@ -53,9 +53,9 @@ def direct(A):
 def assert_invert(A, weights):
     for weight, sums in zip(weights, direct(A), strict=True):
         assert torch.equal(weight > 0, sums > 1e-6 * sums.max())
-        found = torch.where(weight > 0, 1 / weight, 0)
+        inverse = torch.where(weight > 0, 1 / weight, 0)
         torch.testing.assert_close(
-            found, sums.where(weight > 0, 0), rtol=1e-9, atol=1e-12 * sums.max().item()
+            inverse, sums.where(weight > 0, 0), rtol=1e-9, atol=1e-12 * sums.max().item()
         )
 
 

@@ -9,7 +9,14 @@ from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.solids import Phantom
-from mvrecon.visual_hull.footprints import Bricks, Footprints, footprints, ray_gap, sums, tables
+from mvrecon.visual_hull.footprints import (
+    Bricks,
+    Footprints,
+    footprint_sums,
+    footprints,
+    ray_gap,
+    summed_area_tables,
+)
 from tests.visual_hull.cases import KINDS, World, operator, random_world
 
 DETECTOR = {"pixels": [9, 12], "pixel_mm": 1.0}
@@ -49,9 +56,9 @@ def test_no_pixel_that_a_brick_contributes_to_is_missed(kind: str, method: str):
         volumes[n, 0][tuple(slice(*ends) for ends in zip(low, high, strict=True))] = 1.0
     hit = operator(world, method)(volumes)[:, 0].transpose(0, 1) != 0
     prints = footprints(world.cameras, world.grid, bricks, reach=0.0 if method == "siddon" else 0.5)
-    seen = covered(prints, world.cameras.shape)
+    visible = covered(prints, world.cameras.shape)
     assert hit.any()
-    assert not (hit & ~seen).any()
+    assert not (hit & ~visible).any()
 
 
 def test_a_whole_footprint_is_no_wider_than_the_shadow():
@@ -129,16 +136,16 @@ def test_sums_over_footprints_are_those_of_their_pixels():
         direct = torch.einsum(
             "bmvu,mnvu->bmn", counts.double(), covered(prints, world.cameras.shape).double()
         )
-        assert torch.equal(sums(tables(counts), prints).double(), direct)
+        assert torch.equal(footprint_sums(summed_area_tables(counts), prints).double(), direct)
         lit = counts > 500
         direct = torch.einsum(
             "bmvu,mnvu->bmn", lit.double(), covered(prints, world.cameras.shape).double()
         )
-        assert torch.equal(sums(tables(lit), prints).double(), direct)
+        assert torch.equal(footprint_sums(summed_area_tables(lit), prints).double(), direct)
 
 
 def test_sums_of_counts_lose_no_count():
-    table = tables(torch.full((1, 40, 50), 2.0**31 - 128))
+    table = summed_area_tables(torch.full((1, 40, 50), 2.0**31 - 128))
     assert table[0, -1, -1].item() == 2000 * (2**31 - 128)
 
 

@@ -39,17 +39,17 @@ def test_no_occupied_brick_is_lost_and_some_empty_ones_are(kind: str):
     """105 random worlds, 15 of each kind, seen by exact integrals and by the operator of a voxel
     phantom.
     """
-    held = []
+    fractions = []
     for seed in range(15):
         world, brick = random_world(kind, seed), BRICKS[seed % len(BRICKS)]
         volume = voxelise(world.phantom, world.grid, 3)
         assert (volume > 0).any()
-        seen = operator(world)(volume[None, None])
-        for views in (world.views, seen):
+        projection = operator(world)(volume[None, None])
+        for views in (world.views, projection):
             stays = kept(world, views, brick)
             assert not (occupied(volume, brick) & ~stays).any(), f"{kind}, seed {seed}"
-            held.append(stays.float().mean().item())
-    assert min(held) < (1.0 if kind == "inside" else 0.7)
+            fractions.append(stays.float().mean().item())
+    assert min(fractions) < (1.0 if kind == "inside" else 0.7)
 
 
 def test_a_lone_voxel_is_kept_where_the_rays_are_no_further_apart_than_voxels():
@@ -96,8 +96,10 @@ def test_it_shrinks_with_every_view_whatever_their_order(kind: str):
 def test_it_moves_with_the_world(kind: str):
     world, rng = random_world(kind, 7), torch.Generator().manual_seed(2)
     R, t = random_rotation(rng), 300 * torch.randn(3, generator=rng, dtype=torch.float64)
-    there = World(moved(world.grid, R, t), world.cameras.moved(R, t), world.phantom.moved(R, t))
-    assert torch.equal(kept(there, world.views), kept(world))
+    moved_world = World(
+        moved(world.grid, R, t), world.cameras.moved(R, t), world.phantom.moved(R, t)
+    )
+    assert torch.equal(kept(moved_world, world.views), kept(world))
 
 
 def test_what_no_view_sees_whole_stays_and_all_else_goes_when_nothing_is_seen():
@@ -105,14 +107,14 @@ def test_what_no_view_sees_whole_stays_and_all_else_goes_when_nothing_is_seen():
         world = random_world(kind, 4)
         lattice = bricks_along(world.grid.shape, EDGE)
         bricks = Bricks.at(torch.ones(lattice).nonzero(), EDGE, world.grid.shape)
-        seen = (
+        whole = (
             footprints(world.cameras, world.grid, bricks, gaps=True)
             .whole.any(dim=0)
             .reshape(lattice)
         )
         stays = kept(world, torch.zeros_like(world.views))[0]
-        assert torch.equal(stays, ~seen)
-        assert seen.any()
+        assert torch.equal(stays, ~whole)
+        assert whole.any()
 
 
 @pytest.mark.parametrize("kind", ["inside", "beams", "dcspect80"])
@@ -158,9 +160,9 @@ def test_items_of_a_batch_do_not_know_of_each_other():
     world = random_world("cone", 2)
     other = world.views.flip(-1)
     both = torch.cat([world.views, other, torch.zeros_like(other)])
-    each = [kept(world, views[None]) for views in both]
-    assert torch.equal(kept(world, both), torch.cat(each))
-    assert not torch.equal(each[0], each[1])
+    hulls = [kept(world, views[None]) for views in both]
+    assert torch.equal(kept(world, both), torch.cat(hulls))
+    assert not torch.equal(hulls[0], hulls[1])
 
 
 def test_pixels_up_to_the_threshold_are_empty():

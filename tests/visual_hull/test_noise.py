@@ -1,4 +1,4 @@
-"""Emptiness told from noisy views: what is lost, and how often."""
+"""Empty bricks from noisy views: what is lost, and how often."""
 
 import math
 
@@ -107,14 +107,14 @@ def test_an_active_brick_is_lost_no_more_often_than_stated(monkeypatch):
     def lost(stays: torch.Tensor) -> float:
         return (active & ~stays).flatten(1).any(dim=1).double().mean().item()
 
-    rig, told = world.cameras, (brick_sensitivity(back, 3), tolerance * (1 - 1e-9), delta)
-    stays, evidence = bounded_hull(counts, rig, world.grid, 3, *told)
+    rig, terms = world.cameras, (brick_sensitivity(back, 3), tolerance * (1 - 1e-9), delta)
+    stays, evidence = bounded_hull(counts, rig, world.grid, 3, *terms)
     assert lost(stays) <= delta
     assert stays.float().mean() < 0.75
-    assert (evidence.tolerance, evidence.delta, evidence.tests) == (*told[1:], 15)
+    assert (evidence.tolerance, evidence.delta, evidence.tests) == (*terms[1:], 15)
     # what would not do: all of delta for every test, or one view without a count as a proof
     monkeypatch.setattr(noise, "poisson_bound", lambda n, share: poisson_bound(n, delta))
-    assert lost(bounded_hull(counts, rig, world.grid, 3, *told)[0]) > delta
+    assert lost(bounded_hull(counts, rig, world.grid, 3, *terms)[0]) > delta
     assert lost(visual_hull(counts, rig, world.grid, 3)) > delta
 
 

@@ -1,4 +1,4 @@
-"""The support of a case: its kinds, and what it is not told from."""
+"""The support of a case: its kinds, and what it cannot be computed from."""
 
 import warnings
 from dataclasses import replace
@@ -72,9 +72,9 @@ def test_auto_takes_the_hull_only_where_its_box_is_a_part_of_the_grid():
 def test_a_box_holds_the_hulls_of_all_items_of_a_batch():
     views = torch.cat([SMALL.views, SMALL.views.flip(-1)])
     support = support_from_views(views, SMALL.cameras, SMALL.grid, "hull")
-    alone = [support_from_views(each[None], SMALL.cameras, SMALL.grid, "hull") for each in views]
+    alone = [support_from_views(item[None], SMALL.cameras, SMALL.grid, "hull") for item in views]
     assert support.box == alone[0].box.joined(alone[1].box)
-    assert torch.equal(support.mask, torch.cat([each.mask for each in alone]))
+    assert torch.equal(support.mask, torch.cat([item.mask for item in alone]))
 
 
 def test_views_of_nothing_give_an_empty_mask_in_one_brick_at_the_centre():
@@ -95,20 +95,20 @@ def test_noise_chooses_how_emptiness_is_told():
     )
     assert torch.equal(noisy.mask, expand(bricks, edge, shape)) and noisy.evidence is None
     lattice = [-(-n // 4) for n in shape]
-    told = {
+    noise = {
         "sensitivity": torch.ones(len(SMALL.cameras), *lattice),
         "tolerance": 0.5,
         "delta": 1e-2,
     }
-    counts = support_from_views(SMALL.views.round(), SMALL.cameras, SMALL.grid, "hull", told, 4)
+    counts = support_from_views(SMALL.views.round(), SMALL.cameras, SMALL.grid, "hull", noise, 4)
     assert counts.evidence is not None and (counts.evidence.tolerance, counts.evidence.delta) == (
         0.5,
         1e-2,
     )
-    told["sensitivity"][:, 0, 0, 0] = 0.0
+    noise["sensitivity"][:, 0, 0, 0] = 0.0
     for keep in (True, False):
         counts = support_from_views(
-            SMALL.views.round(), SMALL.cameras, SMALL.grid, "hull", told, 4, keep
+            SMALL.views.round(), SMALL.cameras, SMALL.grid, "hull", noise, 4, keep
         )
         assert bool(counts.mask[0, 0, 0, 0, 0]) == keep
     for unknown in (

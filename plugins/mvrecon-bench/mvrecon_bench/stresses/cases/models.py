@@ -175,9 +175,9 @@ def gradients(subject: ModelSubject) -> float:
     if not named:
         raise DoesNotApply("it has nothing to train")
     out = model(subject.views[:2])
-    loss = ReconstructionLoss(1.0)(out, {"volume": subject.truth[:2], "views": subject.views[:2]})[
-        "total"
-    ]
+    loss = ReconstructionLoss(1.0, opinions=0.1, cross_view=0.01)(
+        out, {"volume": subject.truth[:2], "views": subject.views[:2]}
+    )["total"]
     slopes_of = dict(
         zip(named, torch.autograd.grad(loss, list(named.values()), allow_unused=True), strict=True)
     )
