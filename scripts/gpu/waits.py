@@ -16,6 +16,7 @@ import torch
 from as_gpu import AsGpu, OnGpu, launches, put, waits
 from check import VECTORS
 from measuring import reason
+from mvrecon.support.support import support_from_views
 
 import mvrecon as mv
 from mvrecon.config import compose
@@ -27,7 +28,6 @@ from mvrecon.projectors.selection import ray_subset, view_subset
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.reconstruct.iterative import sirt_weights
 from mvrecon.reconstruct.poisson import PoissonLikelihood
-from mvrecon.support.support import support_from_views
 
 N, PIXELS = 24, 36
 DETECTOR = {"pixels": [PIXELS, PIXELS], "pixel_mm": 6.0}

@@ -119,7 +119,9 @@ def test_every_parameter_of_cross_view_learns():
     model = _build("cross_view", projector)
     _stir(model)
     volume, views = _blob_views(projector)
-    loss = ReconstructionLoss(1.0, edges=0.1)(model(views), {"volume": volume, "views": views})
+    loss = ReconstructionLoss(1.0, edges=0.1, opinions=0.1, cross_view=0.01)(
+        model(views), {"volume": volume, "views": views}
+    )
     loss["total"].backward()
     idle = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
     assert not idle and set(loss) == {"volume", "edges", "opinions", "cross_view", "total"}
@@ -159,7 +161,9 @@ def test_models_that_skip_nothing_answer_as_they_did(name):
         model.opinions.pixels.weight.data *= model.opinions.unit
     volume, views = _blob_views(projector)
     out = model(views)
-    loss = ReconstructionLoss(1.0, edges=0.1)(out, {"volume": volume, "views": views})["total"]
+    loss = ReconstructionLoss(1.0, edges=0.1, opinions=0.1, cross_view=0.01)(
+        out, {"volume": volume, "views": views}
+    )["total"]
     x = out.volume
     found = (x.sum(), x.square().mean(), x[0, 0, 5, 6, 5], x[1, 0, 8, 4, 3], loss)
     assert [value.item() for value in found] == pytest.approx(BEFORE[name], rel=1e-3)

@@ -104,9 +104,10 @@ class Bed:
     def operator(self, mode: str, masked: bool = False) -> RayTransform:
         """The projector in a mode, with the support as part of it or not."""
         grid = self.grid.cropped(self.box) if mode == CROPPED else self.grid
-        options = {"method": self.method, "skip": OFF if mode in DENSE else mode}
-        options |= {"support": self.cut(self.mask, mode)} if masked else {}
-        return RayTransform(grid, self.cameras, **options).to(self.device)
+        support = self.cut(self.mask, mode) if masked else None
+        skip = OFF if mode in DENSE else mode
+        A = RayTransform(grid, self.cameras, self.method, skip=skip, support=support)
+        return A.to(self.device)
 
     def cut(self, volume: Tensor, mode: str) -> Tensor:
         """What a mode works on of a volume."""
