@@ -1,4 +1,5 @@
-"""Tensors that say that they lie on a GPU and keep their numbers in main memory: no GPU is needed.
+"""Tensors that say that they lie on a GPU and keep their numbers in main memory: no GPU is needed,
+but a build of torch with CUDA.
 
 What runs on them shows, with real values and so with the real flow of control: devices that do not
 meet (an error, as on a GPU), where the host waits for the device (`waits`, by place in mvrecon),
