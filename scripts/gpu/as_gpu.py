@@ -82,7 +82,7 @@ class OnGpu(torch.Tensor):
         return f"OnGpu({tuple(self.shape)})"
 
     @classmethod
-    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):  # pyright: ignore
         return dispatch(func, args, kwargs or {})
 
 
@@ -213,7 +213,7 @@ class AsGpu:
             mode.__exit__(*error)
 
 
-def put(module: torch.nn.Module) -> torch.nn.Module:
+def put(module: Any) -> Any:
     """A module with its weights and buffers as if on a GPU."""
     for part in module.modules():
         for name, value in list(part._parameters.items()):

@@ -8,7 +8,7 @@ import argparse
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -107,7 +107,7 @@ def show_models(places: bool) -> None:
     show("figures of merit", lambda: figures(batch), places)
 
 
-def figures(batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def figures(batch: Mapping[str, torch.Tensor]) -> dict[str, float]:
     """Of a volume that is a tenth too small."""
     true = batch["volume"][0]
     return volume_metrics(true * 0.9, true, batch["inside"][0], 1.0)
