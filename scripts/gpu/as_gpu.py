@@ -58,7 +58,7 @@ def is_gpu(device: Any) -> bool:
 class OnGpu(torch.Tensor):
     """A tensor in main memory that says it is on a GPU."""
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore
     values: torch.Tensor
 
     @staticmethod
@@ -82,7 +82,7 @@ class OnGpu(torch.Tensor):
         return f"OnGpu({tuple(self.shape)})"
 
     @classmethod
-    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):  # pyright: ignore
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
         return dispatch(func, args, kwargs or {})
 
 
