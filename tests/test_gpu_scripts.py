@@ -38,6 +38,13 @@ def test_a_script_without_a_gpu_says_so(name: str, run_python, tmp_path: Path):
     assert not out.exists()
 
 
+@pytest.mark.skipif(torch.version.cuda is not None, reason="a build of torch with CUDA")
+def test_waits_are_counted_by_a_build_with_cuda_alone(run_python):
+    done = run_python("scripts/gpu/waits.py")
+    assert done.returncode == 1
+    assert "waits.py needs a build of torch with CUDA, got torch" in done.stderr
+
+
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 def test_the_prototype_is_the_reference(run_python):
     done = run_python("scripts/gpu/prototype.py", "--check")

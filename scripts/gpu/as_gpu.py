@@ -1,4 +1,5 @@
-"""Tensors that say that they lie on a GPU and keep their numbers in main memory: no GPU is needed.
+"""Tensors that say that they lie on a GPU and keep their numbers in main memory: no GPU is needed,
+but a build of torch with CUDA.
 
 What runs on them shows, with real values and so with the real flow of control: devices that do not
 meet (an error, as on a GPU), where the host waits for the device (`waits`, by place in mvrecon),
@@ -57,7 +58,7 @@ def is_gpu(device: Any) -> bool:
 class OnGpu(torch.Tensor):
     """A tensor in main memory that says it is on a GPU."""
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore
     values: torch.Tensor
 
     @staticmethod
@@ -212,7 +213,7 @@ class AsGpu:
             mode.__exit__(*error)
 
 
-def put(module: torch.nn.Module) -> torch.nn.Module:
+def put(module: Any) -> Any:
     """A module with its weights and buffers as if on a GPU."""
     for part in module.modules():
         for name, value in list(part._parameters.items()):

@@ -103,7 +103,7 @@ def nvrtc(source: str, flags: Sequence[str]) -> bytes:
     Raises:
         RuntimeError: it does not compile.
     """
-    import nvidia  # torch's own wheels
+    import nvidia  # pyright: ignore[reportMissingImports]  # torch's own wheels
 
     paths = [
         path

@@ -125,6 +125,7 @@ def train(trainer: Trainer, results: Results) -> None:
         results.add("peak MB of a step", torch.cuda.max_memory_allocated() / 2**20)
     steps = options.steps or max(5, int(options.seconds / one))
     results.add("steps", steps)
+    assert trainer.optimizer is not None
     schedule = build_schedule(trainer.optimizer, "cosine", steps, 0.05)
     losses, start = [], time.perf_counter()
     for step in range(1, steps + 1):

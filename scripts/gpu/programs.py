@@ -4,6 +4,8 @@ where they are installed.
 Volumes are [n d h w], views [n m v u]. A program that lacks a direction has None in its place.
 """
 
+# pyright: reportMissingImports=false
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
