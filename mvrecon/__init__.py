@@ -1,11 +1,11 @@
-"""mvrecon: volumes from several cameras' views, by operators, classical methods and networks that
-know the geometry.
+"""Volumes from the views of several cameras: operators, classical methods, and networks that know
+the geometry.
 
 The front door. Every name is imported when it is first used, so `import mvrecon` costs nothing::
 
     import mvrecon as mv
 
-    A = mv.Drr(mv.Grid.centred((64, 64, 64), 4.0), mv.dcspect80(pixels=[32, 32]))
+    A = mv.Drr(mv.Grid.centred(64, spacing=4.0), mv.dcspect80(pixels=[32, 32]))
     volume = mv.sirt(A, A(x), iterations=50)
 """
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from mvrecon.cameras.rigs import circular as circular
     from mvrecon.cameras.rigs import dome as dome
     from mvrecon.cameras.rigs import parallel as parallel
-    from mvrecon.data.nifti import read_nifti as read_volume  # noqa: F401
-    from mvrecon.engine.checkpoints import load as load
-    from mvrecon.engine.export import save_nifti as save_volume  # noqa: F401
+    from mvrecon.data.volume_files import read_volume as read_volume
+    from mvrecon.data.volume_files import save_volume as save_volume
+    from mvrecon.engine.trained import load as load
     from mvrecon.geometry.grid import Grid as Grid
     from mvrecon.projectors.drr import Drr as Drr
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
@@ -45,21 +45,23 @@ _DOOR = {
     "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.cameras.rigs:dome",
     "from_file": "mvrecon.cameras.files:from_file",
-    "load": "mvrecon.engine.checkpoints:load",
+    "load": "mvrecon.engine.trained:load",
     "mlem": "mvrecon.reconstruct.mlem:mlem",
     "parallel": "mvrecon.cameras.rigs:parallel",
-    "read_volume": "mvrecon.data.nifti:read_nifti",
-    "save_volume": "mvrecon.engine.export:save_nifti",
+    "read_volume": "mvrecon.data.volume_files:read_volume",
+    "save_volume": "mvrecon.data.volume_files:save_volume",
     "sirt": "mvrecon.reconstruct.iterative:sirt",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _DOOR:
-        raise AttributeError(f"mvrecon has no {name!r}. It has {', '.join(sorted(_DOOR))}")
+        from mvrecon.registry import hint
+
+        raise AttributeError(f"mvrecon has no {name!r}{hint(name, _DOOR)}")
     module, _, attribute = _DOOR[name].partition(":")
     return getattr(import_module(module), attribute)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_DOOR])
+    return sorted([*_DOOR, "__version__"])

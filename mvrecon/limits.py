@@ -2,15 +2,19 @@
 they are used.
 """
 
+import os
 import reprlib
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 #: Bytes: the most that are read of a text file, of a YAML file (whose parser is slow), and that one
-#: volume or one chunk of a file may unfold to.
-TEXT, YAML, VOLUME = 16 * 2**20, 64 * 2**10, 8 * 2**30
+#: volume, and one chunk, of a file may unfold to.
+TEXT, YAML, VOLUME, CHUNK = 16 * 2**20, 64 * 2**10, 8 * 2**30, 2**28
+#: Voxels that a volume from a file may have along an axis.
+EDGE = 2**14
 #: Bytes that a name may have; values of a YAML file.
 NAME, NODES = 200, 100_000
 #: A deflate stream yields at most this many bytes for each of its own: 258 for two bits (RFC 1951).
@@ -117,3 +121,51 @@ def plain_name(name: Any, where: str | Path) -> str:
 def shown(value: Any) -> str:
     """A value from a file, short enough for a message."""
     return reprlib.repr(value)
+
+
+def check_memory(needed: int, what: str) -> None:
+    """Refuse at once what memory cannot take; a gibibyte or less is not looked at.
+
+    Raises:
+        ValueError: more bytes than are at hand, with both in GiB.
+    """
+    if needed > 2**30 and (room := memory_at_hand()) is not None and needed > room:
+        raise ValueError(
+            f"{what} needs {needed / 2**30:,.1f} GiB of memory; {room / 2**30:,.1f} GiB are at hand"
+        )
+
+
+def memory_at_hand() -> int | None:
+    """Bytes that this process may still take: what the system has free, less where a limit is set;
+    None: not known.
+    """
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    rooms = [*_free(), *_left_in_group()]
+    soft = resource.getrlimit(resource.RLIMIT_AS)[0]
+    statm = Path("/proc/self/statm")
+    if soft != resource.RLIM_INFINITY and statm.exists():
+        rooms.append(soft - int(statm.read_text().split()[0]) * resource.getpagesize())
+    return max(0, min(rooms)) if rooms else None
+
+
+def _free() -> Iterator[int]:
+    meminfo = Path("/proc/meminfo")
+    if meminfo.exists():
+        lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
+        yield sum(
+            int(lines[key].split()[0]) * 1024
+            for key in ("MemAvailable", "SwapFree")
+            if key in lines
+        )
+    else:  # macOS does not say what is free
+        yield os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def _left_in_group() -> Iterator[int]:
+    """What a container may still take (Linux, cgroup v2)."""
+    most, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
+    if most.exists() and used.exists() and (text := most.read_text().strip()) != "max":
+        yield int(text) - int(used.read_text())

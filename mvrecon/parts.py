@@ -33,7 +33,7 @@ HEADS = Registry(
 )
 MODELS = Registry(
     "model",
-    cross_view="mvrecon.models.model:CrossView",
+    cross_view="mvrecon.models.cross_view:CrossView",
     mean_fusion="mvrecon.models.baselines:MeanFusion",
     backprojection_unet="mvrecon.models.baselines:BackprojectionUNet",
     geometry_free="mvrecon.models.baselines:GeometryFree",

@@ -12,6 +12,7 @@ listed is 0; HU are the values - 1024.
 
 import argparse
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -96,26 +97,42 @@ def patients(folders: list[Path], title: str) -> Iterator[Stored]:
         yield patient(folder)
 
 
-def prepare(clone: Path, out: Path) -> dict[Path, int]:
+def prepare(clone: Path, out: Path, skip: bool = False) -> dict[Path, int]:
     """Write every set that the clone has; returns the files and how many patients each holds.
 
+    Args:
+        clone: its folder.
+        out: where the files go.
+        skip: leave out patients without a `ct.csv`.
+
     Raises:
-        FileNotFoundError: the clone has no patients.
+        FileNotFoundError: the clone has no patients, or, without `skip`, some that lack a `ct.csv`;
+            nothing is written.
     """
+    folders = {
+        name: sorted_patients(clone / "provided-data" / folder) for name, folder in SETS.items()
+    }
+    empty = [p for group in folders.values() for p in group if not (p / "ct.csv").is_file()]
+    if empty and not skip:
+        names = ", ".join(f"{p.parent.name}/{p.name}" for p in empty)
+        raise FileNotFoundError(
+            f"{clone}: {len(empty)} patient(s) without ct.csv: {names}; --skip leaves them out"
+        )
     written = {}
-    for name, folder in SETS.items():
-        found = [
-            p for p in (clone / "provided-data" / folder).glob("pt_*") if (p / "ct.csv").exists()
-        ]
-        if found:
-            found.sort(key=lambda p: int(re.sub(r"\D", "", p.name)))
+    for name, group in folders.items():
+        if whole := [p for p in group if p not in empty]:
             path = out / f"openkbp_{name}.h5"
-            written[path] = write_volumes(path, patients(found, path.name), **ATTRIBUTES)
+            written[path] = write_volumes(path, patients(whole, path.name), **ATTRIBUTES)
     if not written:
         raise FileNotFoundError(
             f"{clone}: expected a clone with provided-data/{SETS['train']}/pt_*/ct.csv, found none"
         )
     return written
+
+
+def sorted_patients(folder: Path) -> list[Path]:
+    """The patients' folders of a set, by their numbers."""
+    return sorted(folder.glob("pt_*"), key=lambda p: int(re.sub(r"\D", "", p.name)))
 
 
 def main() -> None:
@@ -125,8 +142,13 @@ def main() -> None:
     )
     parser.add_argument("clone", type=Path, help="folder of the clone")
     parser.add_argument("--out", type=Path, default=Path("data"), help="where the files go (data)")
+    parser.add_argument("--skip", action="store_true", help="leave out patients without ct.csv")
     options = parser.parse_args()
-    for path, count in prepare(options.clone, options.out).items():
+    try:
+        written = prepare(options.clone, options.out, options.skip)
+    except (OSError, ValueError) as error:
+        sys.exit(str(error))
+    for path, count in written.items():
         Console().print(f"{path}: {count} patients")
 
 

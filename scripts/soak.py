@@ -24,7 +24,7 @@ from mvrecon.config import compose
 
 OPTIONS = (
     "experiment=smoke",
-    "grid.shape=[8,8,8]",
+    "grid.size=[8,8,8]",
     "grid.spacing=16.0",
     "camera.detector.pixels=[12,12]",
     "camera.detector.pixel_mm=22.0",

@@ -16,7 +16,7 @@ from mvrecon.cameras.camera import VECTORS
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 
-GRID = ("grid.shape=[16,16,16]", "grid.spacing=8")
+GRID = ("grid.size=[16,16,16]", "grid.spacing=8")
 PARALLEL = (
     "camera=parallel",
     "camera.n_views=3",
@@ -142,12 +142,7 @@ def test_the_app_works_in_foreign_places(root, tmp_path):
     here, out, home = tmp_path / "où ça", tmp_path / "ausgabe für 目录", tmp_path / "home"
     here.mkdir()
     home.touch()
-    options = (
-        "grid.shape=[4,4,4]",
-        "camera.n_views=1",
-        "camera.detector.pixels=[4,4]",
-        "cases=[0]",
-    )
+    options = ("grid.size=[4,4,4]", "camera.n_views=1", "camera.detector.pixels=[4,4]", "cases=[0]")
     place = {
         "PYTHONPATH": str(root),
         "HOME": str(home),

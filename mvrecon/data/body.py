@@ -1,13 +1,15 @@
 """Where the patient is in a CT volume."""
 
 import math
+from collections.abc import Iterable, Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mvrecon.geometry.grid import Grid
+from mvrecon.data.slabs import Slabs, ends
+from mvrecon.geometry.box import Box, three
 
 #: Blocks along the longest edge in which connected parts are told apart, which bounds the time.
 BLOCKS = 48
@@ -19,12 +21,69 @@ def body(mu: Float[Tensor, "d h w"], threshold: float) -> Bool[Tensor, "d h w"]:
     Parts closer to each other than a block of a 48th of the longest edge count as one.
     """
     mask = mu > threshold
-    size = math.ceil(max(mask.shape) / BLOCKS)
-    blocks = F.avg_pool3d(mask[None, None].float(), size, ceil_mode=True)[0, 0] >= 0.5
-    near = _spread(largest_part(blocks if blocks.any() else blocks | True).float(), 3) > 0
-    for axis, n in enumerate(mask.shape):
-        near = near.repeat_interleave(size, dim=axis).narrow(axis, 0, n)
-    return mask & near
+    size = _block(mask.shape)
+    near = _near(F.avg_pool3d(mask[None, None].float(), size, ceil_mode=True)[0, 0] >= 0.5)
+    return mask & _spread_out(near, size, mask.shape, range(3))
+
+
+def body_box(mu: Slabs, threshold: float) -> Box:
+    """The box of the voxels that `body` would give of the whole volume; empty where there are none.
+
+    Memory: a slab, and of every block the voxels above the threshold, counted along each axis.
+    """
+    size, k = _block(mu.shape), mu.axis
+    shape = [
+        mu.shape[k],
+        *(n for axis, n in enumerate(mu.shape) if axis != k),
+    ]  # the slabs' axis first
+    blocks = [-(-n // size) for n in shape]
+    inside = torch.zeros(blocks, dtype=torch.int32)
+    along = [
+        torch.zeros(*blocks[:i], shape[i], *blocks[i + 1 :], dtype=torch.int32) for i in range(3)
+    ]
+    for first, slab in mu:
+        mask = (slab > threshold).movedim(k, 0)
+        at = (first + torch.arange(len(mask))) // size
+        rows, columns = _counted(mask, size, 1), _counted(mask, size, 2)
+        cells = _counted(rows, size, 2)
+        along[0][first : first + len(mask)] = cells
+        for total, part in ((inside, cells), (along[1], columns), (along[2], rows)):
+            total.index_add_(0, at, part)
+    near = _near(2 * inside.movedim(0, k) >= _voxels(mu.shape, size)).movedim(k, 0)
+    masks = [(along[i] > 0) & _spread_out(near, size, shape, [i]) for i in range(3)]
+    limits = [ends(mask.movedim(i, 0).flatten(1).any(dim=1)) for i, mask in enumerate(masks)]
+    limits.insert(k, limits.pop(0))
+    return Box(three([low for low, _ in limits]), three([high for _, high in limits]))
+
+
+def _block(shape: Sequence[int]) -> int:
+    return math.ceil(max(shape) / BLOCKS)
+
+
+def _near(blocks: Bool[Tensor, "e i j"]) -> Bool[Tensor, "e i j"]:
+    """The largest part of blocks that are half full, and all blocks that touch it."""
+    return _spread(largest_part(blocks if blocks.any() else blocks | True).float(), 3) > 0
+
+
+def _spread_out(
+    blocks: Bool[Tensor, "e i j"], size: int, shape: Sequence[int], axes: Iterable[int]
+) -> Bool[Tensor, "d h w"]:
+    """What is true of blocks, for every voxel along some axes."""
+    for axis in axes:
+        blocks = blocks.repeat_interleave(size, dim=axis).narrow(axis, 0, shape[axis])
+    return blocks
+
+
+def _counted(values: Tensor, size: int, axis: int) -> Int[Tensor, "d h w"]:
+    """Sums over blocks along an axis, the last of which may be smaller."""
+    rest = [0, 0] * (2 - axis) + [0, -values.shape[axis] % size]
+    return F.pad(values, rest).unflatten(axis, (-1, size)).sum(dim=axis + 1, dtype=torch.int32)
+
+
+def _voxels(shape: Sequence[int], size: int) -> Int[Tensor, "e i j"]:
+    """How many voxels every block has."""
+    z, y, x = (_counted(torch.ones(n, 1, 1, dtype=torch.bool), size, 0).flatten() for n in shape)
+    return z[:, None, None] * y[:, None] * x
 
 
 def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
@@ -60,9 +119,3 @@ def enclosed(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
         after = mask.flip(axis).cummax(dim=axis).values.flip(axis)
         filled &= before & after
     return mask | filled
-
-
-def centre(mask: Bool[Tensor, "d h w"], grid: Grid) -> Float[Tensor, "3"]:
-    """World mm of the centre of the mask's box."""
-    places = mask.nonzero().flip(1)
-    return grid.to_world((places.amin(dim=0) + places.amax(dim=0)).double() / 2)

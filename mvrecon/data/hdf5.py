@@ -1,31 +1,45 @@
 """Volume files: CT volumes of one shape in one HDF5 file, axes z, y, x.
 
-    ct        [n d h w]  Hounsfield units, any integer or float type; one compressed chunk a volume
-    spacing   [n 3]      mm between voxels along z, y, x
-    id        [n]        name of each volume, UTF-8, of fixed length; one that can be a file's
-    label     [n d h w]  optional, uint8: structures, 0 outside all of them; not read by the scenes
+    ct        [n d h w]  Hounsfield units, any integer or float type; compressed chunks of planes,
+    of up to 32 MiB spacing   [n 3]      mm between voxels along z, y, x
+    id        [n]        name of each volume, UTF-8, of fixed length; one that can be a file's, and
+    no other's label     [n d h w]  optional, uint8: structures, 0 outside all of them; not read by
+    the scenes
 
 Attributes of the file: `axes` = "z, y, x" and `units` = "HU"; optional `orientation`, three letters
 that say towards which side of the patient (L or R, P or A, I or S) the axes x, y, z run; others
 (`labels`, `source`) are for the reader.
+
+What mvrecon writes has checksums throughout, so that a damaged file is refused: of every chunk, and
+of the layout (the format of HDF5 1.10). A file that others wrote has those that they chose, often
+none.
 """
 
+import math
 import os
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import torch
 
+from mvrecon.data.slabs import Slab, Slabs, planes
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.data.texts import texts_of, variable
 from mvrecon.durable import written_whole
 from mvrecon.limits import NAME, SPACING, Refused, blaming, plain_name, shown
 
+#: Bytes of a chunk that is written, unless one plane has more.
+CHUNK = 2**25
+#: Versions of HDF5 whose format is written: the first with checksums of the layout.
+FORMAT = ("v110", "v110")
 LAYOUT = {"axes": "z, y, x", "units": "HU"}
 Texts = dict[str, list[str]]
+Spacing = tuple[float, float, float]
 EXPECTED = (
     "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU, spacing [n 3] in mm, "
     "id [n], axes z, y, x"
@@ -45,7 +59,7 @@ class Stored:
 
     name: str
     ct: np.ndarray
-    spacing: tuple[float, float, float]
+    spacing: Spacing
     label: np.ndarray | None = None
 
 
@@ -55,10 +69,10 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
 
     Raises:
         ValueError: volumes of different shapes, only some with labels, or none; a name that cannot
-            be a file's.
+            be a file's, or that two volumes have.
     """
-    count = 0
-    with written_whole(path) as part, h5py.File(part, "w") as file:
+    count, names = 0, []
+    with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
         for key, value in {**LAYOUT, **attributes}.items():
             text = value.encode()
             file.attrs.create(key, text, dtype=h5py.string_dtype("utf-8", max(1, len(text))))
@@ -80,23 +94,19 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
                 dataset: Any = file[name]
                 dataset.resize(count, axis=0)
                 dataset[count - 1] = array
+            names.append(volume.name)
         if not count:
             raise ValueError(f"{path}: expected at least one volume to write, got none")
+        _check_names(path, names)
     return count
 
 
 def _create(file: h5py.File, arrays: Mapping[str, np.ndarray]) -> None:
     for name, array in arrays.items():
-        chunks = {"chunks": (1, *array.shape), "maxshape": (None, *array.shape)}
-        file.create_dataset(
-            name,
-            (0, *array.shape),
-            array.dtype,
-            **chunks,
-            compression="gzip",
-            compression_opts=9,
-            shuffle=True,
-        )
+        depth = min(array.shape[0], max(1, CHUNK // array[0].nbytes))
+        packed = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "fletcher32": True}
+        sizes = {"chunks": (1, depth, *array.shape[1:]), "maxshape": (None, *array.shape)}
+        file.create_dataset(name, (0, *array.shape), array.dtype, **sizes, **packed)
     file.create_dataset("spacing", (0, 3), "f8", maxshape=(None, 3), fletcher32=True)
     file.create_dataset(
         "id", (0,), h5py.string_dtype("utf-8", NAME), maxshape=(None,), fletcher32=True
@@ -114,9 +124,10 @@ class VolumeFile:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self._open: tuple[int, h5py.File, Texts] | None = None
+        self._sound: set[int] = set()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"path": self.path, "_open": None}
+        return {"path": self.path, "_open": None, "_sound": set()}
 
     @property
     def file(self) -> h5py.File:
@@ -130,7 +141,7 @@ class VolumeFile:
 
     def _checked(self) -> tuple[h5py.File, Texts]:
         if self._open is None or self._open[0] != os.getpid():
-            self._open = (os.getpid(), *_opened(self.path))
+            self._open, self._sound = (os.getpid(), *_opened(self.path)), set()
         return self._open[1:]
 
     def __len__(self) -> int:
@@ -147,16 +158,53 @@ class VolumeFile:
         return next(iter(self._checked()[1].get("@orientation", [])), None)
 
     def read(self, index: int) -> Stored:
-        """One volume, without its labels.
+        """One volume in memory, without its labels.
 
         Raises:
             ValueError: its bytes cannot be read, or its name could not be a file's.
         """
+        name, spacing = self._about(index)
+        ct = self._dataset("ct")
+        parts = np.empty(ct.shape[1:], ct.dtype)
+        for first, part in self._parts(index):
+            parts[first : first + len(part)] = part
+        return Stored(name, parts, spacing)
+
+    def slabs(self, index: int) -> tuple[str, Slabs, Spacing]:
+        """Name, Hounsfield units and spacing (z, y, x) of a volume that is read at every pass, a
+        chunk at a time.
+
+        Raises:
+            ValueError: its name could not be a file's; in a pass: its bytes cannot be read.
+        """
+        name, spacing = self._about(index)
+        shape = self._dataset("ct").shape[1:]
+        step = planes(math.prod(shape[1:]))
+
+        def passes() -> Iterator[Slab]:
+            for first, part in self._parts(index):
+                for k in range(0, len(part), step):
+                    yield first + k, torch.from_numpy(part[k : k + step].astype("float32"))
+
+        return name, Slabs(shape, 0, passes), spacing
+
+    def _about(self, index: int) -> tuple[str, Spacing]:
         names = self._checked()[1]["id"]
         with blaming(self.path, f"volume {index} cannot be read"):
-            check_chunks(self.path, self._dataset("ct"), index)
-            ct, spacing = (self._dataset(key)[index] for key in ("ct", "spacing"))
-            return Stored(plain_name(names[index], self.path), ct, tuple(spacing.tolist()))
+            z, y, x = self._dataset("spacing")[index].tolist()
+            return plain_name(names[index], self.path), (z, y, x)
+
+    def _parts(self, index: int) -> Iterator[tuple[int, np.ndarray]]:
+        """Planes of a volume as they are stored, chunk by chunk, with the first one's index."""
+        with blaming(self.path, f"volume {index} cannot be read"):
+            ct = self._dataset("ct")
+            if index not in self._sound:
+                check_chunks(self.path, ct, index)
+                self._sound.add(index)
+            depth = ct.chunks[1] if ct.chunks else 1
+            step = max(depth, planes(math.prod(ct.shape[2:])) // depth * depth)
+            for first in range(0, ct.shape[1], step):
+                yield first, ct[index, first : first + step]
 
 
 def _opened(path: Path) -> tuple[h5py.File, Texts]:
@@ -188,6 +236,7 @@ def _check(path: Path, file: h5py.File) -> Texts:
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = _texts(path, file, names)
+    _check_names(path, texts["id"])
     found = {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT}
     if found != LAYOUT:
         raise Refused(f"{path}: has the attributes {shown(found)}, expected {LAYOUT}: {EXPECTED}")
@@ -198,6 +247,13 @@ def _check(path: Path, file: h5py.File) -> Texts:
         got = f"volume {first} has the spacing {mm[first].tolist()}"
         raise Refused(f"{path}: {got}, expected positive mm from {SPACING[0]} to {SPACING[1]}")
     return texts
+
+
+def _check_names(path: Path | str, names: Sequence[str]) -> None:
+    if doubled := [name for name, count in Counter(names).items() if count > 1]:
+        raise Refused(
+            f"{path}: has several volumes of the name {shown(doubled)}; expected every name once"
+        )
 
 
 def _texts(path: Path, file: h5py.File, names: h5py.Dataset) -> Texts:

@@ -31,7 +31,7 @@ class SceneData(L.LightningDataModule):
 
     Args:
         scenes: name and options of the scenes "train" and "test".
-        grid: options of `Grid.centred`.
+        grid: options of `Grid.centred`, in the order (x, y, z).
         camera: name and options of the rig.
         sizes: the number of cases for "train", "val" and "test"; a file may hold fewer.
         batch_size: cases in a batch.

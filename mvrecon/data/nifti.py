@@ -3,17 +3,23 @@
 import gzip
 import logging
 import math
+import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.data.slabs import Slab, Slabs, planes
+from mvrecon.durable import written_whole
 from mvrecon.geometry.grid import Grid
-from mvrecon.limits import DEFLATE, SPACING, VOLUME, Refused, blaming
+from mvrecon.limits import DEFLATE, EDGE, SPACING, TEXT, VOLUME, Refused, blaming
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
+ENDING = re.compile(r"\.nii(\.gz)?$", re.IGNORECASE)
 #: Millimetres in the units that a NIfTI header may name.
 MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
 #: The bytes of a header, which begins with their number, by NIfTI's version.
@@ -22,58 +28,144 @@ SILENT = logging.Logger("nibabel's remarks", logging.CRITICAL)
 
 
 def read_nifti(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
+    """Values of a NIfTI volume, in memory as a whole, and where its voxels lie in world mm; see
+    `open_nifti`.
+    """
+    slabs, grid = open_nifti(path)
+    return slabs.whole(), grid
+
+
+def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
     """Values of a NIfTI volume, slope and intercept applied, and where its voxels lie in world mm.
 
     Axes are swapped and reversed (values stay at their places) until x, y, z run roughly to the
     patient's right, front and head; an oblique rest stays in the grid's affine. The header's
-    extensions are not looked at.
+    extensions are not looked at. What is packed is read to its end, where its checksum is; a plain
+    .nii has none, so damage to its values is not noticed.
 
     Raises:
         ImportError: nibabel is not installed.
         FileNotFoundError: nothing is there.
-        ValueError: not NIfTI, cut short, not three axes, more than the file can hold, or an affine
-            that is no grid.
+        ValueError: not NIfTI, cut short, damaged, not three axes (others of one voxel are left
+            out), more than the file can hold, or an affine that is no grid. What lies behind the
+            header is told by the passes of the slabs.
     """
-    try:
-        import nibabel
-        from nibabel.arrayproxy import ArrayProxy
-    except ImportError as error:
-        raise ImportError(f"{path}: NIfTI needs nibabel: pip install 'mvrecon[io]'") from error
+    nibabel = _nibabel(path)
+    from nibabel.orientations import inv_ornt_aff, io_orientation
+
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
     with blaming(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"):
-        header = _header(path)
-        _check(path, header)
-        stored = ArrayProxy(str(path), header, mmap=False)
-        kind = (
-            nibabel.Nifti2Image if isinstance(header, nibabel.Nifti2Header) else nibabel.Nifti1Image
-        )
-        image = nibabel.as_closest_canonical(kind(stored, header.get_best_affine(), header))
-        # reversed axes of values that are single precision already are strides backwards, which
-        # torch does not take
-        values = torch.from_numpy(image.get_fdata(dtype="float32", caching="unchanged").T.copy())
-        affine = torch.from_numpy(image.affine).double().clone()
-        affine[:3] *= MILLIMETRES[image.header.get_xyzt_units()[0]]
-        grid = Grid(tuple(values.shape), affine)  # type: ignore[arg-type]
+        header = _header(path, nibabel)
+        shape = _shape(path, header)
+        axes = io_orientation(header.get_best_affine())
+        affine = torch.from_numpy(header.get_best_affine() @ inv_ornt_aff(axes, shape)).double()
+        affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
+        turned = tuple(shape[int(k)] for k in axes[:, 0].argsort())
+        grid = Grid(turned[::-1], affine)  # type: ignore[arg-type]
         if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
             raise Refused(
                 f"{path}: has voxels of {grid.spacing} mm, expected {SPACING[0]} to {SPACING[1]}"
             )
-        return values, grid
+        slope, intercept = header.get_slope_inter()
+        scale = (1.0, 0.0) if slope is None else (slope, intercept)
+        stored = Stored(shape, header.get_data_dtype(), int(header["vox_offset"]), *scale)
+        return Slabs(grid.shape, 2 - int(axes[2, 0]), lambda: _slabs(path, stored, axes)), grid
 
 
-def _header(path: Path) -> Any:
+class Stored(NamedTuple):
+    """How values lie in a file, as nibabel wants it: voxels along i, j, k, type, first byte, slope
+    and intercept.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    offset: int
+    slope: float
+    intercept: float
+
+
+def _slabs(path: Path, stored: Stored, axes: np.ndarray) -> Iterator[Slab]:
+    """One pass over a file, whose last axis varies slowest: planes of equal place along it."""
+    from nibabel.arrayproxy import ArrayProxy
+    from nibabel.orientations import apply_orientation
+
+    i, j, k = stored.shape
+    step = planes(i * j)
+    with (
+        blaming(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"),
+        _opened(path) as file,
+    ):
+        for first in range(0, k, step):
+            count, place = (
+                min(step, k - first),
+                stored.offset + first * i * j * stored.dtype.itemsize,
+            )
+            part = ArrayProxy(file, stored._replace(shape=(i, j, count), offset=place), mmap=False)
+            # reversed axes are strides backwards, which torch does not take
+            values = apply_orientation(np.asanyarray(part, dtype="float32"), axes).T.copy()
+            yield (k - first - count if axes[2, 1] < 0 else first), torch.from_numpy(values)
+        _finish(path, file)
+
+
+def _finish(path: Path, file: IO[bytes]) -> None:
+    """Read what is packed to its end, where its checksum is compared."""
+    if not isinstance(file, gzip.GzipFile):
+        return
+    rest = 0
+    while block := file.read(2**20):
+        rest += len(block)
+        if rest > TEXT:
+            raise Refused(
+                f"{path}: has over {TEXT} bytes behind the volume that it declares; expected "
+                f"{EXPECTED}"
+            )
+
+
+def _opened(path: Path) -> IO[bytes]:
+    return gzip.open(path) if _packed(path) else path.open("rb")  # type: ignore[return-value]
+
+
+def _packed(path: Path) -> bool:
+    return path.suffix.lower() == ".gz"
+
+
+def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
+    """Write a volume as NIfTI, float32, whose first axis is x: the grid's affine goes with it
+    unchanged.
+
+    Compressed where the name ends in .gz (the same bytes for the same volume), and replaced whole
+    or not at all.
+
+    Raises:
+        ImportError: nibabel is not installed.
+    """
+    nibabel = _nibabel(path)
+    values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
+    raw = nibabel.Nifti1Image(values, grid.affine.numpy()).to_bytes()
+    packed = gzip.compress(raw, 1, mtime=0) if str(path).endswith(".gz") else raw
+    with written_whole(path) as part:
+        part.write_bytes(packed)
+
+
+def _nibabel(path: str | Path) -> Any:
+    try:
+        import nibabel
+    except ImportError as error:
+        raise ImportError(f"{path}: NIfTI needs nibabel: pip install 'mvrecon[io]'") from error
+    return nibabel
+
+
+def _header(path: Path, nibabel: Any) -> Any:
     """The header alone: nibabel's own way would hand extensions and other formats to further
     parsers.
     """
-    import nibabel
-
-    with gzip.open(path) if path.name.endswith(".gz") else path.open("rb") as file:
+    with _opened(path) as file:
         raw = file.read(max(HEADERS))
     sizes = [int.from_bytes(raw[:4], order) for order in ("little", "big")]
     size = next((size for size in sizes if size in HEADERS), None)
-    if size is None or not path.name.endswith((".nii", ".nii.gz")):
+    if size is None or not ENDING.search(path.name):
         raise Refused(
             f"{path}: cannot be read: it does not begin as a NIfTI file does; expected {EXPECTED}"
         )
@@ -84,20 +176,29 @@ def _header(path: Path) -> Any:
     return header
 
 
-def _check(path: Path, header: Any) -> None:
-    shape, dtype, offset = (
+def _shape(path: Path, header: Any) -> tuple[int, ...]:
+    """Voxels along the file's axes i, j, k; the header is believed no further than the file's
+    size.
+    """
+    declared, dtype, offset = (
         header.get_data_shape(),
         header.get_data_dtype(),
         float(header["vox_offset"]),
     )
-    if len(shape) != 3 or min(shape) < 1 or dtype.kind not in "iuf":
-        raise Refused(f"{path}: has {dtype} of shape {shape}; expected {EXPECTED}")
-    held = path.stat().st_size * (DEFLATE if path.name.endswith(".gz") else 1)
-    declared = offset + math.prod(map(int, shape)) * dtype.itemsize
-    if not 0 <= declared <= held or math.prod(map(int, shape)) * max(8, dtype.itemsize) > VOLUME:
+    shape, others = tuple(map(int, declared[:3])), set(declared[3:])
+    if len(shape) != 3 or min(shape) < 1 or others - {1} or dtype.kind not in "iuf":
+        raise Refused(f"{path}: has {dtype} of shape {declared}; expected {EXPECTED}")
+    room = path.stat().st_size * (DEFLATE if _packed(path) else 1)
+    needed = offset + math.prod(shape) * dtype.itemsize
+    if (
+        not 0 <= needed <= room
+        or math.prod(shape) * max(8, dtype.itemsize) > VOLUME
+        or max(shape) > EDGE
+    ):
+        most = f"{VOLUME} and {EDGE} voxels along an axis allowed"
         got = (
-            f"{shape} of {dtype} from byte {offset:.0f} on, where there are at most {held} "
-            f"bytes, {VOLUME} allowed"
+            f"{shape} of {dtype} from byte {offset:.0f} on, where there are at most {room} "
+            f"bytes, {most}"
         )
         raise Refused(
             f"{path}: cannot be read (it declares {got}); is it cut short? Expected {EXPECTED}"
@@ -107,3 +208,4 @@ def _check(path: Path, header: Any) -> None:
         raise Refused(
             f"{path}: has the affine {affine.tolist()}; expected a finite one that can be inverted"
         )
+    return shape

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import h5py
 
-from mvrecon.limits import DEFLATE, VOLUME, Refused, shown
+from mvrecon.limits import CHUNK, DEFLATE, EDGE, VOLUME, Refused, shown
 
 #: Filters that every HDF5 has; others would be loaded as libraries from wherever HDF5_PLUGIN_PATH
 #: says.
@@ -55,11 +55,15 @@ def _check_size(path: Path, dataset: h5py.Dataset, most: int) -> None:
     item = dataset.id.get_type().get_size()
     whole, one = math.prod(dataset.shape) * item, math.prod(dataset.shape[1:]) * item
     chunk = math.prod(dataset.chunks or ()) * item
-    if whole > most or max(one, chunk) > VOLUME:
-        sizes = f"{dataset.shape} x {item} bytes, in chunks of {dataset.chunks}"
+    sizes = (
+        f"{path}: {dataset.name!r} declares {dataset.shape} x {item} bytes, in chunks of "
+        f"{dataset.chunks}"
+    )
+    if whole > most or one > VOLUME:
+        raise Refused(f"{sizes}; expected at most {most} bytes, {VOLUME} at once")
+    if chunk > CHUNK or max(dataset.shape[1:], default=1) > EDGE:
         raise Refused(
-            f"{path}: {dataset.name!r} declares {sizes}; expected at most {most} bytes, {VOLUME} "
-            f"at once"
+            f"{sizes}; expected chunks of at most {CHUNK} bytes and {EDGE} voxels along z, y and x"
         )
 
 

@@ -5,6 +5,7 @@ The grid is the field of view: what lies outside of its box is cut off in the tr
 alike.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,13 +18,14 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.data.attenuation import WATER, attenuation
-from mvrecon.data.body import body, centre, enclosed
+from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
-from mvrecon.data.nifti import read_nifti
+from mvrecon.data.nifti import ENDING, open_nifti
 from mvrecon.data.resample import resample
+from mvrecon.data.slabs import Slabs
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.scenes.analytic import generator, uniform
 from mvrecon.scenes.sample import Sample
 
@@ -33,6 +35,9 @@ SKIN, TISSUE = 0.6 * WATER, 0.25 * WATER
 #: How far a varied copy departs from its case: degrees about each axis, part of the size, mm along
 #: each axis.
 TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
+#: Voxels of a finer grid where the scene chooses it, half a GiB: the same on every machine, as the
+#: cases are.
+FINE = 2**27
 Crop = Literal["body", "none"]
 
 
@@ -45,6 +50,9 @@ class FileScene(ABC):
         crop: "body" puts the centre of the patient's box at the grid's centre, "none" leaves the
             volume where its file says it is (about the origin, if the file does not say).
         fine: views are projected from a grid this many times finer than the truth's; at least 2.
+            None: 4, or 3 or 2 where that would have more than 2^27 voxels: 4 for grids of up to
+                128^3. With 2 an iterative method is
+            still flattered: the views are nearly those of its own voxels.
         rays: a pixel measures the mean over rays x rays lines of sight.
         vary: beyond the last case, count on with copies that are mirrored left to right, turned,
             scaled and shifted at random, others every time round.
@@ -57,7 +65,7 @@ class FileScene(ABC):
 
     path: str
     crop: Crop = "body"
-    fine: int = 2
+    fine: int | None = None
     rays: int = 2
     vary: bool = False
     data_range: float = 0.04
@@ -66,7 +74,7 @@ class FileScene(ABC):
     def __post_init__(self) -> None:
         if self.crop not in ("body", "none"):
             raise ValueError(f"crop must be 'body' or 'none', got {self.crop!r}")
-        if self.fine < 2 or self.rays < 1 or not self.data_range > 0:
+        if (self.fine is not None and self.fine < 2) or self.rays < 1 or not self.data_range > 0:
             got = f"fine {self.fine}, rays {self.rays}, data_range {self.data_range}"
             raise ValueError(
                 f"A scene from a file needs fine >= 2, rays >= 1 and a positive data_range, got "
@@ -83,8 +91,13 @@ class FileScene(ABC):
         """How many cases the file holds."""
 
     @abstractmethod
-    def case(self, index: int) -> tuple[str, Float[Tensor, "d h w"], Grid]:
+    def case(self, index: int) -> tuple[str, Slabs, Grid]:
         """Name, Hounsfield units and grid of a case as it lies in the file."""
+
+    def factor(self, grid: Grid) -> int:
+        """How many times finer than `grid` the grid is that views are projected from."""
+        size = math.prod(grid.shape)
+        return self.fine or next((k for k in (4, 3) if size * k**3 <= FINE), 2)
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Sample:
         """A case, seen by `cameras`, with its truth on `grid`.
@@ -94,12 +107,16 @@ class FileScene(ABC):
             ValueError: values that are not finite, or no patient in the volume.
         """
         name, fine = self.finely(index, seed, grid)
-        truth = F.avg_pool3d(fine[None], self.fine)
+        truth = F.avg_pool3d(fine[None], self.factor(grid))
         inside = enclosed(body(truth[0], TISSUE))
         return Sample(self._views(fine, grid, cameras), truth, inside[None], name)
 
     def finely(self, index: int, seed: int, grid: Grid) -> tuple[str, Float[Tensor, "e i j"]]:
-        """Name of a case, and its attenuation in 1/mm on `grid.refined(fine)`."""
+        """Name of a case, and its attenuation in 1/mm on `grid.refined(self.factor(grid))`.
+
+        Memory: that grid, and a slab of the file. The file is read once, twice where the patient is
+        looked for.
+        """
         turn, case = divmod(index, self.length)
         if index < 0 or (turn and not self.vary):
             raise IndexError(
@@ -107,27 +124,35 @@ class FileScene(ABC):
                 f"varied ones"
             )
         name, hu, source = self.case(case)
+        fine = grid.refined(self.factor(grid))
+        mu = hu.mapped(lambda slab: attenuation(self._finite(name, slab)))
+        rng = generator(seed, index) if turn else None
+        if rng is not None and uniform(rng, 0, 1) < 0.5:
+            mu = mu.flipped([2])
+        pivot = (
+            self._pivot(name, mu, source) if self.crop == "body" or rng is not None else grid.centre
+        )
+        target = grid.centre if self.crop == "body" else pivot
+        placed = moved(source, pivot, target, rng)
+        return f"{name}-{seed}-{turn}" if turn else name, resample(mu, placed, fine)
+
+    def _pivot(self, name: str, mu: Slabs, source: Grid) -> Float[Tensor, "3"]:
+        """World mm of the centre of the patient's box."""
+        patient = body_box(mu, SKIN)
+        if not patient.size:
+            raise ValueError(
+                f"{self.path}: {name} shows no patient: expected values above -400 HU, all are "
+                f"below"
+            )
+        return source.cropped(patient).centre
+
+    def _finite(self, name: str, hu: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
         if not hu.isfinite().all():
             raise ValueError(
                 f"{self.path}: {name} has {int((~hu.isfinite()).sum())} values that are not "
                 f"finite HU"
             )
-        mu = attenuation(hu)
-        rng = generator(seed, index) if turn else None
-        if rng is not None and uniform(rng, 0, 1) < 0.5:
-            mu = mu.flip(-1)
-        patient = body(mu, SKIN) if self.crop == "body" or rng is not None else None
-        if patient is not None and not patient.any():
-            raise ValueError(
-                f"{self.path}: {name} shows no patient: expected values above -400 HU, all are "
-                f"below"
-            )
-        pivot = grid.centre if patient is None else centre(patient, source)
-        target = grid.centre if self.crop == "body" else pivot
-        placed = moved(source, pivot, target, rng)
-        return f"{name}-{seed}-{turn}" if turn else name, resample(
-            mu, placed, grid.refined(self.fine)
-        )
+        return hu
 
     @torch.no_grad()
     def _views(
@@ -138,13 +163,8 @@ class FileScene(ABC):
             or self._operator[0] is not grid
             or self._operator[1] is not cameras
         ):
-            geometry = {
-                "grid": grid.refined(self.fine),
-                "cameras": split_pixels(cameras, self.rays),
-            }
-            A = PROJECTORS.build(
-                "radon" if cameras.parallel else "drr", **geometry, method="siddon"
-            )
+            fine_grid = grid.refined(self.factor(grid))
+            A = RayTransform(fine_grid, split_pixels(cameras, self.rays), method="siddon")
             self._operator = (grid, cameras, A)
         return F.avg_pool2d(self._operator[2](fine[None, None])[0], self.rays)
 
@@ -205,14 +225,14 @@ class Hdf5Volumes(FileScene):
         """How many volumes the file holds."""
         return len(self._file)
 
-    def case(self, index: int) -> tuple[str, Float[Tensor, "d h w"], Grid]:
+    def case(self, index: int) -> tuple[str, Slabs, Grid]:
         """Name, Hounsfield units and grid of a volume, centred on the origin, its axes running to
         RAS.
         """
-        stored = self._file.read(index)
-        hu = torch.from_numpy(stored.ct.astype("float32"))
+        name, hu, spacing = self._file.slabs(index)
         axes = reversed_axes(self.orientation or self._file.orientation or "RAS")
-        return stored.name, hu.flip(axes), Grid.centred(hu.shape, stored.spacing[::-1])
+        grid = Grid.centred(size=hu.shape[::-1], spacing=spacing[::-1])
+        return name, hu.flipped(axes), grid
 
 
 def reversed_axes(orientation: str) -> list[int]:
@@ -242,6 +262,6 @@ class NiftiVolume(FileScene):
         """One."""
         return 1
 
-    def case(self, index: int) -> tuple[str, Float[Tensor, "d h w"], Grid]:
+    def case(self, index: int) -> tuple[str, Slabs, Grid]:
         """Name, Hounsfield units and grid of the volume, its axes running roughly to RAS."""
-        return Path(self.path).name.split(".nii")[0], *read_nifti(self.path)
+        return ENDING.sub("", Path(self.path).name), *open_nifti(self.path)

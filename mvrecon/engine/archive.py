@@ -33,7 +33,8 @@ def check_archive(path: Path) -> None:
 
     Raises:
         Refused: not a zip archive as `torch.save` writes it, packed so that it unfolds to more than
-            it is, or with anything in its pickle but tensors and plain values.
+            it is, with anything in its pickle but tensors and plain values, or bytes that do not
+            fit their checksums, which torch does not compare.
     """
     with blaming(path, "is cut short or no checkpoint"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
@@ -55,6 +56,8 @@ def check_archive(path: Path) -> None:
                     f"{path}: its pickle names {shown(what or op.name)}; expected tensors and "
                     f"plain values only"
                 )
+        if damaged := archive.testzip():
+            raise Refused(f"{path}: its {shown(damaged)} is damaged: the checksum does not fit")
 
 
 def check_settings(path: Path, settings: Any) -> dict[str, Any]:

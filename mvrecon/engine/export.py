@@ -1,6 +1,5 @@
 """A case as files: volumes as NIfTI, views and planes as images, measured views as HDF5."""
 
-import gzip
 import re
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -11,6 +10,7 @@ import h5py
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.data.nifti import save_nifti
 from mvrecon.durable import written_whole
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz import montage
@@ -70,20 +70,6 @@ def save_png(path: Path, image: Image) -> None:
 
     with written_whole(path) as part:
         Pillow.fromarray(image).save(part, format="PNG")
-
-
-def save_nifti(path: Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write a volume as NIfTI, whose first axis is x: the grid's affine goes with it unchanged.
-
-    Compressed (the name ends in .gz, the same bytes for the same volume) and replaced whole or not
-    at all.
-    """
-    import nibabel
-
-    values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
-    image = nibabel.Nifti1Image(values, grid.affine.numpy())
-    with written_whole(path) as part:
-        part.write_bytes(gzip.compress(image.to_bytes(), 1, mtime=0))
 
 
 def _file_name(name: str) -> str:

@@ -30,8 +30,8 @@ def build_projector(
 class ReconstructionModule(L.LightningModule):
     """A model, its loss and its optimiser, all from plain dicts of names and numbers.
 
-    So a checkpoint loads with torch's defaults, and `load_from_checkpoint(path)` needs nothing
-    else.
+    So a checkpoint loads with torch's defaults. `mvrecon.load(path)` looks through it first;
+    Lightning's own way of loading does not (SECURITY.md).
 
     Args:
         geometry: `grid`, `camera` and `projector`.

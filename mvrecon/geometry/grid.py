@@ -5,6 +5,7 @@ indices are integer at centres: pixel (0, 0) is centred at (0, 0), so the princi
 columns is (W - 1) / 2.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.box import Box
+from mvrecon.limits import check_memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,32 +51,50 @@ class Grid:
     @classmethod
     def centred(
         cls,
-        shape: Sequence[int],
-        spacing: float | Sequence[float],
+        n: int | Sequence[int] | None = None,
+        /,
+        spacing: float | Sequence[float] = math.nan,  # every grid says its own
         centre: Sequence[float] = (0.0, 0.0, 0.0),
+        *,
+        size: Sequence[int] | None = None,
+        shape: Sequence[int] | None = None,
     ) -> "Grid":
-        """An axis-aligned grid about a point.
+        """An axis-aligned grid about a point, all in the order (x, y, z)::
+
+            Grid.centred(64, spacing=4.0)  # a cube is the same in either order
+            Grid.centred(size=(96, 80, 40), spacing=(1.0, 1.0, 3.0))
+            Grid.centred(shape=volume.shape, spacing=4.0)
 
         Args:
-            shape: voxels along (z, y, x).
+            n: voxels along every axis, 64 or (64, 64, 64).
             spacing: mm along (x, y, z), or one number for all.
             centre: world position of the grid's centre in mm (x, y, z).
+            size: voxels along (x, y, z), in place of `n`.
+            shape: voxels along (z, y, x), as a tensor's shape, in place of `n`; where its sizes
+                differ, the spacing is one for all.
 
         Raises:
-            ValueError: a shape that is not three positive sizes, a spacing that is not positive and
-                finite, or a centre that is not finite.
+            TypeError: none of `n`, `size` and `shape`, or two.
+            ValueError: no three positive sizes, a spacing that is not positive and finite, a centre
+                that is not finite, sizes whose order is not clear, or a volume that does not
+                fit into memory.
         """
-        _check_shape(shape)
         steps = torch.as_tensor(spacing, dtype=torch.float64).expand(3).clone()
         if not ((steps > 0) & steps.isfinite()).all():
             raise ValueError(f"A grid's spacing must be positive, finite mm, got {spacing}")
         middle = torch.as_tensor(centre, dtype=torch.float64)
         if not middle.isfinite().all():
             raise ValueError(f"A grid's centre must be finite mm, got {centre}")
+        counts = _counts(n, size, shape, steps.tolist())
+        _check_room(counts)
         affine = torch.diag(torch.cat([steps, steps.new_ones(1)]))
-        counts = torch.tensor(list(shape)[::-1], dtype=torch.float64)
-        affine[:3, 3] = middle - steps * (counts - 1) / 2
-        return cls(tuple(shape), affine)  # type: ignore[arg-type]
+        affine[:3, 3] = middle - steps * (torch.tensor(counts[::-1], dtype=torch.float64) - 1) / 2
+        return cls(counts, affine)
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Voxels along (x, y, z)."""
+        return self.shape[2], self.shape[1], self.shape[0]
 
     @property
     def spacing(self) -> tuple[float, float, float]:
@@ -127,19 +147,56 @@ class Grid:
         return Grid(box.shape, affine)
 
     def refined(self, factor: int) -> "Grid":
-        """The same box cut into `factor` times as many voxels along each axis."""
+        """The same box cut into `factor` times as many voxels along each axis.
+
+        Raises:
+            ValueError: their volume does not fit into memory.
+        """
+        shape = tuple(n * factor for n in self.shape)
+        _check_room(shape)
         affine = self.affine.clone()
         affine[:3, :3] /= factor
         first = torch.full((3,), (1 - factor) / (2 * factor), dtype=torch.float64)
         affine[:3, 3] = self.to_world(first)
-        return Grid(tuple(n * factor for n in self.shape), affine)  # type: ignore[arg-type]
+        return Grid(shape, affine)  # type: ignore[arg-type]
 
 
-def _check_shape(shape: Sequence[int]) -> None:
+def _check_shape(shape: Sequence[int], name: str = "shape", order: str = "(z, y, x)") -> None:
     if len(shape) != 3 or min(shape) < 1:
         raise ValueError(
-            f"A grid's shape must be three positive sizes (z, y, x), got {tuple(shape)}"
+            f"A grid's {name} must be three positive sizes {order}, got {tuple(shape)}"
         )
+
+
+def _check_room(shape: Sequence[int]) -> None:
+    check_memory(4 * math.prod(map(int, shape)), f"One volume of {tuple(shape)} voxels in float32")
+
+
+def _counts(
+    n: int | Sequence[int] | None,
+    size: Sequence[int] | None,
+    shape: Sequence[int] | None,
+    steps: Sequence[float],
+) -> tuple[int, int, int]:
+    """Voxels along (z, y, x), from the one that is given; see `Grid.centred`."""
+    options = [value for value in (n, size, shape) if value is not None]
+    if len(options) != 1:
+        raise TypeError(
+            f"A grid needs one of n, size (x, y, z) and shape (z, y, x), got {n}, {size} and "
+            f"{shape}"
+        )
+    counts = (options[0],) * 3 if isinstance(options[0], int) else tuple(options[0])
+    if size is not None:
+        _check_shape(counts, "size", "(x, y, z)")
+        return counts[2], counts[1], counts[0]
+    _check_shape(counts)
+    z, y, x = counts
+    if len(set(counts)) > 1 and (shape is None or len(set(steps)) > 1):
+        raise ValueError(
+            f"Sizes that differ are given as size=(x, y, z), the order of spacing and centre, got "
+            f"{counts}; if that is a tensor's shape (z, y, x), expected size={(x, y, z)}"
+        )
+    return z, y, x
 
 
 def voxel_centres(grid: Grid, dtype: torch.dtype = torch.float64) -> Float[Tensor, "d h w 3"]:

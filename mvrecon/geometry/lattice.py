@@ -3,11 +3,9 @@ lattice into another.
 
 An index (i, j, k), counted from the volume's centre, is lifted to (i s, j s, k, 1) with s = a + b
 k. For each lattice one choice of (a, b) makes space and lifted index a homography of each other: s
-= 1 for a world grid, for parallel beams with depths equally spaced in z, and for a central frustum
-with depths equally spaced in f/z; s in proportion to z for a central frustum with depths equally
-spaced in z, and to 1/z for parallel beams with depths equally spaced in f/z. So is every map
-between two lattices (projective coordinates: Hartley & Zisserman, Multiple View Geometry, ch. 2 and
-3).
+= 1 for a world grid and for parallel beams, s in proportion to z for a central frustum. So is every
+map between two lattices (projective coordinates: Hartley & Zisserman, Multiple View Geometry, ch. 2
+and 3).
 """
 
 from dataclasses import dataclass

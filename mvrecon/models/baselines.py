@@ -1,5 +1,5 @@
-"""What the cross-view model is held against: plain means, a single world U-Net, and methods without
-training.
+"""What the cross-view model is compared with: the plain mean, a single world U-Net, and methods
+without training.
 """
 
 from collections.abc import Mapping
@@ -16,22 +16,23 @@ from mvrecon.models.consistency import (
     normalised,
     typical_chord,
 )
+from mvrecon.models.cropping import Cropping
+from mvrecon.models.cross_view import CrossView
 from mvrecon.models.door import admitted
-from mvrecon.models.model import CrossView
+from mvrecon.models.geometry import Geometry
+from mvrecon.models.networks import UNet3d
+from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.regions import Regions
-from mvrecon.models.skip import Skip
-from mvrecon.models.unet3d import UNet3d
 from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstruct.iterative import correction, sirt, sirt_weights
 
 
 class MeanFusion(CrossView):
     """The mean of the M cameras' networks, as first proposed: no weighting, no refinement.
 
     Args:
-        projector, head, opinion, start, consistency, skip: as in `CrossView`.
+        projector, head, opinion, start, consistency, options: as in `CrossView`.
 
     Raises:
         ValueError: `refine_where`, since nothing is refined.
@@ -44,7 +45,7 @@ class MeanFusion(CrossView):
         opinion: Mapping[str, Any] | None = None,
         start: int = 12,
         consistency: int = 3,
-        **skip: Any,
+        **options: Any,
     ):
         super().__init__(
             projector,
@@ -54,9 +55,9 @@ class MeanFusion(CrossView):
             refine=0,
             start=start,
             consistency=consistency,
-            **skip,
+            **options,
         )
-        _refuse_where(self.skip)
+        _refuse_where(self.options)
 
 
 class BackprojectionUNet(nn.Module):
@@ -68,7 +69,7 @@ class BackprojectionUNet(nn.Module):
         width: channels of the finest level.
         start: SIRT iterations of the classical start.
         consistency: learned gradient steps towards the data at the end.
-        skip: options of `Skip` (support, masked, ...): what is left out; nothing by default.
+        options: of `Options` (support, masked, ...): what is left out; nothing by default.
 
     Raises:
         ValueError: `refine_where`, since no opinions could disagree.
@@ -80,31 +81,34 @@ class BackprojectionUNet(nn.Module):
         width: int = 18,
         start: int = 12,
         consistency: int = 3,
-        **skip: Any,
+        **options: Any,
     ):
         super().__init__()
-        self.skip = Skip.of(skip)
-        _refuse_where(self.skip)
-        self.regions = Regions(projector, self.skip)
+        self.options = Options.of(type(self), options)
+        _refuse_where(self.options)
+        self.cropping = Cropping(projector, self.options)
         self.iterations = start
         self.net = UNet3d(3, 1, width, zero=True)
         self.consistency = Consistency(consistency)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        views = admitted(views, self.regions.cameras, self.consistency.lengths)
-        region = self.regions(views)
-        y, x0, scale = normalised(region, views, self.iterations)
-        seen = torch.cat([x0, region.back(y), region.residual(x0, y)], dim=1)
-        volume = x0 + region.within(self.net(seen, region.net_mask))
-        sigma = None if self.skip.sigma is None else self.skip.sigma / scale
-        volume = self.consistency(region, volume, y, sigma) * scale
-        return Reconstruction(volume=region.pasted(volume), support=region.support)
+        views = admitted(views, self.cropping.cameras, self.consistency.lengths)
+        return self.cropping(views, self.reconstruct)
+
+    def reconstruct(self, views: Float[Tensor, "b 1 m v u"], geometry: Geometry) -> Reconstruction:
+        """The volume on a geometry: the whole grid's, or a crop's."""
+        y, x0, scale = normalised(geometry, views, self.iterations)
+        evidence = torch.cat([x0, geometry.back(y), geometry.residual(x0, y)], dim=1)
+        volume = x0 + geometry.within(self.net(evidence, geometry.network_mask))
+        sigma = None if self.options.sigma is None else self.options.sigma / scale
+        volume = self.consistency(geometry, volume, y, sigma)
+        return Reconstruction(volume * scale, support=geometry.mask, start=x0 * scale)
 
 
-def _refuse_where(skip: Skip) -> None:
-    if skip.refine_where != "all":
+def _refuse_where(options: Options) -> None:
+    if options.refine_where != "all":
         raise ValueError(
-            f"refine_where={skip.refine_where!r} needs opinions and their refinement, as in "
+            f"refine_where={options.refine_where!r} needs opinions and their refinement, as in "
             f"'cross_view'"
         )
 
@@ -164,10 +168,16 @@ class Backprojection(nn.Module):
         projector: holds the grid and the rig.
     """
 
+    row: Tensor
+    column: Tensor
+
     def __init__(self, projector: Projector):
         super().__init__()
-        self.regions = Regions(projector, Skip())
+        self.projector = projector
+        row, column = sirt_weights(projector)
+        self.register_buffer("row", row, persistent=False)
+        self.register_buffer("column", column, persistent=False)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        check_views(views, self.regions.cameras)
-        return Reconstruction(volume=self.regions(views).back(views))
+        check_views(views, self.projector.cameras)
+        return Reconstruction(correction(self.projector, views, (self.row, self.column)))

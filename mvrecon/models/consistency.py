@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.region import Region
+from mvrecon.models.geometry import Geometry
 from mvrecon.reconstruct.iterative import sirt
 
 
@@ -28,7 +28,7 @@ class Consistency(nn.Module):
 
     def forward(
         self,
-        region: Region,
+        geometry: Geometry,
         volume: Float[Tensor, "b 1 d h w"],
         views: Float[Tensor, "b 1 m v u"],
         sigma: Float[Tensor, "b 1 1 1 1"] | None = None,
@@ -40,29 +40,30 @@ class Consistency(nn.Module):
         sample takes every step.
         """
         for length in self.lengths:
-            wrong = views - region.A(volume)
+            residual = views - geometry.A(volume)
             if sigma is None or self.training:
-                volume = volume + length * region.back(wrong)
+                volume = volume + length * geometry.back(residual)
                 continue
-            unmet = (wrong / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
+            unmet = (residual / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
             if not unmet.any():
                 break
-            volume = volume + length * unmet * region.back(wrong)
+            volume = volume + length * unmet * geometry.back(residual)
         return volume
 
 
 def normalised(
-    region: Region, views: Float[Tensor, "b 1 m v u"], iterations: int
+    geometry: Geometry, views: Float[Tensor, "b 1 m v u"], iterations: int
 ) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
-    """The region's views and their classical start, both divided by the content's scale, and that
+    """Views and their classical start, both divided by the content's scale, and that
     scale.
 
     The start is SIRT with momentum from zero, non-negative, not differentiated. The scale of views
     of nothing is zero.
     """
-    views = region.measured(views)
     with torch.no_grad():
-        start = sirt(region.A, views, iterations, weights=region.weights, momentum=True)
+        start = sirt(
+            geometry.A, views, iterations, weights=(geometry.row, geometry.column), momentum=True
+        )
     scale = content_scale(start)
     return views / scale, start / scale, scale * anything(views)
 

@@ -1,45 +1,122 @@
-"""What the other cameras say: pooled statistics of M volumes in the world, and the same with one
-camera left out.
+"""The cross-view model: every camera forms an opinion of the volume, the cameras compare, a network
+weighs them.
 
-Every statistic is a sum over cameras, so it does not depend on their order, costs 2M warps instead
-of M(M-1), and leaving one camera out is a subtraction.
+1 lift, 2 statistics of the other cameras, 3 depth U-Net and head, 4 inverse projection to the
+world, 5 re-projection into all cameras, 6 weighting, then refinement and 7 data consistency.
+`docs/model.md` walks through the shapes.
 """
+
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
+
+from mvrecon.models.consistency import Consistency, normalised
+from mvrecon.models.cropping import Cropping
+from mvrecon.models.door import admitted
+from mvrecon.models.geometry import Geometry
+from mvrecon.models.networks import UNet3d
+from mvrecon.models.opinion import Opinions
+from mvrecon.models.options import Options
+from mvrecon.models.output import Reconstruction
+from mvrecon.models.pooling import deviation, disagreement, pooled
+from mvrecon.models.weighting import Weighting, comparison, fuse
+from mvrecon.projectors.operator import Projector
 
 
-def pooled(
-    volumes: Float[Tensor, "b m c d h w"], visible: Tensor
-) -> tuple[Float[Tensor, "b 1 c d h w"], Float[Tensor, "b 1 c d h w"]]:
-    """Mean and variance over the cameras that see a voxel; zero where none does.
+class CrossView(nn.Module):
+    """Cross-view reconstruction.
 
     Args:
-        volumes: one volume for each camera.
-        visible: which voxels each camera sees, [m 1 d h w].
+        projector: holds the grid and the rig.
+        head: the head's name and options.
+        opinion: options of `Opinions` (width, features, binning, shared, prior).
+        fusion: "weighted" by a U-Net, or the plain "mean" over the cameras that see a voxel.
+        refine: channels of the U-Net that corrects the fused volume, 0 for none: a weighted mean
+            cannot create what no camera holds.
+        start: SIRT iterations of the classical start.
+        consistency: learned gradient steps towards the data at the end.
+        options: of `Options` (support, masked, ...): what is left out; nothing by default.
+
+    Raises:
+        TypeError: an option that there is not.
+        ValueError: an unknown fusion; views that `admitted` refuses (at the call).
     """
-    seen = visible.to(volumes.dtype)
-    count = seen.sum(dim=0, keepdim=True).clamp_min(1)
-    mean = (volumes * seen).sum(dim=1, keepdim=True) / count
-    variance = ((volumes - mean).square() * seen).sum(dim=1, keepdim=True) / count
-    return mean, variance
 
+    def __init__(
+        self,
+        projector: Projector,
+        head: Mapping[str, Any],
+        opinion: Mapping[str, Any] | None = None,
+        fusion: Literal["weighted", "mean"] = "weighted",
+        refine: int = 16,
+        start: int = 12,
+        consistency: int = 3,
+        **options: Any,
+    ):
+        super().__init__()
+        if fusion not in ("weighted", "mean"):
+            raise ValueError(f"fusion must be 'weighted' or 'mean', got {fusion!r}")
+        self.options = Options.of(type(self), options)
+        self.iterations = start
+        self.opinions = Opinions(projector, head, **(opinion or {}))
+        self.cropping = Cropping(projector, self.options, self.opinions.binning)
+        self.weighting = Weighting(5) if fusion == "weighted" else None
+        self.refine = UNet3d(5 + self.opinions.features, 1, refine, zero=True) if refine else None
+        self.consistency = Consistency(consistency)
 
-def leave_one_out(
-    volumes: Float[Tensor, "b m c d h w"], visible: Tensor
-) -> tuple[Float[Tensor, "b m c d h w"], Float[Tensor, "b m c d h w"], Float[Tensor, "m 1 d h w"]]:
-    """For each camera the mean, the variance and the count of the others that see the voxel.
+    def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
+        views = admitted(views, self.cropping.cameras, self.consistency.lengths)
+        return self.cropping(views, self.reconstruct)
 
-    Sums are formed about the mean over all cameras, so that the subtraction cancels no digits.
-    """
-    seen = visible.to(volumes.dtype)
-    centre, _ = pooled(volumes, visible)
-    about = (volumes - centre) * seen
-    count = seen.sum(dim=0, keepdim=True) - seen
-    others = count.clamp_min(1)
-    first = (about.sum(dim=1, keepdim=True) - about) / others
-    second = (about.square().sum(dim=1, keepdim=True) - about.square()) / others
-    some = count > 0
-    variance = (second - first.square()).clamp_min(0)
-    return torch.where(some, first + centre, 0.0), torch.where(some, variance, 0.0), count
+    def reconstruct(self, views: Float[Tensor, "b 1 m v u"], geometry: Geometry) -> Reconstruction:
+        """The volume and the opinions on a geometry: the whole grid's, or a crop's."""
+        y, x0, scale = normalised(geometry, views, self.iterations)
+        expected = geometry.A(x0)
+        opinions, features = self.opinions(geometry, y, x0, y - expected)
+        cross_views = geometry.A(opinions[:, :, 0])  # each opinion as every camera would see it
+        logits = torch.zeros_like(opinions)
+        if self.weighting is not None:
+            evidence = comparison(geometry, opinions, x0, y - cross_views)
+            logits = self.weighting(evidence, geometry.network_mask)
+        volume, weights = fuse(opinions, logits, geometry.visible)
+        if self.refine is not None:
+            features = (weights * features).sum(dim=1)
+            volume = volume + self._correction(geometry, y, x0, volume, opinions, features)
+        sigma = None if self.options.sigma is None else self.options.sigma / scale
+        volume = self.consistency(geometry, volume, y, sigma)
+        return Reconstruction(
+            volume=volume * scale,
+            opinions=opinions * scale[:, None],
+            visible=geometry.fine.visible,
+            weights=weights,
+            cross_views=cross_views * scale,
+            support=geometry.mask,
+            start=x0 * scale,
+            start_views=expected * scale,
+        )
+
+    def _correction(
+        self,
+        geometry: Geometry,
+        y: Float[Tensor, "b 1 m v u"],
+        x0: Float[Tensor, "b 1 d h w"],
+        fused: Float[Tensor, "b 1 d h w"],
+        opinions: Float[Tensor, "b m 1 d h w"],
+        features: Float[Tensor, "b f d h w"],
+    ) -> Float[Tensor, "b 1 d h w"]:
+        """What the refinement adds where it looks, from the fused volume, its residual, the
+        opinions' mean and deviation, the start, and the fused features.
+        """
+        assert self.refine is not None
+        mean, variance = pooled(opinions, geometry.fine.visible)
+        statistics = [mean[:, 0], deviation(variance)[:, 0]]
+        residual = geometry.residual(fused, y)
+        evidence = torch.cat([fused, residual, *statistics, x0, features], dim=1)
+        mask = geometry.network_mask
+        if self.options.refine_where == "disagreement":
+            where = disagreement(variance[:, 0].sqrt(), self.options.tolerance)
+            mask = where if mask is None else where & mask
+        return geometry.within(self.refine(evidence, mask))

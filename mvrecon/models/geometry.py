@@ -1,128 +1,141 @@
-"""What depends on the grid and the rig alone: the operator, the cameras' frusta, the weights of
-SIRT.
+"""What a network knows of the grid and the rig: the operator A, SIRT's weights, the cameras'
+frusta, and a mask.
 
-It is made once for the grid, and once for every crop of it that a scene needs.
+Convention: inside a network every volume has the geometry's shape, be it the whole grid or a crop.
 """
 
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
 import torch
-from jaxtyping import Bool, Int
-from torch import Tensor, nn
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import adaptive_max_pool3d
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.culling import views_that_see
-from mvrecon.geometry.box import Box
-from mvrecon.geometry.grid import Grid
-from mvrecon.models.cropped import CroppedFrusta
-from mvrecon.models.lift import Frusta
-from mvrecon.models.window import brick_corners, window_of
+from mvrecon.models.frusta import Frusta
+from mvrecon.models.networks import MULTIPLE
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.iterative import sirt_weights
-
-#: Coarse bins, along each axis, that the coarsest level of the depth U-Net joins into one.
-MULTIPLE = 4
+from mvrecon.reconstruct.iterative import correction, inverse_sums, sirt_weights
 
 
-class Geometry(nn.Module):
-    """A projector, the fine and the coarse frusta of its cameras, and SIRT's inverse row and column
-    sums.
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """An operator, its weights and its cameras' frusta; all that a network asks of them.
 
     Args:
-        projector: A.
-        weights: (R, C) of A.
-        frusta: (fine, coarse), where a model has cameras' opinions.
-        views: which of the rig's cameras the projector has, those that see its grid; all, by
-            default.
+        A: the operator between volumes and views.
+        row: R, the inverse row sums of A (SIRT), in 1/mm.
+        column: C, the inverse column sums, zero outside the mask.
+        cameras: which of the rig's cameras A has; a crop leaves out those that see nothing of it.
+        frusta: (of the detectors' own pixels, of binned pixels and bins twice as deep); none for a
+            model without opinions.
+        mask: voxels whose density may differ from zero; none for all.
+        masked: whether the networks know the mask: their features are zero outside it.
     """
 
-    row: Tensor
-    column: Tensor
-    views: Tensor
-
-    def __init__(
-        self,
-        projector: Projector,
-        weights: tuple[Tensor, Tensor],
-        frusta: tuple[Frusta, Frusta] | None = None,
-        views: Int[Tensor, " k"] | None = None,
-    ):
-        super().__init__()
-        self.projector = projector
-        every = torch.arange(len(projector.cameras), device=weights[0].device)
-        self.register_buffer("views", every if views is None else views, persistent=False)
-        self.register_buffer("row", weights[0], persistent=False)
-        self.register_buffer("column", weights[1], persistent=False)
-        self.frusta = None if frusta is None else nn.ModuleList(frusta)
+    A: Projector
+    row: Float[Tensor, "#b 1 m v u"]
+    column: Float[Tensor, "#b 1 d h w"]
+    cameras: Int[Tensor, " m"]
+    frusta: tuple[Frusta, Frusta] | None = None
+    mask: Bool[Tensor, "b 1 d h w"] | None = None
+    masked: bool = False
 
     @property
     def fine(self) -> Frusta:
         """Frusta of the detectors' own pixels."""
-        return self._frusta(0)
+        return self._pair[0]
 
     @property
     def coarse(self) -> Frusta:
         """Frusta of binned pixels and bins twice as deep."""
-        return self._frusta(1)
+        return self._pair[1]
 
-    def _frusta(self, which: int) -> Frusta:
-        found = None if self.frusta is None else self.frusta[which]
-        if not isinstance(found, Frusta):
+    @property
+    def _pair(self) -> tuple[Frusta, Frusta]:
+        if self.frusta is None:
             raise ValueError("This geometry was made without frusta")
-        return found
+        return self.frusta
+
+    @cached_property
+    def network_mask(self) -> Bool[Tensor, "b 1 d h w"] | None:
+        """The mask for the networks in the world; none where one of ones would change nothing, and
+        take longer.
+        """
+        if not self.masked or self.mask is None:
+            return None
+        plain = self.mask.all() and not any(size % MULTIPLE for size in self.mask.shape[2:])
+        return None if plain else self.mask
+
+    @property
+    def visible(self) -> Bool[Tensor, "*b m 1 d h w"]:
+        """Which voxels of the mask each camera sees."""
+        visible = self.fine.visible
+        return visible if self.mask is None else visible & self.mask[:, None]
+
+    def back(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
+        """Residual views as a correction of the volume, C A^T R r."""
+        return correction(self.A, residual, (self.row, self.column))
+
+    def residual(
+        self, volume: Float[Tensor, "b c d h w"], views: Float[Tensor, "b c m v u"]
+    ) -> Float[Tensor, "b c d h w"]:
+        """How each voxel should change for the views to be met: C A^T R (y - A x), in the unit of
+        x.
+        """
+        return self.back(views - self.A(volume))
+
+    def within(self, volume: Float[Tensor, "b *m c d h w"]) -> Float[Tensor, "b *m c d h w"]:
+        """Volumes, zero outside the mask."""
+        if self.mask is None:
+            return volume
+        return volume * (self.mask if volume.ndim == 5 else self.mask[:, None])
+
+    def with_mask(self, mask: Bool[Tensor, "b 1 d h w"], masked: bool) -> "Geometry":
+        """The geometry of A diag(M), for each sample: R from rays through the mask, C zero outside
+        it, and in the frusta the bins that touch it.
+        """
+        with torch.no_grad():
+            sums = self.A(mask.to(self.row.dtype))
+        row = torch.cat([inverse_sums(own) for own in sums.split(1)])
+        column, frusta = self.column * mask, self.frusta
+        if frusta is not None:
+            frusta = _touching(*frusta, mask)
+        return replace(self, row=row, column=column, frusta=frusta, mask=mask, masked=masked)
+
+    def to(self, *where: Any) -> "Geometry":
+        """On another device, or with weights of another dtype; A moves by itself."""
+        row = self.row.to(*where)
+        column, cameras = self.column.to(row), self.cameras.to(row.device)
+        frusta = None if self.frusta is None else (self.fine.to(row), self.coarse.to(row))
+        return replace(self, row=row, column=column, cameras=cameras, frusta=frusta)
 
 
-def whole_geometry(projector: Projector, binning: int | None = None) -> Geometry:
-    """The geometry of a projector's own grid, with frusta of pixels binned by `binning`."""
-    if binning is None:
-        return Geometry(projector, sirt_weights(projector))
-    grid, cameras = projector.grid, projector.cameras
-    depth = max(grid.shape)
-    frusta = Frusta(grid, cameras, depth), Frusta(grid, cameras.binned(binning), max(1, depth // 2))
-    return Geometry(projector, sirt_weights(projector), frusta)
-
-
-def cropped_geometry(
-    whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | None = None
-) -> Geometry:
-    """The same for the voxels in a box, and the cameras that see any of it.
-
-    What is equal to them is taken over, the rest made for them alone.
+def whole_geometry(A: Projector, binning: int | None = None) -> Geometry:
+    """The geometry of an operator's own grid.
 
     Args:
-        whole: of the grid.
-        box: the voxels.
-        bricks: of the box, those that may hold anything, from `held_bricks`: the frusta have no
-            bins for others. None: all.
+        A: the operator.
+        binning: detector pixels joined, along each axis, in the coarse frusta; none for no frusta.
     """
-    views = _seeing(whole.projector.cameras, whole.projector.grid.cropped(box)).to(whole.row.device)
-    projector = whole.projector.cropped(box, views.tolist())
-    weights = whole.row[:, :, views], whole.column[..., *box.slices]
-    if whole.frusta is None:
-        return Geometry(projector, weights, views=views)
-    fine, coarse = whole.fine, whole.coarse
-    grid, cameras, binning = (
-        whole.projector.grid,
-        projector.cameras,
-        fine.shape[1] // coarse.shape[1],
+    row, column = sirt_weights(A)
+    cameras = torch.arange(len(A.cameras), device=row.device)
+    if binning is None:
+        return Geometry(A, row, column, cameras)
+    depth = max(A.grid.shape)
+    fine = Frusta.of(A.grid, A.cameras, depth)
+    coarse = Frusta.of(A.grid, A.cameras.binned(binning), max(1, depth // 2))
+    return Geometry(A, row, column, cameras, (fine, coarse))
+
+
+def _touching(
+    fine: Frusta, coarse: Frusta, mask: Bool[Tensor, "b 1 d h w"]
+) -> tuple[Frusta, Frusta]:
+    touched = fine.touched(mask)
+    pooled = adaptive_max_pool3d(touched.flatten(0, 1).to(fine.step.dtype), coarse.shape) > 0
+    pooled = pooled.unflatten(0, touched.shape[:2])
+    return (
+        replace(fine, occupied=fine.occupied & touched),
+        replace(coarse, occupied=coarse.occupied & pooled),
     )
-    binned = cameras.binned(binning)
-    window = window_of(brick_corners(projector.grid, bricks), binned, coarse.edges[views], MULTIPLE)
-    finer = window.scaled(2, binning)
-    if fine.shape[0] % 2:  # coarse bins are no pairs of fine ones: both keep all of them
-        window, finer = window.deep(coarse.shape[0]), finer.deep(fine.shape[0])
-    frusta = (
-        CroppedFrusta(fine, grid, cameras, box, finer, views),
-        CroppedFrusta(coarse, grid, binned, box, window, views),
-    )
-    return Geometry(projector, weights, frusta, views).to(fine.step.device)
-
-
-def _seeing(cameras: Cameras, grid: Grid) -> Int[Tensor, " k"]:
-    """Which cameras see any of a grid; all of them, where none does."""
-    seen = views_that_see(cameras, grid)
-    return (seen if seen.any() else ~seen).nonzero()[:, 0]
-
-
-def crop_of(whole: Geometry, box: Box, bricks: Bool[Tensor, "z y x"] | None = None) -> Geometry:
-    """`cropped_geometry` that training may use although evaluation asked for it first."""
-    with torch.inference_mode(False), torch.no_grad():
-        return cropped_geometry(whole, box, bricks)

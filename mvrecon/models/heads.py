@@ -2,7 +2,7 @@
 
 A head says by `keeps_views` whether its density, in its own frustum, sums to the camera's own view
 (3e-7 in float32). It is called with logits [b m 1 D v u] (zero logits mean: nothing to add to the
-prior), the prior density of the same shape, the measured views and the frusta's bins, and returns a
+prior), the prior density of the same shape, the measured views and the frusta, and returns a
 density [b m 1 D v u] in the unit of (views / mm).
 """
 
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.bins import Bins
+from mvrecon.models.frusta import Frusta
 
 #: A prior of exactly zero could never be raised by a finite logit; relative to the prior's mean
 #: along the ray.
@@ -33,7 +33,7 @@ class SoftmaxDepth(nn.Module):
         logits: Float[Tensor, "b m 1 D v u"],
         prior: Float[Tensor, "b m 1 D v u"],
         views: Float[Tensor, "b 1 m v u"],
-        frusta: Bins,
+        frusta: Frusta,
     ) -> Float[Tensor, "b m 1 D v u"]:
         prior = prior.clamp_min(0) * frusta.occupied
         level = prior.sum(dim=3, keepdim=True) / frusta.occupied.sum(
@@ -59,7 +59,7 @@ class Density(nn.Module):
         logits: Float[Tensor, "b m 1 D v u"],
         prior: Float[Tensor, "b m 1 D v u"],
         views: Float[Tensor, "b 1 m v u"],
-        frusta: Bins,
+        frusta: Frusta,
     ) -> Float[Tensor, "b m 1 D v u"]:
         lifted = frusta.spread(views)
         scale = (

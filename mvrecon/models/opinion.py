@@ -1,5 +1,5 @@
-"""Each camera's opinion of the volume: lift, listen to the others, place the measured integrals
-along their rays.
+"""Each camera's opinion, its own estimate of the volume: the lift, the statistics of the other
+cameras, and the measured integrals placed along their rays.
 """
 
 from collections.abc import Mapping
@@ -9,12 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.bins import Bins
 from mvrecon.models.consistency import typical_chord
-from mvrecon.models.cross_view import leave_one_out
-from mvrecon.models.masks import upsampled
-from mvrecon.models.region import Region
-from mvrecon.models.unet3d import UNet3d
+from mvrecon.models.geometry import Geometry
+from mvrecon.models.networks import UNet3d, upsampled
+from mvrecon.models.pooling import leave_one_out
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
 
@@ -72,7 +70,7 @@ class Opinions(nn.Module):
 
     def forward(
         self,
-        region: Region,
+        geometry: Geometry,
         views: Float[Tensor, "b 1 m v u"],
         start: Float[Tensor, "b 1 d h w"],
         residual: Float[Tensor, "b 1 m v u"],
@@ -80,65 +78,63 @@ class Opinions(nn.Module):
         """Opinions and features in the world.
 
         Args:
-            region: where in the world.
+            geometry: with frusta.
             views: measured.
             start: a classical reconstruction.
             residual: measured less the re-projected start.
         """
-        frusta, (fine, coarse) = region.geometry.fine, region.bins()
-        seen = frusta.part_of(views)
-        prior = frusta.to_frusta(start[:, None])
+        fine, pixels = geometry.fine, geometry.fine.pixels(views)
+        prior = fine.to_frusta(start[:, None])
         if not self.learned:
-            density = self.head(torch.zeros_like(prior), torch.ones_like(prior), seen, fine)
-            opinions = region.within(frusta.to_world(density))
+            density = self.head(torch.zeros_like(prior), torch.ones_like(prior), pixels, fine)
+            opinions = geometry.within(fine.to_world(density))
             return opinions, opinions[:, :, :0]
-        answer = self._listen(
-            region, coarse, torch.stack([seen, frusta.part_of(residual)], dim=3), start
+        answers = self._answers(
+            geometry, torch.stack([pixels, fine.pixels(residual)], dim=3), start
         )
-        density = self.head(_refined(answer[:, :, :1], region, coarse, fine), prior, seen, fine)
+        density = self.head(_at_fine_bins(answers[:, :, :1], geometry), prior, pixels, fine)
         # The change is carried to the world, not the density: what the start holds already is not
         # blurred by two warps.
-        change = frusta.to_world(density - prior * fine.occupied)
-        features = region.geometry.coarse.to_world(answer[:, :, 1:])
-        return start[:, None] + region.within(change), region.within(features)
+        change = fine.to_world(density - prior * fine.occupied)
+        features = geometry.coarse.to_world(answers[:, :, 1:])
+        return start[:, None] + geometry.within(change), geometry.within(features)
 
-    def _listen(
-        self, region: Region, bins: Bins, pixels: Tensor, start: Tensor
+    def _answers(
+        self, geometry: Geometry, pixels: Tensor, start: Tensor
     ) -> Float[Tensor, "b m f D v u"]:
         """The networks' answers in the coarse frusta, from the pixels [b 1 m 2 v u] of views and
         residuals.
         """
-        coarse, (b, m) = region.geometry.coarse, (len(pixels), pixels.shape[2])
+        coarse, (b, m) = geometry.coarse, (len(pixels), pixels.shape[2])
         binned = nn.functional.avg_pool2d(
             pixels[:, :, :, 0].flatten(0, 1), self.pixels.kernel_size
         ).unflatten(0, (b, 1))
         pixels = self.pixels(pixels.flatten(0, 2) / self.unit)  # [b*m c v u]
         pixels = pixels[:, :, None].expand(-1, -1, coarse.shape[0], -1, -1).unflatten(0, (b, m))
-        lifted = bins.spread(binned)
-        world = region.within(coarse.to_world(lifted))
+        lifted = coarse.spread(binned)
+        world = geometry.within(coarse.to_world(lifted))
         mean, variance, _ = leave_one_out(world, coarse.visible)
         ours = start[:, None].expand(-1, m, -1, -1, -1, -1)
         others = coarse.to_frusta(torch.cat([mean, variance.sqrt(), ours], dim=2))
-        where = bins.occupied.expand(b, -1, -1, -1, -1, -1).to(pixels.dtype)
-        inputs = torch.cat([pixels, lifted, others, where, where * coarse.ramp(where)], dim=2)
-        mask = bins.occupied if region.seen_by_nets else None
+        where = coarse.occupied.expand(b, -1, -1, -1, -1, -1).to(pixels.dtype)
+        inputs = torch.cat([pixels, lifted, others, where, where * coarse.depths(where)], dim=2)
+        mask = coarse.occupied if geometry.masked else None
         if len(self.nets) == 1:
             mask = None if mask is None else mask.flatten(0, 1)
             return self.nets[0](inputs.flatten(0, 1), mask).unflatten(0, (b, m))
-        each = [None if mask is None else mask[:, k] for k in range(m)]
-        nets = [self.nets[k] for k in region.geometry.views.tolist()]
-        answers = [net(inputs[:, k], each[k]) for k, net in enumerate(nets)]
+        masks = [None if mask is None else mask[:, k] for k in range(m)]
+        nets = [self.nets[k] for k in geometry.cameras.tolist()]
+        answers = [net(inputs[:, k], masks[k]) for k, net in enumerate(nets)]
         return torch.stack(answers, dim=1)
 
 
-def _refined(
-    logits: Tensor, region: Region, coarse: Bins, fine: Bins
+def _at_fine_bins(
+    logits: Float[Tensor, "b m 1 e i x"], geometry: Geometry
 ) -> Float[Tensor, "b m 1 D v u"]:
     """Logits of coarse bins at the fine ones; by a mask's definition, from its bins alone."""
-    flat, size = logits.flatten(0, 1), region.geometry.fine.shape
-    if region.seen_by_nets:
-        held, onto = (bins.occupied.flatten(0, 1).to(flat.dtype) for bins in (coarse, fine))
-        return upsampled(flat, held, onto, size).unflatten(0, logits.shape[:2])
-    return nn.functional.interpolate(flat, size=size, mode="trilinear").unflatten(
-        0, logits.shape[:2]
-    )
+    flat, (fine, coarse) = logits.flatten(0, 1), (geometry.fine, geometry.coarse)
+    if not geometry.masked:
+        dense = nn.functional.interpolate(flat, size=fine.shape, mode="trilinear")
+        return dense.unflatten(0, logits.shape[:2])
+    mask, onto = (frusta.occupied.flatten(0, 1).to(flat.dtype) for frusta in (coarse, fine))
+    return upsampled(flat, mask, onto, fine.shape).unflatten(0, logits.shape[:2])

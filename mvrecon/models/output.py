@@ -18,6 +18,8 @@ class Reconstruction:
             see it.
         cross_views: opinion m projected into camera n, in the unit of the views.
         support: where the volume may differ from zero; none for everywhere.
+        start: the classical reconstruction that the network began with.
+        start_views: the start projected into every camera, in the unit of the views.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -26,3 +28,5 @@ class Reconstruction:
     weights: Float[Tensor, "b m 1 d h w"] | None = None
     cross_views: Float[Tensor, "b m n v u"] | None = None
     support: Bool[Tensor, "b 1 d h w"] | None = None
+    start: Float[Tensor, "b 1 d h w"] | None = None
+    start_views: Float[Tensor, "b 1 m v u"] | None = None

@@ -1,5 +1,7 @@
-"""Linear operators y = A x: the adjoint, weights, stacks, and the parts of an operator that a
-caller asks for.
+"""Linear operators y = A x: the adjoint, products, weights, and parts of an operator.
+
+A subclass of `LinearOperator` gives the shapes, A x and A^T y. Its parts (`subset`, `cropped`,
+`with_support`) always work: by default the whole operator is computed.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,14 +20,10 @@ Weight = Tensor | Callable[[], Tensor] | None
 
 
 class LinearOperator:
-    """A linear map y = A x from tensors [b c *domain_shape] to tensors [b c *range_shape], with its
-    adjoint.
+    """A linear map y = A x from tensors [b c *domain_shape] to [b c *range_shape], and its adjoint.
 
-    A subclass gives `domain_shape`, `range_shape`, `forward` and `adjoint`; that is all that SIRT,
-    MLEM, likelihoods and models need. The parts of an operator (`subset`, `cropped`,
-    `with_support`) always work: by default the whole operator is computed. An operator that can do
-    a part at the part's cost overrides the method, and names it in `capabilities`, which is what an
-    algorithm asks before it relies on the saving.
+    SIRT, MLEM, likelihoods and models need no more. What an operator can do at less than the cost
+    of the whole it names in `capabilities`, which an algorithm asks before it relies on the saving.
     """
 
     domain_shape: tuple[int, ...]
@@ -51,9 +49,7 @@ class LinearOperator:
 
     @property
     def pose_gradient(self) -> bool:
-        """Whether a gradient by the cameras' pose is asked for: nothing that depends on it may then
-        be kept.
-        """
+        """Whether a gradient by the cameras' pose is asked for: nothing of theirs may be kept."""
         return False
 
     @property
@@ -74,15 +70,11 @@ class LinearOperator:
         return Scaled(self, pixels=torch.tensor(float(factor), dtype=torch.float64))
 
     def subset(self, selection: "LinearOperator") -> "LinearOperator":
-        """The chosen entries of A x alone, S A; `selection` is S, from
-        `projectors/selection.py`.
-        """
+        """S A, the chosen entries of A x; the selection S is one of `projectors/selection.py`."""
         return Composed(selection, self)
 
-    def cropped(self, box: Box, views: Sequence[int] | None = None) -> "LinearOperator":
-        """A for volumes that are zero outside a box of the grid, and for some of the cameras (None:
-        all).
-        """
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> "Projector":
+        """A for volumes that are zero outside a box of the grid, and for some cameras."""
         return Cropped(self, box, views)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> "LinearOperator":
@@ -94,10 +86,8 @@ class LinearOperator:
         return None
 
 
-class Projector(LinearOperator):
-    """A linear operator between the volumes [b c d h w] of a grid and the views [b c m v u] of a
-    rig.
-    """
+class Projector(nn.Module, LinearOperator):
+    """A linear operator between a grid's volumes [b c d h w] and a rig's views [b c m v u]."""
 
     grid: Grid
     cameras: Cameras
@@ -109,7 +99,6 @@ class Transposed(LinearOperator):
     def __init__(self, A: LinearOperator):
         self.A = A
         self.domain_shape, self.range_shape = A.range_shape, A.domain_shape
-        self.forward, self.adjoint = A.adjoint, A.__call__
 
     @property
     def device(self) -> torch.device:
@@ -118,6 +107,12 @@ class Transposed(LinearOperator):
     @property
     def T(self) -> LinearOperator:
         return self.A
+
+    def forward(self, x: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
+        return self.A.adjoint(x)
+
+    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
+        return self.A(y)
 
 
 class Composed(nn.Module, LinearOperator):
@@ -130,9 +125,8 @@ class Composed(nn.Module, LinearOperator):
     def __init__(self, A: LinearOperator, B: LinearOperator):
         super().__init__()
         if A.domain_shape != B.range_shape:
-            raise ValueError(
-                f"A B needs A's domain to be B's range, got {A.domain_shape} and {B.range_shape}"
-            )
+            shapes = f"{A.domain_shape} and {B.range_shape}"
+            raise ValueError(f"A B needs A's domain to be B's range, got {shapes}")
         self.A, self.B = A, B
         self.domain_shape, self.range_shape = B.domain_shape, A.range_shape
 
@@ -151,12 +145,12 @@ class Composed(nn.Module, LinearOperator):
         return self.B.adjoint(self.A.adjoint(y))
 
 
-class Wrapped(nn.Module, Projector):
-    """What an operator made of another one takes over from it: shapes, device, grid and cameras."""
+class Wrapped(Projector):
+    """What an operator made of another one takes over: shapes, device, grid and cameras."""
 
     def __init__(self, A: LinearOperator):
         super().__init__()
-        self.A, self.capabilities = A, A.capabilities
+        self.A: Any = A
         self.domain_shape, self.range_shape = A.domain_shape, A.range_shape
 
     @property
@@ -168,13 +162,11 @@ class Wrapped(nn.Module, Projector):
         return self.A.pose_gradient
 
     @property
-    def grid(self) -> Any:
-        """Where the voxels lie."""
+    def grid(self) -> Grid:
         return self.A.grid
 
     @property
-    def cameras(self) -> Any:
-        """The rig."""
+    def cameras(self) -> Cameras:
         return self.A.cameras
 
 
@@ -185,16 +177,18 @@ class Scaled(Wrapped):
 
     Args:
         A: the operator.
-        pixels: factors that broadcast to [*range_shape], or a function that gives them, called at
+        pixels: factors p that broadcast to [*range_shape], or a function that gives them, called at
             every use where the cameras want a gradient. None: one.
-        voxels: factors or a mask [*domain_shape]; a mask leaves out what is not finite, too. None:
-            one.
+        voxels: factors v or a mask [*domain_shape]; a mask leaves out what is not finite, too.
+            None: one.
     """
 
     voxels: Tensor | None
+    kept: Tensor | None
 
     def __init__(self, A: LinearOperator, pixels: Weight = None, voxels: Tensor | None = None):
         super().__init__(A)
+        self.capabilities = A.capabilities
         self.factors = pixels if callable(pixels) else None
         self.register_buffer("kept", pixels() if callable(pixels) else pixels, persistent=False)
         self.register_buffer("voxels", voxels, persistent=False)
@@ -215,66 +209,51 @@ class Scaled(Wrapped):
         return y if factors is None else y * factors.to(y)
 
     def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
-        factors = self.pixels
-        # in the wider of the two precisions: a half would round small factors to zero
-        y = (
-            y
-            if factors is None
-            else y * factors.to(y.device, torch.promote_types(y.dtype, torch.float32))
-        )
+        if (factors := self.pixels) is not None:
+            # in the wider of the two precisions: a half would round small factors to zero
+            y = y * factors.to(y.device, torch.promote_types(y.dtype, torch.float32))
         return self._weighted(self.A.adjoint(y))
 
     def _weighted(self, x: Tensor) -> Tensor:
         if self.voxels is None:
             return x
-        return (
-            torch.where(self.voxels, x, 0)
-            if self.voxels.dtype == torch.bool
-            else x * self.voxels.to(x)
-        )
+        mask = self.voxels.dtype == torch.bool
+        return torch.where(self.voxels, x, 0) if mask else x * self.voxels.to(x)
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
-        return Scaled(self.A.subset(selection), self._chosen(selection), self.voxels)
+        def chosen(factors: Tensor) -> Tensor:
+            return selection(factors.expand(self.range_shape)[None, None])[0, 0]
 
-    def cropped(self, box: Box, views: Sequence[int] | None = None) -> LinearOperator:
+        return Scaled(self.A.subset(selection), self._changed(chosen), self.voxels)
+
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
+        keep = list(range(self.range_shape[0]) if views is None else views)
+
+        def of_views(factors: Tensor) -> Tensor:
+            return factors.expand(self.range_shape)[keep]
+
         voxels = None if self.voxels is None else self.voxels[box.slices]
-        pick = (lambda w: w) if views is None else (lambda w: self._whole(w)[list(views)])
-        return Scaled(self.A.cropped(box, views), self._through(pick), voxels)
+        return Scaled(self.A.cropped(box, views), self._changed(of_views), voxels)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
         return Scaled(self.A.with_support(support), self.factors or self.kept, self.voxels)
 
     def mirror(self) -> Mirror | None:
         """A's own, where it mirrors the weights into themselves, too."""
-        mirror, factors = self.A.mirror(), self.pixels
-        if (
-            mirror is None
-            or factors is not None
-            and not _same(mirror.views(self._whole(factors)), factors)
-        ):
+        mirror, p, v = self.A.mirror(), self.pixels, self.voxels
+        if mirror is None or not (p is None or _same(mirror.views(p.expand(self.range_shape)), p)):
             return None
-        return (
-            mirror
-            if self.voxels is None or _same(mirror.volume(self.voxels), self.voxels)
-            else None
-        )
+        return mirror if v is None or _same(mirror.volume(v), v) else None
 
-    def _chosen(self, selection: LinearOperator) -> Weight:
-        return self._through(lambda w: selection(self._whole(w)[None, None])[0, 0])
-
-    def _through(self, change: Callable[[Tensor], Tensor]) -> Weight:
-        factors = self.factors
-        if factors is not None:
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> Weight:
+        """The pixels' factors after a change, as a function where they were one."""
+        if (factors := self.factors) is not None:
             return lambda: change(factors())
         return None if self.kept is None else change(self.kept)
 
-    def _whole(self, factors: Tensor) -> Tensor:
-        return factors.expand(self.range_shape)
-
 
 class Cropped(Wrapped):
-    """A for volumes that are zero outside a box, and for some cameras, by way of the whole
-    operator.
+    """A for volumes that are zero outside a box, and for some cameras, by the whole operator.
 
     Args:
         A: of the whole grid.
@@ -284,17 +263,16 @@ class Cropped(Wrapped):
 
     def __init__(self, A: LinearOperator, box: Box, views: Sequence[int] | None = None):
         super().__init__(A)
-        self.capabilities = frozenset()
         count, *pixels = A.range_shape
-        self.box, self.views = box, list(range(count)) if views is None else [int(v) for v in views]
+        self.box, self.views = box, [int(v) for v in (range(count) if views is None else views)]
         self.domain_shape, self.range_shape = box.shape, (len(self.views), *pixels)
 
     @property
-    def grid(self) -> Any:
+    def grid(self) -> Grid:
         return self.A.grid.cropped(self.box)
 
     @property
-    def cameras(self) -> Any:
+    def cameras(self) -> Cameras:
         return self.A.cameras[torch.tensor(self.views)]
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:

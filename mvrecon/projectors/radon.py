@@ -4,6 +4,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.ray_transform import RayTransform
 
@@ -26,7 +27,7 @@ class Radon(RayTransform):
         support: the voxels that may be anything but zero.
 
     Raises:
-        ValueError: a rig of central cameras, or as `RayTransform`.
+        ValueError: central cameras, explicit rays, or as `RayTransform`.
     """
 
     def __init__(
@@ -40,7 +41,6 @@ class Radon(RayTransform):
         support: Bool[Tensor, "d h w"] | None = None,
     ):
         if not cameras.parallel:
-            raise ValueError(
-                "The projector 'radon' needs a parallel rig, got central cameras; use 'drr'"
-            )
+            kind = "explicit rays" if isinstance(cameras, ExplicitRays) else "central cameras"
+            raise ValueError(f"The projector 'radon' needs a parallel rig, got {kind}; use 'drr'")
         super().__init__(grid, cameras, method, backend, rays_per_pixel, skip, support)

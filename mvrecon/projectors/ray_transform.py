@@ -2,36 +2,27 @@
 matched adjoint.
 """
 
-import math
 from collections.abc import Sequence
 from copy import copy
-from types import ModuleType
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.cameras.symmetry import Mirror, mirror_pairs
-from mvrecon.geometry.box import Box, placed
-from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import backends
+from mvrecon.geometry.box import Box
 from mvrecon.kernels.backends import wide
-from mvrecon.kernels.rays import ops, reference
-from mvrecon.kernels.rays.lines import lines_of, lines_of_rays, tensors_of, writes
-from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.projectors.checks import check, check_floating
+from mvrecon.projectors.integrals import LineIntegrals
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.selection import RaySelection, ViewSelection
-from mvrecon.projectors.skipping import SKIPS, Skipped, check_support, told, verify, within
+from mvrecon.projectors.skipping import check_support
 from mvrecon.projectors.subset import SomePixels, SomeViews
 
-METHODS = ("joseph", "siddon", "trilinear")
 
-
-class RayTransform(nn.Module, Projector):
+class RayTransform(LineIntegrals):
     """y = A x: the integrals of volumes along the rays of a rig, in (unit of x) * mm.
 
     Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; second
@@ -70,43 +61,6 @@ class RayTransform(nn.Module, Projector):
     """
 
     capabilities = frozenset({"subset", "crop", "support"})
-    support: Tensor | None
-
-    def __init__(
-        self,
-        grid: Grid,
-        cameras: Cameras | ExplicitRays,
-        method: str = "joseph",
-        backend: str = "auto",
-        rays_per_pixel: int = 1,
-        skip: str = "auto",
-        support: Bool[Tensor, "d h w"] | None = None,
-    ):
-        super().__init__()
-        known = {"method": METHODS, "backend": backends.BACKENDS, "skip": SKIPS}
-        for what, name in (
-            ("method", method.partition(":")[0]),
-            ("backend", backend),
-            ("skip", skip),
-        ):
-            if name not in known[what]:
-                raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(known[what])}")
-        self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
-        self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
-        self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
-        self.last_backend: str | None = None
-        self.ray_extent = list(cameras.ray_extent)
-        lines = self._lines()
-        # without a graph, but with what torch.func knows of them
-        self.register_buffer(
-            "fixed_lines", lines.detach() if lines.requires_grad else lines, persistent=False
-        )
-        self._written = writes(cameras)
-        mask = check_support(support, grid)
-        mask = None if mask is None else mask.to(lines.device)
-        self.register_buffer("support", mask, persistent=False)
-        self._held = self._hold()
-        self._last: Tensor | None = None
 
     def __init_subclass__(cls, **options: object) -> None:
         """A subclass that computes something else has the whole operator's parts alone: right, but
@@ -116,11 +70,6 @@ class RayTransform(nn.Module, Projector):
         if {"forward", "adjoint"} & vars(cls).keys():
             cls.capabilities = frozenset()
 
-    @property
-    def device(self) -> torch.device:
-        """Where the operator computes."""
-        return self.fixed_lines.device
-
     def subset(self, selection: LinearOperator) -> LinearOperator:
         """The rays of some views or pixels alone."""
         if "subset" in self.capabilities and isinstance(selection, ViewSelection):
@@ -129,7 +78,7 @@ class RayTransform(nn.Module, Projector):
             return SomePixels(self, selection)
         return super().subset(selection)
 
-    def cropped(self, box: Box, views: Sequence[int] | None = None) -> LinearOperator:
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
         """The same for the voxels of a box and for some cameras, with the same options.
 
         Raises:
@@ -138,10 +87,8 @@ class RayTransform(nn.Module, Projector):
         if "crop" not in self.capabilities:
             return super().cropped(box, views)
         support = None if self.support is None else self.support[box.slices].cpu()
-        device = self.cameras.source.device
-        cameras = (
-            self.cameras if views is None else self.cameras[torch.tensor(views, device=device)]
-        )
+        rig = self.cameras
+        cameras = rig if views is None else rig[torch.tensor(views, device=rig.source.device)]
         options = (self.method, self.backend, self.rays_per_pixel, self.skip, support)
         return RayTransform(self.grid.cropped(box), cameras, *options).to(self.device)
 
@@ -168,77 +115,6 @@ class RayTransform(nn.Module, Projector):
         other.support = None if moved is None else moved.to(self.fixed_lines.device)
         other._held, other._last = other._hold(), None
         return other
-
-    @property
-    def cameras(self) -> Cameras:
-        """The rig.
-
-        Raises:
-            ValueError: the rays were given one by one, and have no cameras with frusta.
-        """
-        if isinstance(self.rays, ExplicitRays):
-            raise ValueError(
-                "This needs cameras, which the projector has not: it was given explicit rays"
-            )
-        return self.rays
-
-    @property
-    def skipped(self) -> Skipped:
-        """What the last call left out, and why."""
-        return told(self._last, self.skip, self.grid.shape)
-
-    def _lines(self) -> Float[Tensor, "m 4 3 k"]:
-        if isinstance(self.rays, ExplicitRays):
-            if self.rays_per_pixel != 1:
-                raise ValueError(
-                    f"Explicit rays are one a pixel, got rays_per_pixel={self.rays_per_pixel}"
-                )
-            return lines_of_rays(self.rays, self.grid)
-        return lines_of(self.rays.refined(self.rays_per_pixel), self.grid)
-
-    def _apply(self, fn, recurse: bool = True):
-        exact = self.fixed_lines
-        super()._apply(fn, recurse)
-        self.fixed_lines = exact.to(self.fixed_lines.device)
-        return self
-
-    @property
-    def pose_gradient(self) -> bool:
-        """Whether the cameras want a gradient: the rays are then made anew in every call."""
-        return any(tensor.requires_grad for tensor in tensors_of(self.rays))
-
-    @property
-    def lines(self) -> Float[Tensor, "m 4 3 k"]:
-        """The rays in voxel space; made anew, with their graph, where the cameras want a gradient.
-
-        Raises:
-            RuntimeError: cameras that want none were changed in place; graphs of `torch.compile`
-                cannot look.
-        """
-        if self.pose_gradient:
-            return self._lines().to(self.fixed_lines.device)
-        if not torch.compiler.is_compiling() and writes(self.rays) != self._written:
-            raise RuntimeError(
-                "The cameras' tensors were changed in place after the projector was built; build "
-                "another one, or let "
-                "them want a gradient before"
-            )
-        return self.fixed_lines
-
-    def __reduce_ex__(self, protocol):
-        """What copies and pickles are made of; raises as `lines` does."""
-        _ = self.lines
-        return super().__reduce_ex__(protocol)
-
-    def __setstate__(self, state):
-        super().__setstate__(state)
-        self._written = writes(self.rays)  # a copied tensor counts from zero
-
-    @property
-    def detector(self) -> list[int]:
-        """Rays (rows, columns) of one of the views that `lines` describes."""
-        explicit = isinstance(self.rays, ExplicitRays)
-        return [1, 1] if explicit else [n * self.rays_per_pixel for n in self.rays.shape]
 
     def forward(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Views of volumes.
@@ -267,88 +143,8 @@ class RayTransform(nn.Module, Projector):
         y = y.reshape(len(y), len(self.fixed_lines), *self.detector)
         return self.backproject_along(y, self.lines).unflatten(0, views.shape[:2])
 
-    def project_along(
-        self,
-        volume: Float[Tensor, "b c d h w"],
-        lines: Float[Tensor, "r 4 3 k"],
-        detector: Sequence[int],
-    ) -> Float[Tensor, "n r v u"]:
-        """Integrals along rays in voxel space, see `kernels/rays/lines.py`; a detector has so many
-        (rows, columns).
-        """
-        check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
-        check_floating(volume, "a volume")
-        x, kernels = volume.flatten(0, 1), self._kernels(volume)
-        rays = lines, self.ray_extent, list(detector), self.kernel
-        if kernels is reference:
-            self._last = None
-            return kernels.project(
-                wide(x if self.support is None else within(x, self.support)), *rays
-            )
-        if self.support is not None:
-            self._last, box = held = self._held
-            part = within(x[:, *box.slices], self.support[box.slices])
-            return kernels.project(part, *rays, held[0])
-        if self.skip == "off":
-            self._last = None
-            return kernels.project(x, *rays)
-        how = self.skip if self.skip in ("box", "brick") else "auto"
-        # not read from self again: another thread may project another volume meanwhile
-        self._last = there = kernels.occupied(x.detach(), lines.detach(), *rays[1:], how)
-        views = kernels.project(x, *rays, None, there)
-        if self.skip == "verify":
-            verify(views, kernels.project(x, *rays), self.skipped)
-        return views
-
-    def backproject_along(
-        self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]
-    ) -> Float[Tensor, "n d h w"]:
-        """The transpose of `project_along`; views in the precision of arithmetic."""
-        kernels, shape = self._kernels(views[:, None]), list(self.grid.shape)
-        if self.support is None:
-            return kernels.backproject(views, lines, self.ray_extent, shape, self.kernel)
-        if kernels is reference:
-            return within(
-                kernels.backproject(views, lines, self.ray_extent, shape, self.kernel), self.support
-            )
-        self._last, box = held = self._held
-        part = kernels.backproject(
-            views, lines, self.ray_extent, list(box.shape), self.kernel, held[0]
-        )
-        return placed(within(part, self.support[box.slices]), box, self.grid.shape)
-
-    def _hold(self) -> tuple[Tensor, Box]:
-        """Where the support is, in code, and its box: found once."""
-        held = Occupancy.whole(self.grid.shape)
-        if self.support is not None and self.skip != "off" and backends.COMPILED:
-            mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
-            how = self.skip if self.skip in ("box", "brick") else "once"
-            code = ops.occupied(mask, rays, self.ray_extent, self.detector, self.kernel, how)
-            held = Occupancy.unwrapped(code)
-        return held.encoded(), held.box
-
-    def _kernels(self, tensor: Tensor) -> ModuleType:
-        chosen, kernels = backends.kernels_for(tensor, self.backend, self.kernel)
-        self.last_backend = chosen
-        return kernels
-
     def extra_repr(self) -> str:
         return (
             f"{len(self.rays)} views of {self.rays.shape}, grid {self.grid.shape}, "
             f"{self.method}, {self.backend}"
         )
-
-
-def _kernel(method: str, grid: Grid) -> str:
-    name, colon, samples = method.partition(":")
-    if name != "trilinear":
-        if colon:
-            raise ValueError(f"Samples go with method 'trilinear', got {method!r}")
-        return name
-    if not colon:
-        return f"{name}:{math.ceil(math.hypot(*grid.shape))}"
-    if not samples.isdecimal() or int(samples) < 1:
-        raise ValueError(
-            f"A ray needs a positive number of samples, as in 'trilinear:300', got {method!r}"
-        )
-    return method

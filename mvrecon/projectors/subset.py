@@ -2,8 +2,6 @@
 hold counts.
 """
 
-from typing import TYPE_CHECKING
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,11 +10,9 @@ from torch.nn.functional import avg_pool2d
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.kernels.backends import wide
 from mvrecon.projectors.checks import check_floating
+from mvrecon.projectors.integrals import LineIntegrals
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import RaySelection, ViewSelection
-
-if TYPE_CHECKING:
-    from mvrecon.projectors.ray_transform import RayTransform
 
 
 class SomeRays(LinearOperator):
@@ -35,7 +31,7 @@ class SomeRays(LinearOperator):
     #: Pixels (rows, columns) of each of the views that `lines` describes.
     detector: tuple[int, int]
 
-    def __init__(self, A: "RayTransform", selection: LinearOperator):
+    def __init__(self, A: LineIntegrals, selection: LinearOperator):
         self.A, self.selection = A, selection
         self.domain_shape, self.range_shape = A.domain_shape, selection.range_shape
         self._prepare()

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
 from mvrecon.parts import HEADS
 
 

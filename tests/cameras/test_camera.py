@@ -184,7 +184,7 @@ def test_moving_the_rig_moves_what_it_sees():
 
 def test_the_depth_range_holds_the_grid_tightly():
     cameras = record()[0]
-    grid = Grid.centred((4, 6, 8), (1.0, 2.0, 5.0), centre=(1.0, 2.0, 3.0))
+    grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 5.0), centre=(1.0, 2.0, 3.0))
     torch.testing.assert_close(
         cameras.depth_range(grid), torch.tensor([[93.0, 113.0]], dtype=torch.float64)
     )

@@ -151,7 +151,7 @@ def one_camera(**changes) -> Cameras:
     ],
 )
 def test_boxes_beside_behind_and_beyond(centre, extent, sees):
-    grid = Grid.centred((1, 4, 4), (2.0, 2.0, 0.02), centre=centre)
+    grid = Grid.centred(size=(4, 4, 1), spacing=(2.0, 2.0, 0.02), centre=centre)
     assert views_that_see(one_camera(extent=extent), grid, margin=0).tolist() == [sees]
 
 
@@ -196,7 +196,7 @@ def test_a_view_that_holds_the_whole_box_has_its_whole_depth(name):
         detector={"pixels": 40, "pixel_mm": 6.0},
         **({"sid": 400.0, "sdd": 800.0} if name == "circular" else {}),
     )
-    grid = Grid.centred((9, 8, 7), (10.0, 9.0, 8.0), centre=(3.0, 2.0, 1.0))
+    grid = Grid.centred(size=(7, 8, 9), spacing=(10.0, 9.0, 8.0), centre=(3.0, 2.0, 1.0))
     torch.testing.assert_close(
         seen_depth_range(cameras, grid), cameras.depth_range(grid), rtol=1e-12, atol=0
     )

@@ -15,7 +15,7 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.projectors.ray_transform import RayTransform
 from tests.cameras.rigs import DETECTOR, random_cameras
 
-GRID = Grid.centred((6, 5, 8), (11.0, 9.0, 7.0))
+GRID = Grid.centred(size=(8, 5, 6), spacing=(11.0, 9.0, 7.0))
 SHIFTED = {**DETECTOR, "offset_mm": [5.0, 0.0]}  # down
 ASIDE = {**DETECTOR, "offset_mm": [0.0, 5.0]}
 CASES = {
@@ -94,7 +94,7 @@ def test_cameras_on_a_circle_lie_in_its_plane_and_pair_across_it():
         (dcspect80(rows=[0, 1, 2]), GRID),
         (
             dcspect80(),
-            Grid.centred((6, 5, 8), 9.0, centre=(0.0, 0.0, 1e-3)),
+            Grid.centred(size=(8, 5, 6), spacing=9.0, centre=(0.0, 0.0, 1e-3)),
         ),  # not about the rig's plane
         (circular(5, 400.0, 800.0, SHIFTED, 180.0, 10.0), GRID),
         (

@@ -19,7 +19,7 @@ RIG = {
 
 def head(centre=(0.0, 0.0, 0.0), radius=16.0, shape=(20, 30, 30)):
     """HU of a ball of water in air, with a ball of bone off its centre towards (+x, -y, +z)."""
-    xyz = voxel_centres(Grid.centred(shape, SPACING[::-1]))
+    xyz = voxel_centres(Grid.centred(size=shape[::-1], spacing=SPACING[::-1]))
     ball = (xyz - torch.tensor(centre, dtype=xyz.dtype)).norm(dim=-1)
     bone = (xyz - torch.tensor(centre, dtype=xyz.dtype) - torch.tensor([6.0, -4.0, 3.0])).norm(
         dim=-1

@@ -1,8 +1,11 @@
 """Where the patient is."""
 
+import pytest
 import torch
 
-from mvrecon.data.body import body, centre, enclosed, largest_part
+from mvrecon.data.body import body, body_box, enclosed, largest_part
+from mvrecon.data.slabs import Slabs
+from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 
 
@@ -45,9 +48,11 @@ def test_a_winding_part_is_one():
 def test_the_centre_is_that_of_the_box_in_mm():
     mask = torch.zeros(10, 12, 14, dtype=torch.bool)
     mask[2:5, 3:4, 7:13] = True
-    grid = Grid.centred((10, 12, 14), (1.0, 2.0, 3.0), centre=(100.0, 0.0, 0.0))
+    grid = Grid.centred(size=(14, 12, 10), spacing=(1.0, 2.0, 3.0), centre=(100.0, 0.0, 0.0))
+    patient = body_box(Slabs.of(mask.float()), 0.5)
+    assert patient == Box.around(mask)
     assert torch.allclose(
-        centre(mask, grid), torch.tensor([103.0, -5.0, -4.5], dtype=torch.float64)
+        grid.cropped(patient).centre, torch.tensor([103.0, -5.0, -4.5], dtype=torch.float64)
     )
 
 
@@ -57,3 +62,20 @@ def test_small_and_empty_volumes_pass():
     speck = torch.zeros(100, 100, 100)
     speck[50, 50, 50] = 1.0
     assert body(speck, 0.5).nonzero().tolist() == [[50, 50, 50]]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_box_of_slabs_is_that_of_the_whole(axis, seed):
+    rng = torch.Generator().manual_seed(seed)
+    mu = (torch.rand(31, 70, 103, generator=rng) < 0.3 * seed) * 0.01 + scan((31, 70, 103))
+    down = [
+        (k, mu.narrow(axis, k, min(6, mu.shape[axis] - k))) for k in range(0, mu.shape[axis], 6)
+    ][::-1]
+    assert body_box(Slabs((31, 70, 103), axis, lambda: iter(down)), 0.005) == Box.around(
+        body(mu, 0.005)
+    )
+
+
+def test_the_box_of_nothing_is_empty():
+    assert not body_box(Slabs.of(torch.zeros(50, 60, 70)), 0.5).size

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from mvrecon.data import hdf5, slabs
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.durable import written_whole
 from tests.data.conftest import SPACING, head, stored
@@ -201,3 +202,76 @@ def test_an_open_file_goes_to_other_processes(volume_file):
     with multiprocessing.get_context("fork").Pool(2) as pool:
         assert pool.map(first_voxels, [file, file]) == [here, here]
     assert pickle.loads(pickle.dumps(file))._open is None
+
+
+@pytest.mark.door
+def test_names_are_unique(volume_file):
+    """A volume file in which two volumes have one name is refused, and none is written."""
+    rewritten(volume_file, lambda file: file["id"].__setitem__(5, "pt_2"))
+    with pytest.raises(
+        ValueError,
+        match=r"heads\.h5: has several volumes of the name \['pt_2'\]; expected every name",
+    ):
+        len(VolumeFile(volume_file))
+    with pytest.raises(ValueError, match=r"several volumes of the name \['pt_0'\]"):
+        write_volumes(volume_file.with_name("new.h5"), [*stored(2), *stored(1)])
+    assert not volume_file.with_name("new.h5").exists()
+
+
+@pytest.mark.door
+def test_volumes_are_those_that_were_written_or_none(volume_file):
+    """A volume file of mvrecon's in which one bit has flipped, anywhere, is refused or has the
+    values written.
+    """
+    whole, rng = volume_file.read_bytes(), Random(2)
+
+    def contents() -> list[tuple]:
+        volumes = map(VolumeFile(volume_file).read, range(7))
+        return [(v.name, v.spacing, v.ct.tobytes()) for v in volumes]
+
+    written, refused = contents(), 0
+    for _ in range(200):
+        damaged = bytearray(whole)
+        damaged[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        volume_file.write_bytes(damaged)
+        try:
+            assert contents() == written
+        except ValueError as error:
+            refused += "heads.h5" in str(error)
+    assert refused > 100
+
+
+def test_slabs_are_the_volume_whatever_the_chunks(tmp_path, monkeypatch):
+    monkeypatch.setattr(hdf5, "CHUNK", 4 * 30 * 30 * 2)  # four planes
+    write_volumes(tmp_path / "a.h5", stored(2))
+    monkeypatch.setattr(slabs, "VOXELS", 6 * 30 * 30)
+    file = VolumeFile(tmp_path / "a.h5")
+    assert file.file["ct"].chunks == (1, 4, 30, 30)
+    name, parts, spacing = file.slabs(1)
+    assert (name, parts.shape, spacing) == ("pt_1", (20, 30, 30), SPACING)
+    assert [(first, len(part)) for first, part in parts] == [(k, 4) for k in range(0, 20, 4)]
+    assert np.array_equal(parts.whole().numpy(), stored(2)[1].ct) and np.array_equal(
+        file.read(1).ct, stored(2)[1].ct
+    )
+
+
+@pytest.mark.door
+def test_a_chunk_of_gigabytes_is_refused_at_once(tmp_path):
+    """A volume in one chunk of over 256 MiB, which cannot be read in slabs, is refused before it is
+    unpacked.
+    """
+    path = tmp_path / "large.h5"
+    write_volumes(path, stored(1))
+    large = {
+        "shape": (1, 600, 512, 512),
+        "dtype": "i2",
+        "chunks": (1, 600, 512, 512),
+        "compression": "gzip",
+    }
+    rewritten(path, instead("ct", **large))
+    with path.open("ab") as file:
+        file.write(bytes(2**20))  # as much as the zeros would take
+    with pytest.raises(
+        ValueError, match=r"large\.h5: '/ct' declares .*expected chunks of at most 268435456 bytes"
+    ):
+        len(VolumeFile(path))

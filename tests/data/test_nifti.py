@@ -1,14 +1,18 @@
 """NIfTI: the same object lies at the same place, however its voxels are stored."""
 
 import builtins
+import gzip
+from random import Random
 
 import nibabel
 import numpy as np
 import pytest
 import torch
 
+from mvrecon.data import slabs
 from mvrecon.data.nifti import read_nifti
 from mvrecon.data.resample import resample
+from mvrecon.data.volumes import NiftiVolume
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 
@@ -65,9 +69,9 @@ def test_an_object_lands_at_its_world_place(tmp_path, name):
     save(path, centred(AFFINES[name]))
     values, grid = read_nifti(path)
     assert torch.allclose(values.double(), blobs(voxel_centres(grid)), atol=1e-6)
-    target = Grid.centred((12, 16, 18), 2.0, centre=(2.0, 1.0, -1.0))
+    target = Grid.centred(size=(12, 11, 8), spacing=3.0, centre=(2.0, 1.0, -1.0))
     expected = (
-        blobs(voxel_centres(target.refined(4))).reshape(12, 4, 16, 4, 18, 4).mean(dim=(1, 3, 5))
+        blobs(voxel_centres(target.refined(4))).reshape(8, 4, 11, 4, 12, 4).mean(dim=(1, 3, 5))
     )
     assert torch.allclose(resample(values, grid, target).double(), expected, atol=0.03)
 
@@ -125,3 +129,72 @@ def test_without_nibabel_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ImportError, match=r"pip install 'mvrecon\[io\]'"):
         read_nifti(tmp_path / "a.nii")
+
+
+@pytest.mark.door
+def test_packed_values_are_those_that_were_written_or_none(tmp_path):
+    """A `.nii.gz` in which one bit has flipped, anywhere, is refused or has the values that were
+    written.
+    """
+    path = tmp_path / "a.nii.gz"
+    save(path, centred(AFFINES["las"]), 1e-3)
+    whole, (values, grid), rng, refused = path.read_bytes(), read_nifti(path), Random(1), 0
+    for _ in range(200):
+        damaged = bytearray(whole)
+        damaged[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            again, there = read_nifti(path)
+        except ValueError as error:
+            refused += "a.nii.gz" in str(error)
+            continue
+        assert torch.equal(again, values) and torch.equal(there.affine, grid.affine)
+    assert refused > 190
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", ["a.NII", "a.nii.GZ", "a.Nii.gz", "a.b.nii"])
+def test_endings_are_read_in_any_case(tmp_path, name):
+    """`.NII`, `.NII.GZ` and the like are read as `.nii` and `.nii.gz` are."""
+    save(tmp_path / "plain.nii", centred(AFFINES["ras"]))
+    raw = (tmp_path / "plain.nii").read_bytes()
+    (tmp_path / name).write_bytes(gzip.compress(raw) if name.lower().endswith("gz") else raw)
+    assert torch.equal(read_nifti(tmp_path / name)[0], read_nifti(tmp_path / "plain.nii")[0])
+    assert NiftiVolume(path=str(tmp_path / name)).case(0)[0] == name[: name.lower().index(".nii")]
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("more", [(1,), (1, 1)])
+def test_axes_of_one_voxel_behind_the_third_are_left_out(tmp_path, more):
+    """A NIfTI of four or five axes with one volume is read as that volume."""
+    values = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
+    for name, array in (("three.nii", values), ("more.nii", values.reshape(*values.shape, *more))):
+        nibabel.save(nibabel.Nifti1Image(array, np.diag([-2.0, 2.0, 3.0, 1.0])), tmp_path / name)
+    (three, grid), (four, there) = (
+        read_nifti(tmp_path / "three.nii"),
+        read_nifti(tmp_path / "more.nii"),
+    )
+    assert (
+        torch.equal(three, four)
+        and torch.equal(grid.affine, there.affine)
+        and four.shape == (4, 3, 2)
+    )
+
+
+@pytest.mark.parametrize("name", AFFINES)
+def test_slabs_have_the_bits_of_nibabels_values(tmp_path, name, monkeypatch):
+    path = tmp_path / "a.nii.gz"
+    save(path, centred(AFFINES[name]), 1e-3)
+    canonical = nibabel.as_closest_canonical(nibabel.load(path))
+    monkeypatch.setattr(slabs, "VOXELS", 7 * SIZE**2)
+    values, grid = read_nifti(path)
+    assert np.array_equal(values.numpy(), canonical.get_fdata(dtype="float32").T)
+    assert np.array_equal(grid.affine.numpy(), canonical.affine)
+
+
+def test_much_behind_a_packed_volume_is_refused(tmp_path):
+    path = tmp_path / "a.nii.gz"
+    save(tmp_path / "a.nii", centred(AFFINES["ras"]))
+    path.write_bytes(gzip.compress((tmp_path / "a.nii").read_bytes() + bytes(2**25)))
+    with pytest.raises(ValueError, match=r"a\.nii\.gz: has over \d+ bytes behind the volume"):
+        read_nifti(path)

@@ -1,14 +1,19 @@
 """Resampling: exact for what is linear, and it neither makes nor loses attenuation."""
 
+from itertools import pairwise
+
 import pytest
 import torch
+import torch.nn.functional as F
 
 from mvrecon.data import resample as module
 from mvrecon.data.resample import pooled, resample
+from mvrecon.data.slabs import Slabs
+from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 
-SOURCE = Grid.centred((30, 40, 44), (2.0, 2.2, 3.0), centre=(5.0, 0.0, -4.0))
+SOURCE = Grid.centred(size=(44, 40, 30), spacing=(2.0, 2.2, 3.0), centre=(5.0, 0.0, -4.0))
 
 
 def plane(grid):
@@ -24,11 +29,76 @@ def turned(grid, degrees):
 
 
 @pytest.mark.parametrize("spacing", [0.9, 2.0, 3.1, 4.5, 7.0])
-@pytest.mark.parametrize("degrees", [(0, 0, 0), (20, -10, 30)])
-def test_a_linear_field_is_resampled_exactly(spacing, degrees):
+def test_a_linear_field_is_resampled_exactly_to_turned_axes(spacing):
     count = int(36 / spacing)
-    target = turned(Grid.centred((count,) * 3, spacing, centre=(3.0, 1.0, -2.0)), degrees)
+    target = turned(Grid.centred((count,) * 3, spacing, centre=(3.0, 1.0, -2.0)), (20, -10, 30))
     assert torch.allclose(resample(plane(SOURCE), SOURCE, target), plane(target), atol=2e-5)
+
+
+@pytest.mark.parametrize("factors", [(1, 1, 1), (2, 2, 2), (3, 1, 2)])
+def test_a_linear_field_is_resampled_exactly_to_whole_blocks(factors):
+    target = pooled(
+        plane(SOURCE)[:24, :36, :42], SOURCE.cropped(Box((0, 0, 0), (24, 36, 42))), factors
+    )[1]
+    assert torch.allclose(resample(plane(SOURCE), SOURCE, target), plane(target), atol=2e-5)
+
+
+def cut(volume, source, target):
+    """Closed form, voxel by voxel: the lengths that a voxel of each grid have in common, along x, y
+    and z.
+    """
+    means = volume.double()
+    for axis, k in enumerate((2, 1, 0)):
+        edges = []
+        for grid in (source, target):
+            first = grid.affine[k, 3].item() - grid.spacing[k] / 2
+            edges.append([first + grid.spacing[k] * n for n in range(grid.shape[axis] + 1)])
+        (s, t), rows = edges, []
+        for a, b in pairwise(t):
+            rows.append([max(0.0, min(b, d) - max(a, c)) / (b - a) for c, d in pairwise(s)])
+        means = torch.tensordot(
+            torch.tensor(rows, dtype=torch.float64), means, dims=([1], [axis])
+        ).movedim(0, axis)
+    return means
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(
+    "spacing", [(0.9, 1.3, 2.0), (2.0, 2.2, 3.0), (3.1, 4.5, 7.0), (15.0, 9.0, 11.0)]
+)
+def test_the_mean_over_each_voxel_is_exact_whatever_the_slabs(spacing, axis):
+    volume = torch.rand(SOURCE.shape, generator=torch.Generator().manual_seed(3))
+    target = Grid.centred(size=(7, 9, 11), spacing=spacing, centre=(8.0, -3.0, -20.0))
+    down = [
+        (k, volume.narrow(axis, k, min(7, SOURCE.shape[axis] - k)))
+        for k in range(0, SOURCE.shape[axis], 7)
+    ][::-1]
+    means = resample(Slabs(SOURCE.shape, axis, lambda: iter(down)), SOURCE, target)
+    assert torch.allclose(means.double(), cut(volume, SOURCE, target), atol=1e-6)
+
+
+def test_the_means_over_finer_voxels_have_the_mean_of_the_coarse_one():
+    volume = torch.rand(SOURCE.shape, generator=torch.Generator().manual_seed(4))
+    target = Grid.centred(size=(5, 7, 6), spacing=9.3, centre=(2.0, 0.0, -3.0))
+    coarse = resample(volume, SOURCE, target)
+    for factor in (2, 3, 4):
+        finer = resample(volume, SOURCE, target.refined(factor))
+        assert torch.allclose(F.avg_pool3d(finer[None], factor)[0], coarse, atol=1e-6)
+
+
+def test_a_grid_of_the_same_voxels_gets_the_same_values():
+    volume = torch.rand(SOURCE.shape, generator=torch.Generator().manual_seed(5))
+    assert torch.allclose(resample(volume, SOURCE, SOURCE), volume, atol=1e-7)
+
+
+def test_a_turned_grid_needs_only_the_blocks_around_it():
+    volume = torch.rand(SOURCE.shape, generator=torch.Generator().manual_seed(6))
+    target = turned(Grid.centred((2, 2, 2), 9.0, centre=(9.0, -8.0, 11.0)), (20, -10, 30))
+    whole, grid = pooled(volume, SOURCE, (3, 3, 2))
+    assert pooled(volume, SOURCE, (3, 3, 2), target)[0].numel() < whole.numel() / 4
+    assert torch.allclose(
+        resample(volume, SOURCE, target), resample(whole, grid, target), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("spacing", [1.5, 4.0, 6.5])
@@ -54,7 +124,7 @@ def test_there_is_nothing_outside():
 
 
 def test_slabs_change_nothing(monkeypatch):
-    target = Grid.centred((10, 11, 12), 5.0)
+    target = Grid.centred(size=(12, 11, 10), spacing=5.0)
     whole = resample(plane(SOURCE), SOURCE, target)
     monkeypatch.setattr(module, "POINTS", 1)
     assert torch.equal(resample(plane(SOURCE), SOURCE, target), whole)

@@ -77,6 +77,35 @@ def test_a_folder_that_is_no_clone_is_refused(openkbp, tmp_path):
         openkbp.prepare(tmp_path, tmp_path / "data")
 
 
+@pytest.mark.door
+def test_patients_without_a_ct_are_named_and_nothing_is_written(root, tmp_path, run_python):
+    """A patient without `ct.csv` is named, the exit status is not zero, and no file is written
+    unless told to skip.
+    """
+    clone = tmp_path / "clone"
+    for folder, name in (("train-pats", "pt_1"), ("train-pats", "pt_2"), ("test-pats", "pt_300")):
+        add_patient(clone, folder, name)
+    for folder in ("train-pats/pt_2", "test-pats/pt_300"):
+        (clone / "provided-data" / folder / "ct.csv").unlink()
+    command = (
+        str(root / "scripts" / "prepare_openkbp.py"),
+        str(clone),
+        "--out",
+        str(tmp_path / "data"),
+    )
+    done = run_python(*command)
+    assert (
+        done.returncode == 1
+        and "2 patient(s) without ct.csv: train-pats/pt_2, test-pats/pt_300" in done.stderr
+    )
+    assert not (tmp_path / "data").exists()
+    done = run_python(*command, "--skip")
+    assert done.returncode == 0 and [p.name for p in (tmp_path / "data").iterdir()] == [
+        "openkbp_train.h5"
+    ]
+    assert len(VolumeFile(tmp_path / "data" / "openkbp_train.h5")) == 1
+
+
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [

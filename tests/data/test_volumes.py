@@ -10,7 +10,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mvrecon.data.attenuation import WATER
+from mvrecon.data.attenuation import WATER, attenuation
 from mvrecon.data.hdf5 import Stored, write_volumes
 from mvrecon.data.volumes import Hdf5Volumes, NiftiVolume, reversed_axes, split_pixels
 from mvrecon.geometry.grid import Grid, voxel_centres
@@ -200,3 +200,34 @@ def test_wrong_options_are_refused():
         NiftiVolume(path="a.nii", fine=1)
     with pytest.raises(TypeError, match="no option 'crpo'; did you mean 'crop'"):
         SCENES.build("nifti", path="a.nii", crpo="body")
+
+
+def test_views_come_from_a_grid_four_times_finer_where_it_is_not_too_large():
+    scene = NiftiVolume(path="a.nii")
+    factors = {
+        (1, 1, 1): 4,
+        (128, 128, 128): 4,
+        (128, 128, 129): 3,
+        (171, 171, 170): 3,
+        (171, 171, 171): 2,
+    }
+    assert {
+        shape: scene.factor(Grid.centred(shape=shape, spacing=1.0)) for shape in factors
+    } == factors
+    assert NiftiVolume(path="a.nii", fine=8).factor(Grid.centred((171, 171, 171), 1.0)) == 8
+
+
+def test_the_truth_does_not_depend_on_how_fine_the_views_are(volume_file, grid, cameras):
+    truths = [
+        Hdf5Volumes(path=str(volume_file), fine=k).sample(1, 0, grid, cameras).volume
+        for k in (2, 3, 8)
+    ]
+    for truth in truths[1:]:
+        assert torch.allclose(truth, truths[0], atol=1e-7)
+
+
+def test_the_truth_on_the_files_own_voxels_is_the_file(tmp_path, cameras):
+    hu = head()
+    grid = Grid.centred(size=hu.shape[::-1], spacing=SPACING[::-1])
+    sample = Hdf5Volumes(path=one(tmp_path, hu), crop="none").sample(0, 0, grid, cameras)
+    assert torch.allclose(sample.volume[0], attenuation(torch.from_numpy(hu).float()), atol=1e-8)

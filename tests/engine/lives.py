@@ -32,7 +32,7 @@ OPTIONS = (
     "~callbacks.progress",
     "~callbacks.board",
     "model.width=4",
-    "grid.shape=[8,8,8]",
+    "grid.size=[8,8,8]",
     "grid.spacing=16.0",
     "camera.n_views=3",
     "camera.detector.pixels=[12,12]",

@@ -75,7 +75,7 @@ def taken_for_a_gpu(strict, monkeypatch):
 
 
 SMALL = (
-    "grid.shape=[12,10,11]",
+    "grid.size=[11,10,12]",
     "grid.spacing=10.0",
     "camera.n_views=4",
     "camera.detector.pixels=[12,12]",
@@ -199,7 +199,7 @@ def test_the_compiled_loops_keep_their_threads_in_one_order(threads):
 
 @pytest.mark.parametrize("method", ["sirt", "backprojection"])
 def test_methods_without_a_network_have_the_same_bits_on_any_number_of_threads(method, threads):
-    settings = compose("grid.shape=[40,40,40]")
+    settings = compose("grid.size=[40,40,40]")
     module = fit.build_module(settings, {"name": method}, 1.0)
     volumes = []
     for number in (1, 2, 3, 7):

@@ -130,7 +130,7 @@ def shown(found):
 
 def test_a_saved_case_keeps_axes_and_affine(tmp_path):
     nibabel = pytest.importorskip("nibabel")
-    grid = Grid.centred((6, 7, 8), (1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
+    grid = Grid.centred(size=(8, 7, 6), spacing=(1.0, 2.0, 3.0), centre=(10.0, 20.0, 30.0))
     volume = torch.zeros(1, 1, 6, 7, 8)
     volume[0, 0, 5, 4, 3] = 1.0
     scene = {"views": torch.rand(1, 1, 2, 4, 4), "volume": volume, "name": ["pat/1 a"]}

@@ -4,10 +4,14 @@ included.
 
 import struct
 import time
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from random import Random
+from typing import Any
+
+import numpy as np
+import torch
 
 from mvrecon.memory import peak
 
@@ -93,8 +97,8 @@ class Tally:
         seconds: the slowest took, of this process's own time.
         peak: bytes by which this process's largest size grew, native libraries included; 0 where no
             one tells.
-        failures: what must not be: another exception, or a message without the file's name; a line
-            each.
+        failures: what must not be: another exception, a message without the file's name, other
+            values where a format has checksums; a line each.
     """
 
     inputs: int = 0
@@ -104,15 +108,33 @@ class Tally:
     failures: list[str] = field(default_factory=list)
 
 
-def tally(read: Callable[[Path], object], cases: Iterable[bytes], path: Path) -> Tally:
-    """Give every case to a reader, as the file `path`, and note what it does; nothing is raised."""
+def tally(
+    read: Callable[[Path], object], cases: Iterable[bytes], path: Path, whole: bytes | None = None
+) -> Tally:
+    """Give every case to a reader, as the file `path`, and note what it does; nothing is raised.
+
+    Args:
+        read: the reader.
+        cases: damaged files.
+        path: where each is put.
+        whole: for a format with checksums, the file without damage: what is read of a damaged one
+            are the values of it.
+    """
+    expected = None
+    if whole is not None:
+        path.write_bytes(whole)
+        expected = values(read(path))
     found, before = Tally(), peak() or 0
     for case in cases:
         path.write_bytes(case)
         start = time.process_time()
         try:
-            read(path)
+            result = read(path)
             found.read += 1
+            if expected is not None and values(result) != expected:
+                found.failures.append(
+                    f"case {found.inputs}: read, with other values than the file without damage"
+                )
         except REFUSALS as error:
             if path.name not in str(error):
                 found.failures.append(
@@ -124,3 +146,17 @@ def tally(read: Callable[[Path], object], cases: Iterable[bytes], path: Path) ->
         found.inputs += 1
     found.peak = (peak() or 0) - before
     return found
+
+
+def values(result: Any) -> Any:
+    """What a reader returned, as plain values that can be compared to the last bit."""
+    if isinstance(result, torch.nn.Module):
+        return values(result.state_dict())
+    if isinstance(result, torch.Tensor | np.ndarray):
+        array = np.asarray(result)
+        return array.shape, str(array.dtype), array.tobytes()
+    if is_dataclass(result):
+        return [values(getattr(result, part.name)) for part in fields(result)]
+    if isinstance(result, Mapping):
+        return [(key, values(value)) for key, value in result.items()]
+    return [values(item) for item in result] if isinstance(result, list | tuple) else result

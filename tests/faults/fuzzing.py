@@ -11,7 +11,7 @@ from pathlib import Path
 from random import Random
 
 from tests.faults.fuzz import mutations, tally
-from tests.faults.samples import samples
+from tests.faults.samples import CHECKED, samples
 
 #: Bytes that may be added to what the process uses once all is imported; seconds for all cases of a
 #: reader.
@@ -34,11 +34,12 @@ def main(seed: int, count: int, out: Path) -> None:
         table = samples(Path(folder))
         limit()
         for name, (read, data, wrap, suffix) in table.items():
+            whole = data if name in CHECKED else None
             found[name] = {"inputs": 0, "failures": ["the process ended here"]}
             out.write_text(json.dumps(found))
             faulthandler.dump_traceback_later(SECONDS, exit=True)
             cases = (wrap(case) for case in mutations(data, Random(f"{seed} {name}"), count))
-            found[name] = asdict(tally(read, cases, Path(folder) / f"damaged{suffix}"))
+            found[name] = asdict(tally(read, cases, Path(folder) / f"damaged{suffix}", whole))
         faulthandler.cancel_dump_traceback_later()
     out.write_text(json.dumps(found))
 

@@ -21,6 +21,10 @@ from mvrecon.parts import CAMERAS
 from tests.faults.hostile import pickle_of, saved, with_pickle
 
 Wrap = Callable[[bytes], bytes]
+#: Readers of formats with checksums over all that is read: a damaged file is refused or has the
+#: same values. Plain NIfTI, HDF5 that others wrote, cameras (JSON) and settings (YAML) have none:
+#: other values are what the file says.
+CHECKED = ("HDF5 volumes", "NIfTI, packed", "checkpoint")
 HU = np.arange(6 * 7 * 8, dtype=np.int16).reshape(6, 7, 8)
 RIG = {
     "name": "circular",

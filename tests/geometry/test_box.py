@@ -32,7 +32,7 @@ def test_growing_and_aligning_stay_inside_the_volume():
 
 def test_a_cropped_grid_keeps_its_voxels_where_they_are():
     grid, box = (
-        Grid.centred((6, 7, 8), (1.0, 2.0, 3.0), (9.0, -4.0, 1.0)),
+        Grid.centred(size=(8, 7, 6), spacing=(1.0, 2.0, 3.0), centre=(9.0, -4.0, 1.0)),
         Box((1, 2, 3), (4, 7, 5)),
     )
     assert torch.equal(voxel_centres(grid.cropped(box)), voxel_centres(grid)[box.slices])
@@ -43,7 +43,7 @@ def test_a_cropped_grid_keeps_its_voxels_where_they_are():
 )
 def test_a_grid_is_not_cropped_to_nothing_or_beyond(box):
     with pytest.raises(ValueError, match="cannot be cropped"):
-        Grid.centred((6, 7, 8), 1.0).cropped(box)
+        Grid.centred(size=(8, 7, 6), spacing=1.0).cropped(box)
 
 
 def test_a_part_is_put_back_where_it_was_cut_out():

@@ -8,7 +8,7 @@ from mvrecon.geometry.sample import normalised, sample
 
 
 def test_voxel_centres_surround_the_grid_centre():
-    grid = Grid.centred((4, 6, 8), (1.0, 2.0, 3.0), centre=(10.0, 20.0, 30.0))
+    grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 3.0), centre=(10.0, 20.0, 30.0))
     xyz = voxel_centres(grid)
     assert xyz.shape == (4, 6, 8, 3)
     assert torch.allclose(
@@ -31,7 +31,7 @@ def test_index_and_world_are_inverse_on_an_oblique_grid():
 
 
 def test_refined_grid_fills_the_same_box():
-    grid = Grid.centred((4, 6, 8), (1.0, 2.0, 3.0))
+    grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 3.0))
     assert torch.allclose(grid.refined(3).corners(), grid.corners())
     coarse = (
         voxel_centres(grid.refined(3))
@@ -50,11 +50,59 @@ def test_spacing_must_be_positive(spacing):
 
 @pytest.mark.parametrize("shape", [(0, 2, 2), (8, 0, 8), (2, 2), (2, 2, 2, 2)])
 def test_shape_must_be_three_positive_sizes(shape):
-    for build in (lambda: Grid(shape, torch.eye(4)), lambda: Grid.centred(shape, 1.0)):
+    for build in (
+        lambda: Grid(shape, torch.eye(4)),
+        lambda: Grid.centred(shape=shape, spacing=1.0),
+    ):
         with pytest.raises(
             ValueError, match=rf"three positive sizes \(z, y, x\), got {re.escape(str(shape))}"
         ):
             build()
+
+
+def test_all_that_is_typed_is_in_the_order_x_y_z():
+    grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 3.0), centre=(10.0, 20.0, 30.0))
+    assert grid.shape == (4, 6, 8)
+    assert grid.size == (8, 6, 4)
+    assert grid.spacing == (1.0, 2.0, 3.0)
+    extent = grid.corners().amax(dim=0) - grid.corners().amin(dim=0)
+    assert extent.tolist() == [8.0, 12.0, 12.0]
+
+
+def test_a_cube_is_the_same_in_either_order():
+    expected = Grid.centred(size=(4, 4, 4), spacing=(1.0, 2.0, 3.0))
+    for options in ({"shape": (4, 4, 4)}, {"size": [4, 4, 4]}):
+        assert torch.equal(Grid.centred(spacing=(1.0, 2.0, 3.0), **options).affine, expected.affine)
+    for n in (4, (4, 4, 4)):
+        assert torch.equal(Grid.centred(n, (1.0, 2.0, 3.0)).affine, expected.affine)
+
+
+def test_a_shape_of_a_tensor_takes_one_spacing_for_all_axes():
+    grid = Grid.centred(shape=torch.zeros(4, 6, 8).shape, spacing=2.0)
+    assert torch.equal(grid.affine, Grid.centred(size=(8, 6, 4), spacing=2.0).affine)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: Grid.centred((4, 6, 8), 2.0),
+        lambda: Grid.centred(shape=(4, 6, 8), spacing=(1.0, 2.0, 3.0)),
+        lambda: Grid.centred(**{"shape": [4, 6, 8], "spacing": [1.0, 1.0, 3.0]}),
+    ],
+    ids=["positions", "keywords", "settings"],
+)
+def test_sizes_whose_order_is_not_clear_are_refused(call):
+    """Whoever gives a tensor's shape with the steps of an old run's settings is told the size."""
+    with pytest.raises(ValueError, match=r"size=\(x, y, z\).* expected size=\(8, 6, 4\)"):
+        call()
+
+
+def test_a_grid_needs_one_size_and_its_spacing():
+    for options in ({}, {"size": (4, 4, 4), "shape": (4, 4, 4)}):
+        with pytest.raises(TypeError, match="needs one of n, size .* and shape"):
+            Grid.centred(spacing=1.0, **options)
+    with pytest.raises(ValueError, match="spacing must be positive"):
+        Grid.centred(4)
 
 
 def test_left_handed_and_flat_grids_are_refused():
@@ -87,3 +135,26 @@ def test_half_precision_volumes_are_sampled_with_float32_coordinates():
     points = normalised(torch.tensor([[[[[0.25, 0.5, 40.37]]]]]), (64, 2, 2))
     exact = sample(volume.bfloat16().float(), points)
     assert sample(volume.bfloat16(), points).item() == exact.bfloat16().item()
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    "make", [lambda n: Grid.centred((n, n, n), 1.0), Grid.centred((100,) * 3, 1.0).refined]
+)
+def test_a_grid_that_memory_cannot_take_is_refused_with_both_sizes(make):
+    """A grid of 100000^3 voxels is refused before anything is made, with the GiB that it needs and
+    that are at hand.
+    """
+    with pytest.raises(ValueError, match=r"needs [\d,.]+ GiB of memory; [\d,.]+ GiB are at hand"):
+        make(100_000)
+
+
+def test_memory_at_hand_is_no_more_than_a_limit_leaves(run_python):
+    code = (
+        "import resource, mvrecon.limits as m; resource.setrlimit(resource.RLIMIT_AS, (2**32, "
+        "2**32));"
+        "assert 0 < m.memory_at_hand() < 2**32; m.check_memory(2**30, 'a');"
+        "m.check_memory(3 * 2**31, 'This')"
+    )
+    done = run_python("-c", code)
+    assert done.returncode == 1 and "ValueError: This needs 6.0 GiB of memory; " in done.stderr

@@ -29,13 +29,16 @@ kernels = pytest.mark.skipif(
 )
 
 whole = Occupancy.whole
-SMALL = Grid.centred((5, 4, 6), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
-BODY = Grid.centred((4, 5, 4), 45.0)
+SMALL = Grid.centred(size=(6, 4, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
+BODY = Grid.centred(size=(4, 5, 4), spacing=45.0)
 RIGS = {
     "dome": (SMALL, PINHOLES[1:3]),
     "parallel": (SMALL, replace(PARALLEL[:2], extent="line")),
     "dcspect80": (BODY, dcspect80()[::40].binned(16)),
-    "slice": (Grid.centred((1, 5, 6), (1.0, 1.2, 0.9), tuple(GRID.centre.tolist())), PARALLEL[:2]),
+    "slice": (
+        Grid.centred(size=(6, 5, 1), spacing=(1.0, 1.2, 0.9), centre=tuple(GRID.centre.tolist())),
+        PARALLEL[:2],
+    ),
 }
 METHODS = ("joseph", "siddon", "trilinear:8")  # of an odd number, one sample may lie on a kink
 CASES = [(kind, method) for kind in RIGS for method in METHODS]

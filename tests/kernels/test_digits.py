@@ -31,7 +31,9 @@ def elsewhere(rig, offset: float, voxel: float) -> Case:
     scaled = replace(
         rig, **{name: voxel * getattr(rig, name) for name in ("source", "origin", "u", "v")}
     )
-    grid = Grid.centred(SHAPE, [voxel * mm for mm in SPACING], shift.tolist())
+    grid = Grid.centred(
+        size=SHAPE[::-1], spacing=[voxel * mm for mm in SPACING], centre=shift.tolist()
+    )
     return Case(grid, scaled.moved(torch.eye(3), shift))
 
 

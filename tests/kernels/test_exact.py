@@ -45,7 +45,7 @@ def box(grid: Grid) -> Phantom:
     [circular(7, 50.0, 90.0, DETECTOR, start_degrees=3.0), dome(7, 40.0, 20.0, 150.0, DETECTOR)],
 )
 def test_a_box_of_ones_gives_the_chords(rig, backend):
-    grid = Grid.centred((9, 10, 11), (1.5, 2.0, 1.0))
+    grid = Grid.centred(size=(11, 10, 9), spacing=(1.5, 2.0, 1.0))
     expected = box(grid).integrals(*rig.rays(), ray_extent=rig.ray_extent)
     ones = torch.ones(1, 1, *grid.shape, dtype=torch.float64)
     views = PROJECTORS.build("drr", grid=grid, cameras=rig, method="siddon", backend=backend)(ones)[
@@ -58,7 +58,7 @@ def test_a_box_of_ones_gives_the_chords(rig, backend):
 @pytest.mark.parametrize("method", ["joseph", "siddon"])
 def test_both_methods_are_exact_from_face_to_face(method, backend):
     """Rays through a plate of ones, from its upper face to its lower."""
-    grid = Grid.centred((5, 40, 44), (1.5, 1.0, 1.2))
+    grid = Grid.centred(size=(44, 40, 5), spacing=(1.5, 1.0, 1.2))
     rig = dome(5, 40.0, 20.0, 50.0, {"pixels": [9, 9], "pixel_mm": 0.5})
     expected = box(grid).integrals(*rig.rays(), ray_extent=rig.ray_extent)
     ones = torch.ones(1, 1, *grid.shape, dtype=torch.float64)
@@ -136,7 +136,7 @@ def test_a_smooth_blob_converges_at_the_method_order(name, method, least, most):
 def test_a_slice_is_the_radon_transform(backend):
     """One slice of one millimetre under one detector row: the chords of a disc."""
     radius, n = 20.0, 128
-    grid = Grid.centred((1, n, n), (48.0 / n, 48.0 / n, 1.0))
+    grid = Grid.centred(size=(n, n, 1), spacing=(48.0 / n, 48.0 / n, 1.0))
     rig = parallel(5, {"pixels": [1, 40], "pixel_mm": [1.0, 1.1]}, 100.0, start_degrees=10.0)
     solid = Solids(
         "cylinder",

@@ -18,7 +18,7 @@ from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.kernels.rays.trace import Space
 from tests.projectors.rigs import AXIAL, CONE, GRID, INSIDE, PARALLEL, PINHOLES
 
-BODY = Grid.centred((9, 8, 10), 22.0)
+BODY = Grid.centred(size=(10, 8, 9), spacing=22.0)
 #: A source in the volume, its detector so wide that voxels lie on both sides of the source.
 WIDE = circular(2, 40.0, 70.0, {"pixels": [6, 5], "pixel_mm": 25.0}).moved(
     torch.eye(3), GRID.centre

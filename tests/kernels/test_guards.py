@@ -130,7 +130,7 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:82"])
 def test_more_than_2_to_the_31_voxels(method, tmp_path):
     """One ray along the last row of a volume of 8 GB that is a file of nothing but holes."""
-    grid = Grid.centred((7000, 7200, 40), 1.0)
+    grid = Grid.centred(size=(40, 7200, 7000), spacing=1.0)
     rig = parallel(1, {"pixels": [1, 1], "pixel_mm": 1.0}, 60.0).moved(
         torch.eye(3), torch.tensor([0, 3599.5, 3499.5])
     )
@@ -160,7 +160,9 @@ def test_gradients_cross_the_threads(dtype, monkeypatch):
         rig = circular(3, 40.0, 70.0, {"pixels": [9, 10], "pixel_mm": 2.0}, start_degrees=13)
         source = rig.source.clone().requires_grad_()
         A = PROJECTORS.build(
-            "drr", grid=Grid.centred((9, 10, 11), 1.0), cameras=replace(rig, source=source)
+            "drr",
+            grid=Grid.centred(size=(11, 10, 9), spacing=1.0),
+            cameras=replace(rig, source=source),
         )
         x = torch.rand(1, 1, 9, 10, 11).to(dtype).requires_grad_()
         views = A(x)

@@ -11,7 +11,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 
 DETECTOR = {"pixels": [14, 15], "pixel_mm": 2.1}
-GRID = Grid.centred((18, 20, 22), (1.0, 1.1, 0.9))
+GRID = Grid.centred(size=(22, 20, 18), spacing=(1.0, 1.1, 0.9))
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])

@@ -77,7 +77,7 @@ def test_two_boxes_that_touch_share_no_ray(backend):
     total = PROJECTORS.build("radon", grid=both, cameras=rig, method="siddon", backend=backend)(x)
     halves = 0
     for z in (0, 1):
-        part = Grid.centred((2, 4, 4), 1.0, (0, 0, 2 * z - 1.0))
+        part = Grid.centred(size=(4, 4, 2), spacing=1.0, centre=(0, 0, 2 * z - 1.0))
         A = PROJECTORS.build("radon", grid=part, cameras=rig, method="siddon", backend=backend)
         halves = halves + A(x[:, :, 2 * z : 2 * z + 2])
     assert total.abs().max() > 1 and torch.allclose(halves, total, rtol=0, atol=1e-14)

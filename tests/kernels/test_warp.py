@@ -12,7 +12,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.cameras.rigs import circular
-from mvrecon.geometry.frustum import Spacing, depth_centres, depth_edges, depth_index
+from mvrecon.geometry.frustum import depth_edges, depth_index
 from mvrecon.geometry.grid import Grid, pixel_centres, voxel_centres
 from mvrecon.geometry.lattice import Lattice, grid_lattice, lattice_maps, lifted_maps
 from mvrecon.geometry.sample import normalised, sample
@@ -20,36 +20,31 @@ from mvrecon.kernels.warps import ops as warp_ops
 from mvrecon.kernels.warps.warp import warp
 from tests.projectors.rigs import CONE, GRID, PARALLEL, PINHOLES
 
-BODY = Grid.centred((9, 8, 10), 22.0)
+BODY = Grid.centred(size=(10, 8, 9), spacing=22.0)
 RIGS = {
     "cone": (GRID, CONE),
     "pinholes": (GRID, PINHOLES),
     "parallel": (GRID, PARALLEL),
     "dcspect80": (BODY, dcspect80()[::20].binned(8)),
 }
-EVERY = [(kind, spacing) for kind in RIGS for spacing in ("z", "k")]
 DEPTH = 7
 
 
-def edges_of(grid: Grid, cameras: Cameras, spacing: Spacing) -> torch.Tensor:
-    return depth_edges(cameras.depth_range(grid), DEPTH, spacing)
+def edges_of(grid: Grid, cameras: Cameras) -> torch.Tensor:
+    return depth_edges(cameras.depth_range(grid), DEPTH)
 
 
-def lattices(grid: Grid, cameras: Cameras, spacing: Spacing) -> tuple[Lattice, Lattice]:
-    return frusta_lattice(cameras, grid, edges_of(grid, cameras, spacing), spacing), grid_lattice(
-        grid
-    )
+def lattices(grid: Grid, cameras: Cameras) -> tuple[Lattice, Lattice]:
+    return frusta_lattice(cameras, grid, edges_of(grid, cameras)), grid_lattice(grid)
 
 
-def index_in_frusta(
-    cameras: Cameras, edges: torch.Tensor, spacing: Spacing, xyz: torch.Tensor
-) -> torch.Tensor:
+def index_in_frusta(cameras: Cameras, edges: torch.Tensor, xyz: torch.Tensor) -> torch.Tensor:
     uvz = cameras.project(xyz)
-    return torch.cat([uvz[..., :2], depth_index(uvz[..., 2], edges, spacing)[..., None]], dim=-1)
+    return torch.cat([uvz[..., :2], depth_index(uvz[..., 2], edges)[..., None]], dim=-1)
 
 
-def bin_centres(cameras: Cameras, edges: torch.Tensor, spacing: Spacing) -> torch.Tensor:
-    z = depth_centres(edges, spacing)
+def bin_centres(cameras: Cameras, edges: torch.Tensor) -> torch.Tensor:
+    z = (edges[:, 1:] + edges[:, :-1]) / 2
     uv = pixel_centres(cameras.shape)[None, None].expand(len(cameras), z.shape[1], -1, -1, -1)
     return cameras.unproject(
         torch.cat([uv, z[:, :, None, None, None].expand(*uv.shape[:-1], 1)], dim=-1)
@@ -57,15 +52,15 @@ def bin_centres(cameras: Cameras, edges: torch.Tensor, spacing: Spacing) -> torc
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-@pytest.mark.parametrize(("kind", "spacing"), EVERY)
-def test_warps_sample_where_projection_says(kind, spacing, backend):
+@pytest.mark.parametrize("kind", RIGS)
+def test_warps_sample_where_projection_says(kind, backend):
     torch.manual_seed(0)
     grid, cameras = RIGS[kind]
-    edges = edges_of(grid, cameras, spacing)
-    frusta, world = lattices(grid, cameras, spacing)
-    m, bins = len(cameras), bin_centres(cameras, edges, spacing)
+    edges = edges_of(grid, cameras)
+    frusta, world = lattices(grid, cameras)
+    m, bins = len(cameras), bin_centres(cameras, edges)
     x = torch.randn(2, m, 3, *frusta.shape, dtype=torch.float64)
-    points = normalised(index_in_frusta(cameras, edges, spacing, voxel_centres(grid)), frusta.shape)
+    points = normalised(index_in_frusta(cameras, edges, voxel_centres(grid)), frusta.shape)
     expected = torch.stack([sample(each, points) for each in x])[:, :, None]
     assert torch.allclose(
         warp(x, lattice_maps(frusta, world), grid.shape, backend), expected, atol=1e-9
@@ -77,7 +72,7 @@ def test_warps_sample_where_projection_says(kind, spacing, backend):
         warp(y, lattice_maps(world, frusta), frusta.shape, backend), expected, atol=1e-9
     )
     # pair (s, k): frustum s at the bins of frustum k
-    places = index_in_frusta(cameras, edges, spacing, bins)
+    places = index_in_frusta(cameras, edges, bins)
     expected = torch.stack(
         [
             sample(x[:, 1], normalised(places[1, k], frusta.shape).expand(2, -1, -1, -1, -1))
@@ -89,10 +84,10 @@ def test_warps_sample_where_projection_says(kind, spacing, backend):
     assert expected.abs().max() > 0.1
 
 
-@pytest.mark.parametrize(("kind", "spacing"), EVERY)
-def test_warp_back_is_the_transpose(kind, spacing):
+@pytest.mark.parametrize("kind", RIGS)
+def test_warp_back_is_the_transpose(kind):
     torch.manual_seed(0)
-    frusta, world = lattices(*RIGS[kind], spacing)
+    frusta, world = lattices(*RIGS[kind])
     for of, to in ((frusta, world), (world, frusta), (frusta, frusta)):
         maps = lattice_maps(of, to)
         for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-5)):
@@ -133,7 +128,7 @@ def test_gradients_by_values_and_by_homography():
 @pytest.mark.parametrize("kind", ["cone", "parallel"])
 def test_gradients_by_the_lift_reach_the_cameras(kind):
     grid, cameras = RIGS[kind]
-    edges = edges_of(grid, cameras, "z")
+    edges = edges_of(grid, cameras)
     x = torch.randn(1, len(cameras), 1, DEPTH, *cameras.shape, dtype=torch.float64)
     results = []
     for backend in ("cpu", "reference"):
@@ -213,7 +208,7 @@ def test_a_compiled_graph_holds_the_warp_whole():
 
 def test_threads_change_no_bit(threads, monkeypatch):
     monkeypatch.setattr("mvrecon.kernels.threads.LEAST", 1)
-    frusta, world = lattices(GRID, CONE, "z")
+    frusta, world = lattices(GRID, CONE)
     maps = lattice_maps(world, frusta)
     x = torch.randn(1, 1, 2, *GRID.shape)
     y = torch.randn(1, 1, 4, 2, *frusta.shape)
@@ -231,17 +226,16 @@ def test_threads_change_no_bit(threads, monkeypatch):
         assert all(torch.equal(one, other) for one, other in zip(results[0], others, strict=True))
 
 
-@pytest.mark.parametrize("spacing", ["z", "k"])
 @pytest.mark.parametrize("sid", [200.0, 1e6])
 @pytest.mark.parametrize(("offset", "voxel"), [(0.0, 1.0), (1e5, 1.0), (0.0, 1e-6), (0.0, 1e6)])
-def test_far_sources_far_worlds_and_scales_lose_no_digits(spacing, sid, offset, voxel):
+def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
     """The same picture in other units and at another place; a beam from afar is nearly a parallel
     one.
     """
     torch.manual_seed(0)
     detector = {"pixels": [20, 21], "pixel_mm": 1.3 * (1 + 30 / sid)}
     grid, cameras = (
-        Grid.centred((18, 20, 22), (1.0, 1.1, 0.9)),
+        Grid.centred(size=(22, 20, 18), spacing=(1.0, 1.1, 0.9)),
         circular(3, sid, sid + 30, detector, start_degrees=7.0),
     )
     shift = torch.full((3,), offset, dtype=torch.float64)
@@ -250,13 +244,11 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(spacing, sid, offset, 
     affine[:3] *= voxel
     affine[:3, 3] += shift
     moved = replace(cameras, **other).moved(torch.eye(3), shift)
-    frusta, world = lattices(grid, cameras, spacing)
-    far_frusta, far_world = lattices(Grid(grid.shape, affine), moved, spacing)
+    frusta, world = lattices(grid, cameras)
+    far_frusta, far_world = lattices(Grid(grid.shape, affine), moved)
     x = torch.rand(1, 3, 1, *frusta.shape, dtype=torch.float64)
     y = torch.rand(1, 1, 1, *grid.shape, dtype=torch.float64)
-    places = index_in_frusta(
-        cameras, edges_of(grid, cameras, spacing), spacing, voxel_centres(grid)
-    )
+    places = index_in_frusta(cameras, edges_of(grid, cameras), voxel_centres(grid))
     exact = sample(x[0], normalised(places, frusta.shape))[None, :, None]
     for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 2e-6)):
         got = warp(x.to(dtype), lattice_maps(far_frusta, far_world), grid.shape, "cpu")
@@ -283,12 +275,12 @@ def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
 
 
 def test_a_constant_stays_constant_inside_and_nothing_is_seen_outside():
-    frusta, world = lattices(GRID, CONE, "z")
+    frusta, world = lattices(GRID, CONE)
     maps = lattice_maps(world, frusta)
     seen = warp(torch.ones(1, 1, 1, *GRID.shape, dtype=torch.float64), maps, frusta.shape, "cpu")[
         0, 0, :, 0
     ]
-    index = GRID.to_index(bin_centres(CONE, edges_of(GRID, CONE, "z"), "z"))
+    index = GRID.to_index(bin_centres(CONE, edges_of(GRID, CONE)))
     sizes = torch.tensor(GRID.shape[::-1])
     inner = ((index > 0) & (index < sizes - 1)).all(dim=-1)
     outer = ((index < -1) | (index > sizes)).any(dim=-1)
@@ -304,13 +296,13 @@ def test_the_identity_changes_no_bit():
 
 
 def test_what_lies_behind_a_source_is_not_seen():
-    """A source inside the grid: its frustum in k reaches away from it, and no voxel behind it gets
+    """A source inside the grid: its frustum reaches away from it, and no voxel behind it gets
     a value.
     """
     rig = replace(CONE, source=GRID.centre + 0.02 * (CONE.source - GRID.centre))[:1]
     distance = rig.distance[:, None]
-    edges = depth_edges(distance * torch.tensor([[0.002, 0.4]], dtype=torch.float64), DEPTH, "k")
-    maps = lattice_maps(frusta_lattice(rig, GRID, edges, "k"), grid_lattice(GRID))
+    edges = depth_edges(distance * torch.tensor([[0.002, 0.4]], dtype=torch.float64), DEPTH)
+    maps = lattice_maps(frusta_lattice(rig, GRID, edges), grid_lattice(GRID))
     shape = (DEPTH, *rig.shape)
     for backend in ("cpu", "reference"):
         seen = warp(torch.ones(1, 1, 1, *shape), maps, GRID.shape, backend)[0, 0, 0, 0]
@@ -329,7 +321,7 @@ def test_a_linear_ramp_goes_through_the_world_and_back_exactly():
     ramp = torch.arange(24, dtype=torch.float64)[:, None, None].expand(1, 2, 1, 24, 40, 40)
     there = warp(ramp, lattice_maps(frusta, world), grid.shape, "cpu")[:, :, 0]
     back = warp(there, lattice_maps(world, frusta).transpose(0, 1), frusta.shape, "cpu")[0, :, 0, 0]
-    index = grid.to_index(bin_centres(rig, edges, "z"))
+    index = grid.to_index(bin_centres(rig, edges))
     whole = warp(torch.ones_like(ramp), lattice_maps(frusta, world), grid.shape, "cpu")[:, :, 0]
     seen = warp(
         (whole > 1 - 1e-9).double(),
@@ -344,7 +336,7 @@ def test_a_linear_ramp_goes_through_the_world_and_back_exactly():
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_volumes_are_computed_in_float32_and_given_back_as_they_came(dtype):
-    frusta, world = lattices(GRID, CONE, "z")
+    frusta, world = lattices(GRID, CONE)
     x, maps = torch.randn(1, 4, 1, *frusta.shape).to(dtype), lattice_maps(frusta, world)
     assert torch.equal(warp(x, maps, GRID.shape), warp(x.float(), maps, GRID.shape).to(dtype))
 

@@ -6,9 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mvrecon.models.blocks import ConvBlock
-from mvrecon.models.masks import upsampled
-from mvrecon.models.unet3d import UNet3d
+from mvrecon.models.networks import ConvBlock, UNet3d, upsampled
 
 
 def pooled(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,5 +1,6 @@
 """What is made for a crop of the grid: its operator, its frusta, and how long they are kept."""
 
+import copy
 from dataclasses import replace
 
 import pytest
@@ -10,9 +11,12 @@ from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.models import geometry, regions
-from mvrecon.models.geometry import cropped_geometry, whole_geometry
-from mvrecon.models.model import CrossView
+from mvrecon.models import cropping, crops
+from mvrecon.models.cropping import Cropping
+from mvrecon.models.crops import cropped_geometry
+from mvrecon.models.cross_view import CrossView
+from mvrecon.models.geometry import whole_geometry
+from mvrecon.models.options import Options
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.ray_transform import RayTransform
 from tests.models.rig import small_rig
@@ -21,15 +25,26 @@ from tests.models.test_support import _close, _with_mask
 
 @torch.no_grad()
 def test_few_crops_are_kept_and_made_once(projector, monkeypatch):
-    found = regions.Regions(projector, regions.Skip(support="hull"))
-    monkeypatch.setattr(regions, "KEPT", 2)
+    kept = Cropping(projector, Options(support="hull"))
+    monkeypatch.setattr(cropping, "KEPT", 2)
     boxes = [Box((0, 0, 0), (n, 8, 8)) for n in (4, 8, 12)]
-    first = found.crop(boxes[0])
-    assert found.crop(boxes[0]) is first
-    found.crop(boxes[1])
-    found.crop(boxes[0])
-    found.crop(boxes[2])
-    assert [key[0] for key in found.crops] == [boxes[0], boxes[2]]
+    first = kept.crop(boxes[0])
+    assert kept.crop(boxes[0]) is first
+    kept.crop(boxes[1])
+    kept.crop(boxes[0])
+    kept.crop(boxes[2])
+    assert [key[0] for key in kept.crops] == [boxes[0], boxes[2]]
+
+
+def test_the_geometry_moves_with_its_module_and_its_maps_keep_their_digits(projector):
+    whole = Cropping(projector, Options(), 3).double().whole
+    assert whole.row.dtype == whole.column.dtype == whole.fine.step.dtype == torch.float64
+    plain = Cropping(projector, Options(), 3).bfloat16().whole.coarse
+    assert plain.step.dtype == torch.bfloat16 and plain.occupied.dtype == torch.bool
+    assert torch.equal(plain.world_from_frusta, whole.coarse.world_from_frusta)
+    gone = Cropping(copy.deepcopy(projector), Options(), 3).to("meta").whole
+    tensors = (gone.row, gone.column, gone.cameras, gone.fine.edges, gone.coarse.occupied)
+    assert all(tensor.is_meta for tensor in tensors)
 
 
 def test_a_crop_is_the_operator_on_it(projector):
@@ -64,7 +79,7 @@ def test_the_windows_of_a_crop_hold_all_that_its_inner_voxels_read(rig):
     smaller = 0
     for full, part in ((whole.fine, crop.fine), (whole.coarse, crop.coarse)):
         values = torch.rand(1, len(cameras), 1, *full.shape)
-        index = [part.window.first[:, k, None] + torch.arange(n) for k, n in enumerate(part.shape)]
+        index = [part.first[:, k, None] + torch.arange(n) for k, n in enumerate(part.shape)]
         z, v, u = index[0][:, :, None, None], index[1][:, None, :, None], index[2][:, None, None, :]
         m = torch.arange(len(cameras))[:, None, None, None]
         cut = values[0, m, 0, z, v, u][None, :, None]
@@ -96,7 +111,7 @@ def test_touched_bins_are_those_that_hold_part_of_the_mask_and_no_others(project
 
 def helix() -> tuple[Grid, Cameras]:
     """A tall grid, and a detector that climbs along it: no camera sees all of it."""
-    grid = Grid.centred((40, 16, 16), 1.0)
+    grid = Grid.centred(size=(16, 16, 40), spacing=1.0)
     detector = {"pixels": [12, 24], "pixel_mm": 2.4}
     turns = [circular(1, 60.0, 100.0, detector, start_degrees=50.0 * k) for k in range(8)]
     lifted = [
@@ -135,23 +150,23 @@ def test_cameras_that_see_nothing_of_the_crop_are_left_out_and_change_nothing(sh
 
     def done():
         model.zero_grad()
-        region, out = model.regions(views), model(views)
+        crop, out = model.cropping.region(views)[0], model(views)
         ReconstructionLoss(1.0, opinions=0.1, cross_view=0.01)(out, batch)["total"].backward()
         return (
-            region,
+            crop,
             out,
             [torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in model.parameters()],
         )
 
-    region, out, gradients = done()
-    assert region.culled >= 3 and len(region.A.cameras) == 8 - region.culled
-    model.regions.crops.clear()
+    crop, out, gradients = done()
+    assert len(crop.A.cameras) == len(crop.cameras) <= 5
+    model.cropping.crops.clear()
     monkeypatch.setattr(
-        geometry, "views_that_see", lambda cameras, grid: torch.ones(len(cameras)).bool()
+        crops, "views_that_see", lambda cameras, grid: torch.ones(len(cameras)).bool()
     )
     dense, expected, others = done()
-    assert dense.culled == 0
-    for name in ("volume", "opinions", "weights", "cross_views"):
+    assert len(dense.A.cameras) == len(dense.cameras) == 8
+    for name in ("volume", "opinions", "weights", "cross_views", "start", "start_views"):
         assert _close(getattr(out, name), getattr(expected, name), 1e-5), name
     assert all(
         torch.allclose(a, b, rtol=1e-3, atol=1e-6) for a, b in zip(gradients, others, strict=True)
@@ -177,10 +192,10 @@ def test_frusta_end_at_the_mask_and_nothing_changes(monkeypatch):
     mask[..., 12:20, 4:28, 4:28] = ((y - x).abs() < 3)[4:28, 4:28]
     _with_mask(monkeypatch, mask)
     views = A(torch.rand(mask.shape) * mask)
-    found, narrow = model(views), model.regions(views)
-    model.regions.crops.clear()
-    monkeypatch.setattr(regions, "held_bricks", lambda mask: None)
-    expected, wide = model(views), model.regions(views)
-    assert narrow.geometry.fine.step.numel() < wide.geometry.fine.step.numel()
+    found, (narrow, _) = model(views), model.cropping.region(views)
+    model.cropping.crops.clear()
+    monkeypatch.setattr(cropping, "occupied_bricks", lambda mask: None)
+    expected, (wide, _) = model(views), model.cropping.region(views)
+    assert narrow.fine.step.numel() < wide.fine.step.numel()
     for field in ("volume", "opinions", "weights", "cross_views"):
         assert _close(getattr(found, field), getattr(expected, field), 1e-5), field

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
 from mvrecon.parts import HEADS
 from mvrecon.testing import check_head
 from tests.models.rig import small_rig
@@ -9,11 +9,11 @@ from tests.models.rig import small_rig
 
 @pytest.mark.parametrize("name", HEADS.names())
 def test_contract(name):
-    check_head(name, Frusta(*small_rig(), depth=12))
+    check_head(name, Frusta.of(*small_rig(), depth=12))
 
 
 def test_softmax_depth_of_zero_logits_follows_the_prior():
-    frusta = Frusta(*small_rig(), depth=12)
+    frusta = Frusta.of(*small_rig(), depth=12)
     head = HEADS.build("softmax_depth")
     prior = (torch.rand(1, 4, 1, *frusta.shape) + 0.5) * frusta.occupied
     views = frusta.integrate(prior)  # the prior already explains the views, so nothing may change
@@ -21,14 +21,14 @@ def test_softmax_depth_of_zero_logits_follows_the_prior():
 
 
 def test_density_of_zero_logits_is_the_prior():
-    frusta = Frusta(*small_rig(), depth=12)
+    frusta = Frusta.of(*small_rig(), depth=12)
     prior = (torch.rand(1, 4, 1, *frusta.shape) + 0.5) * frusta.occupied
     out = HEADS.build("density")(torch.zeros_like(prior), prior, frusta.integrate(prior), frusta)
     assert torch.allclose(out, prior, rtol=1e-4, atol=1e-6)
 
 
 def test_logits_shift_mass_along_the_ray_and_only_there():
-    frusta = Frusta(*small_rig(), depth=12)
+    frusta = Frusta.of(*small_rig(), depth=12)
     head = HEADS.build("softmax_depth")
     views = torch.rand(1, 1, 4, 12, 12) + 0.1
     logits = torch.zeros(1, 4, 1, *frusta.shape)

@@ -8,8 +8,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mvrecon.models.blocks import ALONE, ConvBlock, convolution
-from mvrecon.models.unet3d import UNet3d
+from mvrecon.models.networks import ALONE, ConvBlock, UNet3d, convolution
 from tests.models.dense import net_on
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.masks import halved
+from mvrecon.models.networks import halved
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from tests.models.rig import small_projector
-from tests.models.test_model import HEAD
+from tests.models.test_cross_view import HEAD
 
 NAMES = tuple(MODELS.names())
 SKIPS = ({}, {"support": "hull"}, {"support": "hull", "masked": False})
@@ -25,7 +25,7 @@ NETWORKS = ("cross_view", "mean_fusion", "backprojection_unet", "geometry_free")
 
 
 def _projector(shape: tuple[int, int, int] = (12, 12, 12), pixels: int = 12) -> Projector:
-    grid = Grid.centred(shape, 24 / max(shape))
+    grid = Grid.centred(shape=shape, spacing=24 / max(shape))
     detector = {"pixels": [pixels, pixels], "pixel_mm": 60 / pixels}
     cameras = CAMERAS.build("circular", n_views=4, sid=100.0, sdd=200.0, detector=detector)
     return PROJECTORS.build("drr", grid=grid, cameras=cameras)

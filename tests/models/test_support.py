@@ -6,8 +6,8 @@ from torch.nn.functional import max_pool3d
 
 from mvrecon.geometry.box import Box
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.models import regions
-from mvrecon.models.model import disagreement
+from mvrecon.models import cropping
+from mvrecon.models.pooling import disagreement
 from mvrecon.parts import MODELS
 from mvrecon.visual_hull.support import Support
 
@@ -51,7 +51,7 @@ def _build(
 def _with_mask(monkeypatch, mask: torch.Tensor) -> None:
     """As if the views told this mask."""
     found = Support(Box.around(mask), mask, "hull", float(mask.float().mean()))
-    monkeypatch.setattr(regions, "support_from_views", lambda *_args, **_options: found)
+    monkeypatch.setattr(cropping, "support_from_views", lambda *_args, **_options: found)
 
 
 def _close(a: torch.Tensor, b: torch.Tensor, relative: float) -> bool:
@@ -66,7 +66,7 @@ def test_the_crop_does_not_matter_to_a_masked_model(name, dtype, projector, scen
     _with_mask(monkeypatch, mask)
     models = [_build(name, projector, dtype, support="hull", halo=halo) for halo in (1, 5, 24)]
     found = [model(views.to(dtype)) for model in models]
-    shapes = [next(iter(model.regions.crops.values())).projector.grid.shape for model in models]
+    shapes = [next(iter(model.cropping.crops.values())).A.grid.shape for model in models]
     assert len(set(shapes)) == 3 and shapes[-1] == (24, 24, 24)
     for other in found[1:]:
         for field in FIELDS:
@@ -161,10 +161,10 @@ def test_a_support_of_everything_is_no_support_in_the_world(projector, scenes, m
 def test_auto_takes_everything_where_the_hull_holds_most_of_it():
     hull = torch.zeros(1, 1, 10, 10, 10, dtype=torch.bool)
     hull[..., 1:7, :, 0] = hull[..., 1, :, 9] = True
-    assert torch.equal(regions.worked_on(hull, "auto"), hull)
+    assert torch.equal(cropping.support_of(hull, "auto"), hull)
     hull[..., 8, 5, 5] = True  # now its box holds 0.8 of the voxels
-    assert regions.worked_on(hull, "auto").all() and torch.equal(
-        regions.worked_on(hull, "hull"), hull
+    assert cropping.support_of(hull, "auto").all() and torch.equal(
+        cropping.support_of(hull, "hull"), hull
     )
 
 
@@ -181,7 +181,7 @@ def test_every_parameter_learns_on_a_support_met_first_in_evaluation(
         out, {"volume": volume, "views": views}
     )["total"].backward()
     assert not [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
-    assert len(model.regions.crops) == 1
+    assert len(model.cropping.crops) == 1
 
 
 def test_disagreement_is_bricks_and_those_around_them():
@@ -221,17 +221,17 @@ def test_refinement_where_opinions_disagree(support, projector, scenes, monkeypa
 def test_steps_stop_for_each_sample_where_noise_explains_what_is_left(projector, scenes):
     volume, views, _ = scenes
     model = _build("backprojection_unet", projector, consistency=3)
-    region = model.regions(views)
+    geometry = model.cropping.whole
     start = torch.cat([volume[:1] * 1.001, volume[1:] * 0.5])
     sigma = 0.01 * views.square().mean().sqrt().expand(2, 1, 1, 1, 1)
-    after = model.consistency(region, start, views, sigma)
+    after = model.consistency(geometry, start, views, sigma)
     assert torch.equal(after[0], start[0]) and not torch.equal(after[1], start[1])
     assert torch.equal(
-        model.consistency(region, start, views, sigma / 1e6),
-        model.consistency(region, start, views),
+        model.consistency(geometry, start, views, sigma / 1e6),
+        model.consistency(geometry, start, views),
     )
-    always = model.train().consistency(region, start, views, sigma)
-    assert torch.equal(always, model.consistency(region, start, views))
+    always = model.train().consistency(geometry, start, views, sigma)
+    assert torch.equal(always, model.consistency(geometry, start, views))
 
 
 def test_losses_count_what_is_in_the_support(projector, scenes, monkeypatch):
@@ -261,9 +261,23 @@ def test_unknown_choices_are_refused(options, said, projector):
         _build("backprojection_unet", projector, **options)
 
 
-def test_a_mistyped_option_is_named_with_the_nearest(projector):
-    with pytest.raises(TypeError, match="no option 'suport'; did you mean 'support'"):
-        _build("cross_view", projector, suport="hull")
+@pytest.mark.parametrize(
+    ("name", "typed", "meant"),
+    [
+        ("cross_view", "suport", "support"),
+        ("cross_view", "fusoin", "fusion"),
+        ("mean_fusion", "consistancy", "consistency"),
+        ("backprojection_unet", "widht", "width"),
+    ],
+)
+def test_a_mistyped_option_is_named_with_the_nearest_of_all_that_the_model_has(
+    name, typed, meant, projector
+):
+    with pytest.raises(TypeError, match=f"no option '{typed}'; did you mean '{meant}'") as error:
+        _build(name, projector, **{typed: 1})
+    own = {"cross_view": "fusion", "mean_fusion": "opinion", "backprojection_unet": "width"}
+    assert all(option in str(error.value) for option in (own[name], "start", "support", "sigma"))
+    assert ("fusion" in str(error.value).split("Known:")[1]) == (name == "cross_view")
 
 
 def test_a_model_that_refines_nothing_refuses_to_choose_where(projector):

@@ -51,7 +51,7 @@ class Case:
 
 #: More slices than the least that is worth the loops for upright columns; no two sizes or spacings
 #: alike.
-TALL = Grid.centred((11, 7, 9), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+TALL = Grid.centred(size=(9, 7, 11), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 #: Rows of a pitch that is not the slices', at places between them, that end inside the volume.
 WITHIN = {"pixels": [8, 5], "pixel_mm": [0.83, 1.9], "offset_mm": [0.37, -0.3]}
 #: Rows that reach beyond the volume.
@@ -102,14 +102,16 @@ CASES = {
     "arc": Case(GRID, about(GRID, arc(3, 40.0, 70.0, WITHIN, 100.0, 5.0))),
     "dome": Case(GRID, about(GRID, dome(4, 30.0, 20.0, 120.0, WITHIN))),
     "tilted beams": Case(GRID, TILTED),
-    "dcspect80": Case(Grid.centred((5, 6, 7), (18.0, 22.0, 16.0)), dcspect80()[::16].binned(8)),
+    "dcspect80": Case(
+        Grid.centred(size=(7, 6, 5), spacing=(18.0, 22.0, 16.0)), dcspect80()[::16].binned(8)
+    ),
     "axial": Case(GRID, AXIAL),
     "inside": Case(GRID, INSIDE),
     "explicit": Case(GRID, curved()),
 }
 UPRIGHT = {kind: case for kind, case in CASES.items() if case.upright}
 #: Few rays, in poses where no ray lies on a kink: for derivatives by differences.
-SMALL = Grid.centred((3, 4, 3), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+SMALL = Grid.centred(size=(3, 4, 3), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 FEW = {"pixels": [3, 2], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 DIFFERENTIABLE = {
     "cone": Case(SMALL, about(SMALL, circular(2, 40.0, 70.0, FEW, start_degrees=13.0))),

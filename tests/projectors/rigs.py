@@ -8,7 +8,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 
-GRID = Grid.centred((5, 6, 7), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+GRID = Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 DETECTOR = {"pixels": [5, 6], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 CONE = circular(4, 40.0, 70.0, DETECTOR, start_degrees=13.0).moved(torch.eye(3), GRID.centre)
 PINHOLES = dome(4, 30.0, 20.0, 120.0, DETECTOR, target=GRID.centre.tolist())

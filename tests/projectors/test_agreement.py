@@ -118,7 +118,9 @@ def test_threads_change_no_bit(kind, option, monkeypatch, threads):
 )
 def test_axes_of_one_voxel(shape, kind, option):
     case = CASES[kind]
-    grid = type(case.grid).centred(shape, case.grid.spacing, case.grid.centre.tolist())
+    grid = type(case.grid).centred(
+        size=shape[::-1], spacing=case.grid.spacing, centre=case.grid.centre.tolist()
+    )
     case = Case(grid, case.rays)
     x, y = noise(case)
     oracle, compiled = (

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.projectors.subset import RaySubset, ViewSubset
+from mvrecon.projectors.selection import ray_subset, view_subset
 from tests.projectors.cases import DIFFERENTIABLE, Case, noise
 
 KINDS = ("cone", "beams", "explicit")
@@ -33,13 +33,13 @@ def test_a_projector_built_without_grad_follows_cameras_that_want_one(kind, back
     case, (x, y) = own(kind, wants=True), noise(DIFFERENTIABLE[kind])
     with torch.no_grad():
         A = case.build(backend=backend)
-        subset = ViewSubset(A, [1])
+        subset = view_subset(A, [1])
         before = A(x)
         move(case)
         B = case.build(backend=backend)
         assert torch.equal(A(x), B(x)) and not torch.allclose(A(x), before)
         assert torch.equal(A.T(y), B.T(y))
-        assert torch.equal(subset(x), ViewSubset(B, [1])(x))
+        assert torch.equal(subset(x), view_subset(B, [1])(x))
     (change,) = torch.autograd.grad(A(x).square().sum(), case.rays.source)
     (expected,) = torch.autograd.grad(B(x).square().sum(), case.rays.source)
     assert torch.equal(change, expected) and change.norm() > 0.1
@@ -62,7 +62,7 @@ def test_cameras_that_were_changed_in_place_are_refused(kind):
     mask = torch.zeros(len(case.rays), *case.rays.shape, dtype=torch.bool)
     mask[0, 0, 0] = True
     subset, support = (
-        RaySubset(A, mask),
+        ray_subset(A, mask),
         A.with_support(torch.ones(case.grid.shape, dtype=torch.bool)),
     )
     calls = [

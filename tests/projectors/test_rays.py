@@ -147,7 +147,7 @@ def test_bad_rays_are_refused(source, target, message):
     ],
 )
 def test_bad_options_are_refused(rays, options, message):
-    case = Case(Grid.centred((5, 6, 7), 1.0), rays or CASES["dome"].rays)
+    case = Case(Grid.centred(size=(7, 6, 5), spacing=1.0), rays or CASES["dome"].rays)
     with pytest.raises(ValueError, match=message):
         case.build(**options)
 
@@ -171,7 +171,7 @@ def test_a_ray_all_but_along_a_face_crosses_it_where_it_does(backend):
     slope 1/60.
     """
     grid, height = (
-        Grid.centred((4, 96, 96), 1.0),
+        Grid.centred(size=(96, 96, 4), spacing=1.0),
         torch.linspace(-0.5, 0.5, 41, dtype=torch.float64)[None, None],
     )
     start = torch.stack(

@@ -16,13 +16,13 @@ from mvrecon.geometry.rigid import random_rotation
 from mvrecon.kernels.rays import choice, plan, reference, scan
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy
 from mvrecon.kernels.rays.scan import bricks_of
-from mvrecon.projectors import ray_transform
+from mvrecon.projectors import integrals
 from tests.projectors.cases import Case, curved
 
 pytestmark = pytest.mark.usefixtures("nothing_is_too_little")
 
 #: No size is a multiple of a brick's edge, and no two spacings are alike.
-GRID = Grid.centred((19, 26, 33), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+GRID = Grid.centred(size=(33, 26, 19), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 DETECTOR = {"pixels": [17, 14], "pixel_mm": [3.1, 4.3], "offset_mm": [0.37, -0.6]}
 TURNED = random_rotation(torch.Generator().manual_seed(3))
 
@@ -43,7 +43,9 @@ CASES = {
         GRID,
         about(circular(3, 9.0, 40.0, DETECTOR, start_degrees=13.0).moved(TURNED, torch.ones(3))),
     ),
-    "dcspect80": Case(Grid.centred((19, 26, 33), (9.0, 8.0, 7.0)), dcspect80()[::13].binned(6)),
+    "dcspect80": Case(
+        Grid.centred(size=(33, 26, 19), spacing=(9.0, 8.0, 7.0)), dcspect80()[::13].binned(6)
+    ),
     "explicit": Case(GRID, curved(9, 7)),
 }
 METHODS = ["joseph", "siddon", "trilinear", "trilinear:7"]
@@ -176,7 +178,7 @@ def test_verify_finds_a_kernel_that_skips_too_much(monkeypatch):
     x = volumes("blob")
     A(x)
     wrong = Occupancy(Box.whole(GRID.shape).high, Box((6, 12, 9), (7, 14, 12))).encoded()
-    monkeypatch.setattr(ray_transform.ops, "occupied", lambda *arguments: wrong)
+    monkeypatch.setattr(integrals.ops, "occupied", lambda *arguments: wrong)
     with pytest.raises(RuntimeError, match="skip='verify': [0-9]+ of 1190 pixels differ"):
         A(x)
 

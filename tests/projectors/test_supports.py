@@ -62,7 +62,7 @@ def test_what_stands_outside_a_support_has_no_say():
 
 
 def test_gradients_with_a_support_are_exact():
-    grid = Grid.centred((9, 10, 11), 3.0)
+    grid = Grid.centred(size=(11, 10, 9), spacing=3.0)
     mask = torch.zeros(grid.shape, dtype=torch.bool)
     mask[4:6, 3:5, 8] = mask[5, 7, 1] = True
     A = Case(grid, dome(2, 45.0, 30.0, 120.0, {"pixels": [3, 2], "pixel_mm": 20.0})).build(

@@ -78,12 +78,14 @@ def test_the_weight_of_a_uniform_view_is_the_square_of_magnification():
 def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
     torch.manual_seed(0)
     shift = torch.full((3,), offset, dtype=torch.float64)
-    grid = Grid.centred((18, 20, 22), (1.0, 1.1, 0.9))
+    grid = Grid.centred(size=(22, 20, 18), spacing=(1.0, 1.1, 0.9))
     rig = circular(3, sid, sid + 30, {"pixels": [20, 21], "pixel_mm": 1.3}, start_degrees=7.0)
     scaled = replace(
         rig, **{each: voxel * getattr(rig, each) for each in ("source", "origin", "u", "v")}
     )
-    other = Grid.centred(grid.shape, [voxel * each for each in grid.spacing], shift.tolist())
+    other = Grid.centred(
+        size=grid.size, spacing=[voxel * mm for mm in grid.spacing], centre=shift.tolist()
+    )
     y = torch.rand(1, 1, 3, 20, 21, dtype=torch.float64)
     exact = backproject(y, rig, grid, "distance", "reference")
     for dtype, tolerance in ((torch.float64, 1e-8), (torch.float32, 2e-6)):
@@ -108,7 +110,7 @@ def test_voxels_off_their_rays_get_nothing():
 
 
 def test_gradients_in_views_and_cameras():
-    rig, grid = CONE[:2], Grid.centred((2, 3, 2), 1.3, GRID.centre.tolist())
+    rig, grid = CONE[:2], Grid.centred(size=(2, 3, 2), spacing=1.3, centre=GRID.centre.tolist())
     y = torch.randn(1, 1, 2, *rig.shape, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda y: backproject(y, rig, grid, "distance", "cpu"), (y,))
     assert torch.autograd.gradgradcheck(

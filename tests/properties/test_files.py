@@ -59,8 +59,7 @@ def test_volumes_of_hdf5(grid, data, mm, tmp_path_factory):
 def test_volumes_of_nifti(grid, data, tmp_path_factory):
     """The voxels that are read lie where they were, whatever axes the reader counts them along."""
     pytest.importorskip("nibabel")
-    from mvrecon.data.nifti import read_nifti
-    from mvrecon.engine.export import save_nifti
+    from mvrecon.data.nifti import read_nifti, save_nifti
 
     folder = tmp_path_factory.mktemp("nifti")
     x = data.draw(volumes(grid.shape, torch.float32))[0, 0]
@@ -104,8 +103,7 @@ def test_floats_whose_axes_are_reversed(tmp_path):
     and head.
     """
     pytest.importorskip("nibabel")
-    from mvrecon.data.nifti import read_nifti
-    from mvrecon.engine.export import save_nifti
+    from mvrecon.data.nifti import read_nifti, save_nifti
 
     x = torch.arange(24.0).reshape(2, 3, 4)
     save_nifti(

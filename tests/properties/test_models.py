@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from mvrecon.geometry.lattice import enclosed
 from mvrecon.kernels.warps.reference import normalised_places
-from mvrecon.models.cross_view import leave_one_out, pooled
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
+from mvrecon.models.pooling import leave_one_out, pooled
 from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from tests.projectors.cases import Case
@@ -21,21 +21,19 @@ SIZES = st.sampled_from([0.0, 1.0, 30.0, 1e3, 1e5])
 SHAPES = st.tuples(st.integers(1, 4), *[st.integers(1, 5)] * 3)
 
 
-def frusta_of(case: Case, depth: int, spacing: str) -> Frusta:
-    """Bins in z where a source in the grid allows no others."""
-    z = case.rays.depth_range(case.grid)
-    return Frusta(case.grid, case.rays, depth, "z" if (z[:, 0] * z[:, 1] <= 0).any() else spacing)
+def frusta_of(case: Case, depth: int) -> Frusta:
+    return Frusta.of(case.grid, case.rays, depth)
 
 
-FRUSTA = st.builds(frusta_of, cases(), st.integers(1, 12), st.sampled_from(["z", "k"]))
+FRUSTA = st.builds(frusta_of, cases(), st.integers(1, 12))
 
 
-@given(case=cases(), depth=st.integers(1, 12), spacing=st.sampled_from(["z", "k"]))
-def test_a_box_holds_the_samples_whose_places_lie_in_it(case, depth, spacing):
+@given(case=cases(), depth=st.integers(1, 12))
+def test_a_box_holds_the_samples_whose_places_lie_in_it(case, depth):
     """Voxels in every frustum, and its bins in the grid; within 1e-12 of a face rounding
     decides.
     """
-    frusta = frusta_of(case, depth, spacing)
+    frusta = frusta_of(case, depth)
     ways = (
         (frusta.frusta_from_world, frusta.shape, case.grid.shape),
         (frusta.world_from_frusta, case.grid.shape, frusta.shape),

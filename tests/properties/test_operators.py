@@ -57,7 +57,7 @@ def beside_nothing(away: float, shape: tuple[int, int]) -> tuple[Case, torch.Ten
     x[:, :, 5] = (
         torch.rand(5, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1
     )
-    return Case(Grid.centred((12, 5, 5), 1.0), cameras), x
+    return Case(Grid.centred(size=(5, 5, 12), spacing=1.0), cameras), x
 
 
 @pytest.mark.parametrize("channels", [1, 4])
@@ -135,7 +135,7 @@ def test_the_compiled_loops_and_the_reference_agree(case, method, dtype, data):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_ray_that_begins_on_a_face_sees_nothing_behind_it(method, backend):
     """Shrunk: rounding gave it a slab too many, of a length below zero."""
-    grid = Grid.centred((1, 1, 2), 1.0)
+    grid = Grid.centred(size=(2, 1, 1), spacing=1.0)
     x = torch.tensor([1.0, 0.0], dtype=torch.float64).reshape(1, 1, 1, 1, 2)
     for near, far in ((1e-17, 0.9), (-1e-17, -0.9)):
         ends = torch.tensor([[near, 0.0, 0.0], [far, 0.0, 0.0]], dtype=torch.float64).reshape(

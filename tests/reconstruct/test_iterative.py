@@ -8,7 +8,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 from mvrecon.reconstruct.iterative import sirt, sirt_weights
 
-GRID = Grid.centred((6, 7, 8), 2.0)
+GRID = Grid.centred(size=(8, 7, 6), spacing=2.0)
 RIG = circular(9, 60.0, 100.0, {"pixels": [9, 11], "pixel_mm": 2.5}, start_degrees=5.0)
 
 
@@ -68,7 +68,7 @@ def test_a_batch_is_its_cases(A):
 
 
 def test_weights_invert_the_sums_and_skip_what_is_empty():
-    far = Grid.centred((6, 7, 30), 8.0)
+    far = Grid.centred(size=(30, 7, 6), spacing=8.0)
     A = PROJECTORS.build("drr", grid=far, cameras=RIG)
     R, C = sirt_weights(A)
     rows = A(torch.ones(1, 1, *far.shape))
@@ -79,7 +79,7 @@ def test_weights_invert_the_sums_and_skip_what_is_empty():
 def test_gradients_flow_through_it():
     A = PROJECTORS.build(
         "drr",
-        grid=Grid.centred((2, 3, 3), 2.0),
+        grid=Grid.centred(size=(3, 3, 2), spacing=2.0),
         cameras=circular(2, 60.0, 100.0, {"pixels": [2, 3], "pixel_mm": 3.0}),
     )
     y = torch.rand(1, 1, 2, 2, 3, dtype=torch.float64, requires_grad=True)

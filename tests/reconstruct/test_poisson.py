@@ -13,7 +13,7 @@ from mvrecon.projectors.subset import SomePixels, SomeViews
 from mvrecon.reconstruct.mlem import mlem
 from mvrecon.reconstruct.poisson import PoissonLikelihood
 
-GRID = Grid.centred((9, 8, 10), 2.0)
+GRID = Grid.centred(size=(10, 8, 9), spacing=2.0)
 #: Detector columns that stand upright over the volume, and pinholes from above.
 RIGS = {
     "circular": circular(6, 60.0, 100.0, {"pixels": [12, 11], "pixel_mm": 2.7}, start_degrees=5.0),
@@ -64,7 +64,7 @@ def test_value_and_gradient_are_those_of_all_bins(kind, background, skip):
 
 @pytest.mark.parametrize("moving", ["source", "origin"])
 def test_differences_confirm_the_derivatives(moving):
-    grid = Grid.centred((3, 4, 3), (6.0, 6.6, 5.1))
+    grid = Grid.centred(size=(3, 4, 3), spacing=(6.0, 6.6, 5.1))
     rig = dome(2, 40.0, 25.0, 120.0, {"pixels": [5, 6], "pixel_mm": 2.1, "offset_mm": [0.3, -0.2]})
     counts = torch.zeros(1, 1, 2, 5, 6, dtype=torch.float64)
     counts[..., 2:4, 2:4] = torch.tensor([[3.0, 1.0], [0.0, 2.0]], dtype=torch.float64)
@@ -147,7 +147,7 @@ def test_what_no_counts_reach_is_zero_after_one_iteration_and_for_ever(kind):
 
 
 def test_voxels_that_no_ray_passes_are_zero_and_nothing_is_divided_by_zero():
-    wide = Grid.centred((9, 8, 40), 4.0)
+    wide = Grid.centred(size=(40, 8, 9), spacing=4.0)
     A = PROJECTORS.build("drr", grid=wide, cameras=RIGS["circular"])
     truth = torch.zeros(1, 1, *wide.shape)
     truth[..., 4, 4, 20] = 1

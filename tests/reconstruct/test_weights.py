@@ -13,7 +13,7 @@ from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.reconstruct import iterative
 from mvrecon.reconstruct.iterative import sirt_weights
 
-GRID = Grid.centred((6, 5, 8), (11.0, 9.0, 7.0))
+GRID = Grid.centred(size=(8, 5, 6), spacing=(11.0, 9.0, 7.0))
 DETECTOR = {"pixels": [5, 9], "pixel_mm": [14.0, 9.0]}
 RIGS = {  # and how many of their views need projecting
     "dcspect80": (dcspect80(pixels=[5, 4]), 40),

@@ -62,7 +62,7 @@ def test_the_random_state_of_torch_is_left_alone(name, grid, rig):
 
 @pytest.mark.parametrize("name", ENDLESS)
 def test_the_object_stays_in_its_field(name, rig):
-    grid = Grid.centred((20, 30, 40), (3.0, 4.0, 5.0), centre=(10, -20, 30))
+    grid = Grid.centred(size=(40, 30, 20), spacing=(3.0, 4.0, 5.0), centre=(10, -20, 30))
     scene = SCENES.build(name)
     radius = scene.radius(grid)
     assert radius == pytest.approx(scene.field * 100)

@@ -39,7 +39,7 @@ def test_no_value_is_negative():
 
 
 def test_there_is_one_case(rig):
-    scene, grid = SheppLogan(), Grid.centred((16, 20, 24), (5.0, 5.0, 7.0))
+    scene, grid = SheppLogan(), Grid.centred(size=(24, 20, 16), spacing=(5.0, 5.0, 7.0))
     assert scene.length == 1
     sample = scene.sample(0, 0, grid, rig)
     assert torch.equal(sample.volume, scene.sample(0, 8, grid, rig).volume)

@@ -26,7 +26,7 @@ def solids(kind, n=3, seed=0, spread=20.0):
 
 
 def skew_grid():
-    grid = Grid.centred((9, 11, 14), (6.0, 8.0, 9.0), centre=(3, -4, 5))
+    grid = Grid.centred(size=(14, 11, 9), spacing=(6.0, 8.0, 9.0), centre=(3, -4, 5))
     affine = grid.affine.clone()
     affine[:3, :3] = random_rotation(torch.Generator().manual_seed(2)) @ affine[:3, :3]
     return Grid(grid.shape, affine)
@@ -73,8 +73,8 @@ def test_solids_that_leave_the_grid_are_cut():
             ),
         )
     )
-    assert (voxelise(big, Grid.centred((4, 5, 6), 3.0)) == 2).all()
-    assert (voxelise(big, Grid.centred((4, 5, 6), 3.0, centre=(900, 0, 0))) == 0).all()
+    assert (voxelise(big, Grid.centred(size=(6, 5, 4), spacing=3.0)) == 2).all()
+    assert (voxelise(big, Grid.centred(size=(6, 5, 4), spacing=3.0, centre=(900, 0, 0))) == 0).all()
 
 
 def test_chunks_change_nothing(monkeypatch):

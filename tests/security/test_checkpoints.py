@@ -250,3 +250,15 @@ def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss
     first = next(iter(kept["state_dict"]))
     with pytest.raises(Refused, match=rf"(?s)a\.ckpt: .*{named or first}"):
         load(written(tmp_path / "a.ckpt", saved(change(kept, first))))
+
+
+@pytest.mark.door
+def test_weights_are_those_that_were_saved_or_none(kept: dict, tmp_path: Path):
+    """A checkpoint without mvrecon's own checksum, with a bit flipped in a weight is refused."""
+    raw = bytearray(saved(kept))
+    weight = next(value for value in kept["state_dict"].values() if value.numel() > 8)
+    raw[raw.index(weight.numpy().tobytes()) + 1] ^= 1
+    with pytest.raises(
+        Refused, match=r"a\.ckpt: its '.*/data/\d+' is damaged: the checksum does not fit"
+    ):
+        load(written(tmp_path / "a.ckpt", bytes(raw)))

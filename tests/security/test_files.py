@@ -122,13 +122,16 @@ def test_a_volumes_name_leads_nowhere(name: str, tmp_path: Path):
 def legacy(path: Path, damage: Callable[[bytearray], None]) -> VolumeFile:
     """A file whose texts have no fixed length, as others write them."""
     text = h5py.string_dtype()
-    file = volume_file(path, instead("id", data=["pt_0", "pt_1"], dtype=text))
-    with h5py.File(path, "r+") as raw:
-        raw.attrs.create("axes", "z, y, x", dtype=text)
+    volume_file(path.with_name("ours.h5"), lambda file: None)
+    with h5py.File(path.with_name("ours.h5")) as ours, h5py.File(path, "w") as raw:
+        for name in ("ct", "spacing"):
+            ours.copy(name, raw)
+        raw.create_dataset("id", data=["pt_0", "pt_1"], dtype=text)
+        raw.attrs.update(units="HU", axes="z, y, x")
     contents = bytearray(path.read_bytes())
     damage(contents)
     path.write_bytes(contents)
-    return file
+    return VolumeFile(path)
 
 
 def test_texts_of_no_fixed_length_are_read(tmp_path: Path):

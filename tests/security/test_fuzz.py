@@ -9,9 +9,12 @@ import sys
 from pathlib import Path
 from random import Random
 
+import numpy as np
 import pytest
+import torch
 
-from tests.faults.fuzz import mutations, tally
+from tests.faults.fuzz import mutations, tally, values
+from tests.faults.samples import CHECKED
 
 COUNT = 240
 READERS = [
@@ -62,6 +65,37 @@ def test_the_same_seed_damages_alike_and_another_otherwise():
     first, again, other = (list(mutations(data, Random(seed), 60)) for seed in (1, 1, 2))
     assert first == again != other
     assert sum(case != data for case in first) > 50
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("reader", CHECKED)
+def test_a_damaged_file_with_checksums_is_refused_or_has_the_values_that_were_written(
+    reader: str, survey: tuple[dict, str]
+):
+    """Volume files of mvrecon's, packed NIfTI and checkpoints: a damaged one is refused or has the
+    same values.
+    """
+    failures = survey[0][reader]["failures"]
+    assert not [line for line in failures if "other values" in line], survey[1]
+
+
+def test_other_values_are_a_failure_where_a_format_has_checksums(tmp_path: Path):
+    whole = bytes(range(200))
+    found = tally(Path.read_bytes, [whole, whole[1:]], tmp_path / "a.bin", whole)
+    assert found.read == 2 and [line[:12] for line in found.failures] == ["case 1: read"]
+    assert not tally(Path.read_bytes, [whole, whole[1:]], tmp_path / "a.bin").failures
+
+
+def test_values_are_compared_to_the_last_bit():
+    first, second = torch.zeros(3), torch.zeros(3)
+    second[1] = 1e-45
+    assert (
+        values({"a": [first, np.ones(2)]})
+        == values({"a": (torch.zeros(3), np.ones(2))})
+        != values({"a": [second]})
+    )
+    assert values(first) != values(second) and values(first) != values(first.double())
+    assert values(torch.nn.Linear(2, 2)) != values(torch.nn.Linear(2, 2))
 
 
 def test_whatever_a_bad_reader_does_is_found(tmp_path: Path):

@@ -43,7 +43,8 @@ def random_world(kind: str, seed: int) -> World:
     rng = torch.Generator().manual_seed(1000 * KINDS.index(kind) + seed)
     scale = 9.0 if kind == "dcspect80" else 1.0
     spacing = [scale * uniform(rng, 0.7, 1.3) for _ in range(3)]
-    grid = Grid.centred([int(torch.randint(18, 27, (), generator=rng)) for _ in range(3)], spacing)
+    shape = [int(torch.randint(18, 27, (), generator=rng)) for _ in range(3)]
+    grid = Grid.centred(size=shape[::-1], spacing=spacing)
     cameras = _rig(kind, rng)
     cameras = cameras.moved(
         random_rotation(rng), 0.2 * scale * torch.randn(3, generator=rng, dtype=torch.float64)

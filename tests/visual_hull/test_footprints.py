@@ -35,7 +35,7 @@ def covered(prints: Footprints, shape: tuple[int, int]) -> torch.Tensor:
 
 def test_bricks_fill_the_grid_once_and_the_last_are_cut():
     shape, filled = (5, 9, 7), torch.zeros(5, 9, 7)
-    bricks = bricks_of(Grid.centred(shape, 1.0), 4)
+    bricks = bricks_of(Grid.centred(shape=shape, spacing=1.0), 4)
     assert len(bricks) == 2 * 3 * 2
     for low, high in zip(bricks.low.tolist(), bricks.high.tolist(), strict=True):
         filled[tuple(slice(*ends) for ends in zip(low, high, strict=True))] += 1

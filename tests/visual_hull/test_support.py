@@ -139,7 +139,7 @@ def test_a_support_is_told_from_finite_views_of_cameras(kind: str):
     ("longest", "edge"), [(5, 1), (48, 1), (64, 2), (128, 4), (256, 8), (512, 8)]
 )
 def test_bricks_are_fine_on_small_grids(longest: int, edge: int):
-    assert brick_edge(Grid.centred((3, longest, 4), 1.0)) == edge
+    assert brick_edge(Grid.centred(size=(4, longest, 3), spacing=1.0)) == edge
 
 
 def rods(pixel: float) -> World:

@@ -32,7 +32,7 @@ def test_projections_see_points_off_the_middle():
 
 @pytest.mark.parametrize("draw", [middle_planes, brightest])
 def test_a_sphere_is_round_on_any_grid(draw):
-    grid = Grid.centred((32, 33, 20), (16.0, 10.0, 12.0))
+    grid = Grid.centred(size=(20, 33, 32), spacing=(16.0, 10.0, 12.0))
     distance = voxel_centres(grid, torch.float32).norm(dim=-1)
     images = draw((120 - distance) / 120, grid.spacing)  # positive within 120 mm
     assert [list(image.shape) for image in images] == [[33, 32], [38, 32], [38, 33]]

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.forward_ad import make_dual, unpack_dual
 
 from mvrecon.cameras.camera import Cameras
@@ -59,7 +59,7 @@ def choice(what: str, given: str, known: tuple[str, ...]) -> str:
     return given
 
 
-class Peer(nn.Module, Projector):
+class Peer(Projector):
     """Another library's projector: [b c d h w] -> [b c m v u], in (unit of the volume) * mm.
 
     `box` and `rig` are the grid and the cameras in the volume's own frame, where the library is

@@ -31,7 +31,7 @@ def framed(grid: Grid, cameras: Cameras) -> tuple[Grid, Cameras]:
             f"Other libraries take voxels with right angles, got axes with cosines "
             f"{(axes.T @ axes).tolist()}"
         )
-    box = Grid.centred(grid.shape, grid.spacing)
+    box = Grid.centred(size=grid.size, spacing=grid.spacing)
     return box, segments(box, cameras.moved(axes.T, -axes.T @ grid.centre))
 
 

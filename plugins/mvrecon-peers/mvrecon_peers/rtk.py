@@ -126,7 +126,7 @@ class Rtk(Paired):
         # ITK has tolerances in mm, so the unit is one, of a power of two, in which a voxel is about
         # 1
         self.unit = 2.0 ** round(math.log2(min(self.box.spacing)))
-        box = Grid.centred(grid.shape, [mm / self.unit for mm in self.box.spacing])
+        box = Grid.centred(size=grid.size, spacing=[mm / self.unit for mm in self.box.spacing])
         rig = replace(self.rig, **{name: getattr(self.rig, name) / self.unit for name in VECTORS})
         views = view_arguments(box, rig)
         self.itk, self.rtk = load("itk", "itk-rtk"), load("itk", "itk-rtk", "RTK")
@@ -137,7 +137,7 @@ class Rtk(Paired):
         pitch = [rig.u[0].norm().item(), rig.v[0].norm().item(), 1.0]
         rows, columns = rig.shape
         self.detector = pitch, [-pitch[0] * (columns - 1) / 2, -pitch[1] * (rows - 1) / 2, 0.0]
-        rim = Grid.centred([n + 2 * RIM for n in grid.shape], box.spacing)
+        rim = Grid.centred(size=[n + 2 * RIM for n in grid.size], spacing=box.spacing)
         self.voxels = list(rim.spacing), rim.affine[:3, 3].tolist()
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:

@@ -1,17 +1,10 @@
 """Rigs in the volume's frame, and what libraries cannot take: pure geometry, no library needed."""
 
-import sys
-import tomllib
 from dataclasses import replace
-from importlib import import_module
-from inspect import signature
-from pathlib import Path
 
 import pytest
 import torch
-import yaml
 
-from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
@@ -25,7 +18,7 @@ from mvrecon_peers.nanodrr import Nanodrr
 from mvrecon_peers.rtk import Rtk, view_arguments
 from mvrecon_peers.skimage import Skimage, turns
 
-GRID = Grid.centred((10, 12, 14), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+GRID = Grid.centred(size=(14, 12, 10), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 DETECTOR = {"pixels": [5, 7], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 CONE = circular(4, 40.0, 70.0, DETECTOR, start_degrees=13.0).moved(torch.eye(3), GRID.centre)
 NORMAL = torch.linalg.cross(CONE.u, CONE.v)
@@ -39,12 +32,6 @@ RIGS = {
     "beam": BEAM,
     "line": replace(BEAM, extent="line"),
     "half lines": replace(BEAM, extent="ahead"),
-}
-PLUGIN = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-PARTS = {
-    k.partition(".")[2]: v
-    for k, v in PLUGIN["entry-points"]["mvrecon.plugins"].items()
-    if k[:9] == "projector"
 }
 
 
@@ -125,7 +112,10 @@ def test_rtk_gets_depths_offsets_and_angles_that_make_the_rays(kind: str):
 
 
 def test_rays_are_cut_off_near_the_box_and_stay_on_their_lines():
-    box, rng = Grid.centred((4, 5, 6), (1.0, 1.2, 0.9)), torch.Generator().manual_seed(0)
+    box, rng = (
+        Grid.centred(size=(6, 5, 4), spacing=(1.0, 1.2, 0.9)),
+        torch.Generator().manual_seed(0),
+    )
     first, way = torch.rand(2, 200, 3, generator=rng, dtype=torch.float64) * 12 - 6
     first[:20], way[:60:7, 0] = 0.0, 0.0
     last = first + 1e5 * way
@@ -177,7 +167,8 @@ def test_mbirtorch_gets_a_scan_that_makes_the_rig(upright: bool):
 def test_rows_know_their_slices_and_the_axis_its_column():
     detector = {"pixels": [6, 9], "pixel_mm": [1.0, 1.5], "offset_mm": [0.0, 3.0]}
     box, rig = framed(
-        Grid.centred((4, 7, 7), (1.5, 1.5, 1.0)), parallel(3, detector, 60.0, start_degrees=20.0)
+        Grid.centred(size=(7, 7, 4), spacing=(1.5, 1.5, 1.0)),
+        parallel(3, detector, 60.0, start_degrees=20.0),
     )
     assert plane_of_rows(box, rig, "it") == [(1, 3), (2, 2), (3, 1), (4, 0)]
     angles, columns = turns(box, rig)
@@ -186,7 +177,7 @@ def test_rows_know_their_slices_and_the_axis_its_column():
 
 
 TILTED = CONE.moved(random_rotation(torch.Generator().manual_seed(0)), torch.zeros(3))
-FLAT = Grid.centred((5, 7, 7), 2.0)
+FLAT = Grid.centred(size=(7, 7, 5), spacing=2.0)
 STACK = parallel(3, {"pixels": [5, 7], "pixel_mm": 2.0}, 60.0)
 SHEARED = Grid(GRID.shape, GRID.affine + torch.tensor([[0.0, 0.3, 0.0, 0.0]] + [[0.0] * 4] * 3))
 REFUSED = {
@@ -216,7 +207,7 @@ REFUSED = {
     ),
     "needles": (
         Rtk,
-        Grid.centred((5, 7, 7), (1.0, 1e-4, 1.0)),
+        Grid.centred(size=(7, 7, 5), spacing=(1.0, 1e-4, 1.0)),
         CONE,
         {},
         "at most 1000 times as long as wide",
@@ -246,7 +237,7 @@ REFUSED = {
     "cone in 2-D": (Astra, GRID, CONE, {}, "stay in the middle of a slice"),
     "oblong voxels": (
         Astra,
-        Grid.centred((5, 7, 7), (2.0, 1.5, 2.0)),
+        Grid.centred(size=(7, 7, 5), spacing=(2.0, 1.5, 2.0)),
         STACK,
         {},
         "square voxels, got 2 by 1.5 mm",
@@ -277,12 +268,12 @@ REFUSED = {
     "cone to radon": (Skimage, FLAT, CONE, {}, "takes parallel beams, got central"),
     "wide columns": (
         Skimage,
-        Grid.centred((5, 7, 7), 1.9),
+        Grid.centred(size=(7, 7, 5), spacing=1.9),
         STACK,
         {},
         "as wide as the detector's columns",
     ),
-    "even size": (Skimage, Grid.centred((5, 8, 8), 2.0), STACK, {}, "take odd sizes"),
+    "even size": (Skimage, Grid.centred(size=(8, 8, 5), spacing=2.0), STACK, {}, "take odd sizes"),
 }
 
 
@@ -291,49 +282,3 @@ def test_what_a_library_cannot_take_is_refused_with_the_reason(why: str):
     part, grid, rig, options, message = REFUSED[why]
     with pytest.raises(ValueError, match=message):
         part(grid, rig, **options)
-
-
-LIBRARIES: dict[str, tuple[str, str, Grid, Cameras]] = {
-    "rtk": ("itk", "itk-rtk", GRID, CONE),
-    "nanodrr": ("nanodrr.data", "nanodrr", GRID, CONE),
-    "diffdrr": ("diffdrr.renderers", "diffdrr", GRID, CONE),
-    "astra": ("astra", "astra-toolbox", FLAT, STACK),
-    "mbirtorch": ("mbirtorch", "mbirtorch", GRID, CONE),
-    "skimage": ("skimage.transform", "scikit-image", FLAT, STACK),
-}
-
-
-@pytest.mark.parametrize("name", LIBRARIES)
-def test_a_library_that_is_absent_is_named_with_what_installs_it(
-    name: str, monkeypatch: pytest.MonkeyPatch
-):
-    module, package, grid, rig = LIBRARIES[name]
-    monkeypatch.setitem(sys.modules, module, None)
-    where, _, attribute = PARTS[name].partition(":")
-    with pytest.raises(ImportError, match=f"pip install {package}"):
-        getattr(import_module(where), attribute)(grid, rig)
-
-
-def test_every_part_is_configured_by_its_own_defaults():
-    folder = Path(__file__).parents[1] / "mvrecon_peers" / "conf" / "projector"
-    assert {file.stem for file in folder.glob("*.yaml")} == set(PARTS) == set(LIBRARIES)
-    for name, where in PARTS.items():
-        module, _, attribute = where.partition(":")
-        parameters = signature(getattr(import_module(module), attribute)).parameters
-        options = {
-            key: p.default for key, p in parameters.items() if key not in ("grid", "cameras")
-        }
-        assert yaml.safe_load((folder / f"{name}.yaml").read_text()) == {"name": name} | options
-
-
-def test_importing_the_parts_imports_no_library():
-    import subprocess
-
-    code = f"import sys\nfor m in {[w.partition(':')[0] for w in PARTS.values()]}: __import__(m)\n"
-    code += (
-        "print({'itk', 'nanodrr', 'diffdrr', 'astra', 'mbirtorch', 'skimage'} & set(sys.modules))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=True
-    )
-    assert done.stdout == "set()\n"

@@ -22,8 +22,8 @@ from mvrecon.scenes.voxelise import voxelise
 
 CENTRE = torch.tensor([7.0, -5.0, 9.0], dtype=torch.float64)
 DETECTOR = {"pixels": [34, 38], "pixel_mm": [1.7, 1.5], "offset_mm": [0.8, -0.6]}
-GRID = Grid.centred((26, 27, 29), (1.1, 0.9, 1.2), CENTRE.tolist())
-SQUARE = Grid.centred((21, 27, 29), (1.1, 1.1, 1.3), CENTRE.tolist())
+GRID = Grid.centred(size=(29, 27, 26), spacing=(1.1, 0.9, 1.2), centre=CENTRE.tolist())
+SQUARE = Grid.centred(size=(29, 27, 21), spacing=(1.1, 1.1, 1.3), centre=CENTRE.tolist())
 
 
 def tilted(grid: Grid) -> Grid:
@@ -256,7 +256,7 @@ def test_boxes_of_ones_are_seen_whole_by_detectors_of_one_pixel(
         torch.linalg.cross(way, way.roll(1, dims=1) + 0.1), dim=-1
     )
     down = torch.nn.functional.normalize(torch.linalg.cross(way, right), dim=-1)
-    grid = Grid.centred(size, (1.0, 1.2, 0.9), CENTRE.tolist())
+    grid = Grid.centred(size=size[::-1], spacing=(1.0, 1.2, 0.9), centre=CENTRE.tolist())
     rig = Cameras(grid.centre - 20 * way, grid.centre + 20 * way, right, down, (1, 1))
     options = {"samples": 500} if peer == "nanodrr" else {}
     views = build(peer, "cone", grid=grid, cameras=rig, **options)(torch.ones(1, 1, *size))

@@ -26,8 +26,12 @@ from mvrecon.projectors.operator import Scaled
 
 
 class Spect(Scaled):
-    """Counts that ideal pinholes see, no attenuation, no blur: [b c d h w] in counts / mm^3 -> [b c
-    m v u] in counts.
+    """Counts behind ideal pinholes, without attenuation and blur: volumes [b c d h w] in counts /
+    mm^3 to views [b c m v u] in counts.
+
+    The line integrals of `drr` times each pixel's sensitivity, so that ordered subsets, lists of
+    rays (bins that hold counts), crops, supports and a rig's mirror symmetry cost what they cost
+    with `drr`.
 
     Args:
         grid: where the activity lies.
@@ -55,7 +59,7 @@ class Spect(Scaled):
 
 
 def sensitivity(cameras: Cameras, diameter_mm: float) -> Float[Tensor, "m v u"]:
-    """Each pixel's counts for a unit line integral, d^2 cos^4(phi) du dv / (16 l^2), in mm^2."""
+    """Sensitivity of each pixel, d^2 cos^4(phi) du dv / (16 l^2) in mm^2: counts per integral."""
     start, end = cameras.rays()
     distance = cameras.distance[:, None, None]
     cosine = distance / (end - start).norm(dim=-1)

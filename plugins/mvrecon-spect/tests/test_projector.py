@@ -69,7 +69,11 @@ def test_the_axis_pixel_and_the_corner_differ_by_cos4():
 )
 def test_the_adjoint_matches(backend: str, dtype: torch.dtype, tolerance: float):
     torch.manual_seed(0)
-    A = Spect(Grid.centred((12, 10, 14), 4.0, (3.0, -2.0, 150.0)), pinhole(), backend=backend)
+    A = Spect(
+        Grid.centred(size=(14, 10, 12), spacing=4.0, centre=(3.0, -2.0, 150.0)),
+        pinhole(),
+        backend=backend,
+    )
     x = torch.rand(1, 2, 12, 10, 14, dtype=dtype)
     y = torch.rand(1, 2, 1, SIDE, SIDE, dtype=dtype)
     left, right = (A(x) * y).sum(dtype=torch.float64), (x * A.T(y)).sum(dtype=torch.float64)

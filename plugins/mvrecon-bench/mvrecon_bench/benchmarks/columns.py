@@ -77,6 +77,25 @@ SCALING = {
     },
 }
 
+SMALL_KEYS = ("part", "options", "device", "dtype", "threads", "n", "pixels", "views")
+
+#: `bench=small`.
+SMALL = {
+    **{
+        name: SCALING[name]
+        for name in ("part", "method", "options", "backend", "device", "dtype", "threads")
+    },
+    **{name: SCALING[name] for name in ("n", "pixels", "views", "status")},
+    "iteration_ms": "SIRT, its weights included, in ms / iterations: median of at least `repeats`",
+    "forward_ms": "y = A x alone, in ms, likewise",
+    "adjoint_ms": "A^T y alone, in ms, likewise",
+    "arithmetic_ms": "what the rays of forward and adjoint take in ms: views x the time that one "
+    "view more adds to both",
+    "over_arithmetic": "iteration_ms / arithmetic_ms: 1 where a call costs nothing but its rays",
+    "calls": "how many calls of SIRT iteration_ms is the median of",
+    "load": OPERATORS["load"],
+}
+
 SKIP_KEYS = ("scene", "rig", "method", "task", "mode", "n", "device", "threads")
 
 #: `bench=skip`.

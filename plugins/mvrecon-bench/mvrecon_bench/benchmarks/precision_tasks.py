@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from mvrecon.engine.checkpoints import load
 from mvrecon.metrics import volume_metrics
-from mvrecon.models.unet3d import UNet3d
+from mvrecon.models.networks import UNet3d
 from mvrecon.parts import MODELS, PROJECTORS, SCENES
-from mvrecon.projectors.ray_transform import METHODS
+from mvrecon.projectors.integrals import METHODS
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig

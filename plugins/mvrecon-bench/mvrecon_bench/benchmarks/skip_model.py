@@ -15,7 +15,7 @@ from mvrecon.engine.checkpoints import load
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import volume_metrics
-from mvrecon.models.geometry import MULTIPLE
+from mvrecon.models.networks import MULTIPLE
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.visual_hull.support import Support, support_from_views
@@ -106,7 +106,7 @@ class Learned:
 
         def call() -> Tensor:
             if task == CHANGING:
-                net.regions.crops.clear()
+                net.cropping.crops.clear()
             return net(views).volume
 
         def score() -> float:

@@ -80,7 +80,7 @@ def filled(config: Mapping[str, Any], grid: Grid) -> Filled:
             f"bench=skip needs a scene of phantoms or of files, got {options['name']!r}"
         )
     patient, fine = scene.finely(case, 0, grid)
-    truth = F.avg_pool3d(fine[None], scene.fine)[0]
+    truth = F.avg_pool3d(fine[None], scene.factor(grid))[0]
     return Filled(truth * enclosed(body(truth, TISSUE)), grid, f"{patient}, without couch and air")
 
 

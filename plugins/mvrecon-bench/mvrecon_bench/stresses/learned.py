@@ -11,14 +11,14 @@ from torch import Tensor, nn
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject, gap
 
 #: No two sizes alike; the detectors see beside it.
-GRID = Grid.centred((8, 9, 10), 2.0)
+GRID = Grid.centred(size=(10, 9, 8), spacing=2.0)
 #: What a model is given that needs it, or has a dearer default, and was not given it.
 NEEDED = {"head": {"name": "softmax_depth"}}
 CHEAPER = {"iterations": 8, "start": 4}
@@ -39,7 +39,7 @@ class HeadSubject(Subject):
     @cached_property
     def frusta(self) -> Frusta:
         """Small ones, some of whose rays miss the grid."""
-        return Frusta(GRID, small_rig(), depth=10).to(self.device, self.dtype)
+        return Frusta.of(GRID, small_rig(), depth=10).to(self.device, self.dtype)
 
     @cached_property
     def head(self) -> nn.Module:

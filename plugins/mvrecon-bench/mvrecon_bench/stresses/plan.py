@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import Any
 
 from mvrecon.parts import REGISTRIES
-from mvrecon.projectors.ray_transform import METHODS
+from mvrecon.projectors.integrals import METHODS
 from mvrecon.registry import hint
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.stresses.case import KINDS, Case
@@ -13,19 +13,9 @@ from mvrecon_bench.stresses.subject import Subject, subject_of
 
 #: The files of cases, in the plan's order.
 FILES = (
-    "rays",
-    "scales",
-    "algebra",
-    "cameras",
-    "poses",
-    "heads",
-    "models",
-    "counts",
-    "tensors",
-    "values",
-    "sizes",
-    "repeats",
-    "gpu",
+    *("rays", "segments", "scales", "algebra", "accuracy", "derivatives"),
+    *("cameras", "images", "poses", "heads", "models", "counts", "line_integrals"),
+    *("tensors", "dtypes", "values", "sizes", "repeats", "gpu"),
 )
 
 

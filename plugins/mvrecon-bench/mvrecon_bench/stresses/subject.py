@@ -17,7 +17,7 @@ from mvrecon.parts import REGISTRIES
 from mvrecon_bench.stresses.case import DoesNotApply
 
 #: No two sizes or spacings alike, off the origin.
-GRID = Grid.centred((5, 6, 7), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+GRID = Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 BEAMS: tuple[tuple[bool, Extent], ...] = ((False, "segment"), (True, "segment"), (False, "behind"))
 #: What a projector is taken to claim, and what a plugin's class says by setting an attribute of
 #: this name to False.

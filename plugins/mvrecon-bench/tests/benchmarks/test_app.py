@@ -191,7 +191,18 @@ def test_scaling_runs_and_fits(tmp_path, call):
     ).read_text()
 
 
-@pytest.mark.parametrize("kind", ["operators", "scaling"])
+def test_small_calls_are_set_against_their_arithmetic(tmp_path, call):
+    base = "bench.base={n: 6, pixels: 6, views: 2, device: cpu, dtype: float32}"
+    parts = "bench.parts=[{name: seen}, {name: broken}]"
+    sizes = ("bench.iterations=2", "bench.repeats=2", "bench.n_threads=[1]")
+    rows = call(tmp_path, "bench=small", parts, base, *sizes)
+    assert [row["status"] for row in rows] == ["ok", "skipped: ValueError: no such"]
+    ratio = float(rows[0]["iteration_ms"]) / float(rows[0]["arithmetic_ms"])
+    assert float(rows[0]["over_arithmetic"]) == pytest.approx(ratio, rel=1e-4)
+    assert "| seen | 1 |" in (tmp_path / "table.md").read_text()
+
+
+@pytest.mark.parametrize("kind", ["operators", "scaling", "small"])
 def test_the_shipped_settings_are_those_of_the_code(kind):
     bench = BENCHES.from_config(compose(f"bench={kind}", config_name="bench")["bench"])
     rows = [job.row for group in bench.groups() for job in group]

@@ -162,4 +162,4 @@ def test_errors_and_counts():
     assert accuracy.adjointness(x, A @ x, y, A.T @ y) < 1e-15
     assert accuracy.adjointness(x, A @ x, y, 1.01 * (A.T @ y)) > 1e-4
     assert accuracy.same_bits(bad, bad.clone()) and not accuracy.same_bits(bad, -bad)
-    assert truth.arm_of(Grid.centred((4, 6, 8), 2.0)) == 4.0
+    assert truth.arm_of(Grid.centred(size=(8, 6, 4), spacing=2.0)) == 4.0

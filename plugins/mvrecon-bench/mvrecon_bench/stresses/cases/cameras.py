@@ -1,6 +1,4 @@
-"""Cameras: points that have no image, sizes that could be mistaken for one another, far places, bad
-options.
-"""
+"""Cameras: far places and all sizes, rigid motions, conversions, and options that are refused."""
 
 import inspect
 import math
@@ -16,9 +14,7 @@ from torch import Tensor
 from mvrecon.cameras import convert
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.cameras.files import from_file, save
-from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import inverse, random_rotation
-from mvrecon.models.lift import Frusta
 from mvrecon.parts import CAMERAS
 from mvrecon.testing import check_camera
 from mvrecon_bench.stresses.case import Case, DoesNotApply
@@ -28,8 +24,6 @@ from mvrecon_bench.stresses.subject import gap, greatest
 
 #: Geometry is worked out in float64, whatever the dtype of volumes and views.
 EXACT = (torch.float64,)
-#: Depths in mm at and about the plane of the source, and behind it.
-NOUGHT = (0.0, -0.0, 1e-12, -1e-12, 1e-8, -1e-8, -7.0)
 
 
 def contract(subject: CameraSubject) -> float:
@@ -40,100 +34,6 @@ def contract(subject: CameraSubject) -> float:
     with subject.given() as options:
         check_camera(subject.name, **options)
     return 0.0
-
-
-def about_the_source(rig: Cameras, side: float) -> Tensor:
-    """Points in, about and (the last two) before the plane of the first source, on and off its
-    axis, in mm [n 3].
-    """
-    across = torch.stack([torch.zeros_like(rig.u[0]), 0.7 * rig.u[0] - 0.4 * rig.v[0]])
-    normal = torch.nn.functional.normalize(torch.linalg.cross(rig.u[0], rig.v[0]), dim=0)
-    normal = normal * (normal @ (rig.origin - rig.source)[0]).sign()
-    depths = side * rig.source.new_tensor([*NOUGHT, 0.3 * float(rig.distance[0])])
-    return (rig.source[0] + across + depths[:, None, None] * normal).flatten(0, 1)
-
-
-def nowhere(like: Tensor) -> Tensor:
-    """Points [9 3] of which one coordinate each is no number, or infinite."""
-    bad = like.new_tensor([math.nan, math.inf, -math.inf])
-    axis = torch.eye(3, dtype=torch.bool, device=like.device)
-    return torch.where(axis[:, None], bad[:, None], like).flatten(0, 1)
-
-
-def without_image(subject: CameraSubject) -> float:
-    """Points in the plane of the source, behind it, and of no place: what is made of them, and what
-    is said of it.
-    """
-    found: dict[str, str] = {}
-    for m, rig in enumerate(subject.few):
-        places = about_the_source(rig, subject.side).to(subject.dtype)
-        points = torch.cat([places, nowhere(places[-1])])
-        uvz = rig.project(points)[0]
-        valid, (uv, z) = rig.valid(uvz[None])[0], uvz[: len(places)].split([2, 1], dim=-1)
-        alone = torch.stack([rig.project(point)[0] for point in places])
-        hits = {
-            "not NaN from nowhere": ~uvz[len(places) :].isnan(),
-            "a valid image of nowhere": valid[len(places) :],
-            "a depth that is not finite": ~z.isfinite(),
-            "an infinite pixel": uv.isinf(),
-            "a valid image that is NaN": valid[: len(places)] & uv.isnan().any(dim=-1),
-            "a valid image behind": valid[: len(places)]
-            & (subject.side * z[:, 0] <= 0)
-            & (not rig.parallel),
-            "no image of what is ahead": ~valid[len(places) - 2 : len(places)],
-            "changed by its neighbours": (
-                (uvz[-2 - 9 : -9] - alone[-2:]).abs() > 1e-6 * (1 + alone[-2:].abs())
-            ),
-        }
-        found |= {
-            f"camera {m}: {what}": str(int(hit.sum())) for what, hit in hits.items() if hit.any()
-        }
-    return none_of(found)
-
-
-def slopes_without_image(subject: CameraSubject) -> float:
-    """Gradients of valid images alone, with points that have none beside them; and of the way
-    back.
-    """
-    wrong = 0
-    for rig in subject.few:
-        places = about_the_source(rig, subject.side).to(subject.dtype)
-        points = torch.cat([places, nowhere(places[-1])]).requires_grad_()
-        for back in (False, True):
-            vectors = [getattr(rig, name).clone().requires_grad_() for name in VECTORS]
-            leaf = replace(rig, **dict(zip(VECTORS, vectors, strict=True)))
-            found = leaf.unproject(points[None]) if back else leaf.project(points)
-            used = found.isfinite().all(dim=-1) if back else leaf.valid(found)
-            gradients = torch.autograd.grad(
-                torch.where(used[..., None], found, 0.0).sum(), (points, *vectors)
-            )
-            wrong += sum(int((~gradient.isfinite()).sum()) for gradient in gradients)
-    return wrong
-
-
-def towards_the_source(subject: CameraSubject) -> float:
-    """The frustum's Jacobian, |det H| / w^4, on the way from 1000 mm to the source."""
-    rig = subject.few
-    uv = rig.source.new_tensor([(n - 1) / 2 for n in rig.shape[::-1]]).expand(len(rig), 13, 2)
-    z = subject.side * torch.logspace(3, -9, 13, dtype=torch.float64, device=rig.source.device)
-    xyz = rig.unproject(torch.cat([uv, z.expand(len(rig), 13)[..., None]], dim=-1))
-    jacobian = torch.stack([convert.frustum_jacobian(rig, xyz[m])[m] for m in range(len(rig))])
-    return float((~jacobian.isfinite()).sum() + (jacobian.diff(dim=1) < 0).sum())
-
-
-def source_in_the_volume(subject: CameraSubject) -> float:
-    """Lifts and warps of frusta whose source is in the middle of the grid."""
-    rig = subject.few
-    step = float(rig.distance[0]) / 10
-    frusta = Frusta(Grid.centred((4, 5, 6), step, rig.source[0].tolist()), rig, depth=6).to(
-        rig.source.device
-    )
-    views = torch.ones(1, 1, len(rig), *rig.shape, device=rig.source.device, requires_grad=True)
-    lifted = frusta.spread(views)
-    world = frusta.to_world(lifted)
-    back = frusta.to_frusta(world)
-    (slope,) = torch.autograd.grad(back.sum(), views)
-    return float(sum((~each.isfinite()).sum() for each in (lifted, world, back, slope)))
 
 
 def sizes_alike(subject: CameraSubject) -> float:
@@ -275,34 +175,7 @@ NO_DETECTORS = [
     *[("pixels", bad) for bad in (0, -3, [4, 0], 2.5, math.nan)],
     *[("offset_mm", bad) for bad in (math.nan, [0.0, math.inf])],
 ]
-
 CASES = (
-    Case(
-        10,
-        "points without an image",
-        "NaN and not valid, and all others as they are",
-        "camera",
-        without_image,
-    ),
-    Case(
-        10, "gradients at points without an image", "all are finite", "camera", slopes_without_image
-    ),
-    Case(
-        11,
-        "towards the source",
-        "the Jacobian is finite and grows",
-        "camera",
-        towards_the_source,
-        dtypes=EXACT,
-    ),
-    Case(
-        11,
-        "a source in the volume",
-        "lifts and warps are finite",
-        "camera",
-        source_in_the_volume,
-        dtypes=EXACT,
-    ),
     Case(
         12,
         "cameras of any size",

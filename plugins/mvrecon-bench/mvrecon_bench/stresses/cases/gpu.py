@@ -44,7 +44,7 @@ def huge_volume(subject: ProjectorSubject) -> float:
     """
     need_gpu(subject, 32)
     subject.need_lines()
-    grid = Grid.centred((2049, 1024, 1024), 1.0)
+    grid = Grid.centred(size=(1024, 1024, 2049), spacing=1.0)
     volume = torch.zeros(grid.shape, dtype=torch.bfloat16, device=subject.device)
     volume[-1] = 1
     volume[-1, -1, -1] = 3

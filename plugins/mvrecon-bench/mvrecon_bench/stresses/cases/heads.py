@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
 from mvrecon.models.weighting import fuse
 from mvrecon.testing import check_head
 from mvrecon_bench.stresses.case import Case
@@ -20,7 +20,7 @@ SUMS = {torch.float64: 1e-12, torch.float32: 1e-5}
 
 def contract(subject: HeadSubject) -> float:
     """`mvrecon.testing.check_head`."""
-    check_head(subject.name, Frusta(GRID, small_rig(), depth=10), **subject.options)
+    check_head(subject.name, Frusta.of(GRID, small_rig(), depth=10), **subject.options)
     return 0.0
 
 
@@ -100,7 +100,7 @@ def bad_logits(subject: HeadSubject) -> float:
 
 def no_ray_hits(subject: HeadSubject) -> float:
     """Frusta of which no bin may hold anything."""
-    frusta = Frusta(GRID, small_rig(), depth=10).to(subject.device, subject.dtype)
+    frusta = Frusta.of(GRID, small_rig(), depth=10).to(subject.device, subject.dtype)
     frusta.occupied.zero_()
     density = subject.head(*subject.given, frusta)
     return float((density != 0).sum())  # true of NaN, too

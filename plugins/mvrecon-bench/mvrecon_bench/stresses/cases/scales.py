@@ -16,7 +16,7 @@ from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
 from mvrecon_bench.stresses.truths import Blob, rows, through
 
-#: Of the plan: what float32 loses where geometry is formed in float64, relative to the volume,
+#: What float32 loses where geometry is formed in float64, relative to the volume,
 #: before it is cast.
 DIGITS = {torch.float64: 1e-12, torch.float32: 2e-6}
 #: 1e6 mm away, float64 knows a place to 1e-10 mm.
@@ -128,7 +128,8 @@ def anisotropic(subject: ProjectorSubject) -> float:
         (1.0, 1e4, 1.0),
     )
     return greatest(
-        _chords(subject, Grid.centred((5, 6, 7), mm, (3.0, -2.0, 4.0))) for mm in spacings
+        _chords(subject, Grid.centred(size=(7, 6, 5), spacing=mm, centre=(3.0, -2.0, 4.0)))
+        for mm in spacings
     )
 
 
@@ -156,7 +157,7 @@ def thin(subject: ProjectorSubject) -> float:
     subject.need_exact()
     worst = 0.0
     for shape in SHAPES:
-        grid = Grid.centred(shape, (0.9, 1.2, 1.0), (3.0, -2.0, 4.0))
+        grid = Grid.centred(size=shape[::-1], spacing=(0.9, 1.2, 1.0), centre=(3.0, -2.0, 4.0))
         volume = subject.random(*shape)
         start, end, sums = rows(grid, volume)
         worst = greatest(
@@ -180,7 +181,9 @@ def letter(subject: ProjectorSubject) -> float:
             [i for i in range(3) if signs[i] < 0]
         )
         volume = held.permute([axes.index(axis) for axis in (2, 1, 0)])
-        grid = Grid.centred(volume.shape, (0.9, 1.2, 1.0), (3.0, -2.0, 4.0))
+        grid = Grid.centred(
+            size=volume.shape[::-1], spacing=(0.9, 1.2, 1.0), centre=(3.0, -2.0, 4.0)
+        )
         u, v = grid.spacing[axes[2]] * right, grid.spacing[axes[1]] * down
         rig = _facing(subject, (grid.centre - u - 2 * v, u, v), (5, 3), 1e5, 1.5)
         seen = subject.projector(grid, rig)(volume.to(subject.device, subject.dtype)[None, None])[
@@ -198,7 +201,7 @@ def _chords(subject: ProjectorSubject, grid: Grid) -> float:
 
 def _smooth(subject: ProjectorSubject) -> tuple[Grid, Tensor]:
     """A blob that fades before the faces of its grid, about the origin."""
-    grid = Grid.centred((16, 15, 14), (0.4, 0.45, 0.5))
+    grid = Grid.centred(size=(14, 15, 16), spacing=(0.4, 0.45, 0.5))
     blob = Blob(torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64), 1.5)
     return grid, blob.values(grid).to(subject.device, subject.dtype)
 

@@ -64,7 +64,7 @@ def no_geometry(subject: Subject) -> float:
     rig, none = rig_about(GRID), torch.zeros(0, 3)
     A = PROJECTORS.build("drr", grid=GRID, cameras=rig)
     calls: list[Callable[[], object]] = [
-        lambda n=n: Grid.centred(n, 1.0) for n in ((0, 2, 3), (2, 0, 3), (2, 3, 0))
+        lambda n=n: Grid.centred(shape=n, spacing=1.0) for n in ((0, 2, 3), (2, 0, 3), (2, 3, 0))
     ]
     calls += [lambda n=n: replace(rig, shape=n) for n in ((0, 4), (4, 0))]
     calls += [

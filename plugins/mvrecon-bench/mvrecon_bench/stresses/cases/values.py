@@ -15,7 +15,7 @@ from mvrecon_bench.stresses.truths import box_lengths
 
 EVERY = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 #: More than one brick along each axis, under a detector that does not see all of them.
-BRICKS = Grid.centred((9, 17, 10), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
+BRICKS = Grid.centred(size=(10, 17, 9), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 NARROW = {"pixels": [5, 4], "pixel_mm": 0.9, "offset_mm": [0.13, -0.21]}
 
 

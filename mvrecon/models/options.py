@@ -1,5 +1,6 @@
-"""What a model may leave out: the options that its skipping is told by, checked once."""
+"""Options of a model that save work, checked once: all are off by default."""
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal
@@ -12,13 +13,13 @@ HALO = 4
 
 
 @dataclass(frozen=True)
-class Skip:
-    """Which work is skipped. All of it is off by default.
+class Options:
+    """Which work is left out.
 
     Args:
-        support: where the density may differ from zero, told from the views: the visual "hull", its
-            "box", "auto" for the hull of a sample if its box is small and else everything, or
-            "none" to ask for nothing. Work is done on a crop around it, and outside it the density
+        support: where the density may differ from zero, from the views: the visual "hull", its
+            "box", "auto" for the hull of a sample if its box is small and else the whole grid, or
+            "none" for the whole grid. Work is done on a crop around it, and outside it the density
             is 0 by definition.
         noise: of the views, as `support_from_views` wants it; none for exact views.
         halo: voxels around the support's box that the crop holds, at least 1. With `masked` they
@@ -63,13 +64,17 @@ class Skip:
         return self.halo if self.halo is not None else 0 if self.masked else HALO
 
     @classmethod
-    def of(cls, options: Mapping[str, Any]) -> "Skip":
-        """From a model's options.
+    def of(cls, model: type, options: Mapping[str, Any]) -> "Options":
+        """From what a model was given besides its own parameters.
 
         Raises:
-            TypeError: an option that no model has; the message names the nearest.
+            TypeError: an option that the model does not have; the message names the nearest, and
+                all that it has.
         """
-        known = {field.name for field in fields(cls)}
+        own = [
+            p.name for p in inspect.signature(model).parameters.values() if p.kind != p.VAR_KEYWORD
+        ]
+        known = {*own, *(field.name for field in fields(cls))}
         for option in options:
             if option not in known:
                 raise TypeError(f"The model has no option {option!r}{hint(option, known)}")

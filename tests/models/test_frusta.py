@@ -4,31 +4,25 @@ import pytest
 import torch
 
 from mvrecon.cameras.culling import seen_depth_range
-from mvrecon.geometry.frustum import depth_centres, depth_edges, depth_index
+from mvrecon.geometry.frustum import depth_edges, depth_index
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.models.lift import Frusta
+from mvrecon.models.frusta import Frusta
 from mvrecon.parts import CAMERAS
 from tests.models.rig import small_rig
 
 
-@pytest.mark.parametrize("spacing", ["z", "k"])
-def test_depth_bins_tile_the_range_and_index_is_its_inverse(spacing):
+def test_depth_bins_tile_the_range_and_index_is_its_inverse():
     z_range = torch.tensor([[80.0, 120.0], [-120.0, -80.0]], dtype=torch.float64)
-    edges = depth_edges(z_range, 10, spacing)
+    edges = depth_edges(z_range, 10)
     assert torch.allclose(edges[:, [0, -1]], z_range)
     expected = torch.arange(10, dtype=torch.float64).expand(2, 10)
-    assert torch.allclose(depth_index(depth_centres(edges, spacing), edges, spacing), expected)
+    centres = (edges[:, 1:] + edges[:, :-1]) / 2
+    assert torch.allclose(depth_index(centres, edges), expected)
 
 
-def test_uniform_k_is_refused_across_the_source():
-    with pytest.raises(ValueError, match="without z = 0"):
-        depth_edges(torch.tensor([[-1.0, 1.0]]), 4, "k")
-
-
-@pytest.mark.parametrize("spacing", ["z", "k"])
-def test_lift_conserves_every_ray_integral(spacing):
+def test_lift_conserves_every_ray_integral():
     grid, cameras = small_rig()
-    frusta = Frusta(grid, cameras, 12, spacing)
+    frusta = Frusta.of(grid, cameras, 12)
     views = torch.rand(2, 3, len(cameras), *cameras.shape)
     sees = frusta.chord.reshape(1, 1, len(cameras), *cameras.shape) > 0
     assert torch.allclose(frusta.integrate(frusta.spread(views)), views * sees, rtol=1e-5)
@@ -37,7 +31,7 @@ def test_lift_conserves_every_ray_integral(spacing):
 
 def test_frustum_chord_is_the_length_of_the_ray_in_the_box():
     grid, cameras = small_rig(n_views=1, size=12, pixels=13)
-    chord = Frusta(grid, cameras, 240).chord[0, 0, 0]
+    chord = Frusta.of(grid, cameras, 240).chord[0, 0, 0]
     assert chord[6, 6].item() == pytest.approx(
         24.0, rel=1e-3
     )  # the central ray crosses 12 voxels of 2 mm
@@ -48,7 +42,7 @@ def test_warp_of_a_linear_field_is_exact_where_seen():
     frustum.
     """
     grid, cameras = small_rig()
-    frusta = Frusta(grid, cameras, 12)
+    frusta = Frusta.of(grid, cameras, 12)
     depth, v, u = frusta.shape
     ramp = torch.arange(depth, dtype=torch.float32)[:, None, None].expand(depth, v, u)
     world = frusta.to_world(ramp.expand(1, len(cameras), 1, -1, -1, -1))
@@ -65,7 +59,7 @@ def test_world_to_frustum_to_world_converges_to_second_order():
     errors = []
     for size in (12, 24, 48):
         grid, cameras = small_rig(n_views=3, size=size, pixels=2 * size)
-        frusta = Frusta(grid, cameras, 2 * size)
+        frusta = Frusta.of(grid, cameras, 2 * size)
         r2 = voxel_centres(grid).float().square().sum(-1)
         blob = torch.exp(-r2 / (2 * (0.3 * size) ** 2))[None, None, None]
         back = frusta.to_world(frusta.to_frusta(blob))[:, :, :, 1:-1, 1:-1, 1:-1]
@@ -83,7 +77,7 @@ def test_pinholes_behind_their_detectors_lift_like_any_other():
         aperture_degrees=60.0,
         detector={"pixels": [9, 9], "pixel_mm": 2.0},
     )
-    frusta = Frusta(grid, cameras, 8)
+    frusta = Frusta.of(grid, cameras, 8)
     views = torch.rand(1, 1, 3, 9, 9) * (frusta.chord.reshape(1, 1, 3, 9, 9) > 0)
     assert (frusta.step > 0).all() and views.any()
     assert torch.allclose(frusta.integrate(frusta.spread(views)), views, rtol=1e-5)
@@ -93,13 +87,13 @@ def test_pinholes_behind_their_detectors_lift_like_any_other():
 def test_casting_the_module_costs_its_geometry_no_digit(dtype):
     grid, cameras = small_rig()
     frusta = torch.rand(1, len(cameras), 1, 12, *cameras.shape)
-    expected = Frusta(grid, cameras, 12).to_world(frusta)
-    assert torch.equal(Frusta(grid, cameras, 12).to(dtype).to_world(frusta), expected)
+    expected = Frusta.of(grid, cameras, 12).to_world(frusta)
+    assert torch.equal(Frusta.of(grid, cameras, 12).to(dtype).to_world(frusta), expected)
 
 
 def test_warps_compile_into_one_graph():
     grid, cameras = small_rig()
-    frusta = Frusta(grid, cameras, 12)
+    frusta = Frusta.of(grid, cameras, 12)
     volumes = torch.rand(1, 1, 2, *grid.shape)
     compiled = torch.compile(
         lambda x: frusta.to_world(frusta.to_frusta(x)), fullgraph=True, backend="aot_eager"
@@ -109,7 +103,7 @@ def test_warps_compile_into_one_graph():
 
 def test_one_volume_for_all_cameras_is_one_for_each():
     grid, cameras = small_rig()
-    frusta, volume = Frusta(grid, cameras, 12), torch.rand(2, 1, 3, *grid.shape)
+    frusta, volume = Frusta.of(grid, cameras, 12), torch.rand(2, 1, 3, *grid.shape)
     each = frusta.to_frusta(volume.expand(-1, len(cameras), -1, -1, -1, -1))
     assert torch.equal(frusta.to_frusta(volume), each) and each.any()
 
@@ -117,8 +111,9 @@ def test_one_volume_for_all_cameras_is_one_for_each():
 def test_nothing_behind_a_source_inside_the_grid_is_occupied_or_visible():
     grid, cameras = small_rig(n_views=1)
     inner = replace(cameras, source=0.05 * cameras.source)
-    frusta = Frusta(grid, inner, 12)
-    z = depth_centres(depth_edges(inner.depth_range(grid), 12))[0]
+    frusta = Frusta.of(grid, inner, 12)
+    planes = depth_edges(inner.depth_range(grid), 12)[0]
+    z = (planes[1:] + planes[:-1]) / 2
     assert (
         (z < 0).any()
         and (depth_edges(seen_depth_range(inner, grid), 12) >= 0).all()

@@ -6,8 +6,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mvrecon.models.masks import upsampled
-from mvrecon.models.voxels import convolved, doubled, group_norm, halved, pyramid, voxels_of
+from mvrecon.models.networks import upsampled
+from mvrecon.models.sparse import convolved, doubled, group_norm, halved, pyramid, voxels_of
 from tests.models.dense import normalised, pooled
 
 

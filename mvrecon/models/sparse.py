@@ -1,4 +1,4 @@
-"""Features of a mask's voxels alone, and a U-Net's steps on them: nothing outside counts, nothing
+"""A U-Net's steps on a mask's voxels alone (sparse convolutions): nothing outside counts, nothing
 outside is computed.
 
 Features are rows [k c], one for each voxel. Every step is a gather of rows and dense arithmetic on
@@ -71,8 +71,8 @@ def voxels_of(mask: Bool[Tensor, "n 1 d h w"]) -> Voxels:
     padded = F.pad(mask[:, 0], (0, behind[2], 0, behind[1], 0, behind[0]))
     bricks = _bricks(padded, 0)
     active = bricks.any(dim=-1).any(dim=-1).any(dim=-1).nonzero()  # [q 4]
-    held = bricks[tuple(active.unbind(dim=1))].flatten(1)  # [q 128]
-    brick, inner = held.nonzero().unbind(dim=1)
+    voxels = bricks[tuple(active.unbind(dim=1))].flatten(1)  # [q 128]
+    brick, inner = voxels.nonzero().unbind(dim=1)
     index = torch.stack(torch.unravel_index(inner, BRICK), dim=1) + active[
         brick, 1:
     ] * active.new_tensor(BRICK)
@@ -85,7 +85,7 @@ def voxels_of(mask: Bool[Tensor, "n 1 d h w"]) -> Voxels:
         place=((sample * d + z) * h + y) * w + x,
         row=row,
         around=_bricks(row, 2)[tuple(active.unbind(dim=1))],
-        own=brick * held.shape[1] + inner,
+        own=brick * voxels.shape[1] + inner,
     )
 
 
@@ -98,10 +98,10 @@ def _bricks(volumes: Shaped[Tensor, "n d h w"], more: int) -> Shaped[Tensor, "n 
 
 def pyramid(mask: Bool[Tensor, "n 1 d h w"], levels: int) -> list[Voxels]:
     """The voxels of a mask, and of it max-pooled by 2, 4, ..."""
-    found = [voxels_of(mask)]
+    scales = [voxels_of(mask)]
     for _ in range(1, levels):
-        found.append(voxels_of(F.max_pool3d(found[-1].mask.float(), 2, ceil_mode=True) > 0))
-    return found
+        scales.append(voxels_of(F.max_pool3d(scales[-1].mask.float(), 2, ceil_mode=True) > 0))
+    return scales
 
 
 def convolved(
@@ -133,10 +133,10 @@ def group_norm(
     """
 
     def mean(rows: Tensor) -> Tensor:
-        each = rows.sum(dim=0).view(groups, -1).sum(dim=1, keepdim=True) / max(
+        means = rows.sum(dim=0).view(groups, -1).sum(dim=1, keepdim=True) / max(
             1, rows.numel() // groups
         )
-        return each.expand(-1, rows.shape[1] // groups).reshape(-1)
+        return means.expand(-1, rows.shape[1] // groups).reshape(-1)
 
     scale, shift = affine
     parts = []

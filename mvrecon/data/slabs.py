@@ -1,0 +1,68 @@
+"""A volume that comes slab by slab, so that memory holds one of them and not the volume."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+#: Voxels of a slab, unless one plane has more: 8 MiB in float32.
+VOXELS = 2**21
+Slab = tuple[int, Float[Tensor, "d h w"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Slabs:
+    """A volume [d h w], read anew at every pass.
+
+    Args:
+        shape: voxels along (z, y, x).
+        axis: of the tensor, 0 to 2, along which the slabs follow each other, in any order.
+        passes: begins a pass, which gives the first index along the axis and the values of every
+            slab once.
+    """
+
+    shape: tuple[int, int, int]
+    axis: int
+    passes: Callable[[], Iterator[Slab]]
+
+    @classmethod
+    def of(cls, volume: Float[Tensor, "d h w"]) -> "Slabs":
+        """A volume in memory, as one slab."""
+        return cls(tuple(volume.shape), 0, lambda: iter([(0, volume)]))  # type: ignore[arg-type]
+
+    def __iter__(self) -> Iterator[Slab]:
+        return self.passes()
+
+    def flipped(self, axes: list[int]) -> "Slabs":
+        """The volume with some of its axes reversed."""
+        n, turned = self.shape[self.axis], self.axis in axes
+
+        def passes() -> Iterator[Slab]:
+            for first, slab in self:
+                yield (n - first - slab.shape[self.axis] if turned else first), slab.flip(axes)
+
+        return replace(self, passes=passes)
+
+    def mapped(self, change: Callable[[Float[Tensor, "d h w"]], Float[Tensor, "d h w"]]) -> "Slabs":
+        """The volume with a function applied to every slab."""
+        return replace(self, passes=lambda: ((first, change(slab)) for first, slab in self))
+
+    def whole(self) -> Float[Tensor, "d h w"]:
+        """All of it, in memory."""
+        values = torch.empty(self.shape)
+        for first, slab in self:
+            values.narrow(self.axis, first, slab.shape[self.axis]).copy_(slab)
+        return values
+
+
+def planes(plane: int) -> int:
+    """How many planes of so many voxels make a slab."""
+    return max(1, VOXELS // plane)
+
+
+def ends(line: Bool[Tensor, " n"]) -> tuple[int, int]:
+    """The first true place and the one after the last; zeros for none."""
+    places = line.nonzero().flatten().tolist()
+    return (places[0], places[-1] + 1) if places else (0, 0)

@@ -1,0 +1,163 @@
+"""The lift: views to frusta of density, and the warps between frusta and the world.
+
+In a camera's own frustum projecting is a plain sum: p[v, u] = sum over d of g[d, v, u] * step[v,
+u], so a lift that divides by the step conserves every ray's integral exactly. A warp is one
+trilinear fetch per bin or voxel.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.culling import seen_depth_range
+from mvrecon.cameras.frusta import frusta_lattice
+from mvrecon.geometry.frustum import depth_edges
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.lattice import enclosed, grid_lattice, lattice_maps
+from mvrecon.kernels.warps.warp import warp
+
+#: Of a voxel: a smaller share is a rounding error, of a bin and a voxel at equal places.
+TOUCH = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Frusta:
+    """The frusta of M cameras over one grid; `Frusta.of` makes them.
+
+    Convention: the sample's axis b of `occupied` is there only where it depends on the sample.
+
+    Args:
+        frusta_from_world: where each voxel lies in each frustum, float64.
+        world_from_frusta: where each bin lies in the grid, float64.
+        edges: planes between the depth bins in mm, float64.
+        visible: voxels inside a frustum.
+        occupied: bins that may be other than zero: those inside the grid's box, ahead of the
+            source, and with a mask those that touch it.
+        step: mm of ray in a bin.
+        n_depths: depth bins of the frusta over the whole grid.
+        first: where these are a part of larger frusta, the index (depth, row, column) of each
+            camera's first bin in them, on the CPU.
+    """
+
+    frusta_from_world: Float[Tensor, "m 1 5 2 3"]
+    world_from_frusta: Float[Tensor, "1 m 5 2 3"]
+    edges: Float[Tensor, "m e"]
+    visible: Bool[Tensor, "m 1 d h w"]
+    occupied: Bool[Tensor, "*b m 1 D v u"]
+    step: Float[Tensor, "m 1 D v u"]
+    n_depths: int
+    first: Int[Tensor, "m 3"] | None = None
+
+    @classmethod
+    def of(cls, grid: Grid, cameras: Cameras, depth: int) -> "Frusta":
+        """Frusta cut tightly to what each camera sees of a grid's box.
+
+        Args:
+            grid: the region of interest, and where `to_world` puts its volumes.
+            cameras: the rig; its detector's pixels are the frusta's rows and columns.
+            depth: number of depth bins.
+        """
+        edges = depth_edges(seen_depth_range(cameras, grid), depth)
+        frusta_from_world, world_from_frusta = maps_between(grid, cameras, edges)
+        ahead = frusta_lattice(cameras, grid, edges).ahead[:, None, :, None, None]
+        shape = depth, *cameras.shape
+        inside = enclosed(world_from_frusta, grid.shape, shape).transpose(0, 1)
+        start, end = cameras.rays()
+        per_mm = (end - start).norm(dim=-1) / cameras.distance[
+            :, None, None
+        ]  # mm of ray per mm of depth
+        step = (edges[:, 1:] - edges[:, :-1]).abs()[:, :, None, None] * per_mm[:, None]
+        return cls(
+            frusta_from_world,
+            world_from_frusta,
+            edges,
+            visible=enclosed(frusta_from_world, shape, grid.shape),
+            occupied=inside & ahead,
+            step=step[:, None].float(),
+            n_depths=depth,
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Bins (depth, row, column)."""
+        depth, v, u = self.step.shape[2:]
+        return depth, v, u
+
+    @property
+    def chord(self) -> Float[Tensor, "*m 1 1 v u"]:
+        """Length in mm of each ray's occupied bins."""
+        return (self.occupied * self.step).sum(dim=-3, keepdim=True)
+
+    def to(self, *where: Any) -> "Frusta":
+        """On another device, or with steps of another dtype; the maps keep their digits."""
+        step = self.step.to(*where)
+        names = ("frusta_from_world", "world_from_frusta", "edges", "visible", "occupied")
+        moved = {name: getattr(self, name).to(step.device) for name in names}
+        return replace(self, step=step, **moved)
+
+    def spread(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b m c D v u"]:
+        """Uniform lift: each pixel's integral spread evenly along its ray's occupied bins."""
+        share = self.occupied / self.chord.clamp_min(torch.finfo(views.dtype).tiny)
+        return views.transpose(1, 2)[:, :, :, None] * share
+
+    def integrate(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b c m v u"]:
+        """Each camera's own view of its own frustum: the sum along every ray, exactly."""
+        return (frusta * self.step).sum(dim=3).transpose(1, 2)
+
+    def pixels(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:
+        """The part of every view that the frusta have; all of it, unless they are a part of larger
+        ones.
+        """
+        if self.first is None:
+            return views
+        _, rows, columns = self.shape
+        parts = zip(views.unbind(2), self.first.tolist(), strict=True)
+        return torch.stack(
+            [view[..., v : v + rows, u : u + columns] for view, (_, v, u) in parts], 2
+        )
+
+    def depths(self, like: Tensor) -> Float[Tensor, "*m D 1 1"]:
+        """The bins' depth, from -1 to 1 in the frusta over the whole grid."""
+        if self.first is None:
+            ramp = torch.linspace(-1, 1, self.n_depths, device=like.device, dtype=like.dtype)
+            return ramp[:, None, None]
+        index = (self.first[:, :1] + torch.arange(self.shape[0])).to(like)
+        return (2 * index / max(1, self.n_depths - 1) - 1)[:, None, :, None, None]
+
+    def to_world(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
+        """Each frustum's density at the voxels of the grid; zero where the camera does not see."""
+        d, h, w = self.visible.shape[2:]
+        return warp(frusta, self.frusta_from_world, (d, h, w))[:, :, 0]
+
+    def to_frusta(self, volumes: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m c D v u"]:
+        """World volumes at the bins of the frusta, one volume for each camera (or one for all, m =
+        1).
+        """
+        if volumes.shape[1] == 1:
+            return warp(volumes, self.world_from_frusta, self.shape)[:, 0]
+        return warp(volumes, self.world_from_frusta.transpose(0, 1), self.shape)[:, :, 0]
+
+    def touched(self, mask: Bool[Tensor, "b 1 d h w"]) -> Bool[Tensor, "b m 1 D v u"]:
+        """Every bin that reads a voxel of the mask, or that one reads: none that holds a part of it
+        is left out.
+        """
+        with torch.inference_mode(False), torch.enable_grad():
+            volume = mask.to(self.step.dtype, copy=True)[:, None]
+            m = len(self.step)
+            bins = self.step.new_zeros(len(mask), m, 1, *self.shape, requires_grad=True)
+            (read,) = torch.autograd.grad(
+                self.to_world(bins), bins, volume.expand(-1, m, -1, -1, -1, -1)
+            )
+        return (self.to_frusta(volume) > TOUCH) | (read > TOUCH)
+
+
+def maps_between(
+    grid: Grid, cameras: Cameras, edges: Float[Tensor, "m e"]
+) -> tuple[Float[Tensor, "m 1 5 2 3"], Float[Tensor, "1 m 5 2 3"]]:
+    """The maps of the warps: where voxels lie in frusta, and where bins lie in the grid."""
+    world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges)
+    return lattice_maps(frusta, world), lattice_maps(world, frusta)

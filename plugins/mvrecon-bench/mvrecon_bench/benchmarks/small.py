@@ -1,0 +1,122 @@
+"""`bench=small`: SIRT on a small volume, the time of an iteration over that of its arithmetic."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mvrecon.reconstruct.iterative import sirt
+from mvrecon_bench.benchmarks import report
+from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.columns import SMALL, SMALL_KEYS
+from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads
+from mvrecon_bench.benchmarks.part import Part
+from mvrecon_bench.benchmarks.rows import Row, number
+from mvrecon_bench.benchmarks.scaling import Point
+from mvrecon_bench.benchmarks.trial import Trial, reason
+
+#: How many times as many views tell what one view more takes.
+MORE = 4
+
+
+class Job(Point):
+    """One part with one number of threads."""
+
+    @property
+    def row(self) -> Row:
+        """The columns that tell this row from all others."""
+        return {name: value for name, value in super().row.items() if name in SMALL}
+
+
+class Small:
+    """SIRT by each part on one small volume, where what a call costs besides its rays shows most.
+
+    Args:
+        parts: the projectors, `{name: ..., **options}`.
+        base: n, pixels, views, device (or auto), dtype.
+        n_threads: each number of threads (0: all that torch has) is a row of its own.
+        iterations: of SIRT.
+        repeats: least number of calls of which a time is the median.
+    """
+
+    columns: Mapping[str, str] = SMALL
+    keys: Sequence[str] = SMALL_KEYS
+    charts: Sequence[str] = ("iteration_ms", "over_arithmetic")
+
+    def __init__(
+        self,
+        parts: Sequence[Mapping[str, Any]],
+        base: Mapping[str, Any],
+        n_threads: Sequence[int] = (1, 0),
+        iterations: int = 50,
+        repeats: int = 5,
+    ):
+        self.parts = [Part.of(config) for config in parts]
+        self.iterations, self.repeats = iterations, repeats
+        self.n_threads = sorted({Case(threads=n).threads for n in n_threads})
+        self.base = {**base, "device": Case(device=base["device"]).device}
+
+    def groups(self) -> list[list[Job]]:
+        """What is measured together: all parts with one number of threads."""
+        return [
+            [Job(part, "views", **self.base, batch=1, channels=1, threads=n) for part in self.parts]
+            for n in self.n_threads
+        ]
+
+    def label(self, row: Row) -> str:
+        """A row's part and threads, short."""
+        return f"{report.part_label(row)}, {row['threads']:.0f} threads"
+
+    def measure(
+        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
+        """The rows of jobs with one number of threads."""
+        for job in jobs:
+            say(self.label(job.row))
+            row = {**job.row, "load": load_average()}
+            try:
+                with threads(job.threads):
+                    row |= self._times(job.trial(), replace(job, views=MORE * job.views).trial())
+            except Exception as error:  # whatever a part raises is its row's status
+                yield {**row, "status": f"skipped: {reason(error)}"}
+            else:
+                yield {**row, "status": "ok"}
+
+    def _times(self, trial: Trial, wide: Trial) -> Row:
+        """Of SIRT, and of its two calls with the rig's views and with `MORE` times as many."""
+        for one in (trial, wide):  # no voxel is zero, as in an iterate of SIRT
+            one.x = torch.rand(one.x.shape, generator=torch.Generator().manual_seed(0)).to(one.x)
+        views = trial.forward()
+        calls = {
+            0: lambda: sirt(trial.A, views, self.iterations),
+            **dict(enumerate((trial.forward, trial.adjoint, wide.forward, wide.adjoint), start=1)),
+        }
+        first = {
+            key: [once(call, trial.device) for _ in range(2)][1][1] for key, call in calls.items()
+        }
+        timings = interleaved(calls, first, self.repeats, trial.device)
+        whole, forward, adjoint, *more = (timings[key].ms for key in calls)
+        arithmetic = (sum(more) - forward - adjoint) / (MORE - 1)
+        return {
+            "backend": trial.backend,
+            "iteration_ms": whole / self.iterations,
+            "forward_ms": forward,
+            "adjoint_ms": adjoint,
+            "arithmetic_ms": arithmetic,
+            "over_arithmetic": whole / self.iterations / arithmetic,
+            "calls": timings[0].calls,
+        }
+
+    def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
+        """The table by name."""
+        names = ("threads", *(n for n in SMALL if n.endswith("_ms")), "over_arithmetic")
+        done = sorted(
+            (row for row in rows if row["status"] == "ok"), key=lambda r: number(r, "iteration_ms")
+        )
+        lines = [
+            (report.part_label(row), *(report.figure(row, name) for name in names)) for row in done
+        ]
+        text = f"# SIRT on a small volume\n\n{report.markdown(('part', *names), lines)}"
+        return {"table": text + report.left_out(rows) + report.legend(self.columns)}

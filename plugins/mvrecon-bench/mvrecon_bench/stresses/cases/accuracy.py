@@ -1,0 +1,134 @@
+"""Accuracy of views: orders of convergence in the voxel size, and other libraries' projectors."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import random_rotation
+from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.integrals import METHODS
+from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon.scenes.voxelise import voxelise
+from mvrecon_bench.stresses.case import Case, DoesNotApply
+from mvrecon_bench.stresses.subject import ProjectorSubject, gap
+from mvrecon_bench.stresses.truths import Blob
+
+#: Grids on which an order of convergence is measured, along each axis, in a box of 48 mm.
+GRIDS = (16, 32, 64)
+#: Projectors of other libraries that take any rig, by the plugin mvrecon-peers: Joseph's, Siddon's,
+#: and samples.
+ORACLES = ("rtk", "diffdrr", "nanodrr")
+
+
+def smooth(subject: ProjectorSubject) -> float:
+    """How far the order in the voxel size is below two for a blob; below 0.9 where voxels are
+    cells.
+    """
+    blob = Blob(torch.tensor([1.3, -0.7, 0.4], dtype=torch.float64), 5.0)
+    return (0.9 if subject.of_cells else 1.8) - _order(
+        subject, blob.values, lambda rig: blob.integrals(*rig.rays())
+    )
+
+
+def sharp(subject: ProjectorSubject) -> float:
+    """How far the order in the voxel size is below one for an ellipsoid, a cylinder and a box,
+    supersampled.
+    """
+    solids = _solids()
+    return 0.9 - _order(
+        subject, _voxels, lambda rig: solids.integrals(*rig.rays(), ray_extent=rig.ray_extent)
+    )
+
+
+def oracles(subject: ProjectorSubject) -> float:
+    """The least distance from what another library's projector sees of a blob that fades before the
+    faces.
+
+    To a plugin's projector mvrecon's own are others too.
+    """
+    subject.need_lines()
+    grid = Grid.centred((49, 49, 49), 1.0, (3.0, -2.0, 4.0))
+    rig = subject.rig(grid, {"pixels": [9, 11], "pixel_mm": [0.9, 0.8], "offset_mm": [0.04, -0.03]})
+    volume = Blob(grid.centre + 0.4, 5.5).values(grid).to(subject.device, subject.dtype)[None, None]
+    views, gaps = subject.projector(grid, rig)(volume), []
+    others = [{"name": name} for name in set(ORACLES) & set(PROJECTORS.names()) - {subject.name}]
+    if not subject.ours:
+        others += [
+            {"name": "radon" if rig.parallel else "drr", "method": method} for method in METHODS
+        ]
+    for other in others:
+        try:
+            B = PROJECTORS.from_config(other, grid=grid, cameras=rig)
+            gaps.append(gap(views, B(volume.cpu())))
+        except (ImportError, ValueError):  # not installed, or made for other rigs
+            continue
+    if not gaps:
+        raise DoesNotApply(
+            "no other library's projector is installed that takes this rig; see mvrecon-peers"
+        )
+    return min(gaps)
+
+
+def _order(
+    subject: ProjectorSubject, volume: Callable[[Grid], Tensor], truth: Callable[[Cameras], Tensor]
+) -> float:
+    """The slope of the error over three grids, finest to coarsest."""
+    subject.need_lines()
+    rig = subject.rig(
+        _box(GRIDS[0]),
+        {"pixels": [20, 21], "pixel_mm": [0.31, 0.33], "offset_mm": [0.03, 0.05]},
+        n_views=4,
+    )
+    rig = rig.moved(
+        random_rotation(torch.Generator().manual_seed(0)), torch.zeros(3)
+    )  # or rows would follow slices
+    errors = []
+    for n in GRIDS:
+        x = volume(_box(n)).to(subject.device, subject.dtype)[None, None]
+        errors.append(gap(subject.projector(_box(n), rig)(x)[0, 0], truth(rig)))
+    return float(torch.tensor(errors[0] / errors[-1]).log2()) / (len(errors) - 1)
+
+
+def _box(n: int) -> Grid:
+    """Voxels that are 48 / n mm wide, and a third longer along z."""
+    return Grid.centred((n, n, n), (48 / n, 48 / n, 64 / n))
+
+
+def _solids() -> Phantom:
+    rng = torch.Generator().manual_seed(5)
+    places = torch.tensor(
+        [[1.0, -2.0, 4.5], [-9.0, 6.0, -12.0], [8.0, 5.0, -10.0]], dtype=torch.float64
+    )
+    axes = torch.tensor([[13.0, 16.0, 11.0], [6.0, 7.0, 9.0], [7.0, 5.0, 8.0]], dtype=torch.float64)
+    kinds = zip(("ellipsoid", "cylinder", "box"), places, axes, strict=True)
+    one = torch.ones(1)
+    return Phantom(
+        tuple(Solids(kind, p[None], random_rotation(rng, 1), a[None], one) for kind, p, a in kinds)
+    )
+
+
+@lru_cache(maxsize=8)
+def _voxels_of(n: int) -> Tensor:
+    return voxelise(_solids(), _box(n))
+
+
+def _voxels(grid: Grid) -> Tensor:
+    return _voxels_of(grid.shape[0])
+
+
+CASES = (
+    Case(31, "a smooth blob on three grids", "what the order lacks", "projector", smooth),
+    Case(31, "solids with edges on three grids", "what the order lacks", "projector", sharp),
+    Case(
+        32,
+        "a blob seen by other libraries",
+        "one of them sees the same",
+        "projector",
+        oracles,
+        1e-3,
+    ),
+)

@@ -1,0 +1,212 @@
+"""Derivatives of a projector: against central differences, at kinks, of second order, in forward
+mode, under vmap and in a compiled graph.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon_bench.stresses.case import Case, DoesNotApply
+from mvrecon_bench.stresses.cases.algebra import DIGITS, LINEAR
+from mvrecon_bench.stresses.subject import ProjectorSubject, gap, greatest
+from mvrecon_bench.stresses.truths import ends, ways
+
+DOUBLE = (torch.float64,)
+#: Few rays, in a pose where none lies on a kink.
+FEW = {"pixels": [3, 2], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
+SMALL = Grid.centred(size=(3, 4, 3), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
+
+
+def differences(subject: ProjectorSubject) -> float:
+    """Derivatives by the volume and by every vector of the cameras, against central differences
+    along four ways.
+    """
+    views, vectors = subject.posed(SMALL, subject.rig(SMALL, FEW, n_views=2))
+    inputs = [subject.random(1, 1, *SMALL.shape).requires_grad_(), *vectors]
+    rng, worst = torch.Generator().manual_seed(0), 0.0
+    weights = subject.random(1, 1, 2, 3, 2, seed=1)
+    found = torch.autograd.grad((views(*inputs) * weights).sum(), inputs)
+    for index, slope in enumerate(found):
+        for _ in range(4):
+            way = torch.randn(slope.shape, generator=rng, dtype=torch.float64).to(slope)
+            ends = [
+                [*inputs[:index], inputs[index] + step * way, *inputs[index + 1 :]]
+                for step in (1e-5, -1e-5)
+            ]
+            more, less = ((views(*each) * weights).sum() for each in ends)
+            error = ((more - less) / 2e-5 - (slope * way).sum()).abs() / (slope.norm() * way.norm())
+            worst = greatest([worst, float(error)])
+    return worst
+
+
+def kinks(subject: ProjectorSubject) -> float:
+    """Rays along axes, on faces and edges, through corners, past the volume: derivatives by the
+    pose not finite.
+    """
+    grid = Grid.centred((4, 4, 4), 1.0)
+    halves = torch.cartesian_prod(*[torch.arange(-2, 10).double() / 2] * 2)
+    rays = [ends(grid, axis, halves) for axis in range(3)] + [(-9 * ways(), 10 * ways())]
+    if subject.beam[1] == "segment":
+        rays.append((0 * ways(), 1e-12 * ways()))
+    start, end = (torch.cat(points) for points in zip(*rays, strict=True))
+    views, vectors = subject.posed(grid, subject.rays(start, end))
+    volume = subject.random(1, 1, 4, 4, 4).requires_grad_()
+    slopes = torch.autograd.grad(views(volume, *vectors).sum(), [volume, *vectors])
+    return float(sum((~slope.isfinite()).sum() for slope in slopes))
+
+
+def twice(subject: ProjectorSubject) -> float:
+    """Second derivatives: by views and volume the operator itself; by the pose right, or
+    NotImplementedError.
+    """
+    rig = subject.rig(SMALL, FEW, n_views=2)
+    A, x, y = (
+        subject.projector(SMALL, rig),
+        subject.random(1, 1, *SMALL.shape),
+        subject.random(1, 1, 2, 3, 2),
+    )
+    for leaf in (x, y):
+        leaf.requires_grad_()
+    by_y, by_x = torch.autograd.grad((A(x) * y).sum(), (y, x), create_graph=True)
+    w, z = subject.random(*y.shape, seed=1), subject.random(*x.shape, seed=2)
+    mixed = torch.autograd.grad((by_y * w).sum(), x)[0], torch.autograd.grad((by_x * z).sum(), y)[0]
+    return greatest([gap(mixed[0], A.T(w)), gap(mixed[1], A(z))])
+
+
+def twice_by_pose(subject: ProjectorSubject) -> float:
+    """A second derivative by the source, against differences of the first, unless
+    NotImplementedError tells of none.
+    """
+    views, (source, *others) = subject.posed(SMALL, subject.rig(SMALL, FEW, n_views=2))
+    volume, way = subject.random(1, 1, *SMALL.shape), torch.randn(source.shape, dtype=torch.float64)
+
+    def slope(at: Tensor, graph: bool = False) -> Tensor:
+        total = views(volume, at, *others).square().sum()
+        return (torch.autograd.grad(total, at, create_graph=graph)[0] * way).sum()
+
+    try:
+        (found,) = torch.autograd.grad(slope(source, True), source)
+    except NotImplementedError as error:
+        if not str(error):
+            raise
+        return 0.0
+    more, less = (slope((source + step * way).detach().requires_grad_()) for step in (1e-5, -1e-5))
+    return float(((found * way).sum() - (more - less) / 2e-5).abs() / (found.norm() * way.norm()))
+
+
+def mapped(subject: ProjectorSubject) -> float:
+    """vmap over volumes and over views, and maps in maps: what a loop gives."""
+    A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2))
+    x, y = subject.random(3, 2, 1, 1, *SMALL.shape), subject.random(3, 2, 1, 1, 2, 3, 2)
+    worst = 0.0
+    for act, given in ((A, x), (A.T, y)):
+        loop = torch.stack([torch.stack([act(one) for one in each]) for each in given])
+        worst = greatest([worst, gap(torch.func.vmap(act)(given[:, 0]), loop[:, 0])])
+        worst = greatest(
+            [worst, gap(torch.func.vmap(act, in_dims=1)(given[0].transpose(0, 1)), loop[0])]
+        )
+        worst = greatest([worst, gap(torch.func.vmap(torch.func.vmap(act))(given), loop)])
+    return worst
+
+
+def jacobian(subject: ProjectorSubject, act: Callable[..., Tensor]) -> float:
+    """The Jacobian, its rows or columns mapped over: the views of every voxel alone."""
+    A, x = (
+        subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2)),
+        subject.random(1, 1, *SMALL.shape),
+    )
+    columns = torch.stack(
+        [A(one) for one in torch.eye(x.numel()).to(x).reshape(-1, *x.shape)], dim=-1
+    )
+    try:
+        return gap(act(A, x).flatten(-x.ndim), columns)
+    except RuntimeError as error:
+        if "functorch" not in str(error):
+            raise
+        raise DoesNotApply("torch.func finds no derivative of it; torch.autograd does") from error
+
+
+def pushed(subject: ProjectorSubject) -> float:
+    """Derivatives forwards, by volume and by views: the operator, or its adjoint, on the
+    tangent.
+    """
+    A, worst = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2)), 0.0
+    for act, shape in ((A, (1, 1, *SMALL.shape)), (A.T, (1, 1, 2, 3, 2))):
+        given, tangent = subject.random(*shape), subject.random(*shape, seed=1)
+        worst = greatest([worst, gap(torch.func.jvp(act, (given,), (tangent,))[1], act(tangent))])
+    return worst
+
+
+def compiled(subject: ProjectorSubject) -> float:
+    """Operator, adjoint and pointwise functions in one graph, then of another size: values and
+    gradients the same.
+    """
+    A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2))
+    x = subject.random(1, 1, *SMALL.shape).requires_grad_()
+
+    def step(x: Tensor) -> Tensor:
+        return A.T((A(x.sin()) - 1).tanh())
+
+    torch.compiler.reset()
+    whole, worst = torch.compile(step, fullgraph=True, backend="aot_eager"), 0.0
+    for given in (x, torch.cat([x, 2 * x])):  # the second makes the sizes of the graph symbols
+        seen, expected = whole(given), step(given)
+        slopes = [torch.autograd.grad(each.square().sum(), given)[0] for each in (seen, expected)]
+        worst = greatest([worst, gap(seen, expected), gap(*slopes)])
+    return worst
+
+
+def _jacrev(A: Callable[..., Tensor], x: Tensor) -> Tensor:
+    return torch.func.jacrev(A)(x)  # type: ignore[return-value]
+
+
+def _rows(A: Callable[..., Tensor], x: Tensor) -> Tensor:
+    return torch.autograd.functional.jacobian(A, x, vectorize=True)  # type: ignore[return-value]
+
+
+CASES = (
+    Case(
+        33, "derivatives by volume and pose", "differences", "projector", differences, 1e-6, DOUBLE
+    ),
+    Case(34, "derivatives where rays tie", "finite", "projector", kinks),
+    Case(
+        35,
+        "second derivatives by volume and views",
+        "the operator itself",
+        "projector",
+        twice,
+        DIGITS,
+    ),
+    Case(
+        35,
+        "second derivatives by pose",
+        "differences, or refused",
+        "projector",
+        twice_by_pose,
+        1e-5,
+        DOUBLE,
+    ),
+    Case(36, "vmap", "what a loop gives", "projector", mapped, LINEAR),
+    Case(36, "jacrev", "the views of voxels", "projector", partial(jacobian, act=_jacrev), LINEAR),
+    Case(
+        36,
+        "a Jacobian by rows at once",
+        "the views of voxels",
+        "projector",
+        partial(jacobian, act=_rows),
+        LINEAR,
+    ),
+    Case(36, "derivatives forwards", "the operator on the tangent", "projector", pushed, LINEAR),
+    Case(
+        37,
+        "a compiled graph, of two sizes",
+        "the eager one",
+        "projector",
+        compiled,
+        DIGITS,
+        (torch.float32,),
+    ),
+)

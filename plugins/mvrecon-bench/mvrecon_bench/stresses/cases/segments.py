@@ -1,0 +1,169 @@
+"""Where rays start and end: short ones, in the volume, beyond it, and detectors that cut it."""
+
+import itertools
+from dataclasses import replace
+from functools import partial
+
+import torch
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.geometry.grid import Grid
+from mvrecon_bench.stresses.case import Case
+from mvrecon_bench.stresses.cases.rays import EXACT
+from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, gap, greatest
+from mvrecon_bench.stresses.truths import box_lengths
+
+
+def short(subject: ProjectorSubject) -> float:
+    """Rays down to 1e-18 mm in the middle of a voxel: its value times their length, and finite
+    gradients.
+    """
+    subject.need_segment()
+    subject.need_lines()
+    grid, volume = Grid.centred(size=(9, 7, 5), spacing=(0.9, 1.2, 1.0)), subject.random(5, 7, 9)
+    volume[1:4, 2:5, 3:6] = 1.75
+    lengths = 10.0 ** -torch.arange(3.0, 19.0, 3.0, dtype=torch.float64)
+    way = torch.nn.functional.normalize(torch.tensor([0.8, -0.5, 0.3], dtype=torch.float64), dim=0)
+    end = lengths[:, None] * way
+    seen = subject.values(grid, torch.zeros_like(end), end, volume)
+    return float((seen / (1.75 * lengths) - 1).abs().max())
+
+
+def pointless(_: Subject) -> float:
+    """How many doors let a ray through that starts where it ends."""
+    point, u, v = torch.eye(3, dtype=torch.float64)[:, None]
+    doors = [lambda: ExplicitRays(point[None, None], point[None, None])]
+    doors += [partial(Cameras, point, point, u, v, (1, 1), parallel) for parallel in (False, True)]
+    open_ = 0
+    for door in doors:
+        try:
+            door()
+        except ValueError as error:
+            if not any(word in str(error) for word in ("length", "flat")):
+                raise
+        else:
+            open_ += 1
+    return float(open_)
+
+
+def inside(subject: ProjectorSubject, source: bool, pixel: bool) -> float:
+    """Rays that start or end inside a box of ones: no more than their length in it."""
+    subject.need_segment()
+    subject.need_lines() if source and pixel else subject.need_exact()
+    grid, rng = Grid.centred((16, 16, 16), 1.0, (3.0, -2.0, 4.0)), torch.Generator().manual_seed(0)
+    place = torch.rand(2, 60, 3, generator=rng, dtype=torch.float64) * 6 - 3
+    place[0, :, 0], place[1, :, 0] = (
+        (place[0, :, 0] - 4 if source else -30),
+        (place[1, :, 0] + 4 if pixel else 30),
+    )
+    start, end = (
+        torch.stack([p.roll(k, dims=1) for k in range(3)]).flatten(0, 1) + grid.centre
+        for p in place
+    )
+    lengths = box_lengths(subject.rays(start, end), grid).flatten()
+    return float((subject.values(grid, start, end) / lengths - 1).abs().max())
+
+
+def tiled(subject: ProjectorSubject) -> float:
+    """A detector that cuts the volume, seen whole, and in tiles of 1, 7 and 64 pixels."""
+    grid = Grid.centred((16, 16, 16), 1.0, (3.0, -2.0, 4.0))
+    rig = _cut(
+        subject.rig(
+            grid, {"pixels": [5, 9], "pixel_mm": [2.2, 1.3], "offset_mm": [0.4, -0.3]}, n_views=2
+        ),
+        grid,
+    )
+    volume = subject.random(1, 1, 16, 16, 16)
+    whole, worst = subject.projector(grid, rig)(volume), 0.0
+    if subject.of_cells:
+        lengths = box_lengths(rig, grid)
+        ones = subject.projector(grid, rig)(torch.ones_like(volume))[0, 0].double().cpu()
+        worst = gap(ones, lengths)
+    for tile in (1, 7, 64):
+        parts = torch.zeros_like(whole)
+        for row, column in itertools.product(range(0, 5, tile), range(0, 9, tile)):
+            shape = min(tile, 5 - row), min(tile, 9 - column)
+            shift = row * rig.v + column * rig.u
+            source = rig.source + shift if rig.parallel else rig.source
+            cut = replace(rig, source=source, origin=rig.origin + shift, shape=shape)
+            parts[..., row : row + shape[0], column : column + shape[1]] = subject.projector(
+                grid, cut
+            )(volume)
+        worst = greatest([worst, gap(parts, whole)])
+    return worst
+
+
+def out_of_reach(subject: ProjectorSubject) -> float:
+    """A volume wholly behind the source, or beyond the detector: how many rays see anything."""
+    grid, rng = (
+        Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0)),
+        torch.Generator().manual_seed(0),
+    )
+    way = torch.nn.functional.normalize(
+        torch.randn(60, 3, generator=rng, dtype=torch.float64), dim=-1
+    )
+    way = torch.cat([way, torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
+    aim = grid.centre + 2 * torch.rand(len(way), 3, generator=rng, dtype=torch.float64) - 1
+    seen = [subject.values(grid, aim + near * way, aim + 40 * way) for near in (9.0, 30.0)]
+    if subject.beam[1] == "segment":
+        seen += [subject.values(grid, aim + 40 * way, aim + near * way) for near in (9.0, 30.0)]
+    return float((torch.stack(seen) != 0).sum())
+
+
+def _cut(rig: Cameras, grid: Grid) -> Cameras:
+    """The same rays, of which those that end do so on a plane through the grid's centre."""
+    if rig.extent != "segment":
+        return rig
+    part = (rig.project(grid.centre)[:, 2] / rig.distance)[:, None]
+    wide = torch.ones_like(part) if rig.parallel else part
+    origin = rig.source + part * (rig.origin - rig.source)
+    return replace(rig, origin=origin, u=rig.u * wide, v=rig.v * wide)
+
+
+CASES = (
+    Case(
+        6,
+        "rays of 1e-3 to 1e-18 mm",
+        "the voxel's value times their length",
+        "projector",
+        short,
+        EXACT,
+    ),
+    Case(6, "rays without length", "refused", "mvrecon", pointless),
+    Case(
+        7,
+        "source inside",
+        "the length from it on",
+        "projector",
+        partial(inside, source=True, pixel=False),
+        EXACT,
+    ),
+    Case(
+        7,
+        "pixel inside",
+        "the length up to it",
+        "projector",
+        partial(inside, source=False, pixel=True),
+        EXACT,
+    ),
+    Case(
+        7,
+        "both inside",
+        "the length between them",
+        "projector",
+        partial(inside, source=True, pixel=True),
+        EXACT,
+    ),
+    Case(
+        8,
+        "a detector that cuts the volume, in tiles",
+        "the whole's views",
+        "projector",
+        tiled,
+        EXACT,
+    ),
+    Case(
+        9, "a volume behind the source or the detector", "nothing at all", "projector", out_of_reach
+    ),
+)

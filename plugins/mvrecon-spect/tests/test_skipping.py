@@ -1,0 +1,80 @@
+"""`spect` skips what `drr` skips: zero bins, half of a mirrored rig, voxels outside a support."""
+
+import pytest
+import torch
+
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.grid import Grid
+from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.projectors.selection import RaySelection
+from mvrecon.reconstruct.iterative import sirt_weights
+from mvrecon.reconstruct.mlem import mlem
+from mvrecon.reconstruct.poisson import PoissonLikelihood
+from mvrecon_spect.projector import Spect
+
+GRID = Grid.centred(size=(8, 12, 10), spacing=12.0)
+
+
+@pytest.fixture(scope="module")
+def A() -> Spect:
+    return Spect(GRID, dcspect80(pixels=[5, 4]))
+
+
+@pytest.fixture
+def counts(A) -> torch.Tensor:
+    """Few: nearly all bins are zero."""
+    views = A(torch.ones(1, 1, *GRID.shape))
+    rng = torch.Generator().manual_seed(0)
+    return torch.poisson(views * (0.05 / views.mean()), generator=rng)
+
+
+@pytest.fixture
+def n_rays(monkeypatch) -> list[int]:
+    """How many rays each forward projection computes."""
+    numbers, project = [], RayTransform.project_along
+
+    def counted(self, volume, lines, detector):
+        numbers.append(len(lines) * detector[0] * detector[1])
+        return project(self, volume, lines, detector)
+
+    monkeypatch.setattr(RayTransform, "project_along", counted)
+    return numbers
+
+
+def test_only_the_rays_of_bins_with_counts_are_computed(A, counts, n_rays):
+    likelihood = PoissonLikelihood(A, counts)
+    assert likelihood.why.startswith("bins with counts: ")
+    likelihood.expected(torch.ones(1, 1, *GRID.shape))
+    assert n_rays == [int((counts > 0).sum())]
+
+
+@pytest.mark.parametrize("subsets", [1, 4])
+def test_leaving_out_zero_bins_changes_no_image(A, counts, subsets):
+    counts = counts.double()
+    images = [mlem(A, counts, 2, 0.1, subsets=subsets, skip_zero_bins=skip) for skip in (0, 1)]
+    torch.testing.assert_close(images[0], images[1], rtol=1e-9, atol=0)
+
+
+def test_a_list_of_rays_has_the_weights_of_its_pixels(A):
+    chosen = torch.rand(A.range_shape, generator=torch.Generator().manual_seed(1)) < 0.1
+    x = torch.rand(1, 1, *GRID.shape)
+    part = A.subset(RaySelection(A.range_shape, chosen))
+    torch.testing.assert_close(part(x), A(x)[..., chosen], rtol=1e-5, atol=0)
+
+
+def test_half_of_the_cameras_tell_the_weights_of_sirt(A, n_rays):
+    R, C = sirt_weights(A, torch.float64)
+    assert n_rays == [40 * 5 * 4]
+    ones = torch.ones(1, 1, *GRID.shape, dtype=torch.float64)
+    rows = A(ones)
+    columns = A.T(torch.ones_like(rows))
+    torch.testing.assert_close(R * rows, (R > 0).double(), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(C * columns, (C > 0).double(), rtol=1e-9, atol=1e-9)
+
+
+def test_a_support_is_the_projectors(A):
+    support = torch.zeros(GRID.shape, dtype=torch.bool)
+    support[2:5] = True
+    x = torch.rand(1, 1, *GRID.shape)
+    assert {"subset", "crop", "support"} <= A.capabilities
+    torch.testing.assert_close(A.with_support(support)(x), A(x * support))

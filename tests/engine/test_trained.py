@@ -1,0 +1,53 @@
+"""A trained method from the path of its checkpoint or of its run."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+import mvrecon as mv
+from mvrecon.config import compose
+from mvrecon.engine import checkpoints, fit, record
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run of one step; its other method, SIRT, learns nothing and has no checkpoint."""
+    settings = compose("experiment=smoke", "trainer.max_steps=1", "trainer.val_check_interval=1")
+    folder = tmp_path_factory.mktemp("run")
+    record.start(folder, settings)
+    fit.fit("cross_view", settings, fit.build_data(settings), folder)
+    return folder
+
+
+def test_a_run_folder_and_its_checkpoint_are_one_method(run: Path):
+    first, second = mv.load(run), mv.load(checkpoints.finished(run, "cross_view"))
+    third = mv.load(str(run), "cross_view")
+    weights = first.module.state_dict()
+    for other in (second, third):
+        assert all(torch.equal(weights[k], v) for k, v in other.module.state_dict().items())
+    A = first.module.projector
+    assert first.module(torch.zeros(1, 1, *A.range_shape)).volume.shape[2:] == A.domain_shape
+
+
+def test_a_method_that_a_run_does_not_have_is_named(run: Path):
+    with pytest.raises(LookupError, match="no method 'unet'. It has cross_view"):
+        mv.load(run, "unet")
+    with pytest.raises(FileNotFoundError, match="sirt.*did the training of"):
+        mv.load(run, "sirt")
+    with pytest.raises(FileNotFoundError, match="No checkpoint or run folder"):
+        mv.load(run / "nowhere")
+
+
+def test_a_run_of_an_older_version_keeps_its_grid(run: Path, tmp_path: Path):
+    """Settings that give a shape and one order alone mean what they meant; others are refused."""
+    settings = yaml.safe_load((run / "config.yaml").read_text())
+    spacing = [1.0, 2.0, 3.0]
+    settings["grid"] = {"shape": [16, 16, 16], "spacing": spacing}
+    assert fit.build_data(settings).grid.spacing == tuple(spacing)
+    settings["grid"] = {"shape": [4, 6, 8], "spacing": 2.0}
+    assert fit.build_data(settings).grid.shape == (4, 6, 8)
+    settings["grid"] = {"shape": [4, 6, 8], "spacing": spacing}
+    with pytest.raises(ValueError, match=r"expected size=\(8, 6, 4\)"):
+        fit.build_data(settings)

@@ -1,0 +1,183 @@
+"""The docs are true: their Python runs, their commands compose, their files, names and tests
+exist.
+"""
+
+import ast
+import importlib
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mvrecon.config import compose
+from mvrecon.parts import REGISTRIES
+
+ROOT = Path(__file__).parents[1]
+DOCS = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "scripts").rglob("*.md")]
+    + [*(ROOT / "plugins").glob("*.md"), *(ROOT / "plugins").glob("*/README.md")]
+    + [*(ROOT / "experiments").rglob("README.md")]
+)
+#: Files that a reader makes, and other projects' files.
+ELSEWHERE = {"my_parts.py"}
+#: Words of Lightning's that SECURITY.md forbids, and the pages that say so or that tell the past.
+UNSAFE, HISTORY = "load_from_checkpoint", {"SECURITY.md", "CHANGELOG.md"}
+
+
+def name_of(file: Path) -> str:
+    return str(file.relative_to(ROOT))
+
+
+def blocks(file: Path, language: str) -> list[str]:
+    """The fenced blocks of a page."""
+    return re.findall(rf"^ *```{language}\n(.*?)^ *```", file.read_text(), re.M | re.S)
+
+
+@pytest.fixture
+def registries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test registers is gone after it."""
+    for registry in REGISTRIES.values():
+        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
+
+
+@pytest.mark.parametrize("file", [f for f in DOCS if blocks(f, "python")], ids=name_of)
+def test_the_python_of_a_page_runs(file: Path, registries: None):
+    """All blocks of a page one after the other; tests that they define are called."""
+    space = {"__name__": "page"}
+    for number, block in enumerate(blocks(file, "python"), 1):
+        try:
+            exec(compile(block, f"{name_of(file)}, block {number}", "exec"), space)  # noqa: S102
+        except ImportError as error:
+            if file.parent.name != "mvrecon-peers":  # whose libraries are the reader's choice
+                raise
+            pytest.skip(str(error))
+    for test in [value for name, value in space.items() if name.startswith("test_")]:
+        test()
+
+
+def commands() -> Iterator[tuple[str, str]]:
+    """Every command line of ours with the page that shows it, in blocks and inside sentences."""
+    for file in DOCS:
+        text = "\n".join([*blocks(file, "bash"), *blocks(file, "")]).replace("\\\n", " ")
+        spans = re.findall(r"`(mvrecon-[a-z]+ [^`]+)`", file.read_text())
+        for line in [*text.splitlines(), *(" ".join(span.split()) for span in spans)]:
+            for part in re.split(r"&&|;", line):
+                if re.match(r"(\w+=\S+ )*(\.venv/bin/)?mvrecon-[a-z]+( |$)", part.strip()):
+                    yield name_of(file), part.strip()
+
+
+@pytest.mark.parametrize(("page", "command"), sorted(set(commands())))
+def test_a_command_of_a_page_composes(page: str, command: str):
+    words = shlex.split(re.sub(r"<\w+>", "name", command), comments=True)
+    first = next(i for i, word in enumerate(words) if "mvrecon-" in word)
+    app, options = words[first].rpartition("mvrecon-")[2], words[first + 1 :]
+    if app == "list":
+        assert set(options) <= {*REGISTRIES, "--check"}, command
+        return
+    compose(*(word for word in options if not word.startswith("-")), config_name=app)
+
+
+def test_pages_show_commands_of_every_app():
+    shown = {re.search(r"mvrecon-([a-z]+)", command)[1] for _, command in commands()}  # type: ignore[index]
+    assert shown >= {"train", "eval", "list", "bench", "stress"}
+
+
+def docstrings(file: Path) -> Iterator[str]:
+    """Every docstring of a module."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield ast.get_docstring(node) or ""
+
+
+def told(folders: tuple[str, ...] = ("mvrecon", "plugins", "scripts", "tests")) -> dict[str, str]:
+    """All that is told to a reader: pages, and the docstrings of each module."""
+    modules = [f for folder in folders for f in sorted((ROOT / folder).rglob("*.py"))]
+    texts = {name_of(f): "\n".join(docstrings(f)) for f in modules}
+    return texts | {name_of(f): f.read_text() for f in DOCS}
+
+
+def test_a_file_that_is_mentioned_is_there():
+    """By the end of its path, as `geometry/grid.py`."""
+    folders = ("mvrecon", "plugins", "scripts", "tests", "docs", "experiments", "conf")
+    files = [*ROOT.glob("*.*"), *(f for folder in folders for f in (ROOT / folder).rglob("*.*"))]
+    paths = [Path("/", f.relative_to(ROOT)).as_posix() for f in files]
+    missing = {
+        f"{page}: {path}"
+        for page, text in told().items()
+        for path in re.findall(r"(?<![\w.*<>/-])[\w./-]*\w\.(?:py|md)\b", text)
+        if path not in ELSEWHERE
+        and not any(p.endswith("/" + re.sub(r"^(\.\./|\./|/)*", "", path)) for p in paths)
+    }
+    assert missing == set()
+
+
+@pytest.mark.parametrize("file", DOCS, ids=name_of)
+def test_a_link_leads_somewhere(file: Path):
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", file.read_text())
+    assert [x for x in links if "://" not in x and not (file.parent / x).exists()] == []
+
+
+def test_a_module_or_name_that_is_mentioned_is_there():
+    """`mvrecon.projectors.drr.Drr`, whole, in a page or a docstring."""
+    missing = {
+        f"{page}: {name}"
+        for page, text in told().items()
+        if page != "CHANGELOG.md"
+        for name in re.findall(r"`(mvrecon(?:_\w+)?(?:\.\w+)+)[`(]", text)
+        if name != "mvrecon.plugins" and not importable(name)  # the group of entry points
+    }
+    assert missing == set()
+
+
+def importable(name: str) -> bool:
+    """Whether a dotted name is a module, or an attribute of one."""
+    module, _, attribute = name.rpartition(".")
+    try:
+        importlib.import_module(name)
+    except ImportError:
+        try:
+            return hasattr(importlib.import_module(module), attribute)
+        except ImportError:
+            return False
+    return True
+
+
+def test_a_test_that_a_page_names_is_there():
+    names = {name for f in DOCS for name in re.findall(r"`(test_\w+)`", f.read_text())}
+    folders = (ROOT / "tests", *ROOT.glob("plugins/*/tests"))
+    code = "\n".join(f.read_text() for folder in folders for f in folder.rglob("test_*.py"))
+    assert len(names) > 20
+    assert [name for name in sorted(names) if f"def {name}(" not in code] == []
+
+
+def test_nobody_is_told_to_load_a_checkpoint_unseen():
+    texts = told(("mvrecon", "plugins", "scripts"))
+    assert [p for p, text in texts.items() if UNSAFE in text and p not in HISTORY] == []
+
+
+def test_the_layers_that_contributors_read_are_those_that_are_checked():
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    layers = next(c["layers"] for c in contracts["contracts"] if c["type"] == "layers")
+    rule = re.search(
+        r"Imports run downward only.*?`registry`[^.]*\.",
+        (ROOT / "CONTRIBUTING.md").read_text(),
+        re.S,
+    )
+    assert rule is not None
+    rows = [set(re.findall(r"`(\w+)`", row)) for row in rule[0].split(";")]
+    assert rows == [set(re.split(r" \| ", layer)) for layer in layers]
+
+
+def test_a_word_of_our_own_is_explained_once():
+    rows = [
+        line.split("|")[1:-1]
+        for line in (ROOT / "docs" / "glossary.md").read_text().splitlines()[6:]
+        if line.startswith("|")
+    ]
+    words = [word.strip() for row in rows for word in row[0].split(",")]
+    assert {"opinion", "lift", "rig"} <= set(words)
+    assert len(words) == len(set(words))
+    assert all(len(row) == 3 and row[2].strip().endswith(".") for row in rows)
