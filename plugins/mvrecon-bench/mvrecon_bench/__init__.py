@@ -1,3 +1,3 @@
-"""What mvrecon's parts cost, how large their errors are, and what they bear: benchmarks and the
-stress plan.
+"""Benchmarks (run time against error) and the stress plan for projectors, cameras, heads and
+models.
 """

@@ -47,7 +47,7 @@ def task(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     rows = stress(to_plain(config), folder)
     tell = Console(markup=False, highlight=False).print
-    found = counts(rows)
+    verdicts = counts(rows)
     for row in rows:
         if row["verdict"] == FAIL:
             tell(
@@ -61,7 +61,7 @@ def task(config: DictConfig) -> None:
         f"{folder}",
         soft_wrap=True,
     )
-    if found[FAIL]:
+    if verdicts[FAIL]:
         raise SystemExit(1)
 
 

@@ -1,3 +1,3 @@
-"""Other people's projectors as mvrecon projectors: RTK, nanodrr, DiffDRR, ASTRA, mbirtorch and
+"""Other libraries' projectors as projectors of mvrecon: RTK, nanodrr, DiffDRR, ASTRA, mbirtorch,
 scikit-image.
 """

@@ -23,7 +23,7 @@ def vectors(rig: Cameras) -> Float[Tensor, "m 6"]:
     centre = rig.origin + rig.u * (rig.shape[1] - 1) / 2
     first = rig.origin - rig.source if rig.parallel else rig.source
     upside = torch.tensor([1.0, -1.0]).to(first)
-    return torch.cat([each[:, :2] * upside for each in (first, centre, rig.u)], dim=-1)
+    return torch.cat([points[:, :2] * upside for points in (first, centre, rig.u)], dim=-1)
 
 
 class Astra(Paired):

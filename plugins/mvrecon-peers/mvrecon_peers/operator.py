@@ -1,6 +1,4 @@
-"""Any peer as an operator of torch's: opaque to `torch.compile` and to autocast, mapped by vmap,
-its own derivative.
-"""
+"""A peer as a custom operator of torch: for `torch.compile`, autocast, vmap and derivatives."""
 
 from collections.abc import Callable
 from itertools import count
@@ -24,20 +22,20 @@ def known_by(peer: Any) -> int:
 
 
 @torch.library.custom_op("mvrecon_peers::linear", mutates_args=())
-def linear(given: Tensor, key: int, back: bool) -> Tensor:
+def linear(operand: Tensor, key: int, back: bool) -> Tensor:
     """Views [n m v u] of volumes [n d h w] by a peer, or back."""
     peer = _PEERS[key]
     act: Callable[[Tensor], Tensor] = peer.backproject if back else peer.project
-    found = given.new_empty(given.shape[0], *peer.sizes(back))
-    with torch.autocast(given.device.type, enabled=False):
-        for one, out in zip(given, found, strict=True):
+    result = operand.new_empty(operand.shape[0], *peer.sizes(back))
+    with torch.autocast(operand.device.type, enabled=False):
+        for one, out in zip(operand, result, strict=True):
             out.copy_(act(one.contiguous()))
-    return found
+    return result
 
 
 @linear.register_fake
-def _(given, key, back):
-    return given.new_empty(given.shape[0], *_PEERS[key].sizes(back))
+def _(operand, key, back):
+    return operand.new_empty(operand.shape[0], *_PEERS[key].sizes(back))
 
 
 def _keep(ctx, inputs, output):
@@ -49,8 +47,8 @@ def _transpose(ctx, grad):
     return linear(grad, ctx.key, not ctx.back), None, None
 
 
-def _mapped(info, in_dims, given, key, back):
-    moved = given.movedim(in_dims[0], 0)
+def _mapped(info, in_dims, operand, key, back):
+    moved = operand.movedim(in_dims[0], 0)
     return linear(moved.flatten(0, 1), key, back).unflatten(0, moved.shape[:2]), 0
 
 

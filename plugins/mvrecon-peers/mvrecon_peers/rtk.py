@@ -69,7 +69,7 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
             f"got {short / size:.2g}"
         )
     gantry, out, inner = zip(*map(angles, axes.tolist()), strict=True)
-    z, below, across, down, x, y = (each.tolist() for each in (z, below, across, down, x, y))
+    z, below, across, down, x, y = (column.tolist() for column in (z, below, across, down, x, y))
     return list(zip(z, below, gantry, across, down, out, inner, x, y, strict=True))
 
 
@@ -143,16 +143,16 @@ class Rtk(Paired):
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
         """JosephForwardProjectionImageFilter."""
         empty = self._image(volume.new_zeros(len(self.rig), *self.rig.shape), self.detector)
-        given = self._image(torch.nn.functional.pad(volume, (RIM,) * 6), self.voxels)
-        return self._run(self.rtk.JosephForwardProjectionImageFilter, empty, given)
+        image = self._image(torch.nn.functional.pad(volume, (RIM,) * 6), self.voxels)
+        return self._run(self.rtk.JosephForwardProjectionImageFilter, empty, image)
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
         """JosephBackProjectionImageFilter."""
         empty = self._image(views.new_zeros([n + 2 * RIM for n in self.grid.shape]), self.voxels)
-        found = self._run(
+        volume = self._run(
             self.rtk.JosephBackProjectionImageFilter, empty, self._image(views, self.detector)
         )
-        return found[RIM:-RIM, RIM:-RIM, RIM:-RIM]
+        return volume[RIM:-RIM, RIM:-RIM, RIM:-RIM]
 
     def _image(self, values: Tensor, frame: tuple[list[float], list[float]]):
         image = self.itk.image_view_from_array(values.numpy())
@@ -167,11 +167,11 @@ class Rtk(Paired):
         image.SetOrigin(frame[1])
         return image
 
-    def _run(self, kind, target, given) -> Tensor:
-        operator = kind[type(target), type(given)].New()
+    def _run(self, kind, target, source) -> Tensor:
+        operator = kind[type(target), type(source)].New()
         operator.SetNumberOfWorkUnits(torch.get_num_threads())
         operator.SetGeometry(self.geometry)
         operator.SetInput(0, target)
-        operator.SetInput(1, given)
+        operator.SetInput(1, source)
         operator.Update()
         return torch.from_numpy(self.itk.array_from_image(operator.GetOutput())) * self.unit

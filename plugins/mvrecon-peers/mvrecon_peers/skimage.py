@@ -38,15 +38,15 @@ def turns(box: Grid, rig: Cameras) -> tuple[list[float], list[int]]:
         )
     depth, rows, columns = box.shape
     axis = box.to_world(torch.tensor([columns // 2, rows // 2, depth / 2], dtype=torch.float64))
-    seen = rig.project(axis)[:, 0]
-    if (off := (seen - seen.round()).abs().max().item()) > 1e-3:
+    axis_columns = rig.project(axis)[:, 0]
+    if (off := (axis_columns - axis_columns.round()).abs().max().item()) > 1e-3:
         raise ValueError(
             f"scikit-image's radon turns the image about the centre of voxel size // 2, which "
             f"must fall on the centre "
             f"of a column, got it {off:.3g} columns off; take odd sizes of grid and detector"
         )
     angles = torch.rad2deg(torch.atan2(-rig.u[:, 1], rig.u[:, 0]))
-    return angles.tolist(), [int(column) for column in seen.round()]
+    return angles.tolist(), [int(column) for column in axis_columns.round()]
 
 
 class Skimage(Paired):

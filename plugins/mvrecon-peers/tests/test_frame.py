@@ -53,12 +53,12 @@ def test_the_rays_of_a_framed_rig_measure_the_same(kind: str, tilt: bool):
     inside = Phantom(
         (Solids("ellipsoid", centres, turn, torch.tensor([[2.0, 3, 1], [1, 2, 2]]), torch.ones(2)),)
     )
-    there = inside.integrals(*inner.rays(), ray_extent=inner.ray_extent)
+    framed_integrals = inside.integrals(*inner.rays(), extent=inner.ray_extent)
     world = inside.moved(torch.eye(3), GRID.centre).integrals(
         *rig.rays(), ray_extent=rig.ray_extent
     )
-    assert there.any()
-    assert torch.allclose(there, world, atol=1e-9)
+    assert framed_integrals.any()
+    assert torch.allclose(framed_integrals, world, atol=1e-9)
     assert torch.allclose(box.centre, torch.zeros(3, dtype=torch.float64), atol=1e-12)
 
 
@@ -125,14 +125,14 @@ def test_rays_are_cut_off_near_the_box_and_stay_on_their_lines():
     hit = (enter < leave) & (leave > 0)
     assert hit.any() and not hit.all()
     assert start.abs().max() < 30 and end.abs().max() < 30
-    for fraction, found in zip(
+    for fraction, part in zip(
         (enter.clamp(min=0), leave), (again[0].clamp(min=0), again[1]), strict=True
     ):
-        there, expected = (
-            start + found[:, None] * (end - start),
+        point, expected = (
+            start + part[:, None] * (end - start),
             first + fraction[:, None] * (last - first),
         )
-        assert torch.allclose(there[hit], expected[hit], atol=1e-9)
+        assert torch.allclose(point[hit], expected[hit], atol=1e-9)
     misses = (again[0] >= again[1]) | (again[1] <= 1e-9)
     assert torch.equal(misses, ~hit)
 

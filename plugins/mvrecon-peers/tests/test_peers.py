@@ -146,8 +146,8 @@ def test_half_a_voxel_or_pixel_a_flip_or_a_turn_would_exceed_the_tolerance(case:
     A, (x, exact) = ours(case, "joseph"), seen(case)
     right = A(x)
     grid, rig = CASES[case]
-    wrong = {f"flipped {axis}": A(x.flip(axis)) for axis in (2, 3, 4)}
-    wrong |= {
+    changed = {f"flipped {axis}": A(x.flip(axis)) for axis in (2, 3, 4)}
+    changed |= {
         f"views flipped {axis}": right.flip(axis) for axis in (2, 3, 4) if right.shape[axis] > 1
     }
     for axis in range(3):
@@ -155,7 +155,7 @@ def test_half_a_voxel_or_pixel_a_flip_or_a_turn_would_exceed_the_tolerance(case:
         affine[:3, 3] += grid.affine[:3, axis] / 2
         if case != "fan" or axis < 2:  # a fan sees one slice
             name = "radon" if rig.parallel else "drr"
-            wrong[f"half a voxel {axis}"] = PROJECTORS.build(
+            changed[f"half a voxel {axis}"] = PROJECTORS.build(
                 name, grid=Grid(grid.shape, affine), cameras=rig
             )(x)
     for axis, steps in ((-1, (0.5, 0)), (-2, (0, 0.5))):
@@ -164,10 +164,10 @@ def test_half_a_voxel_or_pixel_a_flip_or_a_turn_would_exceed_the_tolerance(case:
             moved = replace(
                 rig, origin=rig.origin + shift, source=rig.source + (shift if rig.parallel else 0)
             )
-            wrong[f"half a pixel {axis}"] = phantom().integrals(
+            changed[f"half a pixel {axis}"] = phantom().integrals(
                 *moved.rays(), ray_extent=rig.ray_extent
             )[None, None]
-    for name, views in wrong.items():
+    for name, views in changed.items():
         assert error(views, exact) > TOLERANCE, name
     assert error(right, exact) < TOLERANCE
 
@@ -212,11 +212,11 @@ def test_gradients_are_the_adjoint_and_batch_channels_and_types_go_through(peer:
 def test_what_a_library_does_not_compute_in_is_refused(peer: str):
     A = build(peer, PEERS[peer][2][-1])
     x = torch.rand(1, 1, *A.grid.shape)
-    wrong: list[Any] = [x.int(), x.bool(), torch.complex(x, x)]
-    wrong += [] if torch.float64 in A.precisions else [x.double()]
-    for given in wrong:
-        with pytest.raises(ValueError, match=str(given.dtype)):
-            A(given)
+    tensors: list[Any] = [x.int(), x.bool(), torch.complex(x, x)]
+    tensors += [] if torch.float64 in A.precisions else [x.double()]
+    for tensor in tensors:
+        with pytest.raises(ValueError, match=str(tensor.dtype)):
+            A(tensor)
     with pytest.raises(TypeError, match="ndarray"):
         A(x.numpy())
 

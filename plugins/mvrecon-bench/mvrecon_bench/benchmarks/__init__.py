@@ -1,1 +1,1 @@
-"""Measurements of what the parts cost and how wrong they are: run time against error."""
+"""Benchmarks: run time, memory and error of projectors and models."""

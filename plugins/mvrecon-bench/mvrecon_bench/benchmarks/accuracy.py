@@ -1,5 +1,5 @@
-"""How far a projector is from being right: matched, finite, repeatable, and its gradient by the
-pose.
+"""Accuracy of a projector: adjointness, values that are not finite, repeatability, and its gradient
+by the pose.
 """
 
 from collections.abc import Sequence

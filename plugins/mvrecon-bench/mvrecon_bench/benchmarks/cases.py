@@ -1,4 +1,4 @@
-"""What is projected, and by which rig: scenes, cameras and sizes of one benchmark."""
+"""Cases of a benchmark: scene, rig, sizes, device and precision."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -56,10 +56,10 @@ class Case:
                 )
         if self.n < 1 or not self.ratio > 0 or self.views < 1 or self.threads < 0:
             raise ValueError(f"A benchmark's n, ratio and views must be positive, got {self}")
-        found = "cuda" if torch.cuda.is_available() else "cpu"
+        device = "cuda" if torch.cuda.is_available() else "cpu"
         settled = {
             "views": FIXED_VIEWS.get(self.camera, self.views),
-            "device": found if self.device == "auto" else self.device,
+            "device": device if self.device == "auto" else self.device,
             "threads": self.threads or torch.get_num_threads(),
         }
         for name, value in settled.items():
@@ -117,7 +117,7 @@ def expand(
     A block `{about: {...}, vary: {axis: [values]}, **settings}` is the base with the changes of
     `about`, and from there every axis varied on its own.
     """
-    found: dict[Case, dict[str, Any]] = {}
+    cases: dict[Case, dict[str, Any]] = {}
     for name, block in plan.items():
         about = Case(**{**base, **block.get("about", {})})
         axes: Mapping[str, Sequence[Any]] = block.get("vary", {})
@@ -129,8 +129,8 @@ def expand(
             "block": name
         }
         for case in sorted(points, key=lambda case: case.n):
-            found.setdefault(case, settings)
-    return list(found.items())
+            cases.setdefault(case, settings)
+    return list(cases.items())
 
 
 def _cone(case: Case, sid: float, sdd: float, odd: int = 0, **angles: Any) -> Cameras:

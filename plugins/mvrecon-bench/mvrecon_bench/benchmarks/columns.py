@@ -1,4 +1,4 @@
-"""What each column of `results.csv` means, with its unit."""
+"""Columns of `results.csv`: meaning and unit of each."""
 
 KEYS = ("part", "options", "device", "dtype", "threads", "scene", "camera", "n", "ratio", "views")
 

@@ -1,6 +1,4 @@
-"""What a benchmark ran on: processor, threads, GPU, and the versions of everything that is
-compared.
-"""
+"""The machine of a benchmark: processor, threads, GPU, versions of the libraries compared."""
 
 import os
 import platform
@@ -28,7 +26,7 @@ PEERS = (
 def describe(peers: Sequence[str] = PEERS) -> dict[str, str]:
     """Name -> version or description."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
-    found = {
+    facts = {
         "processor": processor(),
         "cores": str(os.cpu_count()),
         "threads": str(torch.get_num_threads()),
@@ -36,10 +34,10 @@ def describe(peers: Sequence[str] = PEERS) -> dict[str, str]:
     }
     for name in peers:
         try:
-            found[name] = metadata.version(name)
+            facts[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return {**versions(), **found}
+            facts[name] = "not installed"
+    return {**versions(), **facts}
 
 
 def processor() -> str:

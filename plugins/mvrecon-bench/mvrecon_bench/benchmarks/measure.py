@@ -1,6 +1,4 @@
-"""How long a call takes and how much memory it needs, launch and waiting for the device
-included.
-"""
+"""Run time in ms and memory in MB of a call, its launch and the wait for the device included."""
 
 import ctypes
 import os
@@ -34,9 +32,9 @@ def once(call: Call, device: str) -> tuple[Any, float]:
     """What a call returns, and the seconds it took."""
     wait(device)
     start = time.perf_counter()
-    found = call()
+    result = call()
     wait(device)
-    return found, time.perf_counter() - start
+    return result, time.perf_counter() - start
 
 
 def wait(device: str) -> None:
@@ -79,11 +77,11 @@ def with_memory(call: Call, device: str) -> tuple[Any, float]:
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
-        found = once(call, device)[0]
-        return found, (torch.cuda.max_memory_allocated(device) - before) / 2**20
+        result = once(call, device)[0]
+        return result, (torch.cuda.max_memory_allocated(device) - before) / 2**20
     before = _fresh_mark()
-    found = call()
-    return found, max(_high_mark() - before, 0.0)  # in this order a NaN stays
+    result = call()
+    return result, max(_high_mark() - before, 0.0)  # in this order a NaN stays
 
 
 def _fresh_mark() -> float:

@@ -76,14 +76,14 @@ class Operators:
 
     def groups(self) -> list[list[Job]]:
         """What is measured together: one case by all parts that take it."""
-        found = []
+        groups = []
         for case, settings in self.plan:
             parallel, block = case.cameras().parallel, settings["block"]
             parts = [part for part in self.parts if part.takes(case.n, parallel, block)]
-            found.append(
+            groups.append(
                 [Job(part, case, parts[0], settings.get("repeat_s", 5.0)) for part in parts]
             )
-        return found
+        return groups
 
     def label(self, row: Row) -> str:
         """A row's part, short."""
@@ -108,7 +108,7 @@ class Operators:
                 "load": load_average(),
             }
             common |= {"floor_thin": truth.floor_thin, "floor_pixel": truth.floor_pixel}
-            tried: list[tuple[Trial, Row, float]] = []
+            trials: list[tuple[Trial, Row, float]] = []
             for job in jobs:
                 say(f"{shown}: {job.part.label}")
                 row = {**job.row, **common}
@@ -120,9 +120,9 @@ class Operators:
                 ) as error:  # whatever a part raises is its row's status, not the end of the run
                     yield {**row, "status": f"skipped: {reason(error)}"}
                 else:
-                    tried.append((trial, row, job.repeat_s))
+                    trials.append((trial, row, job.repeat_s))
             say(f"{shown}: times")
-            yield from self._timed(tried, case, jobs[0].first)
+            yield from self._timed(trials, case, jobs[0].first)
 
     def _forecast(self, row: Row, rows: Sequence[Row]) -> dict[str, float]:
         """Seconds of each call by the work (rays times voxels along an edge) of the largest similar
@@ -163,14 +163,14 @@ class Operators:
         for name in ("thin", "pixel"):
             row[f"error_{name}"] = relative_error(views[0, 0].cpu(), getattr(truth, name))
         results = [
-            found
-            for found in (views, volume, first["volume_grad"], *(pose or ()))
-            if found is not None
+            result
+            for result in (views, volume, first["volume_grad"], *(pose or ()))
+            if result is not None
         ]
         row["nans"] = accuracy.not_finite(results)
         if pose is not None:
-            found = accuracy.rigid(pose, trial.cameras, trial.grid)[truth.watched]
-            row["pose_cosine"] = accuracy.cosine(found, truth.pose)
+            result = accuracy.rigid(pose, trial.cameras, trial.grid)[truth.watched]
+            row["pose_cosine"] = accuracy.cosine(result, truth.pose)
         return row | self._repeat(trial, {"forward": views, "adjoint": volume}, repeat_s)
 
     def _repeat(
@@ -181,8 +181,8 @@ class Operators:
         for call, name in (("forward", "peak_mb"), ("adjoint", "adjoint_peak_mb")):
             before = first[call]
             if before is not None and trial.seconds[call] <= repeat_s:
-                found, row[name] = trial.again(call)
-                same.append(accuracy.same_bits(found, before))
+                result, row[name] = trial.again(call)
+                same.append(accuracy.same_bits(result, before))
         row["repeatable"] = all(same) if same else None
         volume = first["adjoint"]
         if volume is not None and trial.seconds["forward"] <= repeat_s:
@@ -195,29 +195,29 @@ class Operators:
         return row
 
     def _timed(
-        self, tried: Sequence[tuple[Trial, Row, float]], case: Case, first: Part
+        self, trials: Sequence[tuple[Trial, Row, float]], case: Case, first: Part
     ) -> Iterator[Row]:
         """Each call of all parts in turns; then the rows, with their ratios to the first part's."""
         for call in CALLS:
-            took = {
+            seconds_of = {
                 n: trial.seconds[call]
-                for n, (trial, _, _) in enumerate(tried)
+                for n, (trial, _, _) in enumerate(trials)
                 if call in trial.seconds
             }
-            short = {n: s for n, s in took.items() if s <= tried[n][2]}
-            calls = {n: getattr(tried[n][0], call) for n in short}
-            found = interleaved(calls, short, self.repeats, case.device)
-            for n, seconds in took.items():
-                trial, row, _ = tried[n]
-                timing = found.get(n, Timing(1e3 * seconds, 1))
+            short = {n: s for n, s in seconds_of.items() if s <= trials[n][2]}
+            calls = {n: getattr(trials[n][0], call) for n in short}
+            timings = interleaved(calls, short, self.repeats, case.device)
+            for n, seconds in seconds_of.items():
+                trial, row, _ = trials[n]
+                timing = timings.get(n, Timing(1e3 * seconds, 1))
                 row[f"{call}_ms"], row["calls"] = (
                     timing.ms,
                     min(row.get("calls", timing.calls), timing.calls),
                 )
-                if n not in found:
+                if n not in timings:
                     trial.notes.append(f"{call}: one call, which took {seconds:.1f} s")
-        unit = next((row for trial, row, _ in tried if trial.part == first), {})
-        for trial, row, _ in tried:
+        unit = next((row for trial, row, _ in trials if trial.part == first), {})
+        for trial, row, _ in trials:
             ratios = {
                 f"{c}_ratio": row[f"{c}_ms"] / unit[f"{c}_ms"]
                 for c in CALLS

@@ -99,12 +99,16 @@ class Precision:
         """
         where = {"device": self.device, "threads": self.threads}
         return [
-            [Job(task, each, self.made[task][0], **where) for each in self._of(task)]
+            [Job(task, precision, self.made[task][0], **where) for precision in self._of(task)]
             for task in self.tasks
         ]
 
     def _of(self, task: str) -> list[str]:
-        return [each for each in self.precisions if task in NETS or PRECISIONS[each][1] is None]
+        return [
+            precision
+            for precision in self.precisions
+            if task in NETS or PRECISIONS[precision][1] is None
+        ]
 
     def label(self, row: Row) -> str:
         """A row's task and precision, short."""
@@ -119,12 +123,12 @@ class Precision:
         say(jobs[0].task)
         common: Row = {"load": load_average()}
         with threads(self.threads), torch.no_grad():
-            found = self._compared(self.made[jobs[0].task][1](), self._of(jobs[0].task))
+            rows_of = self._compared(self.made[jobs[0].task][1](), self._of(jobs[0].task))
         for job in jobs:
-            yield {**job.row, **common, **found[job.precision]}
+            yield {**job.row, **common, **rows_of[job.precision]}
 
     def _compared(self, task: Task, precisions: Sequence[str]) -> dict[str, Row]:
-        found: dict[str, Row] = {}
+        rows: dict[str, Row] = {}
         calls: dict[int, Callable[[], Tensor]] = {}
         first: dict[int, float] = {}
         truth = task.call(TRUTH)().double()
@@ -133,36 +137,36 @@ class Precision:
                 call = task.call(precision)
                 answer, peak = with_memory(call, self.device)
                 first[key], calls[key] = once(call, self.device)[1], call
-                found[precision] = {
+                rows[precision] = {
                     "status": "ok",
                     "peak_mb": peak,
                     **_errors(answer.double(), truth),
                 }
                 if task.score is not None:
-                    found[precision]["psnr"] = task.score(answer)
+                    rows[precision]["psnr"] = task.score(answer)
             except (
                 Exception
             ) as error:  # a device may not have a precision; that is its row's status
-                found[precision] = {"status": f"skipped: {reason(error)}"}
+                rows[precision] = {"status": f"skipped: {reason(error)}"}
         for key, timing in interleaved(calls, first, self.repeats, self.device).items():
-            found[precisions[key]] |= {"ms": timing.ms, "calls": timing.calls}
-        usual = found[USUAL].get("ms", float("nan"))
-        for row in found.values():
+            rows[precisions[key]] |= {"ms": timing.ms, "calls": timing.calls}
+        usual = rows[USUAL].get("ms", float("nan"))
+        for row in rows.values():
             if "ms" in row:
                 row["ratio"] = row["ms"] / usual
-        return found
+        return rows
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """The table."""
         return {"table": table(rows, self.columns)}
 
 
-def _errors(found: Tensor, truth: Tensor) -> dict[str, float]:
-    gap = found - truth
+def _errors(result: Tensor, truth: Tensor) -> dict[str, float]:
+    gap = result - truth
     return {
         "error": (gap.norm() / truth.norm()).item(),
         "worst": (gap.abs().max() / truth.abs().max()).item(),
-        "not_finite": float((~found.isfinite()).sum()),
+        "not_finite": float((~result.isfinite()).sum()),
     }
 
 

@@ -1,4 +1,4 @@
-"""What `bench=precision` does in each precision: operators, a U-Net, the cross-view model."""
+"""Tasks of `bench=precision`: operators, a U-Net and the cross-view model, in each precision."""
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -58,10 +58,10 @@ def _operator(case: Case, method: str, direction: str) -> Task:
     A = PROJECTORS.build("drr", grid=case.grid(), cameras=case.cameras(), method=method).to(
         case.device
     )
-    given = x if direction == "forward" else A(x)
+    argument = x if direction == "forward" else A(x)
 
     def call(precision: str) -> Callable[[], Tensor]:
-        operand = given.to(PRECISIONS[precision][0])
+        operand = argument.to(PRECISIONS[precision][0])
         return (lambda: A(operand)) if direction == "forward" else (lambda: A.T(operand))
 
     return Task(call)

@@ -76,12 +76,12 @@ def operators_table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
 
 def left_out(rows: Sequence[Row]) -> str:
     """The parts that were skipped, each reason once, and on how many cases."""
-    found: dict[tuple[str, str], int] = {}
+    counts: dict[tuple[str, str], int] = {}
     for row in rows:
         if row["status"] != "ok":
             key = part_label(row), row["status"]
-            found[key] = found.get(key, 0) + 1
-    lines = [(part, status, str(count)) for (part, status), count in found.items()]
+            counts[key] = counts.get(key, 0) + 1
+    lines = [(part, status, str(count)) for (part, status), count in counts.items()]
     return f"\n## Left out\n\n{markdown(('part', 'status', 'cases'), lines, 2)}" if lines else ""
 
 
@@ -92,11 +92,11 @@ def legend(columns: Mapping[str, str]) -> str:
 
 def figure(row: Row, name: str, form: str | None = None) -> str:
     """A figure as the tables show it."""
-    found = row.get(name, "")
+    value = row.get(name, "")
     return (
-        format(found, SHOWN.get(name, ".4g") if form is None else form)
-        if isinstance(found, float)
-        else str(found)
+        format(value, SHOWN.get(name, ".4g") if form is None else form)
+        if isinstance(value, float)
+        else str(value)
     )
 
 

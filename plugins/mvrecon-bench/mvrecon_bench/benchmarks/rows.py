@@ -1,6 +1,4 @@
-"""A table that grows by a row at a time and outlives a crash: what is in it need not be measured
-again.
-"""
+"""A table on the disk, written row by row, so that a benchmark goes on where it was stopped."""
 
 import csv
 import io
@@ -92,8 +90,8 @@ def value(text: str) -> Any:
 
 def number(row: Mapping[str, Any], name: str) -> float:
     """A figure of a row; NaN where there is none."""
-    found = row.get(name)
-    return found if isinstance(found, float) else math.nan
+    figure = row.get(name)
+    return figure if isinstance(figure, float) else math.nan
 
 
 def _line(cells: Sequence[str]) -> str:

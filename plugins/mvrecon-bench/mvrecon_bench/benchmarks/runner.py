@@ -1,6 +1,4 @@
-"""Runs a benchmark: what is in its table already is left alone, what is not is measured, then the
-report is written.
-"""
+"""The run of a benchmark: rows that its table lacks are measured, then the report is written."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path

@@ -121,32 +121,32 @@ class Scaling:
     ) -> Iterator[Row]:
         """The rows of points on one axis."""
         say(jobs[0].axis)
-        tried: list[tuple[Point, Trial, Row]] = []
+        trials: list[tuple[Point, Trial, Row]] = []
         for point in jobs:
             row = {**point.row, "load": load_average()}
             try:
-                tried.append((point, point.trial(), row))
+                trials.append((point, point.trial(), row))
             except (
                 Exception
             ) as error:  # whatever a part raises is its row's status, not the end of the run
                 yield {**row, "status": f"skipped: {reason(error)}"}
         for call in CALLS:
             say(f"{jobs[0].axis}: {call}")
-            self._time(tried, call, jobs[0].device)
-        for _, trial, row in tried:
+            self._time(trials, call, jobs[0].device)
+        for _, trial, row in trials:
             note = "; ".join(trial.notes)
             status = "ok" if "forward_ms" in row else f"skipped: {note}"
             yield {**row, "backend": trial.backend, "status": status, "note": note}
 
-    def _time(self, tried: Sequence[tuple[Point, Trial, Row]], call: str, device: str) -> None:
+    def _time(self, trials: Sequence[tuple[Point, Trial, Row]], call: str, device: str) -> None:
         calls, first = {}, {}
-        for key, (point, trial, _) in enumerate(tried):
+        for key, (point, trial, _) in enumerate(trials):
             with threads(point.threads):
                 if trial.attempt(call, 0.0, math.inf, math.inf) is not None:
                     calls[key] = threads(point.threads)(getattr(trial, call))
                     first[key] = trial.seconds[call]
         for key, timing in interleaved(calls, first, self.repeats, device).items():
-            row = tried[key][2]
+            row = trials[key][2]
             row |= {
                 f"{call}_ms": timing.ms,
                 "calls": min(row.get("calls", timing.calls), timing.calls),
@@ -175,14 +175,14 @@ class Scaling:
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[tuple[float, float]]]:
     """(part, axis, call) -> (amount of work, ms), the least amount first."""
-    found: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    curves: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for row in sorted(rows, key=lambda row: row["size"]):
         for call in CALLS:
             if (ms := number(row, f"{call}_ms")) == ms:
-                found.setdefault((report.part_label(row), row["axis"], call), []).append(
+                curves.setdefault((report.part_label(row), row["axis"], call), []).append(
                     (row["size"], ms)
                 )
-    return found
+    return curves
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> tuple[float, float]:

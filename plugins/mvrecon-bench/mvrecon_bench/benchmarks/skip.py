@@ -1,6 +1,4 @@
-"""`bench=skip`: what skipping gains, against the full cube and against the cropped volume, and what
-it changes.
-"""
+"""`bench=skip`: gain of skipping over the full cube and the cropped volume, and its error."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -103,13 +101,13 @@ class Skip:
 
     def groups(self) -> list[list[Job]]:
         """What is measured together: the modes of a task."""
-        found = []
+        groups = []
         for name, scene in self.scenes.items():
             where = {"device": self.device, "threads": self.threads}
             for rig_name in scene["rigs"]:
                 for task, methods in self.tasks.items():
                     keys = [{"rig": rig_name, "method": method, "task": task} for method in methods]
-                    found += [
+                    groups += [
                         [Job(name, **key, mode=mode, n=self.n, **where) for mode in self.modes]
                         for key in keys
                     ]
@@ -122,10 +120,10 @@ class Skip:
                         "method": "joseph",
                         "task": task,
                     }
-                    found.append(
+                    groups.append(
                         [Job(name, **key, mode=mode, n=n, **where) for mode in self._modes(task)]
                     )
-        return found
+        return groups
 
     def _modes(self, task: str) -> list[str]:
         return [*DENSE, *self.learned["modes"]] if task in MODEL and self.learned else self.modes
@@ -140,18 +138,18 @@ class Skip:
         """The rows of some modes of a task; all of its modes are timed, since they only compare
         side by side.
         """
-        job = jobs[0]
-        say(f"{job.scene}, {job.rig}, {job.method}: {job.task}")
+        first = jobs[0]
+        say(f"{first.scene}, {first.rig}, {first.method}: {first.task}")
         common: Row = {"load": load_average()}
-        with threads(job.threads), torch.no_grad():
+        with threads(first.threads), torch.no_grad():
             try:
-                setup, known = self._model(job) if job.task in MODEL else self._operator(job)
-                found = compared(setup, self._modes(job.task), self.repeats, job.device)
+                setup, known = self._model(first) if first.task in MODEL else self._operator(first)
+                figures = compared(setup, self._modes(first.task), self.repeats, first.device)
                 common |= known
             except Exception as error:  # what a scene, a rig or a file raises is its rows' status
-                found = {each.mode: {"status": f"skipped: {reason(error)}"} for each in jobs}
-        for each in jobs:
-            yield {**each.row, **common, **found[each.mode]}
+                figures = {job.mode: {"status": f"skipped: {reason(error)}"} for job in jobs}
+        for job in jobs:
+            yield {**job.row, **common, **figures[job.mode]}
 
     def _operator(self, job: Job) -> tuple[Callable[[str], Trial], Row]:
         """How a mode of an operator's task is set up, and what is known of the case."""
@@ -189,12 +187,12 @@ class Skip:
         }
 
 
-def facts(source: str, there: Bool[Tensor, "d h w"], cameras: Cameras) -> Row:
+def facts(source: str, support: Bool[Tensor, "d h w"], cameras: Cameras) -> Row:
     """What a row tells of a volume, by its voxels that are not zero, and of a rig."""
     return {
         "source": source,
-        "grid": "x".join(map(str, there.shape)),
+        "grid": "x".join(map(str, support.shape)),
         "views": "x".join(map(str, (len(cameras), *cameras.shape))),
-        "occupancy": there.double().mean().item(),
-        "box": Box.around(there).size / there.numel(),
+        "occupancy": support.double().mean().item(),
+        "box": Box.around(support).size / support.numel(),
     }

@@ -1,6 +1,4 @@
-"""The modes of one task side by side: what each gives, how far from skipping nothing, and how long
-it takes.
-"""
+"""The modes of one task of `bench=skip` side by side: result, error and time of each."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -40,25 +38,27 @@ def compared(
         try:
             trial = setup(mode)
             once(trial.call, device)  # compiles, and fills caches
-            (found, took), peak = with_memory(lambda call=trial.call: once(call, device), device)
-            whole = trial.whole(found)
+            (result, seconds), peak = with_memory(
+                lambda call=trial.call: once(call, device), device
+            )
+            whole = trial.whole(result)
             reference = whole if mode == OFF else reference
             row = {"peak_mb": peak, **difference(whole, reference), **_built(trial, device)}
             row |= {"psnr": trial.score()} if trial.score is not None else {}
         except Exception as error:
             rows[mode] = {"status": f"skipped: {reason(error)}"}
         else:
-            tried[mode] = Tried(trial, took, row)
+            tried[mode] = Tried(trial, seconds, row)
     return rows | _timed(tried, repeats, device)
 
 
-def difference(found: Tensor, reference: Tensor | None) -> Row:
+def difference(result: Tensor, reference: Tensor | None) -> Row:
     """Greatest absolute difference, and how many values differ in any bit."""
     if reference is None:
         return {}
-    bits = [values.contiguous().view(torch.int32) for values in (found, reference)]
+    bits = [values.contiguous().view(torch.int32) for values in (result, reference)]
     return {
-        "error": (found - reference).abs().max().item(),
+        "error": (result - reference).abs().max().item(),
         "differing": int((bits[0] != bits[1]).sum()),
     }
 

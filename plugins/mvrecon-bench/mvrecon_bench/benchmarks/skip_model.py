@@ -1,6 +1,4 @@
-"""The cross-view model in `bench=skip`, end to end: on the grid, on one cropped by hand, with
-supports from views.
-"""
+"""The cross-view model in `bench=skip`: on the whole grid, a cropped one, a visual hull."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -146,5 +144,5 @@ class Learned:
         return volume_metrics(volume, case.volume, case.inside, self.data_range)["psnr"]
 
 
-def _told(found: Support) -> tuple[str, str]:
-    return found.kind, f"{found.fraction:.1%} of the grid"
+def _told(support: Support) -> tuple[str, str]:
+    return support.kind, f"{support.fraction:.1%} of the grid"

@@ -1,6 +1,4 @@
-"""The rows of `bench=skip` as Markdown and as points of a plot, the cases in which skipping loses
-among them.
-"""
+"""Report of `bench=skip`: Markdown tables and plots, with the cases in which skipping loses."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -56,10 +54,10 @@ def scenes(rows: Sequence[Row]) -> str:
     ordered = sorted(
         rows, key=lambda row: "support" in row
     )  # what tells more comes last, and stays
-    found = {
+    facts = {
         (row["scene"], row["rig"], row["source"], row["grid"], row["views"]): row for row in ordered
     }
-    cells = [(*key, *(figure(row, name, ".2%") for name in names)) for key, row in found.items()]
+    cells = [(*key, *(figure(row, name, ".2%") for name in names)) for key, row in facts.items()]
     return markdown(("scene", "rig", "source", "grid", "views", *names), cells, 5)
 
 
@@ -86,11 +84,11 @@ def lost(rows: Iterable[Row], over: str) -> str:
 
 def panels(rows: Iterable[Row]) -> dict[str, dict[str, list[tuple[str, float]]]]:
     """Task -> against what -> (scene, times as fast) of every rig and method, in mode auto."""
-    found: dict[str, dict[str, list[tuple[str, float]]]] = {}
+    curves: dict[str, dict[str, list[tuple[str, float]]]] = {}
     for row in rows:
         if row["mode"] == "auto" and row["status"] == "ok":
-            kinds = found.setdefault(row["task"], {text: [] for text in AGAINST.values()})
+            kinds = curves.setdefault(row["task"], {text: [] for text in AGAINST.values()})
             for name, text in AGAINST.items():
                 if (times := number(row, name)) == times:
                     kinds[text].append((row["scene"], times))
-    return {task: kinds for task, kinds in found.items() if all(kinds.values())}
+    return {task: kinds for task, kinds in curves.items() if all(kinds.values())}

@@ -1,6 +1,4 @@
-"""What `bench=skip` looks at: volumes that fill from a part in three hundred of their cube to all
-of it.
-"""
+"""Scenes of `bench=skip`: objects that fill from 1/300 of their cube to all of it."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -100,9 +98,9 @@ def seen(config: Mapping[str, Any], A: Projector, index: int = 0) -> Seen:
     """
     options, case = _chosen(config), config.get("case", 0) + index
     if options["name"] in ("random", "body"):
-        found = filled({**config, "case": case}, A.grid)
-        volume = found.volume[None]
-        return Seen(A(volume[None]), volume, volume > 0, found.source)
+        body = filled({**config, "case": case}, A.grid)
+        volume = body.volume[None]
+        return Seen(A(volume[None]), volume, volume > 0, body.source)
     scene: Scene = SCENES.from_config(options)
     sample = scene.sample(case, 0, A.grid, A.cameras)
     return Seen(sample.views[None], sample.volume, sample.inside, sample.name)

@@ -1,4 +1,4 @@
-"""What `bench=skip` times: one operator at one task, in each mode of skipping.
+"""Tasks of `bench=skip`: forward, adjoint and SIRT with one operator in each mode of skipping.
 
 Two modes skip nothing: "off" on the whole cube, and "cropped", off on the box around what is there,
 which is what a careful user does by hand. Neither pays for the mask that tells the box; every other

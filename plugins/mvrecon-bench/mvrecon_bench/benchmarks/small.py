@@ -86,8 +86,8 @@ class Small:
 
     def _times(self, trial: Trial, wide: Trial) -> Row:
         """Of SIRT, and of its two calls with the rig's views and with `MORE` times as many."""
-        for one in (trial, wide):  # no voxel is zero, as in an iterate of SIRT
-            one.x = torch.rand(one.x.shape, generator=torch.Generator().manual_seed(0)).to(one.x)
+        for run in (trial, wide):  # no voxel is zero, as in an iterate of SIRT
+            run.x = torch.rand(run.x.shape, generator=torch.Generator().manual_seed(0)).to(run.x)
         views = trial.forward()
         calls = {
             0: lambda: sirt(trial.A, views, self.iterations),

@@ -1,6 +1,4 @@
-"""What the operators should reach, computed from the rows of a benchmark: met, missed, or not
-measured.
-"""
+"""Targets of the operators, from the rows of a benchmark: met, missed, or not measured."""
 
 import json
 import math
@@ -40,12 +38,12 @@ class Measured:
     def worst(self, figure: Callable[[Row], float], **wanted: Any) -> float:
         """The greatest figure of our own compiled parts' rows with these values; NaN if none."""
         rows = (r for r in self.rows if r.get("part") in OURS and r.get("backend") != "reference")
-        found = [
+        figures = [
             figure(row)
             for row in rows
             if all(row.get(name) == value for name, value in wanted.items())
         ]
-        return max((f for f in found if f == f), default=math.nan)
+        return max((f for f in figures if f == f), default=math.nan)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,4 @@
-"""One part at work on one geometry: its four calls, and what each of them gave and took the first
-time.
-"""
+"""A projector on one geometry: result and time of its forward, adjoint and both gradients."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -53,8 +51,8 @@ class Trial:
     def backend(self) -> str:
         """What computed, as far as the part tells."""
         for name in ("last_backend", "backend"):
-            if isinstance(found := getattr(self.A, name, None), str):
-                return found
+            if isinstance(backend := getattr(self.A, name, None), str):
+                return backend
         return "own"
 
     @torch.no_grad()
@@ -83,12 +81,12 @@ class Trial:
             self._poses = self.part.build(self.grid, rig, self.device), leaves
         A, leaves = self._poses
         views = A(self.x)
-        found = torch.autograd.grad(views, leaves, self.y.to(views.dtype), allow_unused=True)
-        if all(g is None for g in found):
+        gradients = torch.autograd.grad(views, leaves, self.y.to(views.dtype), allow_unused=True)
+        if all(g is None for g in gradients):
             raise NotImplementedError("no gradient reaches the cameras")
         return [
             torch.zeros_like(leaf) if g is None else g
-            for g, leaf in zip(found, leaves, strict=True)
+            for g, leaf in zip(gradients, leaves, strict=True)
         ]
 
     def attempt(self, call: str, forecast_s: float, repeat_s: float, limit_s: float) -> Any:
@@ -103,17 +101,17 @@ class Trial:
             )
             return None
         try:
-            found, took = once(getattr(self, call), self.device)
-            self.first_s.setdefault(call, took)
-            if took > repeat_s:
-                found, took = once(getattr(self, call), self.device)
+            result, seconds = once(getattr(self, call), self.device)
+            self.first_s.setdefault(call, seconds)
+            if seconds > repeat_s:
+                result, seconds = once(getattr(self, call), self.device)
         except (
             Exception
         ) as error:  # a part of another library may raise anything; it must not end the benchmark
             self.notes.append(f"{call}: {reason(error)}")
             return None
-        self.seconds[call] = took
-        return found
+        self.seconds[call] = seconds
+        return result
 
     def again(self, call: str) -> tuple[Any, float]:
         """The result of one more run, and the MB that it needed."""

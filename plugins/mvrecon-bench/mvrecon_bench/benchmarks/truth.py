@@ -1,16 +1,16 @@
-"""What the views ought to be: closed-form integrals along thin rays, their mean over each pixel,
-and their derivative.
+"""True views: closed-form integrals along thin rays, their mean over a pixel, their derivative.
 
 The mean over a pixel is what a detector measures; a thin ray is what most projectors compute. Their
 rankings differ, so a benchmark shows both.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -65,32 +65,12 @@ def relative_error(views: Float[Tensor, "m v u"], truth: Float[Tensor, "m v u"])
     return ((views.double() - truth).norm() / truth.norm()).item()
 
 
-def split(cameras: Cameras, factor: int) -> Cameras:
-    """The same detectors with every pixel cut into factor x factor; undone by `Cameras.binned`."""
-    shift = (cameras.u + cameras.v) * (1 - factor) / (2 * factor)
-    source = cameras.source + shift if cameras.parallel else cameras.source
-    shape = (cameras.shape[0] * factor, cameras.shape[1] * factor)
-    return replace(
-        cameras,
-        source=source,
-        origin=cameras.origin + shift,
-        u=cameras.u / factor,
-        v=cameras.v / factor,
-        shape=shape,
-    )
-
-
-def binned(views: Float[Tensor, "*n v u"], factor: int) -> Float[Tensor, "*n v2 u2"]:
-    """Mean over factor x factor pixels."""
-    return views.unflatten(-2, (-1, factor)).unflatten(-1, (-1, factor)).mean(dim=(-3, -1))
-
-
 def pixel_mean(phantom: Phantom, cameras: Cameras, rays: int) -> Float[Tensor, "m v u"]:
     """Mean of the exact integrals over rays x rays rays that fill each pixel evenly, in float64."""
-    fine = split(cameras, rays)
-    return torch.cat(
-        [binned(phantom.integrals(*one.rays(), ray_extent=one.ray_extent), rays) for one in fine]
+    views = (
+        phantom.integrals(*one.rays(), ray_extent=one.ray_extent) for one in cameras.refined(rays)
     )
+    return torch.cat([avg_pool2d(view, rays) for view in views])
 
 
 def pose_gradient(

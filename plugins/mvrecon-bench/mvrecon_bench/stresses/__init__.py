@@ -1,1 +1,1 @@
-"""The stress plan: what a part must bear, case by case, and what was measured."""
+"""The stress plan: cases, what each asks of a part, and the measured violation."""

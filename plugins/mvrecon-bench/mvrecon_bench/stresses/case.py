@@ -1,4 +1,4 @@
-"""One case of the stress plan: what is done to a part, and what must hold."""
+"""A case of the stress plan: its measure, and the tolerance."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

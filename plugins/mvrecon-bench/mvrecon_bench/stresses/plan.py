@@ -1,4 +1,4 @@
-"""Which cases are done to which subjects."""
+"""The stress plan as a list: every case with every part that it is meant for."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
@@ -14,8 +14,8 @@ from mvrecon_bench.stresses.subject import Subject, subject_of
 #: The files of cases, in the plan's order.
 FILES = (
     *("rays", "segments", "scales", "algebra", "accuracy", "derivatives"),
-    *("cameras", "images", "poses", "heads", "models", "counts", "line_integrals"),
-    *("tensors", "dtypes", "values", "sizes", "repeats", "gpu"),
+    *("cameras", "images", "poses", "heads", "models", "model_state", "counts", "line_integrals"),
+    *("tensors", "dtypes", "values", "sizes", "repeatability", "gpu"),
 )
 
 
@@ -25,17 +25,17 @@ def cases() -> list[Case]:
     Raises:
         ValueError: two cases of one number are done to one kind of part.
     """
-    found = [
+    listed = [
         case
         for file in FILES
         for case in import_module(f"mvrecon_bench.stresses.cases.{file}").CASES
     ]
-    keys = [(case.number, case.kind, case.name) for case in found]
+    keys = [(case.number, case.kind, case.name) for case in listed]
     if len(set(keys)) < len(keys):
         raise ValueError(
             f"Two cases are the same: {sorted(key for key in set(keys) if keys.count(key) > 1)}"
         )
-    return sorted(found, key=lambda case: case.number)
+    return sorted(listed, key=lambda case: case.number)
 
 
 def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> list[Subject]:
@@ -53,7 +53,7 @@ def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> 
     for dtype in dtypes:
         if dtype not in DTYPES:
             raise LookupError(f"No dtype is named {dtype!r}{hint(dtype, DTYPES)}")
-    named = every_part() if parts == "all" else [_part(each) for each in _listed(parts)]
+    named = every_part() if parts == "all" else [_part(part) for part in _listed(parts)]
     return [
         subject_of(kind, name, options, device, DTYPES[dtype])
         for kind, name, options in named
@@ -66,24 +66,24 @@ def every_part() -> list[tuple[str, str, dict[str, Any]]]:
 
     Our own projectors come with each of their methods.
     """
-    found: list[tuple[str, str, dict[str, Any]]] = []
+    parts: list[tuple[str, str, dict[str, Any]]] = []
     for kind in KINDS[:-1]:
         for name in REGISTRIES[kind].names():
             ours = kind == "projector" and REGISTRIES[kind].origin(name).startswith("mvrecon.")
-            found += (
+            parts += (
                 [(kind, name, {"method": method}) for method in METHODS]
                 if ours
                 else [(kind, name, {})]
             )
-    return [*found, ("mvrecon", "", {})]
+    return [*parts, ("mvrecon", "", {})]
 
 
-def jobs(given: Iterable[Subject], chosen: Sequence[int] = ()) -> Iterator[tuple[Case, Subject]]:
+def jobs(subjects: Iterable[Subject], chosen: Sequence[int] = ()) -> Iterator[tuple[Case, Subject]]:
     """Each case with each subject that it is meant for; only these numbers, where some are
     chosen.
     """
     every = [case for case in cases() if not chosen or case.number in chosen]
-    for subject in given:
+    for subject in subjects:
         for case in every:
             if case.kind == subject.kind and subject.dtype in case.dtypes:
                 yield case, subject
@@ -93,21 +93,21 @@ def _listed(parts: str | Sequence[Any]) -> Sequence[Any]:
     return [parts] if isinstance(parts, str) else parts
 
 
-def _part(given: str | Mapping[str, Any]) -> tuple[str, str, dict[str, Any]]:
+def _part(config: str | Mapping[str, Any]) -> tuple[str, str, dict[str, Any]]:
     """Kind, name and options of one part."""
-    if isinstance(given, str):
-        given = {"name": given}
-    options = {key: value for key, value in given.items() if key not in ("kind", "name")}
-    name = given.get("name", "")
-    if given.get("kind", name) == "mvrecon":
+    if isinstance(config, str):
+        config = {"name": config}
+    options = {key: value for key, value in config.items() if key not in ("kind", "name")}
+    name = config.get("name", "")
+    if config.get("kind", name) == "mvrecon":
         return "mvrecon", "", {}
     kinds = (
-        [given["kind"]]
-        if "kind" in given
+        [config["kind"]]
+        if "kind" in config
         else [kind for kind in KINDS[:-1] if name in REGISTRIES[kind].names()]
     )
     if not kinds or kinds[0] not in KINDS:
-        known = [each for kind in KINDS[:-1] for each in REGISTRIES[kind].names()]
-        raise LookupError(f"No part to stress is {dict(given)}{hint(name, known)}")
+        known = [part for kind in KINDS[:-1] for part in REGISTRIES[kind].names()]
+        raise LookupError(f"No part to stress is {dict(config)}{hint(name, known)}")
     REGISTRIES[kinds[0]].origin(name)
     return kinds[0], name, options

@@ -1,6 +1,4 @@
-"""What must be refused, and how: by an error of the right kind whose message tells what was
-wrong.
-"""
+"""Refusals: the right type of exception, with a message that names the fault."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -32,7 +30,7 @@ def refusal(
     return "goes well"
 
 
-def none_of(wrong: Mapping[str, str]) -> float:
+def none_of(faults: Mapping[str, str]) -> float:
     """0 where no sample did anything wrong.
 
     Args:
@@ -41,7 +39,7 @@ def none_of(wrong: Mapping[str, str]) -> float:
     Raises:
         AssertionError: some did; the message begins with how many, and names them.
     """
-    if found := {name: text for name, text in wrong.items() if text}:
-        listed = "; ".join(f"{name}: {text}" for name, text in found.items())
-        raise AssertionError(f"{len(found)} of {len(wrong)}: {listed}")
+    if failures := {name: text for name, text in faults.items() if text}:
+        listed = "; ".join(f"{name}: {text}" for name, text in failures.items())
+        raise AssertionError(f"{len(failures)} of {len(faults)}: {listed}")
     return 0.0

@@ -1,6 +1,4 @@
-"""The stress plan as something that the runner of benchmarks can run: rows that outlive a crash,
-report and board.
-"""
+"""The stress plan as a benchmark, run row by row, with its report and board."""
 
 import json
 from collections import Counter
@@ -92,8 +90,8 @@ class Stress:
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
     """How many rows have each verdict."""
-    found = Counter(str(row["verdict"]) for row in rows)
-    return {verdict: found[verdict] for verdict in (PASS, FAIL, LEFT_OUT)}
+    numbers = Counter(str(row["verdict"]) for row in rows)
+    return {verdict: numbers[verdict] for verdict in (PASS, FAIL, LEFT_OUT)}
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -113,6 +111,6 @@ def table(rows: Sequence[Row]) -> str:
 
 def _cells(row: Row) -> list[str]:
     return [
-        format(found, ".3g") if isinstance(found := row.get(name, ""), float) else found
+        format(value, ".3g") if isinstance(value := row.get(name, ""), float) else value
         for name in SHOWN
     ]

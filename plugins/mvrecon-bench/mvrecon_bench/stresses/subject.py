@@ -1,4 +1,4 @@
-"""What is put under stress: a part by name, with its options, on a device and in a dtype."""
+"""A part under stress: its name and options, on a device and in a dtype."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -55,9 +55,9 @@ class Subject:
             [self.name or self.kind, *(f"{key}={value}" for key, value in self.options.items())]
         )
 
-    def build(self, **given: Any) -> Any:
+    def build(self, **options: Any) -> Any:
         """The part, with its options and what a case adds."""
-        return REGISTRIES[self.kind].build(self.name, **{**self.options, **given})
+        return REGISTRIES[self.kind].build(self.name, **{**self.options, **options})
 
     def random(self, *shape: int, seed: int = 0) -> Tensor:
         """Uniform in [0, 1), exactly representable in the dtype, on the device."""
@@ -221,18 +221,16 @@ def rig_about(
     one.
     """
     scale = _radius(grid) / _radius(GRID)
-    given = dict(detector or DETECTOR)
+    scaled = dict(detector or DETECTOR)
     for length in ("pixel_mm", "offset_mm"):
-        value = given.get(length, 0.0)
-        given[length] = (
-            [each * scale for each in value] if isinstance(value, list) else value * scale
-        )
+        value = scaled.get(length, 0.0)
+        scaled[length] = [mm * scale for mm in value] if isinstance(value, list) else value * scale
     if is_parallel:
-        rig = parallel(n_views, given, 60.0 * scale, start_degrees=11.0)
+        rig = parallel(n_views, scaled, 60.0 * scale, start_degrees=11.0)
     elif extent == "behind":
-        return dome(n_views, 30.0 * scale, 20.0 * scale, 120.0, given, target=grid.centre.tolist())
+        return dome(n_views, 30.0 * scale, 20.0 * scale, 120.0, scaled, target=grid.centre.tolist())
     else:
-        rig = circular(n_views, 40.0 * scale, 70.0 * scale, given, start_degrees=13.0)
+        rig = circular(n_views, 40.0 * scale, 70.0 * scale, scaled, start_degrees=13.0)
     return rig.moved(torch.eye(3), grid.centre)
 
 
@@ -243,9 +241,9 @@ def _radius(grid: Grid) -> float:
 #: The subjects that are more than a part, as strings, since their files import this one.
 SUBJECTS = {
     "projector": "mvrecon_bench.stresses.subject:ProjectorSubject",
-    "camera": "mvrecon_bench.stresses.rig:CameraSubject",
-    "head": "mvrecon_bench.stresses.learned:HeadSubject",
-    "model": "mvrecon_bench.stresses.learned:ModelSubject",
+    "camera": "mvrecon_bench.stresses.camera_subject:CameraSubject",
+    "head": "mvrecon_bench.stresses.learned_subjects:HeadSubject",
+    "model": "mvrecon_bench.stresses.learned_subjects:ModelSubject",
 }
 
 
@@ -255,22 +253,22 @@ def subject_of(kind: str, *arguments: Any) -> Subject:
     return getattr(import_module(module), name)(kind, *arguments)
 
 
-def gap(found: Tensor, expected: Tensor) -> float:
+def gap(result: Tensor, expected: Tensor) -> float:
     """Relative L2 error in float64; of expected zeros, the norm itself; infinite, not NaN, where a
     number is none.
     """
-    a, b = found.detach().double().cpu(), expected.detach().double().cpu()
+    a, b = result.detach().double().cpu(), expected.detach().double().cpu()
     norm = float(b.norm())
     return float((a - b).norm().nan_to_num(torch.inf)) / (norm if 0 < norm < torch.inf else 1.0)
 
 
-def bits(found: Tensor, expected: Tensor) -> float:
+def bits(result: Tensor, expected: Tensor) -> float:
     """How many values differ; two NaN are the same."""
-    if found.shape != expected.shape:
+    if result.shape != expected.shape:
         raise AssertionError(
-            f"expected the shape {tuple(expected.shape)}, got {tuple(found.shape)}"
+            f"expected the shape {tuple(expected.shape)}, got {tuple(result.shape)}"
         )
-    same = (found == expected) | (found.isnan() & expected.isnan())
+    same = (result == expected) | (result.isnan() & expected.isnan())
     return float((~same).sum())
 
 

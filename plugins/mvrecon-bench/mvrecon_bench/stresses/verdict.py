@@ -1,4 +1,4 @@
-"""One case done to one subject: what was measured, and what that means."""
+"""The verdict on a case and a part: measured figure against tolerance."""
 
 import math
 import time

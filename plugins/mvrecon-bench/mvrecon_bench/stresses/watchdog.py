@@ -1,4 +1,4 @@
-"""A limit on time: what hangs is stopped, and said to have hung."""
+"""A time limit for a case: what hangs is stopped and fails."""
 
 import faulthandler
 import signal

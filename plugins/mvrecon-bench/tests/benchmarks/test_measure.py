@@ -11,7 +11,7 @@ from mvrecon_bench.benchmarks.scaling import exponent
 
 
 def test_memory_sees_what_is_known_to_be_allocated():
-    held = torch.ones(2**20)  # what is there before does not count
+    ballast = torch.ones(2**20)  # what is there before does not count
 
     def call():
         return torch.ones(25 * 2**20)  # 100 MB in float32
@@ -21,7 +21,7 @@ def test_memory_sees_what_is_known_to_be_allocated():
 
     for act in (call, brief):
         assert with_memory(act, "cpu")[1] == pytest.approx(100, abs=8)
-    assert with_memory(lambda: held.sum(), "cpu")[1] < 8
+    assert with_memory(lambda: ballast.sum(), "cpu")[1] < 8
 
 
 def test_times_are_medians_taken_in_turns(monkeypatch):
@@ -38,9 +38,9 @@ def test_times_are_medians_taken_in_turns(monkeypatch):
         return act
 
     calls = {0: worker("a", 0.02, 0.5, 0.01), 1: worker("b", 0.04, 0.03, 0.06)}
-    found = interleaved(calls, {0: 0.2, 1: 0.2}, 3, "cpu")
+    timings = interleaved(calls, {0: 0.2, 1: 0.2}, 3, "cpu")
     assert order == ["a", "b"] * 3
-    assert [(key, round(timing.ms, 9), timing.calls) for key, timing in found.items()] == [
+    assert [(key, round(timing.ms, 9), timing.calls) for key, timing in timings.items()] == [
         (0, 20, 3),
         (1, 40, 3),
     ]

@@ -84,19 +84,19 @@ def test_targets_are_met_missed_or_not_measured():
     ]
     base = {"n": 128, "dtype": "float32"}
     text = targets.table((*targets.CPU, *targets.ACCURACY), rows, base)
-    found = {
+    verdicts = {
         line.split(" | ")[0].strip("| "): line.strip(" |").split(" | ")[1:]
         for line in text.splitlines()[2:]
     }
-    assert found["joseph forward / RTK's"] == ["0.3", "0.333", "0.2", "met"]
-    assert found["joseph adjoint / RTK's"][0::3] == ["0.9", "missed"]
-    assert found["joseph adjoint / forward"][-1] == "missed"
+    assert verdicts["joseph forward / RTK's"] == ["0.3", "0.333", "0.2", "met"]
+    assert verdicts["joseph adjoint / RTK's"][0::3] == ["0.9", "missed"]
+    assert verdicts["joseph adjoint / forward"][-1] == "missed"
     assert (
-        found["joseph geometry VJP / forward"][0] == "3"
-        and found["joseph geometry VJP / forward"][-1] == "met"
+        verdicts["joseph geometry VJP / forward"][0] == "3"
+        and verdicts["joseph geometry VJP / forward"][-1] == "met"
     )
-    assert found["joseph forward, 256^3 / 128^3"][0] == "10"
-    assert found["joseph forward / nanodrr's"][-1] == "not measured"
-    assert found["adjointness, float32, worst"][-1] == "met"
-    assert found["adjointness, float64, worst"][-1] == "not measured"
-    assert found["memory beyond input and output, MB, worst"][0] == "0.5"
+    assert verdicts["joseph forward, 256^3 / 128^3"][0] == "10"
+    assert verdicts["joseph forward / nanodrr's"][-1] == "not measured"
+    assert verdicts["adjointness, float32, worst"][-1] == "met"
+    assert verdicts["adjointness, float64, worst"][-1] == "not measured"
+    assert verdicts["memory beyond input and output, MB, worst"][0] == "0.5"

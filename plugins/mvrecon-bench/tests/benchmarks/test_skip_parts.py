@@ -32,7 +32,7 @@ def test_modes_are_compared_with_off_and_pay_for_their_mask():
         build = (lambda: time.sleep(0.02)) if mode == "auto" else None
         return Trial(
             act,
-            lambda found: found,
+            lambda result: result,
             lambda: (mode, "because"),
             build,
             charged=True,

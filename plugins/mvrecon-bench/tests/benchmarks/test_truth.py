@@ -39,7 +39,7 @@ def test_the_pixel_average_of_a_box_that_half_covers_a_pixel():
 @pytest.mark.parametrize("camera", ["circular", "parallel", "dcspect80"])
 def test_splitting_pixels_is_undone_by_binning(camera):
     rig = Case(n=16, camera=camera, views=2).cameras()
-    back = truth.split(rig, 3).binned(3)
+    back = rig.refined(3).binned(3)
     assert back.shape == rig.shape
     for name in VECTORS:
         assert torch.allclose(getattr(back, name), getattr(rig, name), rtol=0, atol=1e-9)

@@ -87,7 +87,9 @@ class Fussy(Drr):
 
 def judged(name, case):
     subject = subject_of("projector", name, {}, "cpu", torch.float32)
-    return next(judge(each, subject) for each, _ in plan.jobs([subject]) if each.name == case)
+    return next(
+        judge(candidate, subject) for candidate, _ in plan.jobs([subject]) if candidate.name == case
+    )
 
 
 @pytest.mark.parametrize(

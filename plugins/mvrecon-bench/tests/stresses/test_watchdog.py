@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from mvrecon_bench.stresses.subprocess_run import python
+from mvrecon_bench.stresses.fresh_process import python
 
 HANGING = """
 import signal, sys, time

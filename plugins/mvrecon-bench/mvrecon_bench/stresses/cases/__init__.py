@@ -1,1 +1,1 @@
-"""The cases of the stress plan, by what they are about."""
+"""Cases of the stress plan, by subject matter."""

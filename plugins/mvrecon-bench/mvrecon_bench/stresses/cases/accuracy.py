@@ -13,9 +13,9 @@ from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.integrals import METHODS
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
+from mvrecon_bench.stresses.analytic import Blob
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.subject import ProjectorSubject, gap
-from mvrecon_bench.stresses.truths import Blob
 
 #: Grids on which an order of convergence is measured, along each axis, in a box of 48 mm.
 GRIDS = (16, 32, 64)

@@ -47,11 +47,11 @@ def linear(subject: ProjectorSubject) -> float:
     """
     A = subject.projector(GRID, subject.rig())
     x, y = subject.random(2, 1, *GRID.shape)[:, None]
-    seen, other = A(x), A(y)
-    worst = gap(A(x + y), seen.double() + other.double())
+    views, other = A(x), A(y)
+    worst = gap(A(x + y), views.double() + other.double())
     for factor in (3.0, -1e-3, 1e6):
-        worst = greatest([worst, gap(A(factor * x), factor * seen.double())])
-    return worst + float((A(0 * x) != 0).sum()) + float((A.T(0 * seen) != 0).sum())
+        worst = greatest([worst, gap(A(factor * x), factor * views.double())])
+    return worst + float((A(0 * x) != 0).sum()) + float((A.T(0 * views) != 0).sum())
 
 
 def moved(subject: ProjectorSubject) -> float:

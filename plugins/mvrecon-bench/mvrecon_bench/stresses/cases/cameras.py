@@ -17,9 +17,9 @@ from mvrecon.cameras.files import from_file, save
 from mvrecon.geometry.rigid import inverse, random_rotation
 from mvrecon.parts import CAMERAS
 from mvrecon.testing import check_camera
+from mvrecon_bench.stresses.camera_subject import CameraSubject
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.refusals import none_of, refusal
-from mvrecon_bench.stresses.rig import CameraSubject
 from mvrecon_bench.stresses.subject import gap, greatest
 
 #: Geometry is worked out in float64, whatever the dtype of volumes and views.
@@ -70,10 +70,10 @@ def far_away(subject: CameraSubject) -> float:
     for offset in (0.0, 1e3, 1e4, 1e5, 1e6):
         t = rig.source.new_tensor([offset, -offset, offset])
         moved = rig.moved(R, t)
-        seen = torch.stack(
+        images = torch.stack(
             [moved.project(x @ R.T + t)[m] for m, x in enumerate(rig.unproject(uvz))]
         )
-        errors.append(float(((seen - uvz).abs() / (1 + uvz.abs())).max()))
+        errors.append(float(((images - uvz).abs() / (1 + uvz.abs())).max()))
     return greatest(errors)
 
 
@@ -85,9 +85,9 @@ def of_any_size(subject: CameraSubject) -> float:
     xyz, errors = rig.unproject(uvz), []
     for scale in (1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9):
         other = replace(rig, **{name: scale * getattr(rig, name) for name in VECTORS})
-        seen = torch.stack([other.project(scale * x)[m] for m, x in enumerate(xyz)])
-        errors += [gap(other.distance, scale * rig.distance), gap(seen[..., :2], uvz[..., :2])]
-        errors.append(gap(seen[..., 2], scale * uvz[..., 2]))
+        images = torch.stack([other.project(scale * x)[m] for m, x in enumerate(xyz)])
+        errors += [gap(other.distance, scale * rig.distance), gap(images[..., :2], uvz[..., :2])]
+        errors.append(gap(images[..., 2], scale * uvz[..., 2]))
     return greatest(errors)
 
 
@@ -95,19 +95,19 @@ def moved_back(subject: CameraSubject) -> float:
     """A rigid motion and its inverse, the transpose: the same rig."""
     rig, R = subject.few, random_rotation(torch.Generator().manual_seed(6)).to(subject.few.source)
     t = rig.source.new_tensor([30.0, -50.0, 70.0])
-    return apart(rig.moved(R, t).moved(*inverse(R, t)), rig)
+    return rig_error(rig.moved(R, t).moved(*inverse(R, t)), rig)
 
 
 def bad_motions(subject: CameraSubject) -> float:
     """The rig moved by what is no rigid motion."""
     R, t = random_rotation(torch.Generator().manual_seed(7)), torch.zeros(3)
     bad = {name: (change(R), t) for name, change in NO_ROTATIONS.items()}
-    found = {
+    refusals = {
         name: refusal(partial(subject.few.moved, *motion), "(?i)rotation")
         for name, motion in bad.items()
     }
     return none_of(
-        found | {"t is NaN": refusal(partial(subject.few.moved, R, t * math.nan), "translation")}
+        refusals | {"t is NaN": refusal(partial(subject.few.moved, R, t * math.nan), "translation")}
     )
 
 
@@ -123,7 +123,7 @@ NO_ROTATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 def conversions(subject: CameraSubject) -> float:
     """To the terms of other libraries, to a file, and back: the same rig."""
-    return greatest(apart(other, subject.few) for other in _there_and_back(subject.few))
+    return greatest(rig_error(other, subject.few) for other in _there_and_back(subject.few))
 
 
 def _there_and_back(rig: Cameras) -> Iterator[Cameras]:
@@ -138,11 +138,11 @@ def _there_and_back(rig: Cameras) -> Iterator[Cameras]:
         yield convert.from_kornia(*convert.to_kornia(rig)[:2], shape, rig.distance, extent)
 
 
-def apart(found: Cameras, expected: Cameras) -> float:
+def rig_error(rig: Cameras, expected: Cameras) -> float:
     """How far two rigs are apart, of the size of each vector."""
-    alike = [(each.shape, each.parallel, each.extent) for each in (found, expected)]
+    alike = [(cameras.shape, cameras.parallel, cameras.extent) for cameras in (rig, expected)]
     assert alike[0] == alike[1], f"expected (shape, parallel, extent) {alike[1]}, got {alike[0]}"
-    pairs = [(getattr(found, name), getattr(expected, name)) for name in VECTORS]
+    pairs = [(getattr(rig, name), getattr(expected, name)) for name in VECTORS]
     return greatest(gap(a, b) for a, b in pairs)
 
 
@@ -152,9 +152,9 @@ def bad_options(subject: CameraSubject) -> float:
     with subject.given() as options:
         parameters = inspect.signature(CAMERAS.get(subject.name)).parameters
         numbers = {
-            name: each.default
-            for name, each in parameters.items()
-            if isinstance(each.default, float)
+            name: parameter.default
+            for name, parameter in parameters.items()
+            if isinstance(parameter.default, float)
         }
         numbers |= {name: value for name, value in options.items() if isinstance(value, float)}
         changes = {f"{name} {bad}": {name: bad} for name in numbers for bad in (math.nan, math.inf)}

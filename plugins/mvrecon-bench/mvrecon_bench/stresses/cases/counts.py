@@ -42,7 +42,7 @@ def odd_counts(subject: ProjectorSubject) -> float:
     """
     A, worst = operator(subject), 0.0
     every = A(subject.random(1, 1, *GRID.shape))
-    seen = every > 1e-3 * every.max()
+    visible = every > 1e-3 * every.max()
     some = torch.zeros_like(every)
     some[..., ::2, 1::2] = 1
     one = torch.zeros_like(every)
@@ -58,7 +58,7 @@ def odd_counts(subject: ProjectorSubject) -> float:
             1e-12 + one,
             torch.zeros_like(every),
         ):
-            counts = level * mask * every * seen
+            counts = level * mask * every * visible
             x = mlem(A, counts, 1)
             kept = float(
                 (PoissonLikelihood(A, counts).sensitivity(x.dtype).double() * x.double()).sum()
@@ -126,15 +126,15 @@ def zero_start(subject: ProjectorSubject) -> float:
     A = operator(subject)
     counts = A(subject.random(1, 1, *GRID.shape))
     starts = {"zeros": 0.0, "below zero": -1.0, "NaN": torch.nan, "infinite": torch.inf}
-    wrong = {}
+    failures = {}
     for name, value in starts.items():
         start = torch.full((1, 1, *GRID.shape), value, dtype=counts.dtype, device=subject.device)
         for skip in (True, False):
-            wrong[f"{name}, skip_zero_bins={skip}"] = refusal(
+            failures[f"{name}, skip_zero_bins={skip}"] = refusal(
                 lambda start=start, skip=skip: mlem(A, counts, 1, start=start, skip_zero_bins=skip),
                 "allow none" if name == "zeros" else "finite and nowhere negative",
             )
-    return none_of(wrong)
+    return none_of(failures)
 
 
 def drawn(subject: ProjectorSubject) -> float:
@@ -150,7 +150,7 @@ def drawn(subject: ProjectorSubject) -> float:
         x = mlem(A, counts, 3)
         value = PoissonLikelihood(A, counts, 1e-3)(x)
         bad += int((~(x >= 0)).sum() + (~x.isfinite()).sum() + (~value.isfinite()).sum())
-    wrong = {
+    failures = {
         "no counts": ""
         if not mlem(A, torch.zeros_like(rates), 2).any()
         else "something came of nothing"
@@ -158,16 +158,16 @@ def drawn(subject: ProjectorSubject) -> float:
     for name, value in (("NaN", torch.nan), ("infinity", torch.inf), ("-1", -1.0)):
         spoiled = rates.clone()
         spoiled[0, 0, 0, 0, 0] = value
-        wrong[f"a count of {name}"] = refusal(
+        failures[f"a count of {name}"] = refusal(
             lambda y=spoiled: mlem(A, y, 1), "got 1 bins that are not"
         )
         # torch refuses to draw at a rate below zero, and may give anything at one that is no number
         draw = generator(subject)
-        wrong[f"a rate of {name}"] = refusal(
+        failures[f"a rate of {name}"] = refusal(
             lambda y=spoiled, draw=draw: PoissonLikelihood(A, torch.poisson(y, generator=draw)),
             kinds=(ValueError, RuntimeError),
         )
-    return bad + none_of(wrong)
+    return bad + none_of(failures)
 
 
 CASES = (

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
+from mvrecon_bench.stresses.analytic import ends, ways
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.cases.algebra import DIGITS, LINEAR
 from mvrecon_bench.stresses.subject import ProjectorSubject, gap, greatest
-from mvrecon_bench.stresses.truths import ends, ways
 
 DOUBLE = (torch.float64,)
 #: Few rays, in a pose where none lies on a kink.
@@ -28,15 +28,15 @@ def differences(subject: ProjectorSubject) -> float:
     inputs = [subject.random(1, 1, *SMALL.shape).requires_grad_(), *vectors]
     rng, worst = torch.Generator().manual_seed(0), 0.0
     weights = subject.random(1, 1, 2, 3, 2, seed=1)
-    found = torch.autograd.grad((views(*inputs) * weights).sum(), inputs)
-    for index, slope in enumerate(found):
+    gradients = torch.autograd.grad((views(*inputs) * weights).sum(), inputs)
+    for index, slope in enumerate(gradients):
         for _ in range(4):
             way = torch.randn(slope.shape, generator=rng, dtype=torch.float64).to(slope)
             ends = [
                 [*inputs[:index], inputs[index] + step * way, *inputs[index + 1 :]]
                 for step in (1e-5, -1e-5)
             ]
-            more, less = ((views(*each) * weights).sum() for each in ends)
+            more, less = ((views(*point) * weights).sum() for point in ends)
             error = ((more - less) / 2e-5 - (slope * way).sum()).abs() / (slope.norm() * way.norm())
             worst = greatest([worst, float(error)])
     return worst
@@ -88,13 +88,13 @@ def twice_by_pose(subject: ProjectorSubject) -> float:
         return (torch.autograd.grad(total, at, create_graph=graph)[0] * way).sum()
 
     try:
-        (found,) = torch.autograd.grad(slope(source, True), source)
+        (second,) = torch.autograd.grad(slope(source, True), source)
     except NotImplementedError as error:
         if not str(error):
             raise
         return 0.0
     more, less = (slope((source + step * way).detach().requires_grad_()) for step in (1e-5, -1e-5))
-    return float(((found * way).sum() - (more - less) / 2e-5).abs() / (found.norm() * way.norm()))
+    return float(((second * way).sum() - (more - less) / 2e-5).abs() / (second.norm() * way.norm()))
 
 
 def mapped(subject: ProjectorSubject) -> float:
@@ -102,13 +102,13 @@ def mapped(subject: ProjectorSubject) -> float:
     A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2))
     x, y = subject.random(3, 2, 1, 1, *SMALL.shape), subject.random(3, 2, 1, 1, 2, 3, 2)
     worst = 0.0
-    for act, given in ((A, x), (A.T, y)):
-        loop = torch.stack([torch.stack([act(one) for one in each]) for each in given])
-        worst = greatest([worst, gap(torch.func.vmap(act)(given[:, 0]), loop[:, 0])])
+    for act, operands in ((A, x), (A.T, y)):
+        loop = torch.stack([torch.stack([act(one) for one in row]) for row in operands])
+        worst = greatest([worst, gap(torch.func.vmap(act)(operands[:, 0]), loop[:, 0])])
         worst = greatest(
-            [worst, gap(torch.func.vmap(act, in_dims=1)(given[0].transpose(0, 1)), loop[0])]
+            [worst, gap(torch.func.vmap(act, in_dims=1)(operands[0].transpose(0, 1)), loop[0])]
         )
-        worst = greatest([worst, gap(torch.func.vmap(torch.func.vmap(act))(given), loop)])
+        worst = greatest([worst, gap(torch.func.vmap(torch.func.vmap(act))(operands), loop)])
     return worst
 
 
@@ -135,8 +135,8 @@ def pushed(subject: ProjectorSubject) -> float:
     """
     A, worst = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2)), 0.0
     for act, shape in ((A, (1, 1, *SMALL.shape)), (A.T, (1, 1, 2, 3, 2))):
-        given, tangent = subject.random(*shape), subject.random(*shape, seed=1)
-        worst = greatest([worst, gap(torch.func.jvp(act, (given,), (tangent,))[1], act(tangent))])
+        operand, tangent = subject.random(*shape), subject.random(*shape, seed=1)
+        worst = greatest([worst, gap(torch.func.jvp(act, (operand,), (tangent,))[1], act(tangent))])
     return worst
 
 
@@ -152,10 +152,12 @@ def compiled(subject: ProjectorSubject) -> float:
 
     torch.compiler.reset()
     whole, worst = torch.compile(step, fullgraph=True, backend="aot_eager"), 0.0
-    for given in (x, torch.cat([x, 2 * x])):  # the second makes the sizes of the graph symbols
-        seen, expected = whole(given), step(given)
-        slopes = [torch.autograd.grad(each.square().sum(), given)[0] for each in (seen, expected)]
-        worst = greatest([worst, gap(seen, expected), gap(*slopes)])
+    for volume in (x, torch.cat([x, 2 * x])):  # the second makes the sizes of the graph symbols
+        result, expected = whole(volume), step(volume)
+        slopes = [
+            torch.autograd.grad(output.square().sum(), volume)[0] for output in (result, expected)
+        ]
+        worst = greatest([worst, gap(result, expected), gap(*slopes)])
     return worst
 
 

@@ -16,30 +16,34 @@ def halves(subject: ProjectorSubject) -> float:
     """Halves are storage: read as they are, summed and given back in float32; gradients in the
     input's dtype.
     """
-    wrong = 0.0
+    violations = 0.0
     for dtype in HALVES:
-        for act, given in both(subject):
-            small = given.to(dtype).requires_grad_()
+        for act, operand in both(subject):
+            small = operand.to(dtype).requires_grad_()
             out, expected = act(small), act(small.detach().float())
             out.sum().backward()
-            wrong += bits(out, expected) + (out.dtype != torch.float32)
-            wrong += small.grad is None or small.grad.dtype != dtype or not bool(small.grad.any())
-    return wrong
+            violations += bits(out, expected) + (out.dtype != torch.float32)
+            violations += (
+                small.grad is None or small.grad.dtype != dtype or not bool(small.grad.any())
+            )
+    return violations
 
 
 def rounded(subject: ProjectorSubject) -> float:
     """By how much more than a half's own rounding the views of half volumes are off."""
     errors = []
     for dtype, allowed in ((torch.bfloat16, 4e-3), (torch.float16, 5e-4)):
-        errors += [gap(act(given.to(dtype)), act(given)) / allowed for act, given in both(subject)]
+        errors += [
+            gap(act(operand.to(dtype)), act(operand)) / allowed for act, operand in both(subject)
+        ]
     return greatest(errors)
 
 
 def no_numbers(subject: ProjectorSubject) -> float:
     """Integers, masks, complex numbers, arrays: refused; a plugin may read them, if rightly."""
-    wrong = 0.0
-    for act, given in both(subject):
-        ones = given.round()
+    violations = 0.0
+    for act, operand in both(subject):
+        ones = operand.round()
         for other in (
             ones.int(),
             ones.bool(),
@@ -47,68 +51,74 @@ def no_numbers(subject: ProjectorSubject) -> float:
             ones.cpu().numpy(),
         ):
             try:
-                found = act(other)  # type: ignore[arg-type]
+                result = act(other)  # type: ignore[arg-type]
             except (ValueError, TypeError):
                 continue
             numbers = (
-                other.to(found.dtype)
+                other.to(result.dtype)
                 if isinstance(other, Tensor) and not other.is_complex()
                 else None
             )
             ours = isinstance(getattr(act, "__self__", act), RayTransform)
-            wrong += ours or numbers is None or bits(found, act(numbers)) > 0
-    return wrong
+            violations += ours or numbers is None or bits(result, act(numbers)) > 0
+    return violations
 
 
 def cast(subject: ProjectorSubject) -> float:
     """The whole module cast to another dtype, as a trainer does: geometry stays as exact as it
     was.
     """
-    wrong = 0.0
+    violations = 0.0
     for dtype in EVERY:
         (A, x), (_, y) = both(subject)
         if not isinstance(A, torch.nn.Module):
             raise DoesNotApply("it is no torch.nn.Module")
         views, volume = A(x), A.T(y)  # type: ignore[operator]
         B = A.to(dtype)
-        wrong += bits(B(x), views) + bits(B.T(y), volume)  # type: ignore[operator]
-    return wrong
+        violations += bits(B(x), views) + bits(B.T(y), volume)  # type: ignore[operator]
+    return violations
 
 
 def half_geometry(subject: Subject) -> float:
     """Cameras, grids and rays given in half or single precision: held in float64, as exact as what
     was given.
     """
-    wrong = 0.0
+    violations = 0.0
     vectors = {"source": [0, 0, 9], "origin": [-1.5, 1, -7], "u": [1, 0, 0], "v": [0, -1, 0]}
     for dtype in (*HALVES, torch.float32):
-        given = {name: torch.tensor([each], dtype=dtype) for name, each in vectors.items()}
-        source, origin, u, v = given.values()
+        rounded_vectors = {
+            name: torch.tensor([vector], dtype=dtype) for name, vector in vectors.items()
+        }
+        source, origin, u, v = rounded_vectors.values()
         rig, rays = (
             Cameras(source, origin, u, v, (2, 3)),
             ExplicitRays(source[None, None], origin[None, None]),
         )
         affine = torch.diag(torch.tensor([1.1, 0.7, 3.3, 1.0])).to(dtype)
-        pairs = [(getattr(rig, name), given[name]) for name in VECTORS]
-        pairs += [(rays.source[0, 0], given["source"]), (Grid((2, 3, 4), affine).affine, affine)]
-        wrong += sum(
-            held.dtype != torch.float64 or bits(held, each.double()) for held, each in pairs
+        pairs = [(getattr(rig, name), rounded_vectors[name]) for name in VECTORS]
+        pairs += [
+            (rays.source[0, 0], rounded_vectors["source"]),
+            (Grid((2, 3, 4), affine).affine, affine),
+        ]
+        violations += sum(
+            stored.dtype != torch.float64 or bits(stored, vector.double())
+            for stored, vector in pairs
         )
-    return wrong
+    return violations
 
 
 def autocast(subject: ProjectorSubject) -> float:
     """Inside an autocast, derivatives included."""
-    wrong, device = 0.0, subject.device.partition(":")[0]
-    for act, given in both(subject):
-        out = act(given.requires_grad_())
-        (gradient,) = torch.autograd.grad(out.square().sum(), given)
+    violations, device = 0.0, subject.device.partition(":")[0]
+    for act, operand in both(subject):
+        out = act(operand.requires_grad_())
+        (gradient,) = torch.autograd.grad(out.square().sum(), operand)
         for dtype in HALVES:
             with torch.autocast(device, dtype):
-                found = act(given)
-                (back,) = torch.autograd.grad(found.square().sum(), given)
-            wrong += (found.dtype != out.dtype) + bits(found, out) + bits(back, gradient)
-    return wrong
+                result = act(operand)
+                (back,) = torch.autograd.grad(result.square().sum(), operand)
+            violations += (result.dtype != out.dtype) + bits(result, out) + bits(back, gradient)
+    return violations
 
 
 CASES = (

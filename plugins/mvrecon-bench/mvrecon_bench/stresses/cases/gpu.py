@@ -1,6 +1,4 @@
-"""What only a GPU can be asked: more than 2^31 voxels and pixels in its memory, and convolutions in
-bfloat16.
-"""
+"""GPU: more than 2^31 voxels and pixels in its memory, and convolutions in bfloat16."""
 
 import torch
 from torch.nn.functional import conv3d
@@ -34,8 +32,8 @@ def convolution(subject: Subject) -> float:
         exact = conv3d(x.bfloat16().float(), weight.bfloat16().float(), padding=1)
     finally:
         torch.backends.cudnn.allow_tf32 = allowed
-    found = conv3d(x.bfloat16(), weight.bfloat16(), padding=1).float()
-    return float((found - exact).norm() / exact.norm())
+    result = conv3d(x.bfloat16(), weight.bfloat16(), padding=1).float()
+    return float((result - exact).norm() / exact.norm())
 
 
 def huge_volume(subject: ProjectorSubject) -> float:
@@ -53,8 +51,8 @@ def huge_volume(subject: ProjectorSubject) -> float:
         dtype=torch.float64,
     )
     ends = rows * torch.tensor([-5.0, 1.0, 1.0], dtype=torch.float64)
-    seen = subject.values(grid, grid.to_world(rows), grid.to_world(ends), volume)
-    return gap(seen, torch.tensor([1024.0, 1024.0, 1026.0]))
+    integrals = subject.values(grid, grid.to_world(rows), grid.to_world(ends), volume)
+    return gap(integrals, torch.tensor([1024.0, 1024.0, 1026.0]))
 
 
 def huge_views(subject: ProjectorSubject) -> float:
@@ -66,8 +64,8 @@ def huge_views(subject: ProjectorSubject) -> float:
     detector = {"pixels": [LONG, LONG], "pixel_mm": 1.0, "offset_mm": [3.0 - middle, 2.5 - middle]}
     rig = subject.rig(detector=detector, n_views=1)
     A, B = (
-        subject.projector(GRID, each)
-        for each in (rig, band(rig, LONG - FEW, LONG - FEW, (FEW, FEW)))
+        subject.projector(GRID, cameras)
+        for cameras in (rig, band(rig, LONG - FEW, LONG - FEW, (FEW, FEW)))
     )
     x = subject.random(1, 1, *GRID.shape)
     views, few = A(x), B(x)

@@ -10,7 +10,7 @@ from mvrecon.models.frusta import Frusta
 from mvrecon.models.weighting import fuse
 from mvrecon.testing import check_head
 from mvrecon_bench.stresses.case import Case
-from mvrecon_bench.stresses.learned import GRID, HeadSubject, small_rig
+from mvrecon_bench.stresses.learned_subjects import GRID, HeadSubject, small_rig
 from mvrecon_bench.stresses.refusals import none_of
 from mvrecon_bench.stresses.subject import Subject, gap, greatest
 
@@ -51,22 +51,22 @@ def extremes(subject: HeadSubject) -> Iterator[tuple[str, tuple[Tensor, Tensor, 
 
 def at_the_ends(subject: HeadSubject) -> float:
     """A density that is finite and within the region, and finite gradients."""
-    found = {}
-    for name, given in extremes(subject):
-        leaves = [each.clone().requires_grad_() for each in given]
+    failures = {}
+    for name, operands in extremes(subject):
+        leaves = [tensor.clone().requires_grad_() for tensor in operands]
         density = subject.head(*leaves, subject.frusta)
         slopes = torch.autograd.grad(density.sum(), leaves, allow_unused=True)
-        wrong = {
+        masks = {
             "densities not finite": ~density.isfinite(),
             "densities outside": (density * ~subject.frusta.occupied) != 0,
             "gradients not finite": torch.cat(
-                [~each.isfinite().flatten() for each in slopes if each is not None]
+                [~tensor.isfinite().flatten() for tensor in slopes if tensor is not None]
             ),
         }
-        found |= {
-            f"{name}, {what}": str(int(hit.sum())) for what, hit in wrong.items() if hit.any()
+        failures |= {
+            f"{name}, {what}": str(int(hit.sum())) for what, hit in masks.items() if hit.any()
         }
-    return none_of(found)
+    return none_of(failures)
 
 
 def views_kept(subject: HeadSubject) -> float:
@@ -87,15 +87,15 @@ def bad_logits(subject: HeadSubject) -> float:
     """One logit that is NaN: that bin is, and no ray but its own."""
     logits, prior, views = subject.given
     *_, d, v, u = (int(i) for i in subject.frusta.occupied[0, 0].nonzero()[0])
-    wrong = 0
+    violations = 0
     for bad in (math.nan, math.inf):
         spoilt = logits.clone()
         spoilt[0, 0, 0, d, v, u] = bad
         density = subject.head(spoilt, prior, views, subject.frusta)
-        wrong += int(density[0, 0, 0, d, v, u].isfinite())
+        violations += int(density[0, 0, 0, d, v, u].isfinite())
         density[0, 0, 0, :, v, u] = 0
-        wrong += int((~density.isfinite()).sum())
-    return wrong
+        violations += int((~density.isfinite()).sum())
+    return violations
 
 
 def no_ray_hits(subject: HeadSubject) -> float:
@@ -109,13 +109,13 @@ def no_ray_hits(subject: HeadSubject) -> float:
 def fused_weights(subject: Subject) -> float:
     """The weights of three cameras' opinions from logits of any size: one in sum where any sees."""
     visible = subject.random(3, 1, 4, 5, 6) < 0.5
-    wrong = []
+    errors = []
     for size in (0.0, 1e4, -1e4, 1e30, -1e30):
         logits = torch.full((2, 3, 1, 4, 5, 6), size, dtype=subject.dtype)
         volume, weights = fuse(subject.random(2, 3, 1, 4, 5, 6), logits, visible)
         expected = visible.to(subject.dtype) / visible.sum(dim=0).clamp_min(1)
-        wrong += [float((weights - expected).abs().max()), float(volume.isnan().sum())]
-    return greatest(wrong)
+        errors += [float((weights - expected).abs().max()), float(volume.isnan().sum())]
+    return greatest(errors)
 
 
 CASES = (

@@ -1,6 +1,4 @@
-"""Points in the plane of a camera's source and behind it, which have no image; a source in the
-volume.
-"""
+"""Points without an image, in the plane of a source and behind it; a source in the volume."""
 
 import math
 from dataclasses import replace
@@ -12,10 +10,10 @@ from mvrecon.cameras import convert
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.frusta import Frusta
+from mvrecon_bench.stresses.camera_subject import CameraSubject
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.cameras import EXACT
 from mvrecon_bench.stresses.refusals import none_of
-from mvrecon_bench.stresses.rig import CameraSubject
 
 #: Depths in mm at and about the plane of the source, and behind it.
 NOUGHT = (0.0, -0.0, 1e-12, -1e-12, 1e-8, -1e-8, -7.0)
@@ -43,7 +41,7 @@ def without_image(subject: CameraSubject) -> float:
     """Points in the plane of the source, behind it, and of no place: what is made of them, and what
     is said of it.
     """
-    found: dict[str, str] = {}
+    failures: dict[str, str] = {}
     for m, rig in enumerate(subject.few):
         places = about_the_source(rig, subject.side).to(subject.dtype)
         points = torch.cat([places, nowhere(places[-1])])
@@ -64,30 +62,30 @@ def without_image(subject: CameraSubject) -> float:
                 (uvz[-2 - 9 : -9] - alone[-2:]).abs() > 1e-6 * (1 + alone[-2:].abs())
             ),
         }
-        found |= {
+        failures |= {
             f"camera {m}: {what}": str(int(hit.sum())) for what, hit in hits.items() if hit.any()
         }
-    return none_of(found)
+    return none_of(failures)
 
 
 def slopes_without_image(subject: CameraSubject) -> float:
     """Gradients of valid images alone, with points that have none beside them; and of the way
     back.
     """
-    wrong = 0
+    violations = 0
     for rig in subject.few:
         places = about_the_source(rig, subject.side).to(subject.dtype)
         points = torch.cat([places, nowhere(places[-1])]).requires_grad_()
         for back in (False, True):
             vectors = [getattr(rig, name).clone().requires_grad_() for name in VECTORS]
             leaf = replace(rig, **dict(zip(VECTORS, vectors, strict=True)))
-            found = leaf.unproject(points[None]) if back else leaf.project(points)
-            used = found.isfinite().all(dim=-1) if back else leaf.valid(found)
+            images = leaf.unproject(points[None]) if back else leaf.project(points)
+            used = images.isfinite().all(dim=-1) if back else leaf.valid(images)
             gradients = torch.autograd.grad(
-                torch.where(used[..., None], found, 0.0).sum(), (points, *vectors)
+                torch.where(used[..., None], images, 0.0).sum(), (points, *vectors)
             )
-            wrong += sum(int((~gradient.isfinite()).sum()) for gradient in gradients)
-    return wrong
+            violations += sum(int((~gradient.isfinite()).sum()) for gradient in gradients)
+    return violations
 
 
 def towards_the_source(subject: CameraSubject) -> float:
@@ -112,7 +110,7 @@ def source_in_the_volume(subject: CameraSubject) -> float:
     world = frusta.to_world(lifted)
     back = frusta.to_frusta(world)
     (slope,) = torch.autograd.grad(back.sum(), views)
-    return float(sum((~each.isfinite()).sum() for each in (lifted, world, back, slope)))
+    return float(sum((~tensor.isfinite()).sum() for tensor in (lifted, world, back, slope)))
 
 
 CASES = (

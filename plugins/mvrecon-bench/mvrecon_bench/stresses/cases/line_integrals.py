@@ -45,14 +45,14 @@ def dense_rays(subject: Subject) -> float:
     ones.
     """
     p = torch.linspace(0, 200, 401, dtype=torch.float64)
-    wrong = 0
+    violations = 0
     for photons in (1e2, 1e4, 1e6):
         for sigmas in (3.0, 4.0, 6.0):
             threshold = noise_threshold(p.to(subject.dtype), photons, sigmas).double()
-            seen = p > threshold
-            first = int(seen.int().argmax())
-            wrong += int((~threshold.isfinite()).sum() + (~seen[first:]).sum())
-    return float(wrong)
+            dense = p > threshold
+            first = int(dense.int().argmax())
+            violations += int((~threshold.isfinite()).sum() + (~dense[first:]).sum())
+    return float(violations)
 
 
 def logarithms(subject: ProjectorSubject) -> float:

@@ -3,7 +3,6 @@ gradients, weights.
 """
 
 import inspect
-import io
 import math
 from collections.abc import Iterator
 from functools import partial
@@ -16,7 +15,7 @@ from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon_bench.stresses.case import Case, DoesNotApply
-from mvrecon_bench.stresses.learned import ModelSubject, small_rig
+from mvrecon_bench.stresses.learned_subjects import ModelSubject, small_rig
 from mvrecon_bench.stresses.refusals import none_of, refusal
 from mvrecon_bench.stresses.subject import bits, gap, greatest
 
@@ -27,13 +26,13 @@ NETWORK = {torch.float64: 1e-10, torch.float32: 1e-5}
 
 def bad_numbers(*tensors: Tensor | None) -> int:
     """How many numbers are not finite."""
-    return sum(int((~each.isfinite()).sum()) for each in tensors if each is not None)
+    return sum(int((~tensor.isfinite()).sum()) for tensor in tensors if tensor is not None)
 
 
 def answers(out: Reconstruction) -> list[Tensor]:
     """All volumes and views of an answer."""
-    found = (out.volume, out.opinions, out.weights, out.cross_views)
-    return [each for each in found if each is not None]
+    outputs = (out.volume, out.opinions, out.weights, out.cross_views)
+    return [output for output in outputs if output is not None]
 
 
 def copies(subject: ModelSubject) -> float:
@@ -41,7 +40,7 @@ def copies(subject: ModelSubject) -> float:
     one, views = small_rig()[[0]], subject.views[:, :, :1]
     single, triple = subject.model(one), subject.model(one[[0, 0, 0]])
     shapes = [
-        {name: tuple(each.shape) for name, each in model.state_dict().items()}
+        {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
         for model in (single, triple)
     ]
     if shapes[0] != shapes[1]:
@@ -60,11 +59,13 @@ def one_camera(subject: ModelSubject) -> float:
 
 def slopes(model: torch.nn.Module, out: Reconstruction) -> dict[str, Tensor | None]:
     """Gradients of all parameters that want one, by the sum of squares of the volume."""
-    named = {name: each for name, each in model.named_parameters() if each.requires_grad}
+    named = {name: weight for name, weight in model.named_parameters() if weight.requires_grad}
     if not named:
         return {}
-    found = torch.autograd.grad(out.volume.square().sum(), list(named.values()), allow_unused=True)
-    return dict(zip(named, found, strict=True))
+    gradients = torch.autograd.grad(
+        out.volume.square().sum(), list(named.values()), allow_unused=True
+    )
+    return dict(zip(named, gradients, strict=True))
 
 
 def nothing(subject: ModelSubject) -> float:
@@ -74,12 +75,12 @@ def nothing(subject: ModelSubject) -> float:
     views = (
         subject.views[:2] * torch.tensor([0.0, 1.0]).to(subject.views)[:, None, None, None, None]
     )
-    wrong = 0
-    for given in (views, views[:1]):
-        out = subject.used(given)
-        wrong += bad_numbers(*answers(out), *slopes(subject.used, out).values())
-        wrong += int(out.volume[0].count_nonzero()) if subject.scales else 0
-    return wrong
+    violations = 0
+    for batch in (views, views[:1]):
+        out = subject.used(batch)
+        violations += bad_numbers(*answers(out), *slopes(subject.used, out).values())
+        violations += int(out.volume[0].count_nonzero()) if subject.scales else 0
+    return violations
 
 
 def any_scale(subject: ModelSubject) -> float:
@@ -90,20 +91,20 @@ def any_scale(subject: ModelSubject) -> float:
     with torch.no_grad():
         volume = subject.used(views).volume
         for power in (-100, -60, 40):
-            found = subject.used(views * 2.0**power).volume
+            scaled = subject.used(views * 2.0**power).volume
             errors.append(
-                gap(found / 2.0**power, volume) if subject.scales else 0.0 * float(found.sum())
+                gap(scaled / 2.0**power, volume) if subject.scales else 0.0 * float(scaled.sum())
             )
     return greatest(errors)
 
 
 def below_nought(subject: ModelSubject) -> float:
     """Views of noise about zero, and below zero everywhere: how many numbers are not finite."""
-    wrong = 0
+    violations = 0
     for views in (subject.views[:1] - subject.views[:1].mean(), -1 - subject.views[:1]):
         out = subject.used(views)
-        wrong += bad_numbers(*answers(out), *slopes(subject.used, out).values())
-    return wrong
+        violations += bad_numbers(*answers(out), *slopes(subject.used, out).values())
+    return violations
 
 
 def doors(subject: ModelSubject) -> float:
@@ -117,15 +118,15 @@ def doors(subject: ModelSubject) -> float:
         "a column less": views[..., :-1],
         "rows for columns": views.mT,
     }
-    found = {
+    refusals = {
         name: refusal(partial(subject.used, bad), "(?i)views.*got.*[0-9]")
         for name, bad in shapes.items()
     }
     for bad in (math.nan, math.inf, -math.inf):
         spoilt = views.clone()
         spoilt[0, 0, 1, 2, 3] = bad
-        found[f"a pixel of {bad}"] = refusal(partial(subject.used, spoilt), "(?i)views.*finite")
-    return none_of(found)
+        refusals[f"a pixel of {bad}"] = refusal(partial(subject.used, spoilt), "(?i)views.*finite")
+    return none_of(refusals)
 
 
 def batches(subject: ModelSubject) -> float:
@@ -153,72 +154,41 @@ def not_contiguous(subject: ModelSubject) -> float:
 
 def autocast(subject: ModelSubject) -> float:
     """The whole model under autocast to bfloat16: all float32, and how far from that without."""
-    model, given = subject.stirred(), []
+    model, dtypes = subject.stirred(), []
     for module in model.modules():
         if isinstance(module, RayTransform):
-            module.register_forward_hook(lambda _module, _volume, views: given.append(views.dtype))
+            module.register_forward_hook(lambda _module, _volume, views: dtypes.append(views.dtype))
     with torch.no_grad():
         volume = model(subject.views[:1]).volume
         with torch.autocast(subject.device.split(":")[0], torch.bfloat16):
-            found = model(subject.views[:1]).volume
-    assert {found.dtype, *given} == {torch.float32}, (
-        f"expected float32 alone, got {found.dtype} and {set(given)}"
+            result = model(subject.views[:1]).volume
+    assert {result.dtype, *dtypes} == {torch.float32}, (
+        f"expected float32 alone, got {result.dtype} and {set(dtypes)}"
     )
-    return gap(found, volume)
+    return gap(result, volume)
 
 
 def gradients(subject: ModelSubject) -> float:
     """Of the loss, by every parameter: how many have none, or one that is zero or not finite."""
     model = subject.stirred().train()
-    named = {name: each for name, each in model.named_parameters() if each.requires_grad}
+    named = {name: weight for name, weight in model.named_parameters() if weight.requires_grad}
     if not named:
         raise DoesNotApply("it has nothing to train")
     out = model(subject.views[:2])
     loss = ReconstructionLoss(1.0, opinions=0.1, cross_view=0.01)(
         out, {"volume": subject.truth[:2], "views": subject.views[:2]}
     )["total"]
-    found = dict(
+    slopes_of = dict(
         zip(named, torch.autograd.grad(loss, list(named.values()), allow_unused=True), strict=True)
     )
-    told = {name: _fault(each) for name, each in found.items()}
-    return none_of(told)
+    faults = {name: _fault(weight) for name, weight in slopes_of.items()}
+    return none_of(faults)
 
 
 def _fault(gradient: Tensor | None) -> str:
     if gradient is None:
         return "no gradient"
     return "not finite" if bad_numbers(gradient) else "" if gradient.any() else "zero"
-
-
-def saved(subject: ModelSubject) -> float:
-    """Weights saved, and loaded into a new model: its answer differs in so many values."""
-    file = io.BytesIO()
-    torch.save(subject.used.state_dict(), file)
-    file.seek(0)
-    other = subject.model()
-    other.load_state_dict(torch.load(file, weights_only=True))
-    with torch.no_grad():
-        return bits(other(subject.views[:1]).volume, subject.used(subject.views[:1]).volume)
-
-
-def twice(subject: ModelSubject) -> float:
-    """The same views twice: volumes, and gradients by the views, differ in so many values."""
-    found = []
-    for _ in range(2):
-        views = subject.views[:1].clone().requires_grad_()
-        volume = subject.used(views).volume
-        slope = torch.autograd.grad(volume.sum(), views)[0] if volume.requires_grad else views
-        found.append(torch.cat([volume.detach().flatten(), slope.detach().flatten()]))
-    return bits(*found)
-
-
-def randomness(subject: ModelSubject) -> float:
-    """Evaluation draws nothing from the global generator."""
-    model, views = subject.used, subject.views[:1]  # making it draws its weights
-    before = torch.random.get_rng_state()
-    with torch.no_grad():
-        model(views)
-    return bits(torch.random.get_rng_state(), before)
 
 
 def empty_scene(subject: ModelSubject) -> float:
@@ -241,11 +211,11 @@ def _skips(subject: ModelSubject) -> bool:
 def _empty(subject: ModelSubject) -> Iterator[tuple[str, str]]:
     views = torch.zeros_like(subject.views[:1])
     both = torch.cat([views, subject.views[1:2]])
-    for support, given in (("hull", views), ("hull", both), ("box", views), ("auto", both)):
-        model, name = subject.stirred(support=support), f"{support}, {len(given)} samples"
-        out = model(given)
-        wrong = bad_numbers(*answers(out), *slopes(model, out).values())
-        yield name, f"{wrong} not finite" if wrong else ""
+    for support, batch in (("hull", views), ("hull", both), ("box", views), ("auto", both)):
+        model, name = subject.stirred(support=support), f"{support}, {len(batch)} samples"
+        out = model(batch)
+        violations = bad_numbers(*answers(out), *slopes(model, out).values())
+        yield name, f"{violations} not finite" if violations else ""
         if out.support is not None:
             yield f"{name}, outside", "not zero" if (out.volume * ~out.support).any() else ""
 
@@ -293,7 +263,4 @@ CASES = (
         any_scale,
         NETWORK,
     ),
-    Case(70, "weights saved and loaded", "the same volume", "model", saved, dtypes=SINGLE),
-    Case(74, "twice the same", "the same volume and gradients", "model", twice),
-    Case(75, "the global generator", "is left alone", "model", randomness),
 )

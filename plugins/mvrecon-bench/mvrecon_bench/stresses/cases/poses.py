@@ -52,12 +52,12 @@ def looking_at_itself(_: Subject) -> float:
     """A camera at its target, or at no place."""
     eye = torch.tensor([3.0, -2.0, 1.0])
     bad = {"at its target": eye, "NaN": eye * math.nan, "infinitely far": eye * math.inf}
-    found = {
+    failures = {
         name: refusal(partial(look_at, eye, target), "must not be at|finite")
         for name, target in bad.items()
     }
     return none_of(
-        found | {"up is NaN": refusal(partial(look_at, eye, -eye, (0.0, math.nan, 1.0)), "up")}
+        failures | {"up is NaN": refusal(partial(look_at, eye, -eye, (0.0, math.nan, 1.0)), "up")}
     )
 
 
@@ -83,32 +83,32 @@ def nearly_singular(_: Subject) -> float:
     for name, K in intrinsics():
         K, cond = K.double()[None], float(torch.linalg.cond(K.double()))
         try:
-            found = convert.to_krt(convert.from_krt(K, R, t, (6, 5), 80.0))
+            krt = convert.to_krt(convert.from_krt(K, R, t, (6, 5), 80.0))
         except ValueError as error:
             assert re.search(r"(determinant|condition)\D*\d", str(error)), f"{name}: {error}"
             assert cond > 1e6, f"{name}, of condition {cond:.0e}, is refused: {error}"
             continue
-        errors += [gap(a, b) / (EPS * cond) for a, b in zip(found, (K, R, t), strict=True)]
+        errors += [gap(a, b) / (EPS * cond) for a, b in zip(krt, (K, R, t), strict=True)]
     return greatest(errors)
 
 
 def no_rotations(_: Subject) -> float:
     """What is no rotation, in K, R, t and in kornia's extrinsics."""
     K, R, t = convert.to_krt(circular(2, 40.0, 70.0, DETECTOR))
-    found = {}
+    failures = {}
     for name, change in NO_ROTATIONS.items():
         bad = torch.stack([R[0], change(R[1])])
-        found[f"K R t: {name}"] = refusal(
+        failures[f"K R t: {name}"] = refusal(
             partial(convert.from_krt, K, bad, t, (6, 5), 70.0), "R must be"
         )
         extrinsics = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
         extrinsics[:, :3, :3] = bad
         four = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
         four[:, :3, :3] = K
-        found[f"kornia: {name}"] = refusal(
+        failures[f"kornia: {name}"] = refusal(
             partial(convert.from_kornia, four, extrinsics, (6, 5), 70.0), "must be"
         )
-    return none_of(found)
+    return none_of(failures)
 
 
 def special_rotations(_: Subject) -> float:
@@ -168,7 +168,7 @@ def undone(_: Subject) -> float:
 
 def doors(_: Subject) -> float:
     """NaN and infinite numbers in each field of grids, records, detectors, matrices and rays."""
-    found = {}
+    failures = {}
     rig = circular(2, 40.0, 70.0, DETECTOR)
     K, R, t = convert.to_krt(rig)
     affine = torch.eye(4, dtype=torch.float64)
@@ -190,10 +190,10 @@ def doors(_: Subject) -> float:
         }
         for name in VECTORS:
             acts[f"{name} "] = partial(_record, rig, **{name: _spoilt(getattr(rig, name), bad)})
-        found |= {
+        failures |= {
             f"{name} {bad}": refusal(act, rf"\b{name.strip()}\b") for name, act in acts.items()
         }
-    return none_of(found)
+    return none_of(failures)
 
 
 def flat_and_left_handed(_: Subject) -> float:

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.grid import Grid
+from mvrecon_bench.stresses.analytic import DIRECTIONS, box_lengths, ends, rows, ways
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.subject import ProjectorSubject, greatest
-from mvrecon_bench.stresses.truths import DIRECTIONS, box_lengths, ends, rows, ways
 
 #: Exact in float64 but for the rotation of a ray into voxels; float32 rounds each of about ten
 #: sums.
@@ -31,8 +31,8 @@ def axis_aligned(subject: ProjectorSubject) -> float:
         volume = subject.random(*grid.shape)
         start, end, sums = rows(grid, volume)
         for a, b in ((start, end), (end, start)):
-            seen = subject.values(grid, a, b, volume)
-            worst = greatest([worst, float((seen - sums).abs().max() / sums.max())])
+            integrals = subject.values(grid, a, b, volume)
+            worst = greatest([worst, float((integrals - sums).abs().max() / sums.max())])
     return worst
 
 
@@ -55,8 +55,10 @@ def on_faces(subject: ProjectorSubject) -> float:
         least, most = (around[-1], around[-1]) if subject.of_cells else around.aminmax(dim=0)
         start, end = ends(grid, axis, halves)
         for a, b in ((start, end), (end, start)):
-            seen = subject.values(grid, a, b, volume)
-            worst = greatest([worst, float(torch.maximum(seen - most, least - seen).max())])
+            integrals = subject.values(grid, a, b, volume)
+            worst = greatest(
+                [worst, float(torch.maximum(integrals - most, least - integrals).max())]
+            )
     return worst
 
 
@@ -103,11 +105,11 @@ def turned_corners(subject: ProjectorSubject) -> float:
     grid, way = Grid.centred((6, 6, 6), 1.0), ways()
     point = torch.randint(-2, 3, way.shape, generator=torch.Generator().manual_seed(0)).double()
     start, end, volume = point - 9 * way, point + 9 * way, subject.random(6, 6, 6)
-    seen, worst = subject.values(grid, start, end, volume), 0.0
+    integrals, worst = subject.values(grid, start, end, volume), 0.0
     for order in itertools.permutations(range(3)):
         turned = volume.permute(2, 1, 0).permute(order).permute(2, 1, 0)
         again = subject.values(grid, start[:, order], end[:, order], turned)
-        worst = greatest([worst, float((again - seen).abs().max() / seen.max())])
+        worst = greatest([worst, float((again - integrals).abs().max() / integrals.max())])
     free = (way != 0).all(dim=1)  # the others lie in faces, which belong to the voxel above
     for axis in range(3):
         sign = torch.ones(3, dtype=torch.float64)
@@ -115,7 +117,7 @@ def turned_corners(subject: ProjectorSubject) -> float:
         again = subject.values(
             grid, (start * sign)[free], (end * sign)[free], volume.flip(2 - axis)
         )
-        worst = greatest([worst, float((again - seen[free]).abs().max() / seen.max())])
+        worst = greatest([worst, float((again - integrals[free]).abs().max() / integrals.max())])
     return worst
 
 
@@ -141,13 +143,15 @@ def grazing(subject: ProjectorSubject) -> float:
         for p in (source, pixel)
     )
     rig, volume = subject.rays(start, end), 1 + subject.random(5, 6, 7)
-    seen = subject.values(grid, start, end, volume)
+    integrals = subject.values(grid, start, end, volume)
     reach = 1e-6 if subject.of_cells else 1.0
     misses, hits = (
         box_lengths(rig, grid, reach).flatten() == 0,
         box_lengths(rig, grid, -0.5).flatten() > 0.1,
     )
-    return float((~seen.isfinite() | (misses & (seen != 0)) | (hits & ~(seen > 0))).sum())
+    return float(
+        (~integrals.isfinite() | (misses & (integrals != 0)) | (hits & ~(integrals > 0))).sum()
+    )
 
 
 def nearly_aligned(subject: ProjectorSubject) -> float:
@@ -158,8 +162,8 @@ def nearly_aligned(subject: ProjectorSubject) -> float:
     volume = subject.random(*grid.shape)
     for axis in range(3):
         tilts, way = _tilted(axis)
-        seen = subject.values(grid, -30 * way, 30 * way, volume)
-        worst = greatest([worst, float(((seen / seen[0] - 1).abs() - 20 * tilts).max())])
+        integrals = subject.values(grid, -30 * way, 30 * way, volume)
+        worst = greatest([worst, float(((integrals / integrals[0] - 1).abs() - 20 * tilts).max())])
     return worst
 
 
@@ -178,8 +182,11 @@ def nearly_on_faces(subject: ProjectorSubject) -> float:
         )
         offset = beside.double() * torch.tensor(grid.spacing)
         known = subject.values(grid, start[:1] + offset, end[:1] + offset, volume)
-        seen = subject.values(grid, start, end, volume)
-        excess = torch.maximum(seen - known.max(), known.min() - seen) / known.max() - 20 * tilts
+        integrals = subject.values(grid, start, end, volume)
+        excess = (
+            torch.maximum(integrals - known.max(), known.min() - integrals) / known.max()
+            - 20 * tilts
+        )
         worst = greatest([worst, float(excess.max())])
     return worst
 

@@ -12,9 +12,9 @@ from torch import Tensor
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
+from mvrecon_bench.stresses.analytic import Blob, rows, through
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
-from mvrecon_bench.stresses.truths import Blob, rows, through
 
 #: What float32 loses where geometry is formed in float64, relative to the volume,
 #: before it is cast.
@@ -45,8 +45,8 @@ def scaled(subject: ProjectorSubject) -> float:
         affine = GRID.affine.clone()
         affine[:3] *= factor
         other = replace(rig, **{name: factor * getattr(rig, name) for name in VECTORS})
-        seen = subject.projector(Grid(GRID.shape, affine), other)(volume)
-        worst = greatest([worst, gap(seen.double() / factor, views)])
+        scaled_views = subject.projector(Grid(GRID.shape, affine), other)(volume)
+        worst = greatest([worst, gap(scaled_views.double() / factor, views)])
     return worst
 
 
@@ -58,8 +58,10 @@ def far_away(subject: ProjectorSubject) -> float:
         shift = distance * torch.tensor([1.0, -0.7, 0.3], dtype=torch.float64)
         affine = GRID.affine.clone()
         affine[:3, 3] += shift
-        seen = subject.projector(Grid(GRID.shape, affine), rig.moved(torch.eye(3), shift))(volume)
-        worst = greatest([worst, gap(seen, views)])
+        moved_views = subject.projector(Grid(GRID.shape, affine), rig.moved(torch.eye(3), shift))(
+            volume
+        )
+        worst = greatest([worst, gap(moved_views, views)])
     return worst
 
 
@@ -73,8 +75,8 @@ def far_source(subject: ProjectorSubject) -> float:
     limit, worst = subject.values(grid, points - 8 * look, points + 8 * look, volume), 0.0
     for distance in (1e2, 1e3, 1e5, 1e7):
         rig = _facing(subject, (corner, 1.1 * right, 1.2 * down), shape, distance, 1 + 8 / distance)
-        seen = subject.projector(grid, rig)(volume[None, None]).flatten()
-        worst = greatest([worst, gap(seen, limit) - 20 / distance])
+        integrals = subject.projector(grid, rig)(volume[None, None]).flatten()
+        worst = greatest([worst, gap(integrals, limit) - 20 / distance])
     return worst
 
 
@@ -93,9 +95,14 @@ def magnified(subject: ProjectorSubject) -> float:
         distance = max(12.0, 8 / (k - 1))
         rig = _facing(subject, (corner, 1.1 * right, 1.2 * down), shape, distance, k)
         source = (-distance * look).expand_as(points)
-        seen = subject.projector(grid, rig)(volume[None, None]).flatten()
+        integrals = subject.projector(grid, rig)(volume[None, None]).flatten()
         worst = greatest(
-            [worst, gap(seen, subject.values(grid, source, source + 3 * (points - source), volume))]
+            [
+                worst,
+                gap(
+                    integrals, subject.values(grid, source, source + 3 * (points - source), volume)
+                ),
+            ]
         )
     return worst
 
@@ -143,12 +150,12 @@ def coarse_and_fine(subject: ProjectorSubject) -> float:
     volume = blob.values(grid).to(subject.device, subject.dtype)[None, None]
     for mm in (1.2, 0.003):
         rig = subject.rig(grid, {"pixels": [6, 5], "pixel_mm": mm}, n_views=7)
-        seen, expected = (
+        views, expected = (
             subject.projector(grid, rig)(volume)[0, 0].double().cpu(),
             blob.integrals(*rig.rays()),
         )
-        lost = (seen.amax(dim=(1, 2)) == 0).sum()
-        worst = greatest([worst, float(lost), float((seen.mean() / expected.mean() - 1).abs())])
+        lost = (views.amax(dim=(1, 2)) == 0).sum()
+        worst = greatest([worst, float(lost), float((views.mean() / expected.mean() - 1).abs())])
     return worst
 
 
@@ -170,27 +177,27 @@ def letter(subject: ProjectorSubject) -> float:
     """The letter F in a volume, seen from all six sides, each way up: how many pixels do not show
     it upright.
     """
-    wrong = 0.0
+    violations = 0.0
     for right, down in itertools.permutations(torch.cat([torch.eye(3), -torch.eye(3)]).double(), 2):
         if (right * down).any():
             continue
         look = torch.linalg.cross(right, down)
         way = torch.stack([look, down, right])
         axes, signs = way.abs().argmax(dim=1).tolist(), way.sum(dim=1).tolist()
-        held = torch.stack([torch.zeros_like(LETTER), LETTER]).flip(
+        slices = torch.stack([torch.zeros_like(LETTER), LETTER]).flip(
             [i for i in range(3) if signs[i] < 0]
         )
-        volume = held.permute([axes.index(axis) for axis in (2, 1, 0)])
+        volume = slices.permute([axes.index(axis) for axis in (2, 1, 0)])
         grid = Grid.centred(
             size=volume.shape[::-1], spacing=(0.9, 1.2, 1.0), centre=(3.0, -2.0, 4.0)
         )
         u, v = grid.spacing[axes[2]] * right, grid.spacing[axes[1]] * down
         rig = _facing(subject, (grid.centre - u - 2 * v, u, v), (5, 3), 1e5, 1.5)
-        seen = subject.projector(grid, rig)(volume.to(subject.device, subject.dtype)[None, None])[
+        image = subject.projector(grid, rig)(volume.to(subject.device, subject.dtype)[None, None])[
             0, 0, 0
         ].cpu()
-        wrong += float((~((seen / seen.max() - LETTER).abs() <= 1e-3)).sum())
-    return wrong
+        violations += float((~((image / image.max() - LETTER).abs() <= 1e-3)).sum())
+    return violations
 
 
 def _chords(subject: ProjectorSubject, grid: Grid) -> float:

@@ -1,4 +1,4 @@
-"""Where rays start and end: short ones, in the volume, beyond it, and detectors that cut it."""
+"""Ends of rays: short rays, sources and pixels inside the volume and beyond it, tiled detectors."""
 
 import itertools
 from dataclasses import replace
@@ -9,10 +9,10 @@ import torch
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
+from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.rays import EXACT
 from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, gap, greatest
-from mvrecon_bench.stresses.truths import box_lengths
 
 
 def short(subject: ProjectorSubject) -> float:
@@ -26,8 +26,8 @@ def short(subject: ProjectorSubject) -> float:
     lengths = 10.0 ** -torch.arange(3.0, 19.0, 3.0, dtype=torch.float64)
     way = torch.nn.functional.normalize(torch.tensor([0.8, -0.5, 0.3], dtype=torch.float64), dim=0)
     end = lengths[:, None] * way
-    seen = subject.values(grid, torch.zeros_like(end), end, volume)
-    return float((seen / (1.75 * lengths) - 1).abs().max())
+    integrals = subject.values(grid, torch.zeros_like(end), end, volume)
+    return float((integrals / (1.75 * lengths) - 1).abs().max())
 
 
 def pointless(_: Subject) -> float:
@@ -105,10 +105,12 @@ def out_of_reach(subject: ProjectorSubject) -> float:
     )
     way = torch.cat([way, torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
     aim = grid.centre + 2 * torch.rand(len(way), 3, generator=rng, dtype=torch.float64) - 1
-    seen = [subject.values(grid, aim + near * way, aim + 40 * way) for near in (9.0, 30.0)]
+    integrals = [subject.values(grid, aim + near * way, aim + 40 * way) for near in (9.0, 30.0)]
     if subject.beam[1] == "segment":
-        seen += [subject.values(grid, aim + 40 * way, aim + near * way) for near in (9.0, 30.0)]
-    return float((torch.stack(seen) != 0).sum())
+        integrals += [
+            subject.values(grid, aim + 40 * way, aim + near * way) for near in (9.0, 30.0)
+        ]
+    return float((torch.stack(integrals) != 0).sum())
 
 
 def _cut(rig: Cameras, grid: Grid) -> Cameras:

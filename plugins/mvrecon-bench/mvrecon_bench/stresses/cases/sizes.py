@@ -1,5 +1,5 @@
-"""Sizes: nothing at all, sizes that could be taken for each other, many cameras, large detectors,
-more than 2^31.
+"""Sizes: empty batches, equal and very different axes, many cameras, large detectors, 2^31
+values.
 """
 
 import math
@@ -43,18 +43,18 @@ SPARSE = (torch.float32,)
 
 def no_volumes(subject: ProjectorSubject) -> float:
     """No cases, or no channels: nothing of the right shape comes out, and gradients go back."""
-    A, wrong = subject.projector(GRID, rig := subject.rig()), 0.0
+    A, violations = subject.projector(GRID, rig := subject.rig()), 0.0
     for lead in ((0, 1), (2, 0), (0, 0)):
         x = subject.random(*lead, *GRID.shape).requires_grad_()
         y = subject.random(*lead, len(rig), *rig.shape).requires_grad_()
-        for act, given, expected in ((A, x, y), (A.T, y, x)):
+        for act, operand, expected in ((A, x, y), (A.T, y, x)):
             try:
-                out = act(given)
+                out = act(operand)
             except ValueError:
                 continue
-            (gradient,) = torch.autograd.grad(out.sum(), given)
-            wrong += (out.shape != expected.shape) + (gradient.shape != given.shape)
-    return wrong
+            (gradient,) = torch.autograd.grad(out.sum(), operand)
+            violations += (out.shape != expected.shape) + (gradient.shape != operand.shape)
+    return violations
 
 
 def no_geometry(subject: Subject) -> float:
@@ -205,17 +205,17 @@ def last_voxels(subject: Subject) -> float:
         Box((side - 5, side - 6, side - 7), (side, side, side)),
     )
     alone = grid.cropped(box)
-    held, x = Occupancy(grid.shape, box).encoded(), subject.random(1, 1, *box.shape)
+    occupancy, x = Occupancy(grid.shape, box).encoded(), subject.random(1, 1, *box.shape)
     for name, is_parallel in (("drr", False), ("radon", True)):
         rig = rig_about(alone, is_parallel)
         for method in ("joseph", "siddon"):
             A, B = (
-                PROJECTORS.build(name, grid=each, cameras=rig, method=method)
-                for each in (grid, alone)
+                PROJECTORS.build(name, grid=voxels, cameras=rig, method=method)
+                for voxels in (grid, alone)
             )
             rays = A.lines, A.ray_extent
-            views = ops.project(x[0], *rays, A.detector, method, held)
-            volume = ops.backproject(views, *rays, list(box.shape), method, held)
+            views = ops.project(x[0], *rays, A.detector, method, occupancy)
+            volume = ops.backproject(views, *rays, list(box.shape), method, occupancy)
             errors += [gap(views, B(x)[0]), gap(volume, B.T(views[None])[0])]
     return greatest(errors)
 
@@ -237,7 +237,7 @@ def last_pixels(subject: Subject) -> float:
         few = band(rig, LONG - FEW, LONG - FEW, (FEW, FEW))
         for method in ("joseph", "siddon", "trilinear"):
             options = {"grid": GRID, "method": method, "support": inside}
-            A, B = (PROJECTORS.build(name, cameras=each, **options) for each in (rig, few))
+            A, B = (PROJECTORS.build(name, cameras=cameras, **options) for cameras in (rig, few))
             try:
                 last = A(x)[..., -FEW:, -FEW:].clone()
                 views = torch.from_numpy(np.zeros((1, 1, 1, LONG, LONG), np.float32))

@@ -1,4 +1,4 @@
-"""Tensors of any layout, dtype and history: what counts are the numbers that they hold."""
+"""Memory layout and history of tensors: only the numbers that they hold count."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -39,13 +39,13 @@ def layouts(values: Tensor) -> Iterator[Tensor]:
 
 def memory(subject: ProjectorSubject) -> float:
     """Turned, spread, cut out of others, and one value for many."""
-    wrong = 0.0
-    for act, given in both(subject):
-        expected = act(given)
-        wrong += sum(bits(act(other), expected) for other in layouts(given))
-        spread = given[:1, :1, :, :1].expand_as(given)
-        wrong += bits(act(spread), act(spread.contiguous()))
-    return wrong
+    violations = 0.0
+    for act, operand in both(subject):
+        expected = act(operand)
+        violations += sum(bits(act(other), expected) for other in layouts(operand))
+        spread = operand[:1, :1, :, :1].expand_as(operand)
+        violations += bits(act(spread), act(spread.contiguous()))
+    return violations
 
 
 def backwards(subject: Subject) -> float:
@@ -59,47 +59,48 @@ def backwards(subject: Subject) -> float:
             np.stack([points, points + 2.0])[:, None],
         ),
     ]
-    wrong = 0.0
+    violations = 0.0
     for take, array in takes:
         try:
-            wrong += bits(take(array[::-1]), take(array[::-1].copy()))
+            violations += bits(take(array[::-1]), take(array[::-1].copy()))
         except (ValueError, TypeError):
             continue
-    return wrong
+    return violations
 
 
 def incoming(subject: ProjectorSubject) -> float:
     """The gradient that comes back is expanded, as that of a sum is, turned, or cut out."""
-    wrong = 0.0
-    for act, given in both(subject):
-        out = act(given.requires_grad_())
+    violations = 0.0
+    for act, operand in both(subject):
+        out = act(operand.requires_grad_())
         whole = torch.rand(out.shape, dtype=torch.float64).to(out)
         spread = [out.new_ones(()).expand_as(out), whole[:1, :, :, :1].expand_as(out)]
         for gradient in [*spread, *layouts(whole)]:
             plain = gradient.clone(memory_format=torch.contiguous_format)
-            found, expected = (
-                torch.autograd.grad(act(given), given, each)[0] for each in (gradient, plain)
+            result, expected = (
+                torch.autograd.grad(act(operand), operand, cotangent)[0]
+                for cotangent in (gradient, plain)
             )
-            wrong += bits(found, expected)
-    return wrong
+            violations += bits(result, expected)
+    return violations
 
 
 def edited(subject: ProjectorSubject) -> float:
     """What went in, and what came out, is written over before the derivative is asked for."""
-    wrong = 0.0
-    for act, given in both(subject):
-        expected = act(given.requires_grad_())
+    violations = 0.0
+    for act, operand in both(subject):
+        expected = act(operand.requires_grad_())
         weight = torch.rand(expected.shape, dtype=torch.float64).to(expected)
-        (gradient,) = torch.autograd.grad(expected, given, weight)
-        out, kept = act(given), given.detach().clone()
+        (gradient,) = torch.autograd.grad(expected, operand, weight)
+        out, kept = act(operand), operand.detach().clone()
         with torch.no_grad():
-            given.fill_(torch.nan)
-        wrong += bits(out, expected) + _unless_refused(out, given, weight, gradient)
+            operand.fill_(torch.nan)
+        violations += bits(out, expected) + _unless_refused(out, operand, weight, gradient)
         with torch.no_grad():
-            given.copy_(kept)
-        doubled = act(given).mul_(2)
-        wrong += _unless_refused(doubled, given, weight, 2 * gradient) + bits(given, kept)
-    return wrong
+            operand.copy_(kept)
+        doubled = act(operand).mul_(2)
+        violations += _unless_refused(doubled, operand, weight, 2 * gradient) + bits(operand, kept)
+    return violations
 
 
 def edited_pose(subject: ProjectorSubject) -> float:
@@ -114,14 +115,14 @@ def edited_pose(subject: ProjectorSubject) -> float:
     return _unless_refused(out, vectors[0], torch.ones_like(out), expected)
 
 
-def _unless_refused(out: Tensor, given: Tensor, weight: Tensor, expected: Tensor) -> float:
+def _unless_refused(out: Tensor, operand: Tensor, weight: Tensor, expected: Tensor) -> float:
     try:
-        (found,) = torch.autograd.grad(out, given, weight)
+        (result,) = torch.autograd.grad(out, operand, weight)
     except RuntimeError as error:
         if "inplace" not in str(error):
             raise
         return 0.0
-    return bits(found, expected)
+    return bits(result, expected)
 
 
 CASES = (

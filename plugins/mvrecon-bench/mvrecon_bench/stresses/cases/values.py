@@ -1,4 +1,4 @@
-"""Values of any kind: zeros of either sign, NaN, infinity, negative ones."""
+"""Values: zeros of either sign, NaN, infinity, negative ones."""
 
 from collections.abc import Callable, Iterator
 
@@ -9,9 +9,9 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.projectors.skipping import SKIPS
+from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, bits, gap
-from mvrecon_bench.stresses.truths import box_lengths
 
 EVERY = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 #: More than one brick along each axis, under a detector that does not see all of them.
@@ -31,7 +31,7 @@ def skips(A: Callable[[Tensor], Tensor]) -> Iterator[None]:
 def zeros(subject: ProjectorSubject) -> float:
     """A volume of zeros of either sign, and its views."""
     rig = subject.rig()
-    A, wrong = subject.projector(GRID, rig), 0.0
+    A, violations = subject.projector(GRID, rig), 0.0
     for zero in (0.0, -0.0):
         x = torch.full(
             (1, 1, *GRID.shape),
@@ -43,12 +43,12 @@ def zeros(subject: ProjectorSubject) -> float:
         y = torch.full(
             (1, 1, len(rig), *rig.shape), zero, dtype=subject.dtype, device=subject.device
         )
-        wrong += float((A.T(y) != 0).sum())
+        violations += float((A.T(y) != 0).sum())
         for _ in skips(A):
             (gradient,) = torch.autograd.grad((views := A(x)).sum(), x)
             expected = A.T(torch.ones_like(views)).to(x.dtype)
-            wrong += float((views != 0).sum()) + (not gap(gradient, expected) <= 1e-5)
-    return wrong
+            violations += float((views != 0).sum()) + (not gap(gradient, expected) <= 1e-5)
+    return violations
 
 
 def negative(subject: ProjectorSubject) -> float:
@@ -67,20 +67,20 @@ def bad_voxels(subject: ProjectorSubject) -> float:
     """
     subject.need("local")
     A = subject.projector(BRICKS, rig := subject.rig(BRICKS, NARROW))
-    x, wrong = subject.random(1, 1, *BRICKS.shape), 0.0
+    x, violations = subject.random(1, 1, *BRICKS.shape), 0.0
     met = A.T(torch.ones(1, 1, len(rig), *rig.shape, dtype=x.dtype, device=x.device)).flatten()
     for voxel in (met.argmax(), torch.where(met > 0, met, torch.inf).argmin(), met.argmin()):
         chosen = torch.zeros_like(x).flatten().index_fill(0, voxel, 1).view_as(x)
-        seen = A(chosen) != 0
-        if bool(seen.any()) != bool(met[voxel] > 0):
+        hits = A(chosen) != 0
+        if bool(hits.any()) != bool(met[voxel] > 0):
             raise AssertionError(
                 f"the adjoint tells of {met[voxel]} at voxel {int(voxel)}, the views do not"
             )
         for bad in (torch.nan, torch.inf):
-            for held in (x, torch.zeros_like(x)):
-                spoilt = torch.where(chosen > 0, bad, held)
-                wrong += sum(float((A(spoilt).isfinite() == seen).sum()) for _ in skips(A))
-    return wrong if float(met.min()) == 0 else torch.nan
+            for background in (x, torch.zeros_like(x)):
+                spoilt = torch.where(chosen > 0, bad, background)
+                violations += sum(float((A(spoilt).isfinite() == hits).sum()) for _ in skips(A))
+    return violations if float(met.min()) == 0 else torch.nan
 
 
 def bad_pixel(subject: ProjectorSubject) -> float:
@@ -88,13 +88,15 @@ def bad_pixel(subject: ProjectorSubject) -> float:
     subject.need("local")
     A = subject.projector(BRICKS, rig := subject.rig(BRICKS))
     y = subject.random(1, 1, len(rig), *rig.shape)
-    one, wrong = torch.zeros_like(y), 0.0
+    one, violations = torch.zeros_like(y), 0.0
     one[..., 1, 2, 3] = 1
     met = A.T(one) != 0
     for bad in (torch.nan, torch.inf):
-        for held in (y, torch.zeros_like(y)):
-            wrong += float((A.T(torch.where(one > 0, bad, held)).isfinite() == met).sum())
-    return wrong if met.any() else torch.nan
+        for background in (y, torch.zeros_like(y)):
+            violations += float(
+                (A.T(torch.where(one > 0, bad, background)).isfinite() == met).sum()
+            )
+    return violations if met.any() else torch.nan
 
 
 def beyond_support(subject: ProjectorSubject) -> float:
@@ -105,9 +107,9 @@ def beyond_support(subject: ProjectorSubject) -> float:
     x, inside = subject.random(1, 1, *BRICKS.shape), torch.zeros(BRICKS.shape, dtype=torch.bool)
     inside[2:7, 3:12, 1:8] = True
     inside[4:6, 5:9, 3:5] = False
-    expected, here = A(x * inside.to(x.device)), inside.to(x.device)
+    expected, mask = A(x * inside.to(x.device)), inside.to(x.device)
     masked = A.with_support(inside)
-    return sum(bits(masked(torch.where(here, x, bad)), expected) for bad in (torch.nan, torch.inf))
+    return sum(bits(masked(torch.where(mask, x, bad)), expected) for bad in (torch.nan, torch.inf))
 
 
 def touched(subject: ProjectorSubject) -> float:
@@ -132,10 +134,10 @@ def touched(subject: ProjectorSubject) -> float:
     spoilt = ~A(torch.where(voxels > 0, torch.nan, alone)).isfinite().flatten(1).cpu()
     weighed = (A(voxels) != 0).flatten(1).cpu()
     reach = 1e-9 + (0.0 if subject.of_cells else 0.5)
-    each = [
+    masks = [
         Box((z, y, x), (z + 1, y + 1, x + 1)) for z in range(4) for y in range(4) for x in range(4)
     ]
-    near = torch.stack([box_lengths(rig, grid.cropped(box), reach).flatten() > 0 for box in each])
+    near = torch.stack([box_lengths(rig, grid.cropped(box), reach).flatten() > 0 for box in masks])
     return float(((weighed & ~spoilt) | (spoilt & ~near)).sum())
 
 

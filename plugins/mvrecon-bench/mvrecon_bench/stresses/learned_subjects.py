@@ -1,4 +1,4 @@
-"""Heads and models under stress: small frusta, a small rig, and weights that are all in use."""
+"""Heads and models under stress, on small frusta and a small rig, with random weights."""
 
 import inspect
 from functools import cached_property
@@ -51,11 +51,11 @@ class HeadSubject(Subject):
         """Logits and prior [2 m 1 D v u], and views [2 1 m v u] of nothing where a ray misses."""
         m, (depth, v, u) = len(self.frusta.step), self.frusta.shape
         shape = (2, m, 1, depth, v, u)
-        seen = self.frusta.chord.reshape(m, v, u) > 0
+        hits = self.frusta.chord.reshape(m, v, u) > 0
         return (
             6 * self.random(*shape) - 3,
             self.random(*shape, seed=1),
-            self.random(2, 1, m, v, u, seed=2) * seen,
+            self.random(2, 1, m, v, u, seed=2) * hits,
         )
 
 
@@ -72,25 +72,25 @@ class ModelSubject(Subject):
         Raises:
             DoesNotApply: it needs an option that it was not given.
         """
-        given = {**self.options, **options}
+        settings = {**self.options, **options}
         for name, parameter in inspect.signature(MODELS.get(self.name)).parameters.items():
-            if name in ("projector", *given) or parameter.kind in (
+            if name in ("projector", *settings) or parameter.kind in (
                 parameter.VAR_KEYWORD,
                 parameter.VAR_POSITIONAL,
             ):
                 continue
             if name in CHEAPER and isinstance(parameter.default, int):
-                given[name] = CHEAPER[name]
+                settings[name] = CHEAPER[name]
             elif parameter.default is parameter.empty:
                 if name not in NEEDED:
                     raise DoesNotApply(
                         f"it needs {name}; stress it as "
                         f"{{kind: model, name: {self.name}, {name}: ..}}"
                     )
-                given[name] = NEEDED[name]
+                settings[name] = NEEDED[name]
         torch.manual_seed(0)
         return (
-            self.build(**{**given, "projector": self.projector(cameras)})
+            self.build(**{**settings, "projector": self.projector(cameras)})
             .to(self.device, self.dtype)
             .eval()
         )

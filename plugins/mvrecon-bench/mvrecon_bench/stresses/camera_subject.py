@@ -1,6 +1,4 @@
-"""A camera under stress: a registered rig, with small options for all that it needs and was not
-given.
-"""
+"""A registered camera under stress, built with small options for all that it needs."""
 
 import inspect
 from collections.abc import Iterator
@@ -53,7 +51,7 @@ class CameraSubject(Subject):
         if self.name == "from_file":
             save(circular(3, SMALL["sid"], SMALL["sdd"], DETECTOR), folder / "rig.json")
             return {"path": folder / "rig.json"}
-        found = (
+        options = (
             {"pixels": PIXELS}
             if "pixels" in parameters and isinstance(parameters["pixels"].default, int)
             else {}
@@ -67,8 +65,8 @@ class CameraSubject(Subject):
                         f"it needs {name}; stress it as "
                         f"{{kind: camera, name: {self.name}, {name}: ..}}"
                     )
-                found[name] = SMALL[name]
-        return found
+                options[name] = SMALL[name]
+        return options
 
     @cached_property
     def cameras(self) -> Cameras:

@@ -1,6 +1,4 @@
-"""Python in a process of its own: what must not run in this one, because it ends it or needs a
-fresh one.
-"""
+"""Python in a fresh process, for what would end this one or needs its imports undone."""
 
 import os
 import subprocess
@@ -19,8 +17,8 @@ def python(*arguments: str) -> subprocess.CompletedProcess[str]:
     Raises:
         TimeoutExpired: it takes longer than `LIMIT`; it is ended.
     """
-    here = str(Path(mvrecon.__file__).parents[1])
-    path = os.pathsep.join([here, *filter(None, [os.environ.get("PYTHONPATH")])])
+    checkout = str(Path(mvrecon.__file__).parents[1])
+    path = os.pathsep.join([checkout, *filter(None, [os.environ.get("PYTHONPATH")])])
     return subprocess.run(
         [sys.executable, *arguments],
         env={**os.environ, "PYTHONPATH": path},

@@ -1,6 +1,4 @@
-"""What rays ought to see, known without a projector: rows of voxels, chords of a box, a Gaussian
-blob.
-"""
+"""Closed-form views: sums over rows of voxels, chords of a box, integrals of a Gaussian blob."""
 
 import itertools
 from dataclasses import dataclass
@@ -23,15 +21,15 @@ def rows(grid: Grid, volume: Float[Tensor, "d h w"]) -> Seen:
     """Rays through the centres of voxels along x, y and z, from outside to outside: sums times the
     spacing.
     """
-    found = []
+    bundles = []
     for axis in range(3):
         counts = [grid.shape[2 - i] for i in range(3) if i != axis]
         index = torch.cartesian_prod(
             *[torch.arange(count, dtype=torch.float64) for count in counts]
         )
         sums = volume.double().cpu().sum(dim=2 - axis).mT.flatten() * grid.spacing[axis]
-        found.append((*ends(grid, axis, index), sums))
-    start, end, sums = (torch.cat(each) for each in zip(*found, strict=True))
+        bundles.append((*ends(grid, axis, index), sums))
+    start, end, sums = (torch.cat(points) for points in zip(*bundles, strict=True))
     return start, end, sums
 
 
@@ -56,7 +54,7 @@ def through(grid: Grid, count: int = 12, seed: int = 0) -> Seen:
     """
     rng = torch.Generator().manual_seed(seed)
     sizes = torch.tensor(grid.shape[::-1], dtype=torch.float64)
-    found = []
+    bundles = []
     for axis in range(3):
         enter, leave = (
             (sizes - 1) * torch.rand(count, 3, generator=rng, dtype=torch.float64) for _ in range(2)
@@ -66,8 +64,8 @@ def through(grid: Grid, count: int = 12, seed: int = 0) -> Seen:
         steep = way.abs().amax(dim=-1, keepdim=True) / (0.9 * sizes[axis])
         way /= steep.clamp(min=1)  # a ray's main axis is its fastest, in voxels
         way[:, axis] = sizes[axis]
-        found.append((grid.to_world(enter - 2 * way), grid.to_world(enter + 3.5 * way)))
-    start, end = (torch.cat(each) for each in zip(*found, strict=True))
+        bundles.append((grid.to_world(enter - 2 * way), grid.to_world(enter + 3.5 * way)))
+    start, end = (torch.cat(points) for points in zip(*bundles, strict=True))
     return start, end, (end - start).norm(dim=-1) / 5.5
 
 
@@ -78,11 +76,11 @@ def ways() -> Float[Tensor, "r 3"]:
     signed = itertools.product(
         DIRECTIONS, itertools.permutations(range(3)), itertools.product((-1, 1), repeat=3)
     )
-    found = {
+    directions = {
         tuple(way[i] * sign for i, sign in zip(order, signs, strict=True))
         for way, order, signs in signed
     }
-    return torch.tensor(sorted(found), dtype=torch.float64)
+    return torch.tensor(sorted(directions), dtype=torch.float64)
 
 
 def box_lengths(rig: Cameras, grid: Grid, grown: float = 0.0) -> Float[Tensor, "m v u"]:

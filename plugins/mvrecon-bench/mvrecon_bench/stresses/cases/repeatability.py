@@ -1,5 +1,5 @@
-"""Again: twice, on more threads, in other threads and processes, many times over; and what a call
-leaves behind.
+"""Repeatability: the same bits twice, on more threads, in other threads and processes, over many
+calls; and what a call leaves behind.
 """
 
 import multiprocessing
@@ -19,8 +19,8 @@ from mvrecon.parts import MODELS, PROJECTORS, SCENES
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from mvrecon_bench.stresses.case import Case, DoesNotApply
+from mvrecon_bench.stresses.fresh_process import LIMIT, python
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits, rig_about
-from mvrecon_bench.stresses.subprocess_run import LIMIT, python
 
 #: Work for several threads.
 WORK = Grid.centred(size=(30, 29, 28), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
@@ -41,9 +41,9 @@ def both(subject: ProjectorSubject) -> list[Tensor]:
     return [A(x).cpu(), A.T(y).cpu()]
 
 
-def differ(found: list[Tensor], expected: list[Tensor]) -> float:
+def differ(results: list[Tensor], expected: list[Tensor]) -> float:
     """How many values of all are not the same."""
-    return sum(bits(*pair) for pair in zip(found, expected, strict=True))
+    return sum(bits(*pair) for pair in zip(results, expected, strict=True))
 
 
 def again(subject: ProjectorSubject) -> float:
@@ -56,11 +56,11 @@ def again(subject: ProjectorSubject) -> float:
 
 def more_threads(subject: ProjectorSubject) -> float:
     """On 1, 2 and 8 threads."""
-    found = []
+    results = []
     for count in (1, 2, 8):
         with threads(count):
-            found.append(both(subject))
-    return differ(found[1], found[0]) + differ(found[2], found[0])
+            results.append(both(subject))
+    return differ(results[1], results[0]) + differ(results[2], results[0])
 
 
 def at_once(subject: ProjectorSubject) -> float:
@@ -78,10 +78,10 @@ def at_once(subject: ProjectorSubject) -> float:
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(8) as pool:
-            found = [[*pool.map(A, volumes), *pool.map(A.T, views)] for _ in range(3)]
+            runs = [[*pool.map(A, volumes), *pool.map(A.T, views)] for _ in range(3)]
     finally:
         sys.setswitchinterval(before)
-    return sum(differ(each, expected) for each in found)
+    return sum(differ(run, expected) for run in runs)
 
 
 def forked(subject: ProjectorSubject) -> float:
@@ -100,17 +100,17 @@ def spawned(subject: Subject) -> float:
     kinds = [(name, dtype) for name in ("drr", "radon") for dtype in SINGLE + DOUBLE]
     ours = [ProjectorSubject("projector", name, {}, "cpu", dtype) for name, dtype in kinds]
     pairs = zip(_elsewhere("spawn", ours), map(both, ours), strict=True)
-    return sum(differ(found, expected) for found, expected in pairs)
+    return sum(differ(results, expected) for results, expected in pairs)
 
 
-def _elsewhere(method: str, given: list[ProjectorSubject]) -> list[list[Tensor]]:
+def _elsewhere(method: str, subjects: list[ProjectorSubject]) -> list[list[Tensor]]:
     with multiprocessing.get_context(method).Pool(1, torch.set_num_threads, (1,)) as pool:
-        found = pool.map_async(_numbers, given).get(PATIENCE[method])
-    return [[torch.from_numpy(each) for each in arrays] for arrays in found]
+        runs = pool.map_async(_numbers, subjects).get(PATIENCE[method])
+    return [[torch.from_numpy(array) for array in arrays] for arrays in runs]
 
 
 def _numbers(subject: ProjectorSubject) -> list[np.ndarray]:
-    return [each.numpy() for each in both(subject)]
+    return [tensor.numpy() for tensor in both(subject)]
 
 
 @contextmanager

@@ -1,0 +1,224 @@
+"""One method profiled, trained for a given time, and judged; results are on the disk all along.
+
+    python scripts/gpu/learn.py --train openkbp_train.h5 --test openkbp_val.h5 --out FOLDER
+
+Volumes and views are those of the experiment `open_kbp`, finer; the test patients are those of the
+second file, which training never sees. The number of steps, for a cosine schedule, follows from the
+time of the first ones.
+"""
+
+import argparse
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from measuring import Results, on_device, wait
+
+from mvrecon.config import compose
+from mvrecon.data.module import SceneData
+from mvrecon.engine.evaluation import evaluate, mean_and_spread
+from mvrecon.engine.fit import build_data, build_module
+from mvrecon.engine.module import ReconstructionModule, Settings
+from mvrecon.engine.schedule import build_schedule
+
+#: mm along (x, y, z), and of the detector along (v, u).
+FIELD, DETECTOR = (512, 320, 384), (864, 960)
+
+
+def arguments() -> argparse.Namespace:
+    """What the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--train", required=True)
+    parser.add_argument("--test", required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--model", default="cross_view")
+    parser.add_argument("--n", type=int, default=64)
+    parser.add_argument("--seconds", type=float, default=420.0, help="of training alone")
+    parser.add_argument("--steps", type=int, default=0, help="instead of seconds")
+    parser.add_argument("--profile", type=int, default=8, help="steps under the profiler")
+    for name, default in (("cases", 96), ("val", 4), ("tests", 33), ("batch", 2), ("views", 8)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--lr", type=float, default=3e-3)
+    parser.add_argument("--precision", default="bf16", choices=["bf16", "fp32"])
+    parser.add_argument("--compile", action="store_true")
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("options", nargs="*", help="more settings, as model.support=hull")
+    return parser.parse_args()
+
+
+def settings_of(options: argparse.Namespace, name: str) -> Settings:
+    """Those of the experiment, with a finer grid and detector."""
+    n, pixels = options.n, 3 * options.n // 2
+    steps, pitch = [mm / n for mm in FIELD], [mm / pixels for mm in DETECTOR]
+    sizes = f"{{train: {options.cases}, val: {options.val}, test: {options.tests}}}"
+    return compose(
+        "experiment=open_kbp",
+        f"model={options.model}",
+        f"name={name}",
+        f"scene.path={options.train}",
+        f"test_scene.path={options.test}",
+        "scene.rays=1",
+        "test_scene.rays=1",
+        "scene.vary=false",
+        f"grid.size=[{n},{n},{n}]",
+        f"grid.spacing={steps}",
+        f"camera.views={options.views}",
+        f"camera.detector.pixels=[{pixels},{pixels}]",
+        f"camera.detector.pixel_mm={pitch}",
+        f"data.batch_size={options.batch}",
+        f"data.sizes={sizes}",
+        *options.options,
+    )
+
+
+class Trainer:
+    """Steps of training, all cases on the device: no loader stands between them and the model."""
+
+    def __init__(self, module: ReconstructionModule, data: SceneData, options: argparse.Namespace):
+        self.module, self.options, self.device = module, options, options.device
+        cases = data.sets["train"].prepare()
+        self.cases = {key: cases[key].to(self.device) for key in ("views", "volume", "inside")}
+        self.weights = [p for p in module.parameters() if p.requires_grad and p.numel()]
+        self.optimizer = None
+        if self.weights:
+            fused = self.device == "cuda"
+            self.optimizer = torch.optim.AdamW(
+                self.weights, lr=options.lr, weight_decay=1e-4, fused=fused
+            )
+
+    def step(self, number: int) -> torch.Tensor:
+        """The loss of a batch, which the number decides, and a step of the optimiser."""
+        assert self.optimizer is not None
+        rng = torch.Generator().manual_seed(number)
+        count = len(self.cases["views"])
+        chosen = torch.randperm(count, generator=rng)[: self.options.batch].to(self.device)
+        batch = {key: values[chosen] for key, values in self.cases.items()}
+        half = self.options.precision == "bf16"
+        with torch.autocast(self.device, torch.bfloat16, enabled=half):
+            loss = self.module.loss(self.module.model(batch["views"]), batch)["total"]
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.weights, 1.0, foreach=True)
+        self.optimizer.step()
+        return loss.detach()
+
+    def steps(self, numbers: range) -> float:
+        """Seconds of some steps."""
+        wait(self.device)
+        start = time.perf_counter()
+        for number in numbers:
+            self.step(number)
+        wait(self.device)
+        return time.perf_counter() - start
+
+
+def train(trainer: Trainer, results: Results) -> None:
+    """Train for the time, or the steps, that are asked for."""
+    options = trainer.options
+    results.add("seconds of the first three steps", trainer.steps(range(3)))
+    some = range(3, 13 if options.device == "cuda" else 5)
+    one = trainer.steps(some) / len(some)
+    results.add("ms per step", 1e3 * one)
+    if options.device == "cuda":
+        results.add("peak MB of a step", torch.cuda.max_memory_allocated() / 2**20)
+    steps = options.steps or max(5, int(options.seconds / one))
+    results.add("steps", steps)
+    schedule = build_schedule(trainer.optimizer, "cosine", steps, 0.05)
+    losses, start = [], time.perf_counter()
+    for step in range(1, steps + 1):
+        losses.append(trainer.step(100 + step))
+        schedule.step()
+        if step % max(1, steps // 20) == 0:
+            mean, took = float(torch.stack(losses).mean()), time.perf_counter() - start
+            losses.clear()
+            results.row(step=step, seconds=took, loss=mean, ms_per_step=1e3 * took / step)
+            late = took > options.seconds * 1.15 and not options.steps
+            if mean != mean or late:
+                results.add("stopped", f"after {step} steps, loss {mean}")
+                break
+    results.add("seconds of training", time.perf_counter() - start)
+
+
+def profiled(trainer: Trainer) -> dict[str, Any]:
+    """The kernels that take longest, and how much of the time the device has nothing to do."""
+    from torch.profiler import ProfilerActivity, profile
+
+    count, on_gpu = trainer.options.profile, trainer.device == "cuda"
+    trainer.step(0)
+    plain = trainer.steps(range(count))
+    kinds = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * on_gpu
+    with profile(activities=kinds) as recorded:
+        slowed = trainer.steps(range(count))
+    events = [e for e in recorded.events() or [] if is_work(e, on_gpu)]
+    spans = sorted((e.time_range.start, e.time_range.end) for e in events)
+    busy, last = 0.0, float("-inf")
+    for start, end in spans:  # what overlaps counts once
+        busy += max(0.0, end - max(start, last))
+        last = max(last, end)
+    by_name: dict[str, list[float]] = defaultdict(list)
+    for event in events:
+        by_name[event.name[:90]].append(event.time_range.end - event.time_range.start)
+    top = sorted(by_name.items(), key=lambda item: -sum(item[1]))[:20]
+    return {
+        "ms_per_step": 1e3 * plain / count,
+        "ms_per_step_profiled": 1e3 * slowed / count,
+        "busy_ms_per_step": busy / 1e3 / count,
+        "idle_share": max(0.0, 1 - busy / 1e6 / plain),
+        "kernels_per_step": len(spans) / count,
+        "top": [
+            {"kernel": name, "calls": len(us) / count, "ms": sum(us) / 1e3 / count}
+            for name, us in top
+        ],
+    }
+
+
+def is_work(event: Any, on_gpu: bool) -> bool:
+    """Whether a profiler's event is a kernel, or on a CPU an operator."""
+    if on_gpu:
+        return str(getattr(event, "device_type", None)).endswith("CUDA")
+    return event.name.startswith(("aten::", "mvrecon::"))
+
+
+def judged(
+    module: ReconstructionModule, data: SceneData, options: argparse.Namespace
+) -> dict[str, Any]:
+    """Figures of merit on the test patients, in the precision of the training."""
+    data.setup("test")
+    model, half = module.model, options.precision == "bf16"
+    model.forward = torch.autocast(options.device, torch.bfloat16, enabled=half)(model.forward)
+    judge = module.projector, data.data_range, options.device
+    scores = evaluate({"one": model}, data.test_dataloader(), *judge)["one"]
+    figures = {key: mean_and_spread([score[key] for score in scores]) for key in scores[0]}
+    return {"scenes": len(scores)} | {
+        key: {k: figure[k] for k in ("mean", "std")} for key, figure in figures.items()
+    }
+
+
+def main() -> None:
+    """Entry point."""
+    options = arguments()
+    on_device(options.device)
+    name = f"{options.model}_{options.n}_{options.precision}" + "_compiled" * options.compile
+    results = Results(options.out, f"learn_{name}")
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
+    torch.backends.cudnn.benchmark = True
+    settings = settings_of(options, name)
+    data = build_data(settings)
+    data.setup("fit")
+    torch.manual_seed(0)
+    module = build_module(settings, settings["model"], data.data_range).to(options.device)
+    results.add("parameters", sum(p.numel() for p in module.parameters()))
+    if options.compile:
+        module.model.compile()
+    trainer = Trainer(module, data, options)
+    if trainer.weights:
+        if options.profile:
+            results.attempt("profile", lambda: profiled(trainer))
+        results.attempt("training", lambda: train(trainer, results))
+    results.attempt("figures", lambda: judged(module.eval(), data, options))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Do the models run on a GPU, in which precision, and where do they wait. About a minute.
+
+python scripts/gpu/models.py --out FOLDER [--device cuda] [--n 24]
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from check import waits
+from measuring import Results, latency, on_device, wait
+
+from mvrecon.config import compose
+from mvrecon.engine.fit import build_module
+from mvrecon.engine.module import ReconstructionModule
+from mvrecon.parts import MODELS
+
+VARIANTS = ("model.support=hull", "model.support=box", "model.refine_where=disagreement")
+
+
+def built(model: str, n: int, device: str, extra: Sequence[str] = ()) -> ReconstructionModule:
+    """A model with fresh weights for 4 cameras of a small detector."""
+    pixels = 3 * n // 2
+    settings = compose(
+        f"model={model}",
+        f"grid.size=[{n},{n},{n}]",
+        "camera.views=4",
+        f"camera.detector.pixels=[{pixels},{pixels}]",
+        "camera.detector.pixel_mm=6.0",
+        *extra,
+    )
+    return build_module(settings, settings["model"], 1.0).to(device)
+
+
+def box(n: int, device: str) -> torch.Tensor:
+    """Volumes of a box that is in nobody's middle."""
+    volume = torch.zeros(2, 1, n, n, n, device=device)
+    volume[..., n // 4 : n // 2, n // 3 : 2 * n // 3, n // 4 : n // 2] = 1
+    return volume
+
+
+def learns(model: str, n: int, device: str) -> dict[str, Any]:
+    """Loss and gradient in both precisions, waits and milliseconds of a reconstruction."""
+    module, volume = built(model, n, device), box(n, device)
+    views = module.projector(volume)
+    batch = {"views": views, "volume": volume, "inside": volume > 0.5}
+    result: dict[str, Any] = {}
+    for precision in ("float32", "bfloat16"):
+        with torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
+            loss = module.loss(module.model(views), batch)["total"]
+        result[precision] = float(loss.detach())
+        if loss.requires_grad:
+            loss.backward()
+            norms = [p.grad.float().norm() for p in module.parameters() if p.grad is not None]
+            result[f"{precision} gradient"] = float(torch.stack(norms).norm())
+            module.zero_grad()
+    with torch.no_grad():
+        if device == "cuda":
+            result |= waits(lambda: module.model(views))
+        result["ms"] = latency(lambda: module.model(views), device, 3)
+    return result
+
+
+def skips(extra: str, n: int, device: str) -> dict[str, Any]:
+    """Milliseconds and waits of the cross-view model that leaves something out."""
+    module = built("cross_view", n, device, [extra]).eval()
+    with torch.no_grad():
+        views = module.projector(box(n, device))
+        result: dict[str, Any] = {"ms": latency(lambda: module.model(views), device, 3)}
+        if device == "cuda":
+            result["waits"] = waits(lambda: module.model(views))["waits"]
+    return result
+
+
+def compiled(n: int, device: str) -> dict[str, Any]:
+    """`torch.compile` of a model: seconds of the first call, its difference, its milliseconds."""
+    module = built("backprojection_unet", n, device)
+    views = torch.rand(1, 1, *module.projector.range_shape, device=device)
+    with torch.no_grad():
+        expected = module.model(views).volume
+        start = time.perf_counter()
+        module.model.compile()
+        result = module.model(views).volume
+        wait(device)
+        seconds = time.perf_counter() - start
+        difference = (result - expected).abs().max() / expected.abs().max()
+        ms = latency(lambda: module.model(views), device, 3)
+    return {"first_s": seconds, "difference": float(difference), "ms": ms}
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--n", type=int, default=24)
+    options = parser.parse_args()
+    device, n = on_device(options.device), options.n
+    results = Results(options.out, "models")
+    for model in MODELS.names():
+        results.attempt(model, lambda m=model: learns(m, n, device))
+    for extra in VARIANTS:
+        results.attempt(f"cross_view {extra}", lambda e=extra: skips(e, n, device))
+    if device == "cuda":
+        results.attempt("torch.compile of backprojection_unet", lambda: compiled(n, device))
+
+
+if __name__ == "__main__":
+    main()
