@@ -27,7 +27,7 @@ from mvrecon.projectors.selection import ray_subset, view_subset
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.reconstruct.iterative import sirt_weights
 from mvrecon.reconstruct.poisson import PoissonLikelihood
-from mvrecon.support.support import support_from_views
+from mvrecon.visual_hull.support import support_from_views
 
 N, PIXELS = 24, 36
 DETECTOR = {"pixels": [PIXELS, PIXELS], "pixel_mm": 6.0}
@@ -88,7 +88,7 @@ def body() -> torch.Tensor:
 
 def show_models(places: bool) -> None:
     """The loss of every model, without its gradient."""
-    x, rig = body(), ["camera.views=4", f"camera.detector.pixels=[{PIXELS},{PIXELS}]"]
+    x, rig = body(), ["camera.n_views=4", f"camera.detector.pixels=[{PIXELS},{PIXELS}]"]
     rig += ["camera.detector.pixel_mm=6.0", f"grid.size=[{N},{N},{N}]"]
     batch = {"volume": OnGpu(x), "inside": OnGpu(x > 0.5)}
     for text in MODELS:
