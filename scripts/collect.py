@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from mvrecon.durable import written_whole
+from mvrecon.files.atomic import written_whole
 
 FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside", "view_nrmse")
 

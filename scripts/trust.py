@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from mvrecon.durable import written_whole
 from mvrecon.engine.record import versions
+from mvrecon.files.atomic import written_whole
 from mvrecon_bench.benchmarks.report import markdown
 from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, PASS
 

@@ -4,10 +4,10 @@ import os
 
 import pytest
 
-from mvrecon.durable import claimed
+from mvrecon.files.atomic import claimed
 
 CLAIM = (
-    "import sys, pathlib; from mvrecon.durable import claimed\nwith "
+    "import sys, pathlib; from mvrecon.files.atomic import claimed\nwith "
     "claimed(pathlib.Path(sys.argv[1])): pass"
 )
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from mvrecon.cameras.camera import VECTORS, Cameras
-from mvrecon.durable import written_whole
-from mvrecon.limits import Refused, shown, text_of
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import Refused, shown, text_of
 
 FORMAT = "mvrecon.cameras"
 VERSION = 1

@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mvrecon.config.guard import guarded
 from mvrecon.config.schemas import SCHEMAS
-from mvrecon.limits import shown
+from mvrecon.files.checks import shown
 from mvrecon.registry import installed, locate
 
 VERSION_BASE = "1.3"

@@ -16,7 +16,7 @@ from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
 
-from mvrecon.limits import plain_name, shown, yaml_of
+from mvrecon.files.checks import plain_name, shown, yaml_of
 from mvrecon.registry import hint
 
 #: Keys of the section `hydra` that may come from anywhere, and those that tell of a composition.

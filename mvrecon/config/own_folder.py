@@ -6,7 +6,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from mvrecon.durable import check_plain, new_folder
+from mvrecon.files.atomic import check_plain, new_folder
 
 
 class OwnFolder(Callback):

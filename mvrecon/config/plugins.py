@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 
-from mvrecon.limits import shown
+from mvrecon.files.checks import shown
 from mvrecon.registry import importing, locate
 
 

@@ -7,8 +7,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mvrecon.limits import shown
-from mvrecon.places import check_places, placed
+from mvrecon.files.checks import shown
+from mvrecon.files.places import check_places, placed
 
 #: Where the classes that a `_target_` may name are defined, and what they must be.
 ALLOWED = ("lightning.pytorch", "mvrecon.engine")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mvrecon.cameras.camera import VECTORS, Cameras
-from mvrecon.limits import Refused
+from mvrecon.files.checks import Refused
 
 RIG = "rig"
 #: Decimals of a mm that count: a rig that another processor's sine and cosine make is the same rig.

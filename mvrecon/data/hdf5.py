@@ -30,8 +30,8 @@ import torch
 from mvrecon.data.slabs import Slab, Slabs, planes
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.data.texts import texts_of, variable
-from mvrecon.durable import written_whole
-from mvrecon.limits import NAME, SPACING, Refused, blaming, plain_name, shown
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import NAME, SPACING, Refused, blaming, plain_name, shown
 
 #: Bytes of a chunk that is written, unless one plane has more.
 CHUNK = 2**25

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.data.slabs import Slab, Slabs, planes
-from mvrecon.durable import written_whole
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import DEFLATE, EDGE, SPACING, TEXT, VOLUME, Refused, blaming
 from mvrecon.geometry.grid import Grid
-from mvrecon.limits import DEFLATE, EDGE, SPACING, TEXT, VOLUME, Refused, blaming
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
 ENDING = re.compile(r"\.nii(\.gz)?$", re.IGNORECASE)

@@ -6,8 +6,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.data.nifti import read_nifti, save_nifti
+from mvrecon.files.checks import Refused
 from mvrecon.geometry.grid import Grid
-from mvrecon.limits import Refused
 
 ENDINGS = (".nii", ".nii.gz")
 

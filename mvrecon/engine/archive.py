@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mvrecon.engine.old_names import current
-from mvrecon.limits import TEXT, Refused, blaming, shown
+from mvrecon.files.checks import TEXT, Refused, blaming, shown
 
 #: The files that `torch.save` puts into an archive, below one folder.
 MEMBERS = re.compile(

@@ -15,10 +15,10 @@ from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.engine.export import save_png
 from mvrecon.engine.record import versions
-from mvrecon.memory import peak
+from mvrecon.files.memory import peak
+from mvrecon.files.places import check_places
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
-from mvrecon.places import check_places
 from mvrecon.viz import montage
 from mvrecon.viz.planes import Image
 

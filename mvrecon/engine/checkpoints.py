@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mvrecon.data.module import SceneData
-from mvrecon.durable import check_plain
 from mvrecon.engine.archive import check_archive, check_settings
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.record import SETTINGS
 from mvrecon.engine.storage import read
-from mvrecon.limits import blaming, plain_name
+from mvrecon.files.atomic import check_plain
+from mvrecon.files.checks import blaming, plain_name
 
 
 @dataclass

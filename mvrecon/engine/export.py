@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.data.nifti import save_nifti
-from mvrecon.durable import written_whole
+from mvrecon.files.atomic import written_whole
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz import montage
 from mvrecon.viz.planes import Image

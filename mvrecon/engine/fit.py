@@ -15,8 +15,8 @@ from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
 from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
+from mvrecon.files.checks import plain_name
 from mvrecon.kernels.threads import in_one_order
-from mvrecon.limits import plain_name
 
 
 def methods(settings: Settings) -> dict[str, Settings]:

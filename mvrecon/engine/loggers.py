@@ -9,7 +9,7 @@ from lightning.fabric.loggers.tensorboard import TensorBoardLogger as FabricBoar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
-from mvrecon.durable import written_whole
+from mvrecon.files.atomic import written_whole
 
 
 class _Continuing(ExperimentWriter):

@@ -13,9 +13,9 @@ from typing import Any
 import yaml
 
 from mvrecon import __version__
-from mvrecon.durable import written_whole
 from mvrecon.engine.old_names import current
-from mvrecon.limits import yaml_of
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import yaml_of
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"

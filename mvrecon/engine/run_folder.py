@@ -13,10 +13,10 @@ import yaml
 from mvrecon.cameras import files
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
-from mvrecon.durable import claimed
 from mvrecon.engine import record
 from mvrecon.engine.old_names import current
-from mvrecon.limits import Refused, blaming, shown, text_of, yaml_of
+from mvrecon.files.atomic import claimed
+from mvrecon.files.checks import Refused, blaming, shown, text_of, yaml_of
 
 DIGESTS, RIG = "digests.json", "rig.json"
 #: What a folder without settings of its own must not hold: the work of a run that nobody could

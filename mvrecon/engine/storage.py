@@ -18,10 +18,10 @@ import torch
 from lightning.fabric.plugins import CheckpointIO
 from torch import Tensor
 
-from mvrecon.durable import written_whole
 from mvrecon.engine.archive import check_archive
-from mvrecon.limits import Refused, blaming, shown
-from mvrecon.places import inside
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import Refused, blaming, shown
+from mvrecon.files.places import inside
 
 TAG = b"sha256:"
 COMMENT = len(TAG) + 64

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.files.checks import check_memory
 from mvrecon.geometry.box import Box
-from mvrecon.limits import check_memory
 
 
 @dataclass(frozen=True, eq=False)

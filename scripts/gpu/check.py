@@ -21,7 +21,8 @@ from measuring import Results, on_device, throughput
 
 import mvrecon as mv
 from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.ray_transform import METHODS, RayTransform
+from mvrecon.projectors.integrals import METHODS
+from mvrecon.projectors.ray_transform import RayTransform
 
 PACKAGES = ("torch", "triton", "numpy", "numba", "numba-cuda", "llvmlite", "lightning", "kornia")
 SKIPS = ("off", "auto", "box")

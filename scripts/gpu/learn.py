@@ -64,7 +64,7 @@ def settings_of(options: argparse.Namespace, name: str) -> Settings:
         "scene.vary=false",
         f"grid.size=[{n},{n},{n}]",
         f"grid.spacing={steps}",
-        f"camera.views={options.views}",
+        f"camera.n_views={options.views}",
         f"camera.detector.pixels=[{pixels},{pixels}]",
         f"camera.detector.pixel_mm={pitch}",
         f"data.batch_size={options.batch}",

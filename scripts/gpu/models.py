@@ -27,7 +27,7 @@ def built(model: str, n: int, device: str, extra: Sequence[str] = ()) -> Reconst
     settings = compose(
         f"model={model}",
         f"grid.size=[{n},{n},{n}]",
-        "camera.views=4",
+        "camera.n_views=4",
         f"camera.detector.pixels=[{pixels},{pixels}]",
         "camera.detector.pixel_mm=6.0",
         *extra,

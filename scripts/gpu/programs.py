@@ -55,7 +55,7 @@ def scattered(grid: mv.Grid, rig: mv.Cameras, device: str) -> Program:
     from mvrecon.kernels.rays.occupancy import Occupancy
 
     A, whole = mv.Drr(grid, rig).to(device), Occupancy.whole(grid.shape)
-    return Program(None, lambda y: cuda.scatter(y, A.fixed_lines, A.window, whole, "joseph"))
+    return Program(None, lambda y: cuda.scatter(y, A.fixed_lines, A.ray_extent, whole, "joseph"))
 
 
 def prototype(grid: mv.Grid, rig: mv.Cameras, device: str, nv: int) -> Program:

@@ -58,7 +58,7 @@ class Joseph:
         self.steep = steep(lines, self.rows, self.columns)
         self.lines = lines.to(kernels.device).contiguous()
         self.frames = frames_of(lines).to(kernels.device)
-        low, high = (min(max(float(end), -FAR), FAR) for end in A.window)
+        low, high = (min(max(float(end), -FAR), FAR) for end in A.ray_extent)
         self.scene = Scene(lines=self.lines.data_ptr(), frames=self.frames.data_ptr())
         self.scene.sizes[:] = self.shape[::-1]
         self.scene.window[:] = low, high
@@ -119,7 +119,7 @@ def worst_error(kernels: Host | Gpu) -> float:
         kind = "radon" if rig.parallel else "drr"
         A = PROJECTORS.build(kind, grid=grid, cameras=rig)
         J, rng = Joseph(A, kernels), torch.Generator().manual_seed(0)
-        geometry = A.fixed_lines, A.window
+        geometry = A.fixed_lines, A.ray_extent
         for count in (1, 5):
             x = torch.rand(count, *grid.shape, generator=rng)
             y = torch.rand(count, len(rig), *rig.shape, generator=rng)

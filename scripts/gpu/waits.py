@@ -1,14 +1,13 @@
 """Where mvrecon would wait for a GPU, how many kernels it would start, and which devices would not
-meet. Needs a build of torch with CUDA, but no GPU.
+meet. Needs no GPU.
 
     python scripts/gpu/waits.py [--places]
 """
 
 import argparse
-import sys
 import traceback
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -17,18 +16,18 @@ import torch
 from as_gpu import AsGpu, OnGpu, launches, put, waits
 from check import VECTORS
 from measuring import reason
-from mvrecon.support.support import support_from_views
 
 import mvrecon as mv
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_module
 from mvrecon.kernels.rays import selfcheck
 from mvrecon.metrics import volume_metrics
-from mvrecon.models import lift
+from mvrecon.models import frusta
 from mvrecon.projectors.selection import ray_subset, view_subset
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.reconstruct.iterative import sirt_weights
 from mvrecon.reconstruct.poisson import PoissonLikelihood
+from mvrecon.visual_hull.support import support_from_views
 
 N, PIXELS = 24, 36
 DETECTOR = {"pixels": [PIXELS, PIXELS], "pixel_mm": 6.0}
@@ -58,7 +57,7 @@ def pretend() -> None:
         shape = len(mask), len(self.step), 1, *self.shape
         return OnGpu(torch.ones(shape, dtype=torch.bool))
 
-    lift.Frusta.touched = touched
+    frusta.Frusta.touched = touched
 
 
 def show(what: str, call: Callable[[], Any], places: bool) -> None:
@@ -89,7 +88,7 @@ def body() -> torch.Tensor:
 
 def show_models(places: bool) -> None:
     """The loss of every model, without its gradient."""
-    x, rig = body(), ["camera.views=4", f"camera.detector.pixels=[{PIXELS},{PIXELS}]"]
+    x, rig = body(), ["camera.n_views=4", f"camera.detector.pixels=[{PIXELS},{PIXELS}]"]
     rig += ["camera.detector.pixel_mm=6.0", f"grid.size=[{N},{N},{N}]"]
     batch = {"volume": OnGpu(x), "inside": OnGpu(x > 0.5)}
     for text in MODELS:
@@ -107,7 +106,7 @@ def show_models(places: bool) -> None:
     show("figures of merit", lambda: figures(batch), places)
 
 
-def figures(batch: Mapping[str, torch.Tensor]) -> dict[str, float]:
+def figures(batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Of a volume that is a tenth too small."""
     true = batch["volume"][0]
     return volume_metrics(true * 0.9, true, batch["inside"][0], 1.0)
@@ -164,8 +163,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--places", action="store_true", help="each wait, by file and line")
     places = parser.parse_args().places
-    if torch.version.cuda is None:
-        sys.exit(f"waits.py needs a build of torch with CUDA, got torch {torch.__version__}")
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     pretend()

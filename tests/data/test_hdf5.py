@@ -10,7 +10,7 @@ import pytest
 
 from mvrecon.data import hdf5, slabs
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
-from mvrecon.durable import written_whole
+from mvrecon.files.atomic import written_whole
 from tests.data.conftest import SPACING, head, stored
 from tests.faults.damage import LINKS, instead, linked
 

@@ -141,7 +141,7 @@ def apps(folder: Path) -> list[tuple[int, str]]:
 
 def resuming(folder: Path) -> list[tuple[int, str]]:
     """One process is at work in a run folder until another has tried to resume it."""
-    from mvrecon.durable import claimed
+    from mvrecon.files.atomic import claimed
 
     def hold() -> str:
         with claimed(folder):

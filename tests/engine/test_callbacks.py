@@ -44,4 +44,4 @@ def test_where_the_system_tells_no_memory_the_clock_logs_the_rest(monkeypatch):
         logged.clear()
         Clock().on_train_batch_end(None, Module(), None, {"views": torch.zeros(2, 1)}, 0)
         assert set(logged) == {"time/step_ms", "time/volumes_per_s", "time/seconds"} | known
-        monkeypatch.setattr("mvrecon.memory.resource", None)
+        monkeypatch.setattr("mvrecon.files.memory.resource", None)

@@ -20,11 +20,11 @@ from mvrecon.cameras import files
 from mvrecon.config import compose
 from mvrecon.data import digests
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.durable import new_folder
 from mvrecon.engine import agreement, checkpoints, fit, record, run_folder
 from mvrecon.engine.checkpoints import Trained
 from mvrecon.engine.evaluation import seen_in_training
-from mvrecon.limits import Refused
+from mvrecon.files.atomic import new_folder
+from mvrecon.files.checks import Refused
 from mvrecon.parts import CAMERAS
 from tests.engine.lives import METHOD, OPTIONS
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.durable import claimed, written_whole
 from mvrecon.engine import storage
 from mvrecon.engine.survival import RandomNumbers
-from mvrecon.limits import Refused
+from mvrecon.files.atomic import claimed, written_whole
+from mvrecon.files.checks import Refused
 from tests.faults.fault_injection import counted, signalled
 
 SEED = int(os.environ.get("MVRECON_SEED", "0"))

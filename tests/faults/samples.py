@@ -16,7 +16,7 @@ from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.nifti import read_nifti
 from mvrecon.engine.checkpoints import load
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.limits import yaml_of
+from mvrecon.files.checks import yaml_of
 from mvrecon.parts import CAMERAS
 from tests.faults.hostile import pickle_of, saved, with_pickle
 

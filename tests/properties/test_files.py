@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.engine import record
+from mvrecon.files.checks import plain_name
 from mvrecon.geometry.grid import Grid
-from mvrecon.limits import plain_name
 from tests.properties.strategies import grids, real, volumes
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)

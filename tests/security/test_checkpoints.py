@@ -13,7 +13,7 @@ import torch
 from mvrecon.engine.archive import check_archive
 from mvrecon.engine.checkpoints import finished, load, unfinished
 from mvrecon.engine.storage import read_newest
-from mvrecon.limits import Refused
+from mvrecon.files.checks import Refused
 from tests.faults.hostile import SETTINGS, Payload, pickle_of, pickles, saved, with_pickle
 from tests.faults.samples import checkpoint
 

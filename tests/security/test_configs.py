@@ -13,7 +13,7 @@ import torch
 from mvrecon.config import compose
 from mvrecon.config.plugins import import_plugins
 from mvrecon.config.targets import instantiate
-from mvrecon.limits import Refused, yaml_of
+from mvrecon.files.checks import Refused, yaml_of
 from tests.faults.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
 
 

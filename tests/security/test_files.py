@@ -17,7 +17,7 @@ from mvrecon import memory
 from mvrecon.cameras.files import from_file, save
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.nifti import read_nifti
-from mvrecon.limits import Refused, plain_name, text_of
+from mvrecon.files.checks import Refused, plain_name, text_of
 from mvrecon.parts import CAMERAS
 from tests.data.conftest import RIG, stored
 from tests.faults.damage import DECLARED, HEADERS, instead, nifti

@@ -13,11 +13,11 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from mvrecon.config import compose
 from mvrecon.config.targets import instantiate
-from mvrecon.durable import claimed
 from mvrecon.engine import fit
 from mvrecon.engine.callbacks import Confined
 from mvrecon.engine.storage import DurableCheckpoints, previous, remove
-from mvrecon.limits import Refused
+from mvrecon.files.atomic import claimed
+from mvrecon.files.checks import Refused
 from mvrecon.train import resumed, train
 from tests.engine.lives import OPTIONS
 

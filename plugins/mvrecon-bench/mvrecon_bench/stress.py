@@ -21,8 +21,8 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
         PermissionError: anything but files and folders is in it.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.durable import claimed
     from mvrecon.engine import record
+    from mvrecon.files.atomic import claimed
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.stresses.stress import Stress
 

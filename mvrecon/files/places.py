@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mvrecon.limits import shown
+from mvrecon.files.checks import shown
 
 #: Options whose value is a file or a folder of its own; `sub_dir` is one below another.
 PLACE = re.compile(r"(?!sub_dir$)(.*_)?(dir|dirpath|path)")
