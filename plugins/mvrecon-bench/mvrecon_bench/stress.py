@@ -57,7 +57,7 @@ def task(config: DictConfig) -> None:
                 soft_wrap=True,
             )
     tell(
-        f"{', '.join(f'{count} {verdict}' for verdict, count in found.items())}; all is in "
+        f"{', '.join(f'{count} {verdict}' for verdict, count in verdicts.items())}; all is in "
         f"{folder}",
         soft_wrap=True,
     )
