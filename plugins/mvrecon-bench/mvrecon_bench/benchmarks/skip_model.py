@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.engine.checkpoints import load
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import volume_metrics
 from mvrecon.models.networks import MULTIPLE
@@ -18,7 +18,7 @@ from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.visual_hull.support import Support, support_from_views
 from mvrecon_bench.benchmarks.skip_scenes import Seen, cube, edge, rig, seen
-from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial, pasted
+from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial
 
 #: Voxels left around the object where a user crops: as many as the model leaves by default.
 HALO = 4
@@ -112,7 +112,7 @@ class Learned:
 
         return Trial(
             call=call,
-            whole=lambda part: pasted(part, box, self.A.grid),
+            whole=lambda part: placed(part, box, self.A.grid.shape),
             told=lambda: ("none", "") if mode in DENSE else _told(self.support(mode)),
             build=None if mode in DENSE else lambda: self.support(mode),
             score=None if self.weights is None else score,
@@ -140,7 +140,7 @@ class Learned:
     def psnr(self, net: Any, box: Box, index: int) -> float:
         """Of one case in dB, over the whole grid."""
         case = seen(self.scene, self.A, index)
-        volume = pasted(net(case.views.to(self.device)).volume, box, self.A.grid)[0].cpu()
+        volume = placed(net(case.views.to(self.device)).volume, box, self.A.grid.shape)[0].cpu()
         return volume_metrics(volume, case.volume, case.inside, self.data_range)["psnr"]
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.reconstruct.iterative import sirt
@@ -115,14 +115,7 @@ class Bed:
 
     def pasted(self, part: Tensor, mode: str) -> Tensor:
         """The inverse of `cut`, zero elsewhere."""
-        return pasted(part, self.box, self.grid) if mode == CROPPED else part
-
-
-def pasted(part: Float[Tensor, "b c d h w"], box: Box, grid: Grid) -> Float[Tensor, "b c d2 h2 w2"]:
-    """A box's voxels in their place in the grid, zero elsewhere."""
-    volume = part.new_zeros(*part.shape[:2], *grid.shape)
-    volume[..., *box.slices] = part
-    return volume
+        return placed(part, self.box, self.grid.shape) if mode == CROPPED else part
 
 
 def forward(bed: Bed, mode: str) -> Trial:

@@ -1,0 +1,38 @@
+"""`mvrecon-stress` as a user calls it."""
+
+import csv
+import sys
+
+import pytest
+
+import mvrecon_bench.stress
+from mvrecon_bench.stresses.case import Case
+from mvrecon_bench.stresses.cases import segments
+
+
+def call(folder, monkeypatch) -> list[dict[str, str]]:
+    options = ("parts=[mvrecon]", "cases=[6]", "hydra/job_logging=none")
+    monkeypatch.setattr(sys, "argv", ["mvrecon-stress", f"out={folder}", *options])
+    try:
+        mvrecon_bench.stress.main()
+    finally:
+        with open(folder / "results.csv", newline="") as file:
+            rows = list(csv.DictReader(file))
+    return rows
+
+
+def test_verdicts_are_counted_and_kept(tmp_path, monkeypatch, capsys):
+    rows = call(tmp_path, monkeypatch)
+    assert {row["dtype"] for row in rows} == {"float64", "float32"}
+    assert {(row["number"], row["verdict"]) for row in rows} == {("6", "pass")}
+    assert "2 pass, 0 FAIL, 0 n/a; all is in" in capsys.readouterr().out
+    assert "# Stress plan" in (tmp_path / "table.md").read_text()
+
+
+def test_a_case_that_fails_is_told_and_ends_the_app_with_an_error(tmp_path, monkeypatch, capsys):
+    bad = Case(6, "a bad case", "nothing", "mvrecon", lambda subject: 3.0)
+    monkeypatch.setattr(segments, "CASES", (bad,))
+    with pytest.raises(SystemExit) as error:
+        call(tmp_path, monkeypatch)
+    assert error.value.code == 1
+    assert "FAIL 6 a bad case, mvrecon float64: 3.0 > 0" in capsys.readouterr().out
