@@ -302,7 +302,7 @@ def test_of_a_full_volume_few_voxels_are_looked_at(monkeypatch):
     case = CASES["cone"]
     A = replace(case, grid=Grid.centred((64, 64, 64), 1.0)).build(skip="auto")
     full = torch.rand(1, 64, 64, 64) + 0.1
-    held = choice.occupancy_of(full, choice.Scene(A.lines, A.window, A.detector, A.kernel), "auto")
+    held = choice.occupancy_of(full, plan.Scene(A.lines, A.window, A.detector, A.kernel), "auto")
     assert held.box == Box.whole((64, 64, 64)) and held.bricks is None
     assert 0 < Counted.reads < full.numel() / 200
 

@@ -83,7 +83,8 @@ def occupied(
     skip: str,
 ) -> Tensor:
     """Where volumes [n d h w] are not zero, in code; see `choice.occupancy_of`."""
-    from mvrecon.kernels.rays.choice import Scene, occupancy_of
+    from mvrecon.kernels.rays.choice import occupancy_of
+    from mvrecon.kernels.rays.plan import Scene
 
     return occupancy_of(volume, Scene(lines, window, detector, method), skip).encoded()
 
