@@ -8,10 +8,10 @@ from torch import Tensor
 from mvrecon.geometry.box import Box
 from mvrecon.kernels.compiling import compiled
 from mvrecon.kernels.rays.loops import pixel
+from mvrecon.kernels.rays.nonzero import box_of, bricks_of, empty_share, readable
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
 from mvrecon.kernels.rays.order import empty
 from mvrecon.kernels.rays.plan import Scene, rig_of
-from mvrecon.kernels.rays.scan import box_of, bricks_of, empty_share, readable
 from mvrecon.kernels.rays.shadow import spans_of
 from mvrecon.kernels.rays.trace import main_axis, trace
 
