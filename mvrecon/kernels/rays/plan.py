@@ -15,11 +15,11 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box, Three
 from mvrecon.kernels.padding import padded_shape
+from mvrecon.kernels.rays.footprint import spans_of
 from mvrecon.kernels.rays.lanes import LANES
 from mvrecon.kernels.rays.lines import DIRECTION, START, shifted
 from mvrecon.kernels.rays.loops import Rig
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of, bricks_of_rig
-from mvrecon.kernels.rays.shadow import spans_of
 from mvrecon.kernels.rays.trace import TRILINEAR, numbered
 from mvrecon.kernels.rays.upright import columnar
 
@@ -31,7 +31,7 @@ PLANS, SMALL = 64, 2**14
 
 
 #: The oblique views, which of them are tall, and the spans of their units, see `loops.walk` and
-#: `shadow.spans_of`.
+#: `footprint.spans_of`.
 Reads = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -75,7 +75,7 @@ class Plan:
         oblique: indices of the others.
         axes: whether a ray of an oblique view can have each main axis.
         lanes: volumes that lie side by side.
-        boxes: what the rays are to meet, see `shadow.spans_of`.
+        boxes: what the rays are to meet, see `footprint.spans_of`.
         pieces: see `pieces`.
     """
 
