@@ -5,8 +5,8 @@ Every result is the same to the last bit for any number of threads: each ray's s
 thread, and so does each voxel of the adjoint (a thread owns a range of slabs, one main axis at a
 time, and meets the rays in one order).
 
-Rays read copies of the volume, see `stores.py`, made piece by piece so that little is added to the
-caller's memory.
+Rays read copies of the volume, see `packed_volume.py`, made piece by piece so that little is added
+to the caller's memory.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,8 +21,8 @@ from mvrecon.kernels.rays.columns import backproject_columns, column_of, project
 from mvrecon.kernels.rays.lines import unshifted
 from mvrecon.kernels.rays.loops import Rig, backproject_slabs, project_rows, room_of, vary_rows
 from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.kernels.rays.packed_volume import Store, add, empty, fill, part_of, store
 from mvrecon.kernels.rays.plan import Plan, Scene, plan_of, ray_plan_of
-from mvrecon.kernels.rays.stores import Store, add, empty, fill, part_of, store
 from mvrecon.kernels.threads import share
 
 #: Rows of a volume of half precision that are widened at a time.
