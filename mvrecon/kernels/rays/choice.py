@@ -11,8 +11,8 @@ from mvrecon.kernels.rays.footprint import spans_of
 from mvrecon.kernels.rays.loops import pixel
 from mvrecon.kernels.rays.nonzero import box_of, bricks_of, empty_share, readable
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
-from mvrecon.kernels.rays.order import empty
 from mvrecon.kernels.rays.plan import Scene, rig_of
+from mvrecon.kernels.rays.summation import empty
 from mvrecon.kernels.rays.trace import main_axis, trace
 
 #: Slabs of all rays from which on it is worth while to look for a volume's box, and for its bricks.
