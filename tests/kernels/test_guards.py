@@ -9,7 +9,7 @@ import torch
 
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays import columns, cpu, ops, plan, reference, stores, upright
+from mvrecon.kernels.rays import columns, cpu, ops, packed_volume, plan, reference, upright
 from mvrecon.kernels.rays.loops import backproject_slabs, project_rows, room_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.parts import PROJECTORS
@@ -54,6 +54,7 @@ def test_upright_columns_are_walked_once_for_all_of_their_rays(monkeypatch):
         # circle
         assert walked == {"project_columns": 8 * 48, "backproject_columns": 2 * slabs}
         walked.clear()
+        monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
         monkeypatch.setattr(plan, "columnar", lambda rig: upright.columnar(rig) & False)
         for one, other in zip((A(x), A.T(y)), results, strict=True):
             assert (one - other).norm() < 1e-12 * other.norm()
@@ -118,7 +119,7 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
     narrow = results()
 
     def wide(volumes, near):
-        held = stores.store(volumes, near)
+        held = packed_volume.store(volumes, near)
         assert held.strides.dtype == np.int32
         return held._replace(strides=held.strides.astype(np.int64))
 
@@ -137,7 +138,7 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
     A = Case(grid, rig).build()
     held = plan.rig_of(A.lines, A.ray_extent, Occupancy.whole(grid.shape), [1, 1], method)
     file = np.memmap(tmp_path / "holes", np.float32, "w+", shape=(1, 7203, 43, 7003, 1))
-    volume = stores.store(file.view(np.ndarray), near=2)
+    volume = packed_volume.store(file.view(np.ndarray), near=2)
     assert volume.size > 2**31 and volume.strides.dtype == np.int64
     reads = np.arange(1), np.zeros(1, bool), np.array([[[0, 1]]], np.int32)
     row = file.view(np.ndarray)[0, 7200, 1:41, 7000, 0]

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mvrecon.kernels.rays import choice
+from mvrecon.kernels.rays import skip_policy
 
 
 @pytest.fixture
@@ -15,5 +15,5 @@ def threads():
 @pytest.fixture
 def nothing_is_too_little(monkeypatch):
     """Small volumes are looked at, too."""
-    monkeypatch.setattr(choice, "SOME", 0)
-    monkeypatch.setattr(choice, "MUCH", 0)
+    monkeypatch.setattr(skip_policy, "SOME", 0)
+    monkeypatch.setattr(skip_policy, "MUCH", 0)

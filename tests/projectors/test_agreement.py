@@ -18,7 +18,12 @@ SINGLE = {option: 5e-6 if option == "siddon" else 2e-6 for option in OPTIONS}
 @pytest.fixture
 def oblique(monkeypatch):
     """Sends every view through the loops for any ray."""
-    return lambda: monkeypatch.setattr(plan, "columnar", lambda rig: upright.columnar(rig) & False)
+
+    def send() -> None:
+        monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
+        monkeypatch.setattr(plan, "columnar", lambda rig: upright.columnar(rig) & False)
+
+    return send
 
 
 def test_the_cases_stand_upright_where_they_say_so():
@@ -89,7 +94,8 @@ def test_pieces_of_the_volume_add_up(kind, option, monkeypatch):
         monkeypatch.setattr(plan, "BUDGET", budget)
         held = Occupancy.whole(case.grid.shape)
         rig = plan.rig_of(A.lines, A.ray_extent, held, A.detector, A.kernel)
-        assert len(list(plan.pieces(rig, held, 4, 8))) > 1 or "trilinear" in A.kernel
+        parts = plan.parts_of(A.kernel, held.shape, 4 * 8)
+        assert len(list(plan.pieces(rig, held, parts))) > 1 or "trilinear" in A.kernel
         assert gap(A(x), whole[0]) < 1e-12 and gap(A.T(y), whole[1]) < 1e-12
 
 

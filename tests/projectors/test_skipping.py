@@ -13,9 +13,9 @@ from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.kernels.rays import choice, plan, reference, scan
+from mvrecon.kernels.rays import nonzero, plan, reference, skip_policy
+from mvrecon.kernels.rays.nonzero import bricks_of
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy
-from mvrecon.kernels.rays.scan import bricks_of
 from mvrecon.projectors import integrals
 from tests.projectors.cases import Case, curved
 
@@ -297,15 +297,19 @@ class Counted(np.ndarray):
 def test_of_a_full_volume_few_voxels_are_looked_at(monkeypatch):
     """A row of each face of its box, and one voxel of each of a few hundred bricks."""
     for name in ("inward", "look", "_face_holds", "_brick_holds", "_stride"):
-        monkeypatch.setattr(scan, name, getattr(scan, name).py_func)
-    monkeypatch.setattr(choice, "bricks_of", lambda *_: pytest.fail("all voxels are looked at"))
+        monkeypatch.setattr(nonzero, name, getattr(nonzero, name).py_func)
+    monkeypatch.setattr(
+        skip_policy, "bricks_of", lambda *_: pytest.fail("all voxels are looked at")
+    )
     Counted.reads = 0
-    monkeypatch.setattr(choice, "readable", lambda volumes: scan.readable(volumes).view(Counted))
+    monkeypatch.setattr(
+        skip_policy, "readable", lambda volumes: nonzero.readable(volumes).view(Counted)
+    )
     case = CASES["cone"]
     A = replace(case, grid=Grid.centred((64, 64, 64), 1.0)).build(skip="auto")
     full = torch.rand(1, 64, 64, 64) + 0.1
-    held = choice.occupancy_of(
-        full, choice.Scene(A.lines, A.ray_extent, A.detector, A.kernel), "auto"
+    held = skip_policy.occupancy_of(
+        full, plan.Scene(A.lines, A.ray_extent, A.detector, A.kernel), "auto"
     )
     assert held.box == Box.whole((64, 64, 64)) and held.bricks is None
     assert 0 < Counted.reads < full.numel() / 200

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mvrecon.geometry.box import Box
-from mvrecon.kernels.rays import choice
+from mvrecon.kernels.rays import skip_policy
 from mvrecon.projectors.selection import ray_subset, view_subset
 from tests.projectors.cases import CASES
 from tests.properties.rays import allowed
@@ -28,8 +28,8 @@ ANY = {
 def nothing_is_too_little():
     """Small volumes are looked at, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(choice, "SOME", 0)
-        patch.setattr(choice, "MUCH", 0)
+        patch.setattr(skip_policy, "SOME", 0)
+        patch.setattr(skip_policy, "MUCH", 0)
         yield
 
 

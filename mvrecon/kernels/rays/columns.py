@@ -6,7 +6,7 @@ about it, every stack of slices), the rays of one detector column lie in one upr
 slab they all meet the same two rows of voxels along z (joseph) or the same one or two (siddon).
 These rows are blended once, as contiguous vectors, and each ray then takes one pair of neighbours
 out of the blend: a third of the work of `loops.py`, in the level plane not even that, with the same
-weights. The volume must be turned so that z is contiguous, see `stores.py`.
+weights. The volume must be turned so that z is contiguous, see `packed_volume.py`.
 """
 
 from collections import namedtuple
@@ -16,8 +16,8 @@ import numpy as np
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.lanes import LANES, between, mix, more, put, take
 from mvrecon.kernels.rays.loops import Rig, pixel, silent, steps_of
-from mvrecon.kernels.rays.stores import Store
-from mvrecon.kernels.rays.stores import store as store_of
+from mvrecon.kernels.rays.packed_volume import Store
+from mvrecon.kernels.rays.packed_volume import store as store_of
 from mvrecon.kernels.rays.trace import main_axis, slab_length, within
 from mvrecon.kernels.rays.upright import extent, pieces, places, upright, within_held
 

@@ -5,8 +5,8 @@ Every result is the same to the last bit for any number of threads: each ray's s
 thread, and so does each voxel of the adjoint (a thread owns a range of slabs, one main axis at a
 time, and meets the rays in one order).
 
-Rays read copies of the volume, see `stores.py`, made piece by piece so that little is added to the
-caller's memory.
+Rays read copies of the volume, see `packed_volume.py`, made piece by piece so that little is added
+to the caller's memory.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,8 +21,8 @@ from mvrecon.kernels.rays.columns import backproject_columns, column_of, project
 from mvrecon.kernels.rays.lines import unshifted
 from mvrecon.kernels.rays.loops import Rig, backproject_slabs, project_rows, room_of, vary_rows
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.kernels.rays.plan import Plan, pieces, plan_of, ray_plan_of, rig_of
-from mvrecon.kernels.rays.stores import Store, add, empty, fill, part_of, store
+from mvrecon.kernels.rays.packed_volume import Store, add, empty, fill, part_of, store
+from mvrecon.kernels.rays.plan import Plan, Scene, plan_of, ray_plan_of
 from mvrecon.kernels.threads import share
 
 #: Rows of a volume of half precision that are widened at a time.
@@ -50,7 +50,7 @@ def _overlap(held: Occupancy, rows: slice, piece: Rig) -> tuple[slice, tuple[sli
 
 
 def _copies(
-    volume: Tensor, rig: Rig, held: Occupancy, plan: Plan
+    volume: Tensor, held: Occupancy, plan: Plan
 ) -> Iterator[tuple[Store, Rig, tuple[bool, bool, bool], slice]]:
     """Pieces of volumes in each layout that the plan needs: the rig about them, the main axes that
     read them, rows.
@@ -61,7 +61,7 @@ def _copies(
     volume = volume.detach()
     into, real = None, wide(volume[:0]).numpy().dtype
     for near, axes in plan.layouts:
-        for rows, piece in pieces(rig, held, len(volume), real.itemsize):
+        for rows, piece in plan.pieces:
             into = empty(len(volume), _piece_sizes(piece), (near, plan.lanes), real, into)
             some, where = _overlap(held, rows, piece)
             to, given = part_of(into, near, where), volume[:, :, some]
@@ -85,12 +85,12 @@ def project(
     """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is what
     is held.
     """
-    rig = rig_of(lines, window, held, detector, method)
-    plan = plan_of(rig, held, len(volume))
-    views = np.zeros((len(volume), len(lines), *rig.detector), wide(volume[:0]).numpy().dtype)
-    reads, columns = {near: plan.reads(rig, near) for near, _ in plan.layouts}, plan.columns(rig)
-    oblique, upright = len(plan.oblique) * max(rig.detector), len(plan.upright) * rig.detector[1]
-    for copy, piece, axes, _ in _copies(volume, rig, held, plan):
+    real = wide(volume[:0]).numpy().dtype
+    plan = plan_of(Scene(lines, window, detector, method), held, len(volume), real.itemsize)
+    rig, reads, columns = plan.rig, plan.reads, plan.upright
+    views = np.zeros((len(volume), len(lines), *rig.detector), real)
+    oblique, upright = len(plan.oblique) * max(rig.detector), len(columns[0]) * rig.detector[1]
+    for copy, piece, axes, _ in _copies(volume, held, plan):
 
         def add_rows(first: int, last: int, copy=copy, piece=piece, axes=axes) -> None:
             project_rows(
@@ -115,18 +115,19 @@ def backproject(
     method: str,
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project`, the same to the last bit for any number of threads."""
-    rig = rig_of(lines, window, held, views.shape[2:], method)
-    plan, given = plan_of(rig, held, len(views)), np.ascontiguousarray(views.numpy())
+    given = np.ascontiguousarray(views.numpy())
+    scene = Scene(lines, window, views.shape[2:], method)
+    plan = plan_of(scene, held, len(views), given.itemsize)
     volume, into = np.zeros((len(views), *held.box.shape), given.dtype), None
-    reads, columns = {near: plan.reads(rig, near) for near, _ in plan.layouts}, plan.columns(rig)
     for near, axes in plan.layouts:
-        for rows, piece in pieces(rig, held, len(views), given.itemsize):
+        for rows, piece in plan.pieces:
             into = empty(len(views), _piece_sizes(piece), (near, plan.lanes), given.dtype, into)
             some, where = _overlap(held, rows, piece)
             source, part = part_of(into, near, where), volume[:, :, some]
             for axis in range(3):
-                oblique = reads[near] if axes[axis] else None
-                upright = columns if near == 2 and axis < 2 and len(plan.upright) else None
+                oblique = plan.reads[near] if axes[axis] else None
+                stands = near == 2 and axis < 2 and len(plan.upright[0])
+                upright = plan.upright if stands else None
                 _spread(store(into, near), piece, axis, (oblique, upright), given)
             share(
                 lambda a, b, source=source, to=part, near=near: add(source, near, to, a, b),
@@ -168,11 +169,12 @@ def lines_vjp(
     """The derivative of <views, project(volume, lines)> by the lines, all methods by hand;
     float64.
     """
-    rig = rig_of(lines, window, held, views.shape[2:], method)
-    plan, given = ray_plan_of(rig, held), np.ascontiguousarray(views.numpy())
+    given = np.ascontiguousarray(views.numpy())
+    scene = Scene(lines, window, views.shape[2:], method)
+    plan = ray_plan_of(scene, held, len(volume), wide(volume[:0]).element_size())
+    rig, reads = plan.rig, plan.reads
     total = torch.zeros(lines.shape, dtype=torch.float64)
-    reads = {near: plan.reads(rig, near) for near, _ in plan.layouts}
-    for copy, piece, axes, rows in _copies(volume, rig, held, plan):
+    for copy, piece, axes, rows in _copies(volume, held, plan):
         # a row or column of pixels has its own sum, so that threads change no bit
         change = np.zeros((len(lines), max(rig.detector), *lines.shape[1:]))
 

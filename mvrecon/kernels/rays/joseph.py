@@ -12,13 +12,13 @@ import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.rays.lanes import LANES, between, mix, more, plus, put, take, times
-from mvrecon.kernels.rays.order import fold
+from mvrecon.kernels.rays.summation import fold
 
 
 @scalar
 def cells(ray, count, steps, room):
-    """Per slab that `order.visit` has chosen: flat index of a bilinear cell, place in it towards b
-    and c, length.
+    """Per slab that `summation.visit` has chosen: flat index of a bilinear cell, place in it
+    towards b and c, length.
     """
     index, y, z, share, slab = room.index, room.one, room.two, room.three, room.four
     real, whole = y.dtype.type, index.dtype.type

@@ -10,8 +10,8 @@ from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays import joseph, march, siddon, slopes
 from mvrecon.kernels.rays.lanes import LANES
 from mvrecon.kernels.rays.occupancy import EDGE
-from mvrecon.kernels.rays.order import visit
-from mvrecon.kernels.rays.stores import Store
+from mvrecon.kernels.rays.packed_volume import Store
+from mvrecon.kernels.rays.summation import visit
 from mvrecon.kernels.rays.trace import (
     JOSEPH,
     SIDDON,

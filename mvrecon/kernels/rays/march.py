@@ -36,7 +36,7 @@ def cells(ray, span, steps, room):
     weight beyond span.
 
     Returns:
-        how many there are; where their terms begin, see `order.fold`.
+        how many there are; where their terms begin, see `summation.fold`.
     """
     at, y, z, share = room.index, room.one, room.two, room.three
     step = (ray.end - ray.begin) / steps.samples

@@ -82,8 +82,9 @@ def occupied(
     method: str,
     skip: str,
 ) -> Tensor:
-    """Where volumes [n d h w] are not zero, in code; see `choice.occupancy_of`."""
-    from mvrecon.kernels.rays.choice import Scene, occupancy_of
+    """Where volumes [n d h w] are not zero, in code; see `skip_policy.occupancy_of`."""
+    from mvrecon.kernels.rays.plan import Scene
+    from mvrecon.kernels.rays.skip_policy import occupancy_of
 
     return occupancy_of(volume, Scene(lines, window, detector, method), skip).encoded()
 

@@ -5,46 +5,87 @@ piece.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.geometry.box import Box, Three
 from mvrecon.kernels.padding import padded_shape
+from mvrecon.kernels.rays.footprint import spans_of
 from mvrecon.kernels.rays.lanes import LANES
 from mvrecon.kernels.rays.lines import DIRECTION, START, shifted
 from mvrecon.kernels.rays.loops import Rig
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of, bricks_of_rig
-from mvrecon.kernels.rays.shadow import spans_of
-from mvrecon.kernels.rays.trace import JOSEPH, TRILINEAR, numbered
+from mvrecon.kernels.rays.trace import TRILINEAR, numbered
 from mvrecon.kernels.rays.upright import columnar
 
 #: Bytes of the copy of a piece of the volume.
 BUDGET = 24 * 2**20
+#: Plans that are kept, and the numbers of lines, and rows or columns of pixels, up to which one is:
+#: beyond, a call takes so long that its plan costs next to nothing.
+PLANS, SMALL = 64, 2**14
 
 
 #: The oblique views, which of them are tall, and the spans of their units, see `loops.walk` and
-#: `shadow.spans_of`.
+#: `footprint.spans_of`.
 Reads = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-@dataclass(frozen=True)
+class Scene(NamedTuple):
+    """The rays that a volume is met by, as the operators have them."""
+
+    lines: Tensor
+    window: Sequence[float]
+    detector: Sequence[int]
+    method: str
+
+    def slabs(self, shape: Sequence[int]) -> int:
+        """Slabs of all rays, at most."""
+        return len(self.lines) * math.prod(self.detector) * max(shape)
+
+
+class Key(NamedTuple):
+    """All that a plan depends on, by its content; `lines` are the bytes of float64 numbers [m 4 3
+    k].
+    """
+
+    lines: bytes
+    shape: tuple[int, ...]
+    window: tuple[float, float]
+    detector: tuple[int, int]
+    method: str
+    volume: Three
+    box: Box
+    lanes: int
+    parts: int
+
+
+@dataclass(frozen=True, eq=False)
 class Plan:
-    """Which views are read how.
+    """Which views are read how; nobody writes to its arrays, which several threads share.
 
     Args:
-        upright: indices of the views whose columns are read as rows of voxels.
+        rig: what the loops know of the rays.
+        upright: indices of the views whose columns are read as rows of voxels, and the spans of
+            their columns.
         oblique: indices of the others.
         axes: whether a ray of an oblique view can have each main axis.
         lanes: volumes that lie side by side.
-        boxes: what the rays are to meet, see `shadow.spans_of`.
+        boxes: what the rays are to meet, see `footprint.spans_of`.
+        pieces: see `pieces`.
     """
 
-    upright: np.ndarray
+    rig: Rig
+    upright: tuple[np.ndarray, np.ndarray]
     oblique: np.ndarray
     axes: tuple[bool, bool, bool]
     lanes: int
     boxes: Float[np.ndarray, "n 6"] | None
+    pieces: tuple[tuple[slice, Rig], ...]
 
     @property
     def layouts(self) -> list[tuple[int, tuple[bool, bool, bool]]]:
@@ -52,22 +93,21 @@ class Plan:
         read it.
         """
         x, y, z = self.axes
-        turned = [(2, (x, y, False))] if x or y or len(self.upright) else []
+        turned = [(2, (x, y, False))] if x or y or len(self.upright[0]) else []
         return turned + ([(0, (False, False, z))] if z else [])
 
-    def reads(self, rig: Rig, near: int) -> Reads:
-        """How the oblique views are read: those are tall for a near axis whose greatest steps are
-        from row to row.
+    @cached_property
+    def reads(self) -> dict[int, Reads]:
+        """How the oblique views are read for each near axis: those are tall for a near axis whose
+        greatest steps are from row to row.
         """
-        lines = rig.lines[self.oblique]
+        return {near: self._reads(near) for near, _ in self.layouts}
+
+    def _reads(self, near: int) -> Reads:
+        lines = self.rig.lines[self.oblique]
         steps = np.abs(lines[:, DIRECTION, near]) + np.abs(lines[:, START, near])
         tall = steps[:, 1] > steps[:, 0] if lines.shape[3] == 3 else np.zeros(len(steps), bool)
-        return self.oblique, tall, spans_of(lines, rig.detector, tall, self.boxes)
-
-    def columns(self, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-        """The upright views, and the spans of their columns."""
-        tall = np.ones(len(self.upright), bool)
-        return self.upright, spans_of(rig.lines[self.upright], rig.detector, tall, self.boxes)
+        return self.oblique, tall, spans_of(lines, self.rig.detector, tall, self.boxes)
 
 
 def rig_of(
@@ -95,24 +135,62 @@ def bounds_of(held: Occupancy) -> tuple[int, ...]:
     return (*held.read.low[::-1], *held.read.high[::-1])
 
 
-def plan_of(rig: Rig, held: Occupancy, volumes: int) -> Plan:
-    """The plan for projecting volumes, or for back-projecting into them."""
+def plan_of(scene: Scene, held: Occupancy, volumes: int, itemsize: int) -> Plan:
+    """The plan for projecting volumes, of numbers of so many bytes, or for back-projecting into
+    them.
+
+    Those of small scenes are kept: an iteration asks for the same one again and again.
+    """
+    lanes = LANES if scene.method == "joseph" and volumes > 2 else 1
+    parts = parts_of(scene.method, held.shape, volumes * itemsize)
+    units = len(scene.lines) * max(scene.detector)
+    if held.bricks is None and max(units, scene.lines.numel()) <= SMALL:
+        maps = np.ascontiguousarray(scene.lines.detach().numpy(), dtype=np.float64)
+        window, detector = tuple(map(float, scene.window)), tuple(map(int, scene.detector))
+        key = Key(
+            *(maps.tobytes(), maps.shape, window, detector, scene.method),
+            *(held.shape, held.box, lanes, parts),
+        )
+        return kept_plan(key)
+    return _made(rig_of(*scene[:2], held, *scene[2:]), held, lanes, parts)
+
+
+def keyed_plan(key: Key) -> Plan:
+    """The plan that belongs to a key."""
+    lines = torch.from_numpy(np.frombuffer(key.lines).reshape(key.shape).copy())
+    held = Occupancy(key.volume, key.box)
+    return _made(rig_of(lines, key.window, held, *key[3:5]), held, key.lanes, key.parts)
+
+
+kept_plan = lru_cache(maxsize=PLANS)(keyed_plan)
+
+
+def ray_plan_of(scene: Scene, held: Occupancy, volumes: int, itemsize: int) -> Plan:
+    """The plan that goes ray by ray, volume by volume, for derivatives in the geometry."""
+    rig = rig_of(*scene[:2], held, *scene[2:])
+    parts = parts_of(scene.method, held.shape, volumes * itemsize)
+    return _plan(rig, held, np.zeros(len(rig.lines), bool), 1, parts)
+
+
+def _made(rig: Rig, held: Occupancy, lanes: int, parts: int) -> Plan:
     upright = columnar(rig) if rig.method != TRILINEAR else np.zeros(len(rig.lines), bool)
-    oblique = np.flatnonzero(~upright)
-    lanes = LANES if rig.method == JOSEPH and volumes > 2 else 1
+    return _plan(rig, held, upright, lanes, parts)
+
+
+def _plan(
+    rig: Rig, held: Occupancy, upright: Bool[np.ndarray, " m"], lanes: int, parts: int
+) -> Plan:
+    oblique, boxes, columns = np.flatnonzero(~upright), boxes_of(held), np.flatnonzero(upright)
+    tall = np.ones(len(columns), bool)
     return Plan(
-        np.flatnonzero(upright),
+        rig,
+        (columns, spans_of(rig.lines[columns], rig.detector, tall, boxes)),
         oblique,
         _main_axes(rig, rig.lines[oblique, 0]),
         lanes,
-        boxes_of(held),
+        boxes,
+        tuple(pieces(rig, held, parts)),
     )
-
-
-def ray_plan_of(rig: Rig, held: Occupancy) -> Plan:
-    """The plan that goes ray by ray, volume by volume, for derivatives in the geometry."""
-    every = np.arange(len(rig.lines))
-    return Plan(every[:0], every, _main_axes(rig, rig.lines[:, 0]), 1, boxes_of(held))
 
 
 def _main_axes(rig: Rig, direction: Float[np.ndarray, "m 3 k"]) -> tuple[bool, bool, bool]:
@@ -135,18 +213,26 @@ def _main_axes(rig: Rig, direction: Float[np.ndarray, "m 3 k"]) -> tuple[bool, b
     return bool(x), bool(y), bool(z)
 
 
-def pieces(rig: Rig, held: Occupancy, volumes: int, itemsize: int) -> Iterator[tuple[slice, Rig]]:
-    """Ranges of the volume's rows whose copies fit the budget, each with the rig about its own
+def parts_of(method: str, shape: Sequence[int], itemsize: int) -> int:
+    """In how many pieces volumes [d h w] are read, whose voxels have so many bytes each.
+
+    The samples of "trilinear" are spaced along the ray's way through the whole volume: it is one
+    piece.
+    """
+    if "trilinear" in method:
+        return 1
+    return max(1, -(-math.prod(padded_shape(shape)) * itemsize // BUDGET))
+
+
+def pieces(rig: Rig, held: Occupancy, parts: int) -> Iterator[tuple[slice, Rig]]:
+    """Ranges of the volume's rows, as many as parts or fewer, each with the rig about its own
     centre.
 
     Weights of both methods are of single voxels, so that the pieces' projections add up to the
-    whole volume's. The samples of "trilinear" are spaced along the ray's way through the whole
-    volume: it is one piece. What is held cuts pieces short, but never moves them, so that sums keep
-    their order.
+    whole volume's. What is held cuts pieces short, but never moves them, so that sums keep their
+    order.
     """
     width, height, depth = rig.sizes
-    size = volumes * math.prod(padded_shape(rig.sizes)) * itemsize
-    parts = 1 if rig.method == TRILINEAR else max(1, -(-size // BUDGET))
     rows = (
         -(-height // (parts * EDGE)) * EDGE
     )  # the first is the greatest, and its memory serves the others

@@ -12,7 +12,7 @@ the cell above it.
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.order import fold
+from mvrecon.kernels.rays.summation import fold
 
 
 @scalar
@@ -26,7 +26,7 @@ def reach(low, high, before, per_slope, length):
 
 @scalar
 def cells(ray, count, steps, room):
-    """Per slab that `order.visit` has chosen: flat indices of the cells that the ray crosses in
+    """Per slab that `summation.visit` has chosen: flat indices of the cells that the ray crosses in
     order, lengths.
 
     Crossings are found in float64 and rounded last: a ray that is all but along a plane moves its

@@ -13,7 +13,7 @@ import numpy as np
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.rays import corners, march
 
-#: As much of `stores.Store` as is read here: padded volumes in one row, and the size of one.
+#: As much of `packed_volume.Store` as is read here: padded volumes in one row, and the size of one.
 Values = namedtuple("Values", ["values", "size"])
 
 

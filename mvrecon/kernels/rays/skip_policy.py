@@ -2,21 +2,17 @@
 pay.
 """
 
-import math
-from collections.abc import Sequence
-from typing import NamedTuple
-
 import numpy as np
 from torch import Tensor
 
 from mvrecon.geometry.box import Box
 from mvrecon.kernels.compiling import compiled
+from mvrecon.kernels.rays.footprint import spans_of
 from mvrecon.kernels.rays.loops import pixel
+from mvrecon.kernels.rays.nonzero import box_of, bricks_of, empty_share, readable
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
-from mvrecon.kernels.rays.order import empty
-from mvrecon.kernels.rays.plan import rig_of
-from mvrecon.kernels.rays.scan import box_of, bricks_of, empty_share, readable
-from mvrecon.kernels.rays.shadow import spans_of
+from mvrecon.kernels.rays.plan import Scene, rig_of
+from mvrecon.kernels.rays.summation import empty
 from mvrecon.kernels.rays.trace import main_axis, trace
 
 #: Slabs of all rays from which on it is worth while to look for a volume's box, and for its bricks.
@@ -29,19 +25,6 @@ SET_UP, ASK = 16.0, 3.0
 #: The share of empty bricks from which on all of them are looked at, and the part of the work that
 #: they must leave.
 WORTH, LESS = 0.35, 0.85
-
-
-class Scene(NamedTuple):
-    """The rays that a volume is met by, as the operators have them."""
-
-    lines: Tensor
-    window: Sequence[float]
-    detector: Sequence[int]
-    method: str
-
-    def slabs(self, shape: Sequence[int]) -> int:
-        """Slabs of all rays, at most."""
-        return len(self.lines) * math.prod(self.detector) * max(shape)
 
 
 def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
