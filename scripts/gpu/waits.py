@@ -1,13 +1,14 @@
 """Where mvrecon would wait for a GPU, how many kernels it would start, and which devices would not
-meet. Needs no GPU.
+meet. Needs a build of torch with CUDA, but no GPU.
 
     python scripts/gpu/waits.py [--places]
 """
 
 import argparse
+import sys
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -88,7 +89,7 @@ def body() -> torch.Tensor:
 
 def show_models(places: bool) -> None:
     """The loss of every model, without its gradient."""
-    x, rig = body(), ["camera.n_views=4", f"camera.detector.pixels=[{PIXELS},{PIXELS}]"]
+    x, rig = body(), ["camera.views=4", f"camera.detector.pixels=[{PIXELS},{PIXELS}]"]
     rig += ["camera.detector.pixel_mm=6.0", f"grid.size=[{N},{N},{N}]"]
     batch = {"volume": OnGpu(x), "inside": OnGpu(x > 0.5)}
     for text in MODELS:
@@ -106,7 +107,7 @@ def show_models(places: bool) -> None:
     show("figures of merit", lambda: figures(batch), places)
 
 
-def figures(batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def figures(batch: Mapping[str, torch.Tensor]) -> dict[str, float]:
     """Of a volume that is a tenth too small."""
     true = batch["volume"][0]
     return volume_metrics(true * 0.9, true, batch["inside"][0], 1.0)
@@ -163,6 +164,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--places", action="store_true", help="each wait, by file and line")
     places = parser.parse_args().places
+    if torch.version.cuda is None:
+        sys.exit(f"waits.py needs a build of torch with CUDA, got torch {torch.__version__}")
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     pretend()

@@ -146,9 +146,10 @@ def plan_of(scene: Scene, held: Occupancy, volumes: int, itemsize: int) -> Plan:
     units = len(scene.lines) * max(scene.detector)
     if held.bricks is None and max(units, scene.lines.numel()) <= SMALL:
         maps = np.ascontiguousarray(scene.lines.detach().numpy(), dtype=np.float64)
-        window, detector = tuple(map(float, scene.window)), tuple(map(int, scene.detector))
+        first, last = map(float, scene.window)
+        rows, columns = map(int, scene.detector)
         key = Key(
-            *(maps.tobytes(), maps.shape, window, detector, scene.method),
+            *(maps.tobytes(), maps.shape, (first, last), (rows, columns), scene.method),
             *(held.shape, held.box, lanes, parts),
         )
         return kept_plan(key)
