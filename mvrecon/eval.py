@@ -29,7 +29,7 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
         FileExistsError: the folder is a run's own.
     """
     import_plugins(given["plugins"])
-    from mvrecon.engine import agreement, checkpoints, evaluation, export, fit, record, run_folder
+    from mvrecon.engine import agreement, checkpoints, evaluation, export, fit, run_folder
 
     run = checkpoints.run_folder(given["checkpoint"])
     described = (label for label, model in given["compare"].items() if model)
@@ -37,7 +37,7 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
         raise ValueError(
             f"compare describes {trained}, which the run has trained already; expected other labels"
         )
-    settings = merged(record.read_settings(run), given)
+    settings = merged(run_folder.read_settings(run), given)
     import_plugins(settings["plugins"])
     data = fit.build_data(settings)
 
@@ -46,11 +46,11 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     see = save if given["save"] else None
     run_folder.compare_measurement(run, data.digests("test"))
-    with run_folder.taken(folder, given, record.EVALUATION):
+    with run_folder.taken(folder, given, run_folder.EVALUATION):
         agreement.warn_of_other_views(settings, data)
         found = evaluation.results(settings, run, data, evaluation.device_of(given["device"]), see)
         found["checkpoint"] = str(run)
-        record.write_results(folder, found)
+        run_folder.write_results(folder, found)
     return found
 
 
@@ -73,8 +73,8 @@ def merged(run: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's mean PSNR in dB."""
-    from mvrecon.engine.record import anchored
     from mvrecon.engine.report import show
+    from mvrecon.engine.run_folder import anchored
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     found = evaluate(anchored(to_plain(config)), folder)

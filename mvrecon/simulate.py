@@ -54,7 +54,7 @@ def task(config: DictConfig) -> None:
     """One run of the app."""
     from rich.console import Console
 
-    from mvrecon.engine.record import anchored
+    from mvrecon.engine.run_folder import anchored
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     saved = simulate(anchored(to_plain(config)), folder)

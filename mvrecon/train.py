@@ -27,7 +27,7 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         ValueError: the folder's run has other settings, another rig or other data.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.engine import agreement, evaluation, fit, record, run_folder
+    from mvrecon.engine import agreement, evaluation, fit, run_folder
 
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     data = fit.build_data(settings)
@@ -38,7 +38,7 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             fit.fit(method, settings, data, folder)
         device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
         found = evaluation.results(settings, folder, data, device)
-        record.write_results(folder, found)
+        run_folder.write_results(folder, found)
     return found
 
 
@@ -49,23 +49,22 @@ def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
         ValueError: other options were given, which a resumed run could not honour.
         FileNotFoundError: no run folder is there.
     """
-    from mvrecon.engine import checkpoints, record
+    from mvrecon.engine import checkpoints, run_folder
 
     if others:
         raise ValueError(
             f"resume goes on with the run's own settings; but got also {' '.join(others)}"
         )
     run = checkpoints.run_folder(folder)
-    return record.read_settings(run), run
+    return run_folder.read_settings(run), run
 
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's mean PSNR in dB, for sweepers."""
     from mvrecon.engine import run_folder
-    from mvrecon.engine.record import anchored
     from mvrecon.engine.report import show
 
-    settings = anchored(to_plain(config))
+    settings = run_folder.anchored(to_plain(config))
     folder = Path(HydraConfig.get().runtime.output_dir)
     if settings["resume"]:
         given = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.engine.export import save_png
-from mvrecon.engine.record import versions
+from mvrecon.engine.run_folder import versions
 from mvrecon.files.memory import peak
 from mvrecon.files.places import check_places
 from mvrecon.models.output import Reconstruction

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mvrecon.data.module import SceneData
-from mvrecon.engine.archive import check_archive, check_settings
+from mvrecon.engine.checkpoint_check import check_archive, check_settings
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.engine.record import SETTINGS
+from mvrecon.engine.run_folder import SETTINGS
 from mvrecon.engine.storage import read
 from mvrecon.files.atomic import check_plain
 from mvrecon.files.checks import blaming, plain_name

@@ -18,7 +18,7 @@ import torch
 from lightning.fabric.plugins import CheckpointIO
 from torch import Tensor
 
-from mvrecon.engine.archive import check_archive
+from mvrecon.engine.checkpoint_check import check_archive
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import Refused, blaming, shown
 from mvrecon.files.places import inside
