@@ -31,7 +31,7 @@ def installed() -> tuple[EntryPoint, ...]:
 
 
 def locate(module: str) -> ModuleSpec | None:
-    """Where a module is, as importlib's find_spec tells, but without importing its parent
+    """The spec of a module, as importlib's find_spec gives it, but without importing its parent
     packages.
     """
     top, *rest = module.split(".")
@@ -53,8 +53,8 @@ def hint(name: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def importing(what: str) -> Iterator[None]:
-    """Imports something of a plugin's: what breaks it off is told, and the parts that it had
-    registered are gone.
+    """Context for the import of a plugin: any error becomes an ImportError, and parts that the
+    plugin had registered are removed.
 
     Raises:
         ImportError: in place of whatever the import raised, an exit included; the message begins

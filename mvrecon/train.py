@@ -16,7 +16,7 @@ from mvrecon.config.plugins import import_plugins
 
 
 def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Train every method of `settings` in a run folder, go on where it was left, and return its
+    """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
 
     The folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
@@ -37,13 +37,13 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         for method in fit.methods(settings):
             fit.fit(method, settings, data, folder)
         device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
-        found = evaluation.results(settings, folder, data, device)
-        run_folder.write_results(folder, found)
-    return found
+        table = evaluation.results(settings, folder, data, device)
+        run_folder.write_results(folder, table)
+    return table
 
 
 def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
-    """The settings and the folder of a run that goes on.
+    """Settings and folder of a run to resume.
 
     Raises:
         ValueError: other options were given, which a resumed run could not honour.
@@ -67,12 +67,12 @@ def task(config: DictConfig) -> float:
     settings = run_folder.anchored(to_plain(config))
     folder = Path(HydraConfig.get().runtime.output_dir)
     if settings["resume"]:
-        given = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
-        settings, folder = resumed(settings["resume"], given)
+        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        settings, folder = resumed(settings["resume"], others)
     run_folder.check(folder, settings)
-    found = train(settings, folder)
-    show(found, folder)
-    return next(iter(found["methods"].values()))["psnr"]["mean"]
+    table = train(settings, folder)
+    show(table, folder)
+    return next(iter(table["methods"].values()))["psnr"]["mean"]
 
 
 def main() -> None:

@@ -31,8 +31,8 @@ WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 @contextmanager
 def taken(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> Iterator[None]:
-    """A run folder that is this process's meanwhile, new or with the very settings that it had;
-    they are written down.
+    """Context that locks a run folder, new or started with the same settings, and writes the
+    settings into it.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -45,11 +45,11 @@ def taken(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> It
 
 
 def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
-    """Compare settings with those that a folder's run was started with; nothing is written.
+    """Compare settings with those that the folder's run was started with, without writing anything.
 
     Raises:
         ValueError: they differ; the message names each that does.
-        FileExistsError: results are there, and no settings of theirs.
+        FileExistsError: the folder has results but no file of settings.
     """
     remedy = "choose another folder by hydra.run.dir=..."
     if not (folder / file).is_file():
@@ -58,9 +58,9 @@ def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> No
                 f"{folder} holds {', '.join(work)} of another run without its {file}; {remedy}"
             )
         return
-    kept = current(yaml_of(folder / file))
+    expected = current(yaml_of(folder / file))
     plain = yaml.safe_load(yaml.safe_dump(dict(settings)))
-    if changed := differences(plain, kept):
+    if changed := differences(plain, expected):
         raise ValueError(
             f"{folder} is the folder of a run with other settings: {'; '.join(changed)}; {remedy}"
         )
@@ -82,8 +82,8 @@ def differences(got: Any, expected: Any, key: str = "") -> list[str]:
 
 
 def keep_measurement(folder: Path, data: SceneData) -> None:
-    """Keep a run's rig, and the digests of its rig and its data files; or compare them with those
-    kept before.
+    """Write a run's rig, and the digests of its rig and its data files; a resumed run compares them
+    instead.
 
     Raises:
         Refused: the rig or a file is not what the run began with.
@@ -96,7 +96,7 @@ def keep_measurement(folder: Path, data: SceneData) -> None:
 
 
 def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
-    """Compare digests with those that a run folder keeps, if it does.
+    """Compare digests with those in a run folder, if it has any.
 
     Raises:
         Refused: the rig or a file differs, or the file of digests is none.
@@ -105,10 +105,10 @@ def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
     if not path.is_file():
         return
     with blaming(path, "is not JSON"):
-        kept = json.loads(text_of(path))
-    if not isinstance(kept, dict):
-        raise Refused(f"{path}: expected digests by name, got {shown(kept)}")
-    digests.compare(got, kept, f"{path} (its rig is kept as {RIG})")
+        expected = json.loads(text_of(path))
+    if not isinstance(expected, dict):
+        raise Refused(f"{path}: expected digests by name, got {shown(expected)}")
+    digests.compare(got, expected, f"{path} (its rig is kept as {RIG})")
 
 
 def versions() -> dict[str, str]:
@@ -119,18 +119,18 @@ def versions() -> dict[str, str]:
     """
     import torch
 
-    known = {
+    packages = {
         "mvrecon": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
     }
-    known["torch"] = str(torch.__version__)
+    packages["torch"] = str(torch.__version__)
     for name in PACKAGES:
         try:
-            known[name] = metadata.version(name)
+            packages[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            known[name] = "not installed"
-    return known
+            packages[name] = "not installed"
+    return packages
 
 
 def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:

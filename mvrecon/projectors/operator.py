@@ -78,7 +78,7 @@ class LinearOperator:
         return Cropped(self, box, views)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> "LinearOperator":
-        """A diag(support): what lies outside the mask is neither read nor written."""
+        """A diag(support): voxels outside the mask are neither read nor written."""
         return self if support is None else Scaled(self, voxels=support)
 
     def mirror(self) -> Mirror | None:

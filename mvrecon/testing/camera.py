@@ -1,4 +1,4 @@
-"""The contract of a camera."""
+"""Checks that every camera must pass."""
 
 from typing import Any
 
@@ -29,12 +29,12 @@ def check_camera(name: str, **options: Any) -> None:
     uvz = _somewhere(cameras)
     xyz = cameras.unproject(uvz)
     for m, camera in enumerate(cameras):
-        seen = camera.project(xyz[m])[0]
-        error = ((seen - uvz[m]).abs() / (1 + uvz[m].abs())).max()
+        uv = camera.project(xyz[m])[0]
+        error = ((uv - uvz[m]).abs() / (1 + uvz[m].abs())).max()
         assert error < 1e-9, (
             f"camera {m}: projecting a point that was unprojected misses by {error:.2g}"
         )
-        assert torch.allclose(cameras.project(xyz[m])[m], seen, rtol=1e-12, atol=1e-9), (
+        assert torch.allclose(cameras.project(xyz[m])[m], uv, rtol=1e-12, atol=1e-9), (
             f"camera {m} differs when alone"
         )
 
