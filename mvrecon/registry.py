@@ -162,7 +162,7 @@ class Registry:
                     )
         return part(*args, **options)
 
-    def from_config(self, config: Mapping[str, Any], *args: Any, **given: Any) -> Any:
+    def from_config(self, config: Mapping[str, Any], *args: Any, **keywords: Any) -> Any:
         """Construct the part that a mapping `{"name": ..., **options}` describes."""
         if "name" not in config:
             raise TypeError(
@@ -170,7 +170,7 @@ class Registry:
                 f"{', '.join(self.names())}"
             )
         options = {key: value for key, value in config.items() if key != "name"}
-        return self.build(config["name"], *args, **given, **options)
+        return self.build(config["name"], *args, **keywords, **options)
 
 
 def _where(part: Any) -> str:

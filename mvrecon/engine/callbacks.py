@@ -25,10 +25,10 @@ from mvrecon.viz.planes import Image
 
 def peak_megabytes() -> dict[str, float]:
     """Peak memory so far in units of 2^20 bytes: of the GPU if there is one, else of this process;
-    None if it is not known.
+    empty if it is not known.
     """
-    most = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
-    return {} if most is None else {"peak_mb": most / 2**20}
+    peak_bytes = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
+    return {} if peak_bytes is None else {"peak_mb": peak_bytes / 2**20}
 
 
 class Clock(L.Callback):

@@ -83,16 +83,16 @@ def claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-def new_folder(wanted: str | Path) -> Path:
+def new_folder(path: str | Path) -> Path:
     """Make a new folder at a path; if it exists already, with _2, _3, ... at its end.
 
     Raises:
         OSError: no space, no permission.
     """
-    wanted = Path(wanted)
-    wanted.parent.mkdir(parents=True, exist_ok=True)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     for number in count(1):
-        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
+        folder = path if number == 1 else path.with_name(f"{path.name}_{number}")
         try:
             folder.mkdir()  # by one process alone: the system sees to that
             break

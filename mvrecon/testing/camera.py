@@ -66,10 +66,10 @@ def _check_pixels(cameras: Cameras) -> None:
 
 def _somewhere(cameras: Cameras, count: int = 50) -> Float[Tensor, "m n 3"]:
     """Random pixel coordinates and depths on the side of each camera that counts."""
-    least, most = (max(min(w, 3.0), -3.0) for w in cameras.ray_extent)
+    nearest, farthest = (max(min(w, 3.0), -3.0) for w in cameras.ray_extent)
     t = torch.rand(
         len(cameras), count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
     uv = t[..., :2] * t.new_tensor(cameras.shape[::-1]) - 0.5
-    w = least + (most - least) * (0.05 + 0.9 * t[..., 2:])
+    w = nearest + (farthest - nearest) * (0.05 + 0.9 * t[..., 2:])
     return torch.cat([uv, w * cameras.distance[:, None, None]], dim=-1)
