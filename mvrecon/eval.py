@@ -12,13 +12,13 @@ from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
 
 
-def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
+def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Evaluate a run's methods and write `results.json` (with `save`, the cases too) into a folder.
 
     Args:
-        given: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the
+        options: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the
             run: `test_scene`, `data`, further `compare`; `device` and `save`.
-        folder: where the results go, with `eval.yaml`, which is `given`, and `versions.txt`.
+        folder: where the results go, with `eval.yaml`, which is `options`, and `versions.txt`.
 
     Raises:
         FileNotFoundError: no checkpoint or no run is there.
@@ -28,43 +28,45 @@ def evaluate(given: dict[str, Any], folder: Path) -> dict[str, Any]:
             decides.
         FileExistsError: the folder is a run's own.
     """
-    import_plugins(given["plugins"])
-    from mvrecon.engine import agreement, checkpoints, evaluation, export, fit, record, run_folder
+    import_plugins(options["plugins"])
+    from mvrecon.engine import agreement, checkpoints, evaluation, export, fit, run_folder
 
-    run = checkpoints.run_folder(given["checkpoint"])
-    described = (label for label, model in given["compare"].items() if model)
+    run = checkpoints.run_folder(options["checkpoint"])
+    described = (label for label, model in options["compare"].items() if model)
     if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
         raise ValueError(
             f"compare describes {trained}, which the run has trained already; expected other labels"
         )
-    settings = merged(record.read_settings(run), given)
+    settings = merged(run_folder.read_settings(run), options)
     import_plugins(settings["plugins"])
     data = fit.build_data(settings)
 
     def save(scene: dict[str, Any], volumes: dict[str, Any]) -> None:
         export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
 
-    see = save if given["save"] else None
+    see = save if options["save"] else None
     run_folder.compare_measurement(run, data.digests("test"))
-    with run_folder.taken(folder, given, record.EVALUATION):
+    with run_folder.taken(folder, options, run_folder.EVALUATION):
         agreement.warn_of_other_views(settings, data)
-        found = evaluation.results(settings, run, data, evaluation.device_of(given["device"]), see)
-        found["checkpoint"] = str(run)
-        record.write_results(folder, found)
-    return found
+        table = evaluation.results(
+            settings, run, data, evaluation.device_of(options["device"]), see
+        )
+        table["checkpoint"] = str(run)
+        run_folder.write_results(folder, table)
+    return table
 
 
-def merged(run: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+def merged(run: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     """A run's settings with the test scene, the data options and the compared methods that an
     evaluation gives.
     """
-    data = {**run["data"], **(given["data"] or {})}
+    data = {**run["data"], **(options["data"] or {})}
     data["sizes"] = {**run["data"]["sizes"], **(data["sizes"] or {})}
-    scene = given["test_scene"] or run["test_scene"]
-    compare = {**run["compare"], **given["compare"]}
+    scene = options["test_scene"] or run["test_scene"]
+    compare = {**run["compare"], **options["compare"]}
     return {
         **run,
-        "name": f"{run['name']} ({given['name']})",
+        "name": f"{run['name']} ({options['name']})",
         "test_scene": scene,
         "data": data,
         "compare": compare,
@@ -73,13 +75,13 @@ def merged(run: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's mean PSNR in dB."""
-    from mvrecon.engine.record import anchored
     from mvrecon.engine.report import show
+    from mvrecon.engine.run_folder import anchored
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    found = evaluate(anchored(to_plain(config)), folder)
-    show(found, folder)
-    return next(iter(found["methods"].values()))["psnr"]["mean"]
+    table = evaluate(anchored(to_plain(config)), folder)
+    show(table, folder)
+    return next(iter(table["methods"].values()))["psnr"]["mean"]
 
 
 def main() -> None:

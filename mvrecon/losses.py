@@ -28,7 +28,7 @@ def edge_difference(
 
 
 def mean_where(values: Float[Tensor, "*n"], where: Bool[Tensor, "*n"] | None) -> Float[Tensor, ""]:
-    """The mean of the values that count; zero where none does."""
+    """Mean of the values where the mask is true; zero if it is true nowhere."""
     if where is None:
         return values.mean()
     where = where.expand_as(values)

@@ -31,7 +31,7 @@ def installed() -> tuple[EntryPoint, ...]:
 
 
 def locate(module: str) -> ModuleSpec | None:
-    """Where a module is, as importlib's find_spec tells, but without importing its parent
+    """The spec of a module, as importlib's find_spec gives it, but without importing its parent
     packages.
     """
     top, *rest = module.split(".")
@@ -53,8 +53,8 @@ def hint(name: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def importing(what: str) -> Iterator[None]:
-    """Imports something of a plugin's: what breaks it off is told, and the parts that it had
-    registered are gone.
+    """Context for the import of a plugin: any error becomes an ImportError, and parts that the
+    plugin had registered are removed.
 
     Raises:
         ImportError: in place of whatever the import raised, an exit included; the message begins
@@ -162,7 +162,7 @@ class Registry:
                     )
         return part(*args, **options)
 
-    def from_config(self, config: Mapping[str, Any], *args: Any, **given: Any) -> Any:
+    def from_config(self, config: Mapping[str, Any], *args: Any, **keywords: Any) -> Any:
         """Construct the part that a mapping `{"name": ..., **options}` describes."""
         if "name" not in config:
             raise TypeError(
@@ -170,7 +170,7 @@ class Registry:
                 f"{', '.join(self.names())}"
             )
         options = {key: value for key, value in config.items() if key != "name"}
-        return self.build(config["name"], *args, **given, **options)
+        return self.build(config["name"], *args, **keywords, **options)
 
 
 def _where(part: Any) -> str:

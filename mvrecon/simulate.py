@@ -35,31 +35,31 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
     scene = SCENES.from_config(settings["scene"])
     cases = SceneDataset(scene, grid, cameras, settings["cases"], settings["seed"], cache=False)
-    saved = []
+    case_folders = []
     with run_folder.taken(folder, settings):
         files.save(cameras, folder / "cameras.json")
         for item in track(
             range(len(cases)), "Simulating", transient=True, console=Console(stderr=True)
         ):
             case = cases[item]
-            saved.append(
+            case_folders.append(
                 export.save_views(
                     folder / "cases", case["name"], case["views"][0], f"{scene.unit} * mm"
                 )
             )
-    return saved
+    return case_folders
 
 
 def task(config: DictConfig) -> None:
     """One run of the app."""
     from rich.console import Console
 
-    from mvrecon.engine.record import anchored
+    from mvrecon.engine.run_folder import anchored
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    saved = simulate(anchored(to_plain(config)), folder)
+    case_folders = simulate(anchored(to_plain(config)), folder)
     Console(markup=False, highlight=False).print(
-        f"{len(saved)} case(s) kept in {folder}", soft_wrap=True
+        f"{len(case_folders)} case(s) written to {folder}", soft_wrap=True
     )
 
 

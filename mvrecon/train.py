@@ -16,7 +16,7 @@ from mvrecon.config.plugins import import_plugins
 
 
 def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Train every method of `settings` in a run folder, go on where it was left, and return its
+    """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
 
     The folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
@@ -27,7 +27,7 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         ValueError: the folder's run has other settings, another rig or other data.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.engine import agreement, evaluation, fit, record, run_folder
+    from mvrecon.engine import agreement, evaluation, fit, run_folder
 
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     data = fit.build_data(settings)
@@ -37,43 +37,42 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         for method in fit.methods(settings):
             fit.fit(method, settings, data, folder)
         device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
-        found = evaluation.results(settings, folder, data, device)
-        record.write_results(folder, found)
-    return found
+        table = evaluation.results(settings, folder, data, device)
+        run_folder.write_results(folder, table)
+    return table
 
 
 def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
-    """The settings and the folder of a run that goes on.
+    """Settings and folder of a run to resume.
 
     Raises:
         ValueError: other options were given, which a resumed run could not honour.
         FileNotFoundError: no run folder is there.
     """
-    from mvrecon.engine import checkpoints, record
+    from mvrecon.engine import checkpoints, run_folder
 
     if others:
         raise ValueError(
             f"resume goes on with the run's own settings; but got also {' '.join(others)}"
         )
     run = checkpoints.run_folder(folder)
-    return record.read_settings(run), run
+    return run_folder.read_settings(run), run
 
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's mean PSNR in dB, for sweepers."""
     from mvrecon.engine import run_folder
-    from mvrecon.engine.record import anchored
     from mvrecon.engine.report import show
 
-    settings = anchored(to_plain(config))
+    settings = run_folder.anchored(to_plain(config))
     folder = Path(HydraConfig.get().runtime.output_dir)
     if settings["resume"]:
-        given = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
-        settings, folder = resumed(settings["resume"], given)
+        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        settings, folder = resumed(settings["resume"], others)
     run_folder.check(folder, settings)
-    found = train(settings, folder)
-    show(found, folder)
-    return next(iter(found["methods"].values()))["psnr"]["mean"]
+    table = train(settings, folder)
+    show(table, folder)
+    return next(iter(table["methods"].values()))["psnr"]["mean"]
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ import yaml
 
 import mvrecon.eval
 import mvrecon.train
-from mvrecon.engine import record
+from mvrecon.engine import run_folder
 
 FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside", "view_nrmse")
 
@@ -135,7 +135,7 @@ def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
 def test_resume_goes_on_in_the_same_folder(run, tmp_path):
     folder, first = run
     found, where = mvrecon.train.resumed(str(folder), []), folder
-    assert found == (record.read_settings(folder), where)
+    assert found == (run_folder.read_settings(folder), where)
     again = mvrecon.train.train(*found)
     assert again["methods"]["cross_view"]["psnr"]["values"] == pytest.approx(
         first["methods"]["cross_view"]["psnr"]["values"], abs=1e-6

@@ -1,5 +1,4 @@
-"""Settings: where they live, how they are composed, and what may be built from them. The one door
-to Hydra.
+"""Settings of the apps: their YAML files, composed by Hydra to plain dicts, and checked.
 
 Below this door everything is a plain dict of names and numbers, so that checkpoints load with
 torch's defaults and no loop pays for a config object. Importing this file imports neither torch nor
@@ -38,8 +37,8 @@ class PluginConf(SearchPathPlugin):
 
 def conf_dir() -> Path:
     """Where the YAML files are: beside the code in a wheel, one level up in a checkout."""
-    here = Path(__file__).resolve().parents[1]
-    return here / "conf" if (here / "conf").is_dir() else here.parent / "conf"
+    package = Path(__file__).resolve().parents[1]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def plugin_conf_dirs() -> list[Path]:
@@ -102,9 +101,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
 
 
 def help_text(config_name: str) -> str:
-    """What an app can be told: every group with its choices, and the settings with their
-    comments.
-    """
+    """The text of `--help`: every config group with its choices, and all settings with comments."""
     choices: dict[str, set[str]] = {}
     for folder in (conf_dir(), *plugin_conf_dirs()):
         for file in folder.glob("*/*.yaml"):
@@ -135,8 +132,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
     prepare_hydra()
-    own = guarded(conf_dir(), plugin_conf_dirs())
-    with own, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+    guard = guarded(conf_dir(), plugin_conf_dirs())
+    with guard, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
         return to_plain(hydra.compose(config_name, list(overrides)))
 
 

@@ -1,9 +1,9 @@
-"""What configs from elsewhere may tell Hydra: their own settings, and nothing about how Hydra
-itself runs.
+"""Guard of configs: a config file from elsewhere sets mvrecon's settings, never Hydra's own.
 
 Before it calls a task, Hydra builds callbacks, launchers and log handlers from its own section,
 sets environment variables and makes folders. A file that a user fetched must not choose these; the
-command line may.
+command line may. Hydra has no hook between composing and acting, so the guard replaces two of its
+internal functions; `pyproject.toml` therefore asks for one exact version of Hydra.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,13 +19,13 @@ from omegaconf import DictConfig, OmegaConf
 from mvrecon.files.checks import plain_name, shown, yaml_of
 from mvrecon.registry import hint
 
-#: Keys of the section `hydra` that may come from anywhere, and those that tell of a composition.
+#: Keys of the section `hydra` that any file may set, or that Hydra fills in when it composes.
 OPEN = {"mode", "verbose", "help", "sweeper.params", "runtime", "overrides", "job.override_dirname"}
 
 
 @contextmanager
 def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
-    """Check every config that Hydra composes meanwhile, before Hydra acts on it.
+    """Context in which every config that Hydra composes is checked before Hydra acts on it.
 
     Args:
         main: the folder of mvrecon's own configs.
@@ -74,20 +74,19 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
         ConfigLoaderImpl.load_configuration, files.load_config = load, read
 
 
-def used(config: DictConfig, own: DictConfig) -> DictConfig:
-    """A config whose top-level keys are the app's own; `+key=...` on a command line adds any other
-    unasked.
+def used(config: DictConfig, app: DictConfig) -> DictConfig:
+    """Return the config if every top-level key is one of the app's; Hydra itself accepts any
+    `+key=...`.
 
     Raises:
         LookupError: a key that the app does not have, so that nothing would come of it; the message
             names it.
     """
-    known = {
-        str(key) for key in own
-    }  # `key in own` is false for a setting that is still to be given
-    if unused := [str(key) for key in config if key not in known]:
+    # `key in app` is false for a setting that the user has yet to give
+    allowed = {str(key) for key in app}
+    if unused := [str(key) for key in config if key not in allowed]:
         raise LookupError(
-            f"This app does not use the setting {unused[0]!r}{hint(unused[0], known - {'hydra'})}"
+            f"This app does not use the setting {unused[0]!r}{hint(unused[0], allowed - {'hydra'})}"
         )
     return config
 
@@ -104,8 +103,8 @@ def check_foreign(
     overrides: list[str],
     compose: Callable[[list[str]], DictConfig],
 ) -> None:
-    """Compare Hydra's own section, and `out`, the folder that an app writes to, with what they are
-    without the files.
+    """Check that files from elsewhere change neither Hydra's own section nor `out`, the folder that
+    an app writes to.
 
     Raises:
         PermissionError: they differ, or the folders' files cannot be told apart.
@@ -122,12 +121,14 @@ def check_foreign(
         raise PermissionError(
             "--config-path and --config-name of other apps are not allowed; use --config-dir"
         )
-    own = compose([line for line in overrides if line.lstrip("+~").startswith(("hydra", "out="))])
-    found, expected = (dict(_leaves(_hydra(c))) for c in (config, own))
+    trusted = compose(
+        [line for line in overrides if line.lstrip("+~").startswith(("hydra", "out="))]
+    )
+    section, expected = (dict(_leaves(_hydra(c))) for c in (config, trusted))
     changed = sorted(
         key
-        for key in {**found, **expected}
-        if found.get(key) != expected.get(key) and not _open(key)
+        for key in {**section, **expected}
+        if section.get(key) != expected.get(key) and not _open(key)
     )
     if changed:
         raise PermissionError(f"A config sets {shown(changed)}; only a command line may")

@@ -1,4 +1,4 @@
-"""A folder of its own for every run and every sweep, made before Hydra writes."""
+"""A new folder for every run and every sweep, made before Hydra writes."""
 
 from pathlib import Path
 from typing import Any

@@ -48,8 +48,8 @@ class Settings(Measurement):
 
 @dataclass
 class Evaluation:
-    """Every top-level key of `mvrecon-eval`: what the run itself decides, such as its camera, is
-    not among them.
+    """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the camera, are
+    not keys.
     """
 
     name: str = MISSING

@@ -1,5 +1,5 @@
-"""Callbacks and loggers that a config names by `_target_`: which are allowed, and where they may
-write.
+"""Build the callbacks and loggers that a config names by `_target_`; only allowed classes, which
+write inside the run folder.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ ALLOWED = ("lightning.pytorch", "mvrecon.engine")
 BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.loggers.Logger")
 
 
-def instantiate(node: Mapping[str, Any], folder: Path, **given: Any) -> Any:
+def instantiate(node: Mapping[str, Any], folder: Path, **options: Any) -> Any:
     """Build the callback or the logger that a node's `_target_` names, with the node's other
     entries as options.
 
@@ -23,20 +23,20 @@ def instantiate(node: Mapping[str, Any], folder: Path, **given: Any) -> Any:
         node: `_target_` and options; places among these, such as `dirpath`, are taken from
             `folder`.
         folder: the run folder, out of which nothing is written.
-        given: further options, which are trusted.
+        options: further options, which are trusted.
 
     Raises:
         PermissionError: the target is not a class of that kind that is defined below one of
             `ALLOWED`, every run has it already, or the options hold instructions of Hydra's such as
             another target, or lead out of the folder.
     """
-    options = {key: value for key, value in node.items() if key != "_target_"}
-    if instructions := _instructions(options):
+    entries = {key: value for key, value in node.items() if key != "_target_"}
+    if instructions := _instructions(entries):
         raise PermissionError(
             f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain "
             f"values"
         )
-    made = _allowed(str(node["_target_"]))(**placed(options, folder), **given)
+    made = _allowed(str(node["_target_"]))(**placed(entries, folder), **options)
     check_places(made, folder)
     return made
 
@@ -44,26 +44,26 @@ def instantiate(node: Mapping[str, Any], folder: Path, **given: Any) -> Any:
 def _instructions(node: Any) -> list[str]:
     if isinstance(node, Mapping):
         keys = [str(key) for key in node if str(key).startswith("_")]
-        return keys + [found for value in node.values() for found in _instructions(value)]
+        return keys + [key for value in node.values() for key in _instructions(value)]
     return (
-        [found for value in node for found in _instructions(value)]
+        [key for value in node for key in _instructions(value)]
         if isinstance(node, list | tuple)
         else []
     )
 
 
 def _allowed(target: str) -> type:
-    """A class by its name. What it is decides, not how it is called: a name may lead out of a
-    module (`a.b.os.system`), and a function of an allowed library may call whatever it is told
-    to."""
-    found = _found(target) if target.startswith(tuple(f"{name}." for name in ALLOWED)) else None
-    if isinstance(found, type) and issubclass(found, tuple(map(_found, BASES))):
-        if getattr(found, "of_every_run", False):
+    """The class that a target names. Its bases and its module decide, not the name: a name may lead
+    out of a module (`a.b.os.system`), and a function of an allowed library may call any other.
+    """
+    cls = _attribute(target) if target.startswith(tuple(f"{name}." for name in ALLOWED)) else None
+    if isinstance(cls, type) and issubclass(cls, tuple(map(_attribute, BASES))):
+        if getattr(cls, "of_every_run", False):
             raise PermissionError(
                 f"_target_ {target!r} is not allowed; expected none that every run has already"
             )
-        if found.__module__.startswith(tuple(f"{name}." for name in ALLOWED)):
-            return found
+        if cls.__module__.startswith(tuple(f"{name}." for name in ALLOWED)):
+            return cls
     raise PermissionError(
         f"_target_ {target!r} is not allowed; expected a class from {' or '.join(ALLOWED)} "
         f"derived from "
@@ -71,7 +71,7 @@ def _allowed(target: str) -> type:
     )
 
 
-def _found(target: str) -> Any:
+def _attribute(target: str) -> Any:
     module, _, name = target.rpartition(".")
     try:
         return getattr(import_module(module), name, None)

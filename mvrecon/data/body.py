@@ -1,4 +1,4 @@
-"""Where the patient is in a CT volume."""
+"""Segment the patient in a CT volume: the mask of the body and the box around it."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ def body(mu: Float[Tensor, "d h w"], threshold: float) -> Bool[Tensor, "d h w"]:
 
 
 def body_box(mu: Slabs, threshold: float) -> Box:
-    """The box of the voxels that `body` would give of the whole volume; empty where there are none.
+    """The box around the mask that `body` gives for the whole volume; empty if the mask is.
 
     Memory: a slab, and of every block the voxels above the threshold, counted along each axis.
     """

@@ -1,4 +1,4 @@
-"""Cases of a scene as training samples, and the order in which they are seen."""
+"""Training samples from the cases of a scene, and their random order in each epoch."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -63,8 +63,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         return self._made(item)
 
     def prepare(self, what: str = "cases") -> dict[str, Any]:
-        """Make every case, once; stacked, so that worker processes share a few blocks of memory and
-        not thousands.
+        """Compute every case once and stack them, so that worker processes share a few blocks of
+        memory and not thousands.
         """
         if self._ready is None:
             console = Console(stderr=True)
@@ -92,8 +92,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
 
 
 class EpochOrder(Sampler[int]):
-    """A random order of `count` items that depends on (seed, epoch) alone, so that a resumed run
-    sees what it missed.
+    """A random order of `count` items that depends only on (seed, epoch), so that a resumed run
+    continues with the items it has not used.
 
     Args:
         count: of items.
@@ -113,20 +113,19 @@ class EpochOrder(Sampler[int]):
         return self.count
 
     def __iter__(self) -> Iterator[int]:
-        epoch, seen = self.resumed
+        epoch, n_done = self.resumed
         order = torch.randperm(self.count, generator=generator(self.seed, self.epoch)).tolist()
-        return iter(order[seen:] if self.epoch == epoch else order)
+        return iter(order[n_done:] if self.epoch == epoch else order)
 
     def set_epoch(self, epoch: int) -> None:
-        """Which epoch the next order is for; Lightning calls it."""
+        """Set the epoch of the next order; Lightning calls this."""
         self.epoch = epoch
         self.generator.manual_seed(mixed(self.seed, epoch))
 
-    def resume(self, epoch: int, seen: int) -> None:
-        """Go on in an epoch and leave out its first `seen` items: the run had them before it broke
-        off.
+    def resume(self, epoch: int, n_done: int) -> None:
+        """Continue an epoch after its first `n_done` items, which the interrupted run has used.
 
         Worker processes ask for their first items before Lightning tells the epoch.
         """
-        self.resumed = (epoch, seen)
+        self.resumed = (epoch, n_done)
         self.set_epoch(epoch)

@@ -1,6 +1,4 @@
-"""What a run was measured with, as SHA-256 digests: of the rig's record, and of the files that
-scenes read.
-"""
+"""SHA-256 digests of a run's measurement: of the rig, and of the files that its scenes read."""
 
 import hashlib
 import json
@@ -53,7 +51,7 @@ def files_in(settings: Any) -> Iterator[str]:
 
 
 def compare(got: Mapping[str, str], expected: Mapping[str, str], where: str | Path) -> None:
-    """Compare the digests of what both name, the rig or the path of a file.
+    """Compare the digests that both mappings have, of the rig or of a file by its path.
 
     Args:
         got: digests of what is there now.

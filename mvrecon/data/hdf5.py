@@ -80,11 +80,11 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
             arrays = {"ct": volume.ct} | ({} if volume.label is None else {"label": volume.label})
             if count == 1:
                 _create(file, arrays)
-            found = {name: array.shape for name, array in arrays.items()}
+            shapes = {name: array.shape for name, array in arrays.items()}
             expected = {name: file[name].shape[1:] for name in ("ct", "label") if name in file}  # type: ignore[union-attr]
-            if found != expected:
+            if shapes != expected:
                 raise ValueError(
-                    f"{path}: volume {volume.name!r} has {found}, expected {expected} as the first"
+                    f"{path}: volume {volume.name!r} has {shapes}, expected {expected} as the first"
                 )
             for name, array in {
                 **arrays,
@@ -237,9 +237,9 @@ def _check(path: Path, file: h5py.File) -> Texts:
         check_chunks(path, dataset)
     texts = _texts(path, file, names)
     _check_names(path, texts["id"])
-    found = {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT}
-    if found != LAYOUT:
-        raise Refused(f"{path}: has the attributes {shown(found)}, expected {LAYOUT}: {EXPECTED}")
+    layout = {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT}
+    if layout != LAYOUT:
+        raise Refused(f"{path}: has the attributes {shown(layout)}, expected {LAYOUT}: {EXPECTED}")
     mm = spacing[:]
     bad = ~((mm >= SPACING[0]) & (mm <= SPACING[1])).all(axis=1)
     if bad.any():

@@ -109,10 +109,9 @@ class SceneData(L.LightningDataModule):
             return list(range(size))
         if part == "test" and not self.shared:
             return list(range(min(size, scene.length)))
-        kept = (
-            scene.length // 5 if self.sizes["train"] else scene.length
-        )  # whatever `test` is: a model may be older
-        first, last = kept * self.shared, scene.length - self.sizes["val"]
+        # a fifth whatever `test` is, since a checkpoint may be older than this `test`
+        n_test = scene.length // 5 if self.sizes["train"] else scene.length
+        first, last = n_test * self.shared, scene.length - self.sizes["val"]
         if last < first or (size and not {"train": last - first, "val": size, "test": first}[part]):
             raise ValueError(
                 f"A scene with {scene.length} case(s) cannot be split into the sizes {self.sizes}"
@@ -125,7 +124,7 @@ class SceneData(L.LightningDataModule):
         return [i // (last - first) * scene.length + first + i % (last - first) for i in turns]
 
     def setup(self, stage: str | None = None) -> None:
-        """Make the cases of a stage, unless they are there."""
+        """Compute the cases of a stage unless they exist already."""
         series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}
         for part in STAGES[stage] if stage else ("train", "val", "test"):
             if part not in self.sets:
@@ -139,7 +138,7 @@ class SceneData(L.LightningDataModule):
             self._order = EpochOrder(len(self.sets["train"]), self.seed)
 
     def train_dataloader(self) -> DataLoader[dict[str, Any]]:
-        """Training batches, in an order of their own in every epoch."""
+        """Training batches, in another random order in every epoch."""
         return self._loader("train", self._order)
 
     def val_dataloader(self) -> DataLoader[dict[str, Any]]:
@@ -179,16 +178,16 @@ class SceneData(L.LightningDataModule):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint: how far the training has come, its cases by name, and the digests of
-        its rig and files.
+        """State for a checkpoint: epoch and position in it, names of the training cases, digests of
+        the rig and the files.
         """
         loop = self.trainer.fit_loop if self.trainer else None
         if loop is None or self._order is None:
             return {}
-        done = int(loop.epoch_loop.batch_progress.current.processed)  # pyright: ignore[reportAttributeAccessIssue]
-        seen = done * self.batch_size
-        whole = seen >= len(self._order)  # the epoch: then the next one goes on
-        place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else seen}
+        n_batches = int(loop.epoch_loop.batch_progress.current.processed)  # pyright: ignore[reportAttributeAccessIssue]
+        n_done = n_batches * self.batch_size
+        whole = n_done >= len(self._order)  # the epoch: then the next one goes on
+        place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}
         return {
             **place,
             "cases": list(self.sets["train"].prepare()["name"]),
@@ -196,7 +195,7 @@ class SceneData(L.LightningDataModule):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from a checkpoint with the cases that the broken epoch has not seen.
+        """Resume from a checkpoint with the cases that the interrupted epoch has not used.
 
         Raises:
             Refused: the rig or a file is not what the checkpoint was trained with.
@@ -211,6 +210,6 @@ class SceneData(L.LightningDataModule):
 
 
 def same_cases(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
-    """Whether two scenes draw on the same cases: they are equal, or read one file."""
+    """Whether two scenes have the same cases: they are equal, or read one file."""
     paths = [Path(scene["path"]).resolve() for scene in (first, second) if "path" in scene]
     return dict(first) == dict(second) or (len(paths) == 2 and paths[0] == paths[1])

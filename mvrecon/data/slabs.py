@@ -1,4 +1,4 @@
-"""A volume that comes slab by slab, so that memory holds one of them and not the volume."""
+"""A volume that is read slab by slab, so that memory holds one slab and not the volume."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -50,7 +50,7 @@ class Slabs:
         return replace(self, passes=lambda: ((first, change(slab)) for first, slab in self))
 
     def whole(self) -> Float[Tensor, "d h w"]:
-        """All of it, in memory."""
+        """The whole volume in memory."""
         values = torch.empty(self.shape)
         for first, slab in self:
             values.narrow(self.axis, first, slab.shape[self.axis]).copy_(slab)
@@ -58,11 +58,11 @@ class Slabs:
 
 
 def planes(plane: int) -> int:
-    """How many planes of so many voxels make a slab."""
+    """Number of planes in a slab, for a number of voxels in one plane."""
     return max(1, VOXELS // plane)
 
 
 def ends(line: Bool[Tensor, " n"]) -> tuple[int, int]:
-    """The first true place and the one after the last; zeros for none."""
+    """Index of the first true value and index behind the last one; (0, 0) if none is true."""
     places = line.nonzero().flatten().tolist()
     return (places[0], places[-1] + 1) if places else (0, 0)

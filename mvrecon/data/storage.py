@@ -1,5 +1,5 @@
-"""What an HDF5 file may ask of its reader: data in the file itself, in chunks that unfold to what
-they declare.
+"""Checks of an HDF5 dataset before it is read: its data are in the file itself, and no chunk
+unpacks to more bytes than it declares.
 """
 
 import math
@@ -19,8 +19,7 @@ CHUNKS = 2**16
 
 
 def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Dataset:
-    """A dataset whose bytes lie in this very file, in a form that unfolds to no more than it
-    declares.
+    """A dataset that is stored in this file and that decompresses to no more than it declares.
 
     Raises:
         Refused: it is not there, is a link or stored elsewhere, filtered by a plugin, or larger
@@ -68,8 +67,8 @@ def _check_size(path: Path, dataset: h5py.Dataset, most: int) -> None:
 
 
 def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) -> None:
-    """Unfold the chunks of one volume, or of all, without keeping them: a few bytes must not become
-    more than declared.
+    """Decompress the chunks of one volume, or of all, and discard them: refuse a chunk that has
+    more bytes than declared.
 
     Raises:
         Refused: a chunk that is missing, or that unfolds to more than its size.

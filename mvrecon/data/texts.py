@@ -45,19 +45,19 @@ def texts_of(path: Path) -> dict[str, list[str]]:
 
 
 def read(path: str) -> dict[str, list[str]]:
-    """What `texts_of` returns, in this process."""
+    """Read the texts in this process; `texts_of` calls this in another one."""
     with h5py.File(path, "r", locking="best-effort") as file:
         kinds = {name: file.attrs.get_id(name) for name in list(file.attrs)[:64]}
         short = [name for name, kind in kinds.items() if kind.shape == () and variable(kind.dtype)]
-        found = {f"@{name}": [str(file.attrs[name])] for name in short}
+        texts = {f"@{name}": [str(file.attrs[name])] for name in short}
         names = file["id"] if isinstance(file.get("id", getlink=True), h5py.HardLink) else None
         if isinstance(names, h5py.Dataset) and variable(names.dtype):
-            found["id"] = [text.decode() for text in names[:]]
-        return found
+            texts["id"] = [text.decode() for text in names[:]]
+        return texts
 
 
 def limit() -> None:
-    """Take little memory and little time."""
+    """Limit the memory (bytes) and the computing time (s) of this process."""
     if sys.platform != "win32":
         import resource
 

@@ -1,1 +1,1 @@
-"""Training under Lightning, and the board."""
+"""Training with Lightning, evaluation, and the files of a run."""

@@ -1,4 +1,4 @@
-"""Whether a run's projector makes what its scenes measure."""
+"""Check that a run's projector gives the views that its scenes measure."""
 
 import warnings
 
@@ -14,11 +14,10 @@ ALLOWED = 0.25
 
 @torch.inference_mode()
 def warn_of_other_views(settings: Settings, data: SceneData) -> None:
-    """Warn where the projections of the first test case's truth add up to something else than its
-    views do.
+    """Warn if the projections of the first test case's truth and its views have different sums.
 
-    Scenes measure line integrals, so a projector of counts, of attenuated rays or of another unit
-    is told at once; one that only blurs is not.
+    Scenes measure line integrals, so the sums reveal a projector of counts, of attenuated rays or
+    of another unit; they do not reveal one that only blurs.
     """
     data.setup("test")
     cases = data.sets["test"].prepare()

@@ -1,4 +1,4 @@
-"""What happens beside the training: time and memory, and the pictures on the board."""
+"""Callbacks of a training: run time, memory, compilation, and pictures for TensorBoard."""
 
 import sys
 import time
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.engine.export import save_png
-from mvrecon.engine.record import versions
+from mvrecon.engine.run_folder import versions
 from mvrecon.files.memory import peak
 from mvrecon.files.places import check_places
 from mvrecon.models.output import Reconstruction
@@ -24,11 +24,11 @@ from mvrecon.viz.planes import Image
 
 
 def peak_megabytes() -> dict[str, float]:
-    """The most memory in use so far, 2^20 bytes: the GPU's where there is one, else this process's,
-    else nothing.
+    """Peak memory so far in units of 2^20 bytes: of the GPU if there is one, else of this process;
+    empty if it is not known.
     """
-    most = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
-    return {} if most is None else {"peak_mb": most / 2**20}
+    peak_bytes = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
+    return {} if peak_bytes is None else {"peak_mb": peak_bytes / 2**20}
 
 
 class Clock(L.Callback):
@@ -60,7 +60,7 @@ class Clock(L.Callback):
         self._mark = time.perf_counter()
 
     def on_validation_end(self, *_: Any) -> None:
-        """Leave the validation out."""
+        """Exclude the time of the validation."""
         self._mark = time.perf_counter()
 
     def on_train_batch_end(
@@ -79,7 +79,7 @@ class Clock(L.Callback):
 
 
 class Confined(L.Callback):
-    """Lets no training begin whose callbacks or loggers would write outside the run folder.
+    """Refuses a training whose callbacks or loggers would write outside the run folder.
 
     Their options were looked at when they were built; a checkpoint to go on from may hold other
     places.
@@ -94,7 +94,7 @@ class Confined(L.Callback):
         self.folder = folder
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Look, once all states are restored.
+        """Check the paths after all states are restored.
 
         Raises:
             PermissionError: a place outside the folder.
@@ -115,7 +115,7 @@ class CompileModel(L.Callback):
 
 
 class BoardReview(L.Callback):
-    """The same few validation scenes at every review, as pictures on the board and in `review/`.
+    """Pictures of the same few validation scenes during training, in TensorBoard and in `review/`.
 
     Args:
         every: of how many validations one is pictured.
@@ -127,12 +127,12 @@ class BoardReview(L.Callback):
         self, every: int = 1, cases: int = 2, baselines: Sequence[str] = ("backprojection", "sirt")
     ):
         self.every, self.cases, self.baselines = every, cases, tuple(baselines)
-        self.seen = 0
+        self.n_validations = 0
         self._fixed: dict[str, Tensor] = {}
         self._shown: tuple[Any, Reconstruction] | None = None
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Write down what runs."""
+        """Log the command line and the versions."""
         for board in _boards(trainer):
             lines = [f"    {name} {version}" for name, version in versions().items()]
             board.add_text(
@@ -159,12 +159,12 @@ class BoardReview(L.Callback):
             self._shown = batch, out
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Draw, at every `every`-th validation."""
+        """Write the pictures at every `every`-th validation."""
         if self._shown is None or trainer.sanity_checking:
             return
         (batch, out), self._shown = self._shown, None
-        self.seen += 1
-        if (self.seen - 1) % self.every:
+        self.n_validations += 1
+        if (self.n_validations - 1) % self.every:
             return
         cases = [
             self._pictures(pl_module, batch, out, case)
@@ -177,10 +177,12 @@ class BoardReview(L.Callback):
                 board.add_image(f"review/{name}", image, trainer.global_step, dataformats="HWC")
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Error against run time, once: what the board's HParams tab compares runs by."""
-        known = {"psnr": "val/psnr", "seconds": "time/seconds", "peak_mb": "time/peak_mb"}
-        found = trainer.callback_metrics
-        figures = {f"hp/{name}": float(found[key]) for name, key in known.items() if key in found}
+        """Log PSNR, run time and peak memory once, for the HParams tab of TensorBoard."""
+        names = {"psnr": "val/psnr", "seconds": "time/seconds", "peak_mb": "time/peak_mb"}
+        metrics = trainer.callback_metrics
+        figures = {
+            f"hp/{name}": float(metrics[key]) for name, key in names.items() if key in metrics
+        }
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 logger.log_hyperparams(dict(pl_module.hparams), figures)

@@ -1,13 +1,13 @@
-"""Where a run keeps its checkpoints, and how its methods come back from them."""
+"""Paths of the checkpoints in a run folder, and loading a trained method from one."""
 
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from mvrecon.data.module import SceneData
-from mvrecon.engine.archive import check_archive, check_settings
+from mvrecon.engine.checkpoint_check import check_archive, check_settings
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.engine.record import SETTINGS
+from mvrecon.engine.run_folder import SETTINGS
 from mvrecon.engine.storage import read
 from mvrecon.files.atomic import check_plain
 from mvrecon.files.checks import blaming, plain_name
@@ -15,14 +15,14 @@ from mvrecon.files.checks import blaming, plain_name
 
 @dataclass
 class Trained:
-    """A method as a run left it.
+    """A trained method with its weights and the record of its training.
 
     Args:
         module: with its weights.
         seconds: of training.
         steps: of the optimiser.
-        cases: names of those that it was trained on; none: the checkpoint is of a version that did
-            not tell.
+        cases: names of the training cases; None: the checkpoint is of a version that did not
+            store them.
         digests: SHA-256 of the rig and of the files that it was trained with.
     """
 

@@ -1,4 +1,6 @@
-"""The result table: every method on the same scenes, and which of them a training has seen."""
+"""The result table: figures of merit of every method on the same test scenes, and which of these
+scenes were used in training.
+"""
 
 import math
 import statistics
@@ -64,41 +66,40 @@ def mean_and_spread(values: list[float]) -> dict[str, Any]:
 
     A nan among them, from a scene without an object, counts in neither.
     """
-    known = [value for value in values if not math.isnan(value)]
-    mean = sum(known) / len(known) if known else math.nan
-    spread = statistics.stdev(known) if len(known) > 1 and math.isfinite(mean) else math.nan
+    numbers = [value for value in values if not math.isnan(value)]
+    mean = sum(numbers) / len(numbers) if numbers else math.nan
+    spread = statistics.stdev(numbers) if len(numbers) > 1 and math.isfinite(mean) else math.nan
     return {"mean": mean, "std": spread, "values": values}
 
 
 def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[str, Trained]:
-    """Every method of a run: from its checkpoint, or just built where there is nothing to learn.
+    """Every method of a run: from its checkpoint, or built anew if it has no weights to learn.
 
     Raises:
         FileNotFoundError: a method whose training has not ended.
     """
-    found = {}
+    trained: dict[str, Trained] = {}
     for label, model in methods(settings).items():
         path = finished(folder, label)
         fresh = None if path.exists() else build_module(settings, model, data_range)
-        found[label] = load(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
-    return found
+        trained[label] = load(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
+    return trained
 
 
 def results(
     settings: Settings, folder: Path, data: SceneData, device: str = "cpu", see: See | None = None
 ) -> dict[str, Any]:
-    """Everything that the table of a run tells, evaluated on the test scenes of `data` from the
-    run's checkpoints.
+    """The result table of a run: its checkpoints evaluated on the test scenes of `data`.
 
     Raises:
         FileNotFoundError: a method whose training has not ended.
         Refused: a method that was trained with another rig, or with other contents of a file.
     """
-    found = load_methods(settings, folder, data.data_range)
-    for label, method in found.items():
+    trained = load_methods(settings, folder, data.data_range)
+    for label, method in trained.items():
         digests.compare(data.digests("test"), method.digests, finished(folder, label))
-    models: dict[str, nn.Module] = {label: method.module.model for label, method in found.items()}
-    A = next(iter(found.values())).module.projector
+    models: dict[str, nn.Module] = {label: method.module.model for label, method in trained.items()}
+    A = next(iter(trained.values())).module.projector
     names: list[str] = []
 
     def watch(scene: dict[str, Any], volumes: dict[str, Tensor]) -> None:
@@ -112,12 +113,12 @@ def results(
         "name": settings["name"],
         "seed": settings["seed"],
         "scenes": names,
-        "seen_in_training": seen_in_training(found.values(), names),
+        "seen_in_training": seen_in_training(trained.values(), names),
         "data_range": data.data_range,
         "device": device,
         "threads": torch.get_num_threads(),
         "units": {**UNITS, "ms_per_volume": "ms", "train_seconds": "s", "data_range": data.unit},
-        "methods": {label: _row(method, scores[label]) for label, method in found.items()},
+        "methods": {label: _row(method, scores[label]) for label, method in trained.items()},
     }
 
 
@@ -132,8 +133,8 @@ def _row(method: Trained, scores: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def seen_in_training(methods: Iterable[Trained], names: Iterable[str]) -> list[str] | None:
-    """The scenes, by name, that any method was trained on; none where a checkpoint does not tell
-    its training cases.
+    """Names of the scenes that any method was trained on; None if a checkpoint does not store its
+    training cases.
     """
     trained = [method.cases for method in methods if method.steps]
     if None in trained:

@@ -1,4 +1,4 @@
-"""One run: its data, its methods, and the training of each that has something to learn."""
+"""One run: its data, its methods, and the training of every method that has weights to learn."""
 
 from pathlib import Path
 from typing import Any
@@ -64,13 +64,13 @@ def build_module(settings: Settings, model: Settings, data_range: float) -> Reco
 
 
 def trainable(module: L.LightningModule) -> bool:
-    """Whether there is anything to learn."""
+    """Whether a method has weights to learn."""
     return any(p.requires_grad and p.numel() for p in module.parameters())
 
 
 def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
-    """Train one method of a run and leave `checkpoints/<method>.ckpt`, unless it is there or
-    nothing can be learnt.
+    """Train one method of a run and write `checkpoints/<method>.ckpt`; do nothing if that file
+    exists or the method has no weights to learn.
 
     Goes on from the method's last checkpoint where there is one, and on the CPU ends with the same
     bits as a run that never broke off on as many threads; with `trainer.deterministic`, on any
@@ -134,5 +134,5 @@ def build_trainer(settings: Settings, folder: Path, board: Path, last: Path) -> 
         "enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks),
         **settings["trainer"],
     }
-    given = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
-    return L.Trainer(**options, **given, plugins=[DurableCheckpoints(folder)])
+    fixed = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
+    return L.Trainer(**options, **fixed, plugins=[DurableCheckpoints(folder)])

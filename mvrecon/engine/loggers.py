@@ -1,4 +1,4 @@
-"""Logs flat in the run folder: a table of numbers, and the board."""
+"""Logs in the run folder: `metrics.csv`, and events for TensorBoard."""
 
 import csv
 import os
@@ -13,7 +13,7 @@ from mvrecon.files.atomic import written_whole
 
 
 class _Continuing(ExperimentWriter):
-    """Goes on with a `metrics.csv` that is there already, where Lightning's own would delete it."""
+    """Appends to an existing `metrics.csv`, which Lightning's own writer would delete."""
 
     def _check_log_dir_exists(self) -> None:
         if os.path.isfile(self.metrics_file_path):
@@ -27,7 +27,7 @@ class _Continuing(ExperimentWriter):
         self._write(fieldnames, rows)
 
     def rewind(self, step: int) -> None:
-        """Drop what was logged from a step on, and a last line that a kill cut off."""
+        """Delete the rows from a step on, and a last row that is incomplete."""
         if not os.path.isfile(self.metrics_file_path):
             return
         with open(self.metrics_file_path, newline="") as file:
@@ -64,7 +64,7 @@ class MetricsFile(CSVLogger):
         return self._experiment
 
     def rewind(self, step: int) -> None:
-        """Forget what a broken run logged from a step on: a resumed one comes by again."""
+        """Delete what an interrupted run logged from a step on: the resumed run logs it again."""
         self.experiment.rewind(step)
 
 
@@ -80,8 +80,8 @@ class Board(TensorBoardLogger):
         super().__init__(save_dir, name="", version="", default_hp_metric=False)
 
     def rewind(self, step: int) -> None:
-        """Let the board leave out what a broken run logged from a step on: a resumed one comes by
-        again.
+        """Make TensorBoard hide what an interrupted run logged from a step on: the resumed run logs
+        it again.
         """
         self._kwargs["purge_step"] = step
 

@@ -1,4 +1,4 @@
-"""One model in training: what Lightning needs to know of it."""
+"""One model in training, as a LightningModule: its loss, figures of merit and optimiser."""
 
 from collections.abc import Mapping
 from typing import Any

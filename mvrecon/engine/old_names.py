@@ -1,4 +1,4 @@
-"""Settings of earlier versions: options that have another name since."""
+"""Settings of earlier versions: options that have a new name now."""
 
 from typing import Any
 
@@ -7,8 +7,8 @@ RIGS = ("arc", "circular", "dome", "parallel")
 
 
 def current(settings: Any) -> Any:
-    """The settings of a run, or the geometry of a checkpoint, by the option names of this version;
-    what is no settings of a rig stays as it is.
+    """The settings of a run, or the geometry of a checkpoint, with the option names of this
+    version; other values are returned unchanged.
     """
     camera = settings.get("camera") if isinstance(settings, dict) else None
     if not isinstance(camera, dict) or camera.get("name") not in RIGS:

@@ -59,11 +59,11 @@ class StepProgress(ProgressBar):
             )
 
     def on_train_end(self, *_: Any) -> None:
-        """Leave the line as it is."""
+        """Stop the line; it stays visible."""
         self._close()
 
     def on_exception(self, *_: Any) -> None:
-        """Leave the line as it is, and the terminal in order."""
+        """Stop the line and restore the terminal."""
         self._close()
 
     def _close(self) -> None:

@@ -21,11 +21,11 @@ COLUMNS = {
 }
 
 
-def table(found: Mapping[str, Any]) -> Table:
+def table(results: Mapping[str, Any]) -> Table:
     """The result table for a terminal: mean over the scenes, and the standard deviation below
     it.
     """
-    title = f"{found['name']}: {_scenes(len(found['scenes']), found['seen_in_training'])}"
+    title = f"{results['name']}: {_scenes(len(results['scenes']), results['seen_in_training'])}"
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     shown.add_column("method\n", no_wrap=True)
     shown.add_column("parameters\n", justify="right", no_wrap=True)
@@ -33,7 +33,7 @@ def table(found: Mapping[str, Any]) -> Table:
         shown.add_column(heading, justify="right")
     shown.add_column("ms per\nvolume", justify="right")
     shown.add_column("training\ns", justify="right")
-    for label, row in found["methods"].items():
+    for label, row in results["methods"].items():
         cells = [_cell(row[name], form) for name, (_, form) in COLUMNS.items()]
         seconds = f"{row['train_seconds']:.0f}" if row["train_steps"] else "-"
         shown.add_row(
@@ -42,20 +42,20 @@ def table(found: Mapping[str, Any]) -> Table:
     return shown
 
 
-def show(found: Mapping[str, Any], folder: Path) -> None:
+def show(results: Mapping[str, Any], folder: Path) -> None:
     """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
     console = Console(width=max(Console().width, WIDTH))
-    console.print(table(found))
+    console.print(table(results))
     console.print(f"Kept in {folder}", soft_wrap=True)
 
 
 def _scenes(count: int, overlap: list[str] | None) -> str:
-    noun, moments = ("scenes", ", mean ± standard deviation") if count > 1 else ("scene", "")
+    noun, statistics = ("scenes", ", mean ± standard deviation") if count > 1 else ("scene", "")
     if overlap is None:
-        return f"{count} {noun}, not known whether seen in training{moments}"
+        return f"{count} {noun}, not known whether seen in training{statistics}"
     if overlap:
-        return f"{count} {noun}, {len(overlap)} of them seen in training{moments}"
-    return f"{count} unseen {noun}{moments}"
+        return f"{count} {noun}, {len(overlap)} of them seen in training{statistics}"
+    return f"{count} unseen {noun}{statistics}"
 
 
 def _cell(figure: Mapping[str, Any], form: str) -> str:

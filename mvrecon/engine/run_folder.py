@@ -1,33 +1,38 @@
-"""A folder that belongs to one run: locked while it is at work, with settings and measurements that
-do not change.
+"""The folder of one run: its lock, settings, versions, measurement and results; every file is
+written whole or not at all.
 """
 
 import json
+import math
+import platform
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from mvrecon import __version__
 from mvrecon.cameras import files
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
-from mvrecon.engine import record
 from mvrecon.engine.old_names import current
-from mvrecon.files.atomic import claimed
+from mvrecon.files.atomic import claimed, written_whole
 from mvrecon.files.checks import Refused, blaming, shown, text_of, yaml_of
 
+PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
+SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
 DIGESTS, RIG = "digests.json", "rig.json"
-#: What a folder without settings of its own must not hold: the work of a run that nobody could
-#: tell.
-WORK = (record.SETTINGS, record.RESULTS, "checkpoints", "cases")
+#: Results of a run; a folder that has one of them but no file of settings is refused.
+WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 
 @contextmanager
-def taken(folder: Path, settings: Mapping[str, Any], file: str = record.SETTINGS) -> Iterator[None]:
-    """A run folder that is this process's meanwhile, new or with the very settings that it had;
-    they are written down.
+def taken(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> Iterator[None]:
+    """Context that locks a run folder, new or started with the same settings, and writes the
+    settings into it.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -35,16 +40,16 @@ def taken(folder: Path, settings: Mapping[str, Any], file: str = record.SETTINGS
     """
     with claimed(folder):
         check(folder, settings, file)
-        record.start(folder, dict(settings), file)
+        start(folder, dict(settings), file)
         yield
 
 
-def check(folder: Path, settings: Mapping[str, Any], file: str = record.SETTINGS) -> None:
-    """Compare settings with those that a folder's run was started with; nothing is written.
+def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
+    """Compare settings with those that the folder's run was started with, without writing anything.
 
     Raises:
         ValueError: they differ; the message names each that does.
-        FileExistsError: results are there, and no settings of theirs.
+        FileExistsError: the folder has results but no file of settings.
     """
     remedy = "choose another folder by hydra.run.dir=..."
     if not (folder / file).is_file():
@@ -53,9 +58,9 @@ def check(folder: Path, settings: Mapping[str, Any], file: str = record.SETTINGS
                 f"{folder} holds {', '.join(work)} of another run without its {file}; {remedy}"
             )
         return
-    kept = current(yaml_of(folder / file))
+    expected = current(yaml_of(folder / file))
     plain = yaml.safe_load(yaml.safe_dump(dict(settings)))
-    if changed := differences(plain, kept):
+    if changed := differences(plain, expected):
         raise ValueError(
             f"{folder} is the folder of a run with other settings: {'; '.join(changed)}; {remedy}"
         )
@@ -77,8 +82,8 @@ def differences(got: Any, expected: Any, key: str = "") -> list[str]:
 
 
 def keep_measurement(folder: Path, data: SceneData) -> None:
-    """Keep a run's rig, and the digests of its rig and its data files; or compare them with those
-    kept before.
+    """Write a run's rig, and the digests of its rig and its data files; a resumed run compares them
+    instead.
 
     Raises:
         Refused: the rig or a file is not what the run began with.
@@ -87,11 +92,11 @@ def keep_measurement(folder: Path, data: SceneData) -> None:
         compare_measurement(folder, data.digests("train", "test"))
         return
     files.save(data.cameras, folder / RIG)
-    record.write(folder / DIGESTS, json.dumps(data.digests("train", "test"), indent=1) + "\n")
+    write(folder / DIGESTS, json.dumps(data.digests("train", "test"), indent=1) + "\n")
 
 
 def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
-    """Compare digests with those that a run folder keeps, if it does.
+    """Compare digests with those in a run folder, if it has any.
 
     Raises:
         Refused: the rig or a file differs, or the file of digests is none.
@@ -100,7 +105,84 @@ def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
     if not path.is_file():
         return
     with blaming(path, "is not JSON"):
-        kept = json.loads(text_of(path))
-    if not isinstance(kept, dict):
-        raise Refused(f"{path}: expected digests by name, got {shown(kept)}")
-    digests.compare(got, kept, f"{path} (its rig is kept as {RIG})")
+        expected = json.loads(text_of(path))
+    if not isinstance(expected, dict):
+        raise Refused(f"{path}: expected digests by name, got {shown(expected)}")
+    digests.compare(got, expected, f"{path} (its rig is kept as {RIG})")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, of mvrecon and of what its numbers depend on.
+
+    Torch's is its own, which tells the build (2.13.0+cu130) that the package index leaves out
+    (2.13.0).
+    """
+    import torch
+
+    packages = {
+        "mvrecon": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+    packages["torch"] = str(torch.__version__)
+    for name in PACKAGES:
+        try:
+            packages[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            packages[name] = "not installed"
+    return packages
+
+
+def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
+    """Write down a run's settings, plain and resolved, and the versions it runs with."""
+    write(folder / file, yaml.safe_dump(settings, sort_keys=False))
+    write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """The settings that a run was started with, by the option names of this version.
+
+    Raises:
+        FileNotFoundError: the folder is no run folder.
+    """
+    path = folder / SETTINGS
+    if not path.is_file():
+        raise FileNotFoundError(f"Expected a run folder with {SETTINGS} in it, got {folder}")
+    return current(yaml_of(path))
+
+
+def anchored(value: Any) -> Any:
+    """Settings with every `path` in them made absolute, so that they mean the same from any other
+    folder.
+    """
+    if isinstance(value, dict):
+        return {
+            key: _absolute(item) if key == "path" else anchored(item) for key, item in value.items()
+        }
+    return [anchored(item) for item in value] if isinstance(value, list) else value
+
+
+def write_results(folder: Path, results: dict[str, Any]) -> None:
+    """Write `results.json` with the command and the versions; figures that are not finite become
+    null.
+    """
+    whole = {**results, "command": sys.argv, "versions": versions()}
+    write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file; one of that name is replaced whole or not at all."""
+    with written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def _absolute(path: Any) -> Any:
+    return str(Path(path).expanduser().absolute()) if isinstance(path, str) else path
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,5 +1,5 @@
-"""Checkpoint files that survive: put in place whole, with a checksum inside, and the one before
-kept beside it.
+"""Write and read checkpoint files: each complete, with a checksum, and with the previous one beside
+it.
 
 A file is what `torch.save` writes, a zip archive, with the SHA-256 of all before it as the
 archive's comment: other programs read it as they would without.
@@ -18,7 +18,7 @@ import torch
 from lightning.fabric.plugins import CheckpointIO
 from torch import Tensor
 
-from mvrecon.engine.archive import check_archive
+from mvrecon.engine.checkpoint_check import check_archive
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import Refused, blaming, shown
 from mvrecon.files.places import inside
@@ -70,12 +70,12 @@ class DurableCheckpoints(CheckpointIO):
 
 
 def previous(path: Path) -> Path:
-    """Where the checkpoint goes that was at `path` before."""
+    """Path to which the earlier checkpoint at `path` is moved."""
     return path.with_stem(f"{path.stem}.previous")
 
 
 def not_finite(checkpoint: Mapping[str, Any]) -> list[str]:
-    """The names of the weights, averaged or not, among which is an infinite number or none."""
+    """Names of the weight tensors, averaged or not, that have an infinite value or NaN."""
     states = (checkpoint.get(key) or {} for key in ("state_dict", "current_model_state"))
     weights = (pair for state in states for pair in state.items())
     return [
@@ -84,10 +84,9 @@ def not_finite(checkpoint: Mapping[str, Any]) -> list[str]:
 
 
 def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
-    """Put a checkpoint on the disk under its name; the one that was there stays, as
-    `previous(path)`.
+    """Write a checkpoint to `path`; an earlier one is moved to `previous(path)`.
 
-    Whatever goes wrong, a full disk or a kill at any moment, one of the two is whole.
+    After a full disk or a kill at any moment, at least one of the two files is complete.
 
     Raises:
         FloatingPointError: weights that are not finite, which must not take a good checkpoint's
@@ -110,8 +109,8 @@ def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """A checkpoint of plain values and tensors, checked; one without a checksum of ours is taken as
-    it is.
+    """Read a checkpoint of plain values and tensors and check its checksum, if it has one of
+    mvrecon's.
 
     Raises:
         DamagedCheckpoint: the checksum does not fit, or the file is cut short.
@@ -174,9 +173,9 @@ def _verify(path: Path, file: BinaryIO) -> None:
             f"{path} is cut short or no checkpoint: {size} bytes, whose end is missing"
         )
     file.seek(0)
-    digest, left = hashlib.sha256(), size - COMMENT
-    while block := file.read(min(left, 2**20)):
+    digest, remaining = hashlib.sha256(), size - COMMENT
+    while block := file.read(min(remaining, 2**20)):
         digest.update(block)
-        left -= len(block)
+        remaining -= len(block)
     if digest.hexdigest().encode() != tail[len(TAG) :]:
         raise DamagedCheckpoint(f"{path} is damaged: its checksum does not fit its contents")

@@ -1,5 +1,5 @@
-"""What a training needs to go on after a break as if there had been none, and what it says when it
-breaks off.
+"""Callbacks for a training that resumes exactly after an interruption, and the error message that
+names its last checkpoint.
 """
 
 import random
@@ -18,8 +18,8 @@ from mvrecon.engine.storage import previous
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint to go on from: after every validation, every epoch without one, and at
-    SIGTERM.
+    """Writes the checkpoint for resuming: after every validation, after every epoch if there is no
+    validation, and at SIGTERM.
 
     Args:
         path: of the checkpoint; the one before stays beside it.
@@ -50,8 +50,8 @@ class KeepLast(Checkpoint):
 
 
 class AveragedWeights(EMAWeightAveraging):
-    """Lightning's exponential moving average of the weights, which also remembers the last epoch
-    that it took in.
+    """Lightning's exponential moving average of the weights; also stores the last epoch that it
+    averaged.
 
     A checkpoint of an epoch's last step is from before that epoch's end, which Lightning does not
     come back to.
@@ -67,7 +67,7 @@ class AveragedWeights(EMAWeightAveraging):
         self._latest_update_epoch = state_dict["latest_update_epoch"]
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Take in the weights of an epoch whose end was broken off."""
+        """Average the weights of an epoch whose end was interrupted."""
         last = trainer.current_epoch - 1
         if last > self._latest_update_epoch and self.should_update(epoch_idx=last):
             assert self._average_model is not None
@@ -76,8 +76,8 @@ class AveragedWeights(EMAWeightAveraging):
 
 
 class RandomNumbers(L.Callback):
-    """Takes the global random numbers of Python, NumPy and torch along in checkpoints: for layers
-    that draw from them.
+    """Stores the states of the global random generators of Python, NumPy and torch in checkpoints,
+    for layers that use them.
 
     Data, its order and its augmentation do not: they are pure functions of seed, epoch and index.
     """
@@ -88,7 +88,7 @@ class RandomNumbers(L.Callback):
         self._loaded: dict[str, Any] | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the generators are."""
+        """States of the random generators."""
         version, words, gauss = random.getstate()
         kind, keys, place, has, cached = np.random.get_state(legacy=True)
         return {
@@ -105,11 +105,11 @@ class RandomNumbers(L.Callback):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Put them there once all is set up, which may use up random numbers."""
+        """Keep the states until the training starts, since the setup may draw random numbers."""
         self._loaded = state_dict
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Go on with the numbers of the broken run."""
+        """Restore the states of the interrupted run."""
         if self._loaded is None:
             return
         state, self._loaded = self._loaded, None
@@ -124,8 +124,8 @@ class RandomNumbers(L.Callback):
 
 @contextmanager
 def remembered(last: Path) -> Iterator[None]:
-    """Whatever breaks a training off also tells where its last good checkpoint is; SIGTERM ends
-    with an error too.
+    """Context that adds the path of the last good checkpoint to the error of an interrupted
+    training; SIGTERM becomes an error too.
 
     Raises:
         SystemExit: SIGTERM came. Lightning's own would end the process as if all had gone well.
@@ -140,7 +140,7 @@ def remembered(last: Path) -> Iterator[None]:
 
 
 def _kept(last: Path) -> str:
-    found = next((path for path in (last, previous(last)) if path.exists()), None)
-    if found is None:
+    checkpoint = next((path for path in (last, previous(last)) if path.exists()), None)
+    if checkpoint is None:
         return "There is no checkpoint yet: resume=<run folder> begins again"
-    return f"The last good checkpoint is {found}: resume=<run folder> goes on from it"
+    return f"The last good checkpoint is {checkpoint}: resume=<run folder> goes on from it"

@@ -6,7 +6,7 @@ from mvrecon.config.plugins import import_plugins
 from mvrecon.engine import checkpoints
 from mvrecon.engine.checkpoints import Trained
 from mvrecon.engine.fit import methods
-from mvrecon.engine.record import read_settings
+from mvrecon.engine.run_folder import read_settings
 
 
 def load(path: str | Path, method: str | None = None) -> Trained:

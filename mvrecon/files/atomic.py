@@ -1,6 +1,4 @@
-"""Files that are there whole or not at all, folders of one's own, and folders that one process at a
-time writes to.
-"""
+"""Write a file completely or not at all, make a new folder, and lock a folder for one process."""
 
 import os
 import socket
@@ -20,8 +18,8 @@ LOCK, PART = ".lock", ".part"
 
 @contextmanager
 def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place once all is written: a crash leaves what
-    was there before.
+    """Context with a temporary path that replaces `path` after all is written; a crash leaves the
+    old file.
 
     The contents reach the disk before the name does, so that a loss of power cannot leave half a
     file either. The temporary file of a killed process, `.<name>.<process>.part`, is cleared away
@@ -56,8 +54,8 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """A folder that no other process writes to meanwhile; what killed writers left half done in it
-    is cleared away.
+    """Context that locks a folder for this process, and deletes incomplete files that killed
+    processes left in it.
 
     The claim ends with the process, however that ends; worker processes do not inherit it.
 
@@ -80,22 +78,21 @@ def claimed(folder: Path) -> Iterator[None]:
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         lock.flush()
-        for left in folder.rglob(f".*.[0-9]*{PART}"):
-            left.unlink(missing_ok=True)
+        for part in folder.rglob(f".*.[0-9]*{PART}"):
+            part.unlink(missing_ok=True)
         yield
 
 
-def new_folder(wanted: str | Path) -> Path:
-    """A new folder: the path wanted, or where another process or run has that, with _2, _3, ... at
-    its end.
+def new_folder(path: str | Path) -> Path:
+    """Make a new folder at a path; if it exists already, with _2, _3, ... at its end.
 
     Raises:
         OSError: no space, no permission.
     """
-    wanted = Path(wanted)
-    wanted.parent.mkdir(parents=True, exist_ok=True)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     for number in count(1):
-        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
+        folder = path if number == 1 else path.with_name(f"{path.name}_{number}")
         try:
             folder.mkdir()  # by one process alone: the system sees to that
             break
@@ -105,8 +102,7 @@ def new_folder(wanted: str | Path) -> Path:
 
 
 def check_plain(folder: Path) -> None:
-    """Refuse a folder that leads to other places: with a link in it, or a pipe or a device, at any
-    depth.
+    """Refuse a folder that has a link, a pipe or a device in it, at any depth.
 
     The folder itself may be reached by a link.
 

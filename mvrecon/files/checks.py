@@ -1,6 +1,4 @@
-"""How far a file from elsewhere is believed: its size, its text and its names are looked at before
-they are used.
-"""
+"""Check files from elsewhere before use: size, text, names, memory needed."""
 
 import os
 import reprlib
@@ -24,15 +22,15 @@ SPACING = (1e-6, 1e6)
 
 
 class Refused(ValueError):
-    """A file that is damaged, or not what is expected of it. The message names it."""
+    """Error for a file that is damaged or has unexpected contents; the message names the file."""
 
 
 @contextmanager
 def blaming(
     path: str | Path, what: str, hint: str = "is it cut short or damaged?"
 ) -> Iterator[None]:
-    """Whatever a library raises over a file's contents names the file: a damaged one makes
-    libraries raise anything.
+    """Context that turns any error of a library into one that names the file: a damaged file can
+    make a library raise any error.
 
     Raises:
         Refused: in place of any error but these: a `Refused`, a missing import.
@@ -95,7 +93,7 @@ def _unfolded(node: Any, sizes: dict[int, float]) -> float:
 
 
 def plain_name(name: Any, where: str | Path) -> str:
-    """A name that may become a file's or a folder's: it leads nowhere else.
+    """Check that a name can be the name of a file or a folder, and not a path; return it.
 
     Args:
         name: as found.
@@ -124,7 +122,7 @@ def shown(value: Any) -> str:
 
 
 def check_memory(needed: int, what: str) -> None:
-    """Refuse at once what memory cannot take; a gibibyte or less is not looked at.
+    """Raise an error if more bytes are needed than are free; a gibibyte or less is not checked.
 
     Raises:
         ValueError: more bytes than are at hand, with both in GiB.
@@ -136,9 +134,7 @@ def check_memory(needed: int, what: str) -> None:
 
 
 def memory_at_hand() -> int | None:
-    """Bytes that this process may still take: what the system has free, less where a limit is set;
-    None: not known.
-    """
+    """Free memory for this process in bytes, within the limits set for it; None: not known."""
     if sys.platform == "win32":
         return None
     import resource
@@ -165,7 +161,7 @@ def _free() -> Iterator[int]:
 
 
 def _left_in_group() -> Iterator[int]:
-    """What a container may still take (Linux, cgroup v2)."""
+    """Free memory in bytes within the limit of the container (Linux, cgroup v2)."""
     most, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
     if most.exists() and used.exists() and (text := most.read_text().strip()) != "max":
         yield int(text) - int(used.read_text())

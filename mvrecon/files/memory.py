@@ -1,4 +1,4 @@
-"""Memory that this process takes."""
+"""Peak memory of this process."""
 
 import sys
 

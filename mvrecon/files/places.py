@@ -1,4 +1,4 @@
-"""Where a callback or a logger may write: inside the run folder, whatever its options and its
+"""Keep the files of callbacks and loggers inside the run folder, whatever their options or a
 checkpoint say.
 """
 
@@ -21,7 +21,7 @@ ADDRESS = re.compile(r"(?!https?://)(file:|.*(:/|::))")
 
 
 def inside(path: str | os.PathLike[str], folder: Path, what: str) -> Path:
-    """A path with its links followed, if it lies in a folder.
+    """Resolve the links of a path and check that it lies inside a folder.
 
     Args:
         path: to a file or a folder, there or not.
@@ -67,8 +67,7 @@ def _placed(key: str, value: Any, folder: Path) -> Any:
 
 
 def check_places(thing: Any, folder: Path) -> None:
-    """Look through a callback or a logger for places that it would write to: those of its options,
-    and a logger's own.
+    """Check every path that a callback or a logger would write to.
 
     Raises:
         PermissionError: one of them lies outside the folder.

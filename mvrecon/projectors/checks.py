@@ -1,4 +1,4 @@
-"""The door of operators: shapes, devices and dtypes of volumes and views."""
+"""Check shape, device and dtype of the volumes and views that operators are given."""
 
 from collections.abc import Sequence
 
@@ -35,7 +35,7 @@ def check_floating(tensor: Tensor, what: str) -> None:
 
 
 def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
-    """The door for measured views.
+    """Check the shape of measured views, and that all values are finite.
 
     Raises:
         ValueError: a wrong rank or size, or values that are not finite.

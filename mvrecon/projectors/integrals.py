@@ -1,5 +1,5 @@
-"""Integrals of volumes along the rays of a rig: the rays in voxel space, the back end that computes
-them, and the zeros that it skips.
+"""Line integrals of volumes along the rays of a rig: rays in voxel space, choice of the back end,
+skipping of zeros.
 """
 
 import math
@@ -21,7 +21,7 @@ from mvrecon.kernels.rays.lines import lines_of, lines_of_rays, tensors_of, writ
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import Projector
-from mvrecon.projectors.skipping import SKIPS, Skipped, check_support, told, verify, within
+from mvrecon.projectors.skipping import SKIPS, Skipped, check_support, skip_report, verify, within
 
 METHODS = ("joseph", "siddon", "trilinear")
 
@@ -42,14 +42,14 @@ class LineIntegrals(Projector):
         support: Bool[Tensor, "d h w"] | None = None,
     ):
         super().__init__()
-        known = {"method": METHODS, "backend": backends.BACKENDS, "skip": SKIPS}
+        names = {"method": METHODS, "backend": backends.BACKENDS, "skip": SKIPS}
         for what, name in (
             ("method", method.partition(":")[0]),
             ("backend", backend),
             ("skip", skip),
         ):
-            if name not in known[what]:
-                raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(known[what])}")
+            if name not in names[what]:
+                raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(names[what])}")
         self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
@@ -64,7 +64,7 @@ class LineIntegrals(Projector):
         mask = check_support(support, grid)
         mask = None if mask is None else mask.to(lines.device)
         self.register_buffer("support", mask, persistent=False)
-        self._held = self._hold()
+        self._support_code, self._support_box = self._occupied_by_support()
         self._last: Tensor | None = None
 
     @property
@@ -87,8 +87,8 @@ class LineIntegrals(Projector):
 
     @property
     def skipped(self) -> Skipped:
-        """What the last call left out, and why."""
-        return told(self._last, self.skip, self.grid.shape)
+        """Voxels that the last call skipped, and why."""
+        return skip_report(self._last, self.skip, self.grid.shape)
 
     def _lines(self) -> Float[Tensor, "m 4 3 k"]:
         if isinstance(self.rays, ExplicitRays):
@@ -107,16 +107,16 @@ class LineIntegrals(Projector):
 
     @property
     def pose_gradient(self) -> bool:
-        """Whether the cameras want a gradient: the rays are then made anew in every call."""
+        """Whether the cameras require a gradient; the rays are then computed in every call."""
         return any(tensor.requires_grad for tensor in tensors_of(self.rays))
 
     @property
     def lines(self) -> Float[Tensor, "m 4 3 k"]:
-        """The rays in voxel space; made anew, with their graph, where the cameras want a gradient.
+        """The rays in voxel space; computed again, with a graph, if the cameras require a gradient.
 
         Raises:
-            RuntimeError: cameras that want none were changed in place; graphs of `torch.compile`
-                cannot look.
+            RuntimeError: cameras without a gradient were changed in place; not seen in graphs of
+                `torch.compile`.
         """
         if self.pose_gradient:
             return self._lines().to(self.fixed_lines.device)
@@ -162,16 +162,16 @@ class LineIntegrals(Projector):
                 wide(x if self.support is None else within(x, self.support)), *rays
             )
         if self.support is not None:
-            self._last, box = held = self._held
+            self._last, box = self._support_code, self._support_box
             part = within(x[:, *box.slices], self.support[box.slices])
-            return kernels.project(part, *rays, held[0])
+            return kernels.project(part, *rays, self._support_code)
         if self.skip == "off":
             self._last = None
             return kernels.project(x, *rays)
         how = self.skip if self.skip in ("box", "brick") else "auto"
         # not read from self again: another thread may project another volume meanwhile
-        self._last = there = kernels.occupied(x.detach(), lines.detach(), *rays[1:], how)
-        views = kernels.project(x, *rays, None, there)
+        self._last = occupancy = kernels.occupied(x.detach(), lines.detach(), *rays[1:], how)
+        views = kernels.project(x, *rays, None, occupancy)
         if self.skip == "verify":
             verify(views, kernels.project(x, *rays), self.skipped)
         return views
@@ -187,21 +187,21 @@ class LineIntegrals(Projector):
             return within(
                 kernels.backproject(views, lines, self.ray_extent, shape, self.kernel), self.support
             )
-        self._last, box = held = self._held
+        self._last, box = self._support_code, self._support_box
         part = kernels.backproject(
-            views, lines, self.ray_extent, list(box.shape), self.kernel, held[0]
+            views, lines, self.ray_extent, list(box.shape), self.kernel, self._support_code
         )
         return placed(within(part, self.support[box.slices]), box, self.grid.shape)
 
-    def _hold(self) -> tuple[Tensor, Box]:
-        """Where the support is, in code, and its box: found once."""
-        held = Occupancy.whole(self.grid.shape)
+    def _occupied_by_support(self) -> tuple[Tensor, Box]:
+        """The occupancy code of the support, and the box around it."""
+        occupancy = Occupancy.whole(self.grid.shape)
         if self.support is not None and self.skip != "off" and backends.COMPILED:
             mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
             how = self.skip if self.skip in ("box", "brick") else "once"
             code = ops.occupied(mask, rays, self.ray_extent, self.detector, self.kernel, how)
-            held = Occupancy.unwrapped(code)
-        return held.encoded(), held.box
+            occupancy = Occupancy.unwrapped(code)
+        return occupancy.encoded(), occupancy.box
 
     def _kernels(self, tensor: Tensor) -> ModuleType:
         chosen, kernels = backends.kernels_for(tensor, self.backend, self.kernel)

@@ -78,7 +78,7 @@ class LinearOperator:
         return Cropped(self, box, views)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> "LinearOperator":
-        """A diag(support): what lies outside the mask is neither read nor written."""
+        """A diag(support): voxels outside the mask are neither read nor written."""
         return self if support is None else Scaled(self, voxels=support)
 
     def mirror(self) -> Mirror | None:
@@ -184,25 +184,27 @@ class Scaled(Wrapped):
     """
 
     voxels: Tensor | None
-    kept: Tensor | None
+    fixed_factors: Tensor | None
 
     def __init__(self, A: LinearOperator, pixels: Weight = None, voxels: Tensor | None = None):
         super().__init__(A)
         self.capabilities = A.capabilities
         self.factors = pixels if callable(pixels) else None
-        self.register_buffer("kept", pixels() if callable(pixels) else pixels, persistent=False)
+        self.register_buffer(
+            "fixed_factors", pixels() if callable(pixels) else pixels, persistent=False
+        )
         self.register_buffer("voxels", voxels, persistent=False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Scaled":
-        exact = self.kept, self.voxels
+        exact = self.fixed_factors, self.voxels
         super()._apply(fn, recurse)  # moves them; their digits stay
-        self.kept, self.voxels = (None if w is None else w.to(self.device) for w in exact)
+        self.fixed_factors, self.voxels = (None if w is None else w.to(self.device) for w in exact)
         return self
 
     @property
     def pixels(self) -> Tensor | None:
         """The pixels' factors."""
-        return self.factors() if self.factors and self.pose_gradient else self.kept
+        return self.factors() if self.factors and self.pose_gradient else self.fixed_factors
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
         y, factors = self.A(self._weighted(x)), self.pixels
@@ -236,7 +238,7 @@ class Scaled(Wrapped):
         return Scaled(self.A.cropped(box, views), self._changed(of_views), voxels)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
-        return Scaled(self.A.with_support(support), self.factors or self.kept, self.voxels)
+        return Scaled(self.A.with_support(support), self.factors or self.fixed_factors, self.voxels)
 
     def mirror(self) -> Mirror | None:
         """A's own, where it mirrors the weights into themselves, too."""
@@ -249,7 +251,7 @@ class Scaled(Wrapped):
         """The pixels' factors after a change, as a function where they were one."""
         if (factors := self.factors) is not None:
             return lambda: change(factors())
-        return None if self.kept is None else change(self.kept)
+        return None if self.fixed_factors is None else change(self.fixed_factors)
 
 
 class Cropped(Wrapped):

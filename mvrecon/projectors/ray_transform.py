@@ -96,8 +96,8 @@ class RayTransform(LineIntegrals):
         """A plane that mirrors grid, rig and support into themselves."""
         # a ray in the face between two voxels is given to one of them by "siddon": not to that
         # one's mirror image
-        known = bool(self.capabilities) and self.method != "siddon"
-        if not known or isinstance(self.rays, ExplicitRays):
+        exact = bool(self.capabilities) and self.method != "siddon"
+        if not exact or isinstance(self.rays, ExplicitRays):
             return None
         mirror = mirror_pairs(self.rays, self.grid)
         if mirror is None or mirror.share.all():
@@ -113,7 +113,8 @@ class RayTransform(LineIntegrals):
         other._buffers = dict(self._buffers)
         moved = check_support(support, self.grid)
         other.support = None if moved is None else moved.to(self.fixed_lines.device)
-        other._held, other._last = other._hold(), None
+        other._support_code, other._support_box = other._occupied_by_support()
+        other._last = None
         return other
 
     def forward(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:

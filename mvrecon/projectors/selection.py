@@ -1,5 +1,5 @@
-"""Chosen cameras or chosen pixels of views, as operators: what picks them, and what puts them back
-among zeros.
+"""Selection of cameras or pixels as operators: forward picks values of the views, the adjoint puts
+them back among zeros.
 """
 
 from collections.abc import Sequence

@@ -1,5 +1,5 @@
-"""What an operator leaves out: supports that are part of it, and what it tells of the zeros that it
-passes by.
+"""Skipping of zeros: the support that is part of an operator, and the report of what a call
+skipped.
 """
 
 import math
@@ -19,14 +19,14 @@ SKIPS = ("auto", "off", "box", "brick", "verify")
 
 @dataclass(frozen=True)
 class Skipped:
-    """What a call left out.
+    """Voxels that one call of an operator skipped.
 
     Args:
         mode: "off", "box" or "brick".
-        box: the voxels that were looked at.
-        why: in words.
-        fractions: "voxels", of the volume, in the box; "box" and "brick", of the work on a few
-            rays, that either leaves, where they were counted.
+        box: voxels outside it are zero, or outside the support, and were not read.
+        why: the reason for the mode, as a sentence.
+        fractions: "voxels": share of the volume in the box; "box" and "brick": share of the work
+            that is left with each, counted on a few rays, absent if not counted.
     """
 
     mode: str
@@ -35,39 +35,41 @@ class Skipped:
     fractions: Mapping[str, float] = field(default_factory=dict)
 
 
-def told(code: Tensor | None, asked: str, shape: Sequence[int]) -> Skipped:
-    """What the code of an occupancy says; none: nothing was left out."""
+def skip_report(code: Tensor | None, skip: str, shape: Sequence[int]) -> Skipped:
+    """Report of a call by the code of its occupancy; None: nothing was skipped."""
     if code is None:
         return Skipped(
             "off",
             Box.whole(shape),
             "nothing was asked to be skipped, or the back end skips nothing",
         )
-    held = Occupancy.decoded(code)
-    whole = held.box == Box.whole(shape)
-    mode = "brick" if held.bricks is not None else "off" if whole else "box"
-    fractions = {"voxels": held.box.size / math.prod(shape)}
+    occupancy = Occupancy.decoded(code)
+    whole = occupancy.box == Box.whole(shape)
+    mode = "brick" if occupancy.bricks is not None else "off" if whole else "box"
+    fractions = {"voxels": occupancy.box.size / math.prod(shape)}
     fractions |= {
-        name: each for name, each in zip(("box", "brick"), held.shares, strict=True) if each == each
+        name: share
+        for name, share in zip(("box", "brick"), occupancy.shares, strict=True)
+        if share == share
     }
     if "brick" in fractions:
         why = (
             f"on a few rays the box leaves {fractions['box']:.1%} of the work, bricks "
             f"{fractions['brick']:.1%}"
         )
-    elif asked in ("box", "brick"):
-        why = f"{asked!r} was asked for"
+    elif skip in ("box", "brick"):
+        why = f"{skip!r} was asked for"
     else:
         why = (
             "it is small work, or the volume is full"
             if whole
             else "bricks are full, or too small work to count them"
         )
-    return Skipped(mode, held.box, why, fractions)
+    return Skipped(mode, occupancy.box, why, fractions)
 
 
 def check_support(support: Tensor | None, grid: Grid) -> Bool[Tensor, "d h w"] | None:
-    """The door for supports.
+    """Check the shape and dtype of a support.
 
     Raises:
         ValueError: not a mask of the grid's shape.
@@ -83,7 +85,7 @@ def check_support(support: Tensor | None, grid: Grid) -> Bool[Tensor, "d h w"] |
 def within(
     volumes: Float[Tensor, "n d h w"], support: Bool[Tensor, "d h w"]
 ) -> Float[Tensor, "n d h w"]:
-    """Volumes with nothing outside a support, whatever stood there."""
+    """Volumes set to zero outside a support, NaN and infinity included."""
     return torch.where(support, volumes, 0)
 
 

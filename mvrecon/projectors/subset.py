@@ -1,5 +1,5 @@
-"""Some rays of a ray transform, at a cost that falls with their number: ordered subsets, bins that
-hold counts.
+"""Part of a ray transform: some views (ordered subsets) or some pixels, at a cost that falls with
+their number.
 """
 
 import torch
@@ -38,7 +38,7 @@ class SomeRays(LinearOperator):
         self._fixed = None if A.pose_gradient else self._choose(A.lines)
 
     def _prepare(self) -> None:
-        """What does not depend on where the rays lie."""
+        """Compute what does not depend on the position of the rays."""
         raise NotImplementedError
 
     def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]:
@@ -55,7 +55,7 @@ class SomeRays(LinearOperator):
 
     @property
     def lines(self) -> Float[Tensor, "n 4 3 k"]:
-        """The rays in voxel space; made anew, with their graph, where the cameras want a
+        """The rays in voxel space; computed again, with a graph, if the cameras require a
         gradient.
         """
         lines = self.A.lines
@@ -126,8 +126,8 @@ class SomePixels(SomeRays):
         )
         u = r * (u - (columns - 1) / 2).to(lines)[:, None, None]
         v = r * (v - (rows - 1) / 2).to(lines)[:, None, None]
-        here = across * u + down * v + middle
-        return torch.stack([across, down, here], dim=3) if r > 1 else here[..., None]
+        centre = across * u + down * v + middle
+        return torch.stack([across, down, centre], dim=3) if r > 1 else centre[..., None]
 
     def _walked(self, values: Float[Tensor, "b c r"]) -> Float[Tensor, "b c r"]:
         return values.new_zeros(values.shape).index_copy(2, self.order.to(values.device), values)

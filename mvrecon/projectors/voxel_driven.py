@@ -1,5 +1,5 @@
-"""Voxel-driven back-projection: every voxel looks up its own image, as filtered back-projection
-wants it.
+"""Voxel-driven back-projection, as in filtered back-projection: every voxel reads the views at the
+projection of its centre.
 """
 
 from dataclasses import replace
@@ -27,8 +27,8 @@ def backproject(
     weight: Weight = "none",
     backend: str = "auto",
 ) -> Float[Tensor, "b c d h w"]:
-    """The sum over cameras of each view at the image of every voxel's centre, weighted by distance
-    if asked for.
+    """Sum over cameras of each view at the projection of every voxel's centre, optionally with
+    distance weights.
 
     Bilinear in the view; beyond the outermost pixel centres values fade to zero over one pixel. A
     voxel counts where its ray does: on the right side of the source, and for a segment before the

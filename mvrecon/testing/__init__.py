@@ -1,4 +1,4 @@
-"""The contract of each kind of part, for mvrecon and for the authors of plugins."""
+"""Checks that every part of a kind must pass, for mvrecon and for the authors of plugins."""
 
 from mvrecon.testing.camera import check_camera as check_camera
 from mvrecon.testing.head import check_head as check_head

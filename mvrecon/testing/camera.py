@@ -1,4 +1,4 @@
-"""The contract of a camera."""
+"""Checks that every camera must pass."""
 
 from typing import Any
 
@@ -29,12 +29,12 @@ def check_camera(name: str, **options: Any) -> None:
     uvz = _somewhere(cameras)
     xyz = cameras.unproject(uvz)
     for m, camera in enumerate(cameras):
-        seen = camera.project(xyz[m])[0]
-        error = ((seen - uvz[m]).abs() / (1 + uvz[m].abs())).max()
+        uv = camera.project(xyz[m])[0]
+        error = ((uv - uvz[m]).abs() / (1 + uvz[m].abs())).max()
         assert error < 1e-9, (
             f"camera {m}: projecting a point that was unprojected misses by {error:.2g}"
         )
-        assert torch.allclose(cameras.project(xyz[m])[m], seen, rtol=1e-12, atol=1e-9), (
+        assert torch.allclose(cameras.project(xyz[m])[m], uv, rtol=1e-12, atol=1e-9), (
             f"camera {m} differs when alone"
         )
 
@@ -66,10 +66,10 @@ def _check_pixels(cameras: Cameras) -> None:
 
 def _somewhere(cameras: Cameras, count: int = 50) -> Float[Tensor, "m n 3"]:
     """Random pixel coordinates and depths on the side of each camera that counts."""
-    least, most = (max(min(w, 3.0), -3.0) for w in cameras.ray_extent)
+    nearest, farthest = (max(min(w, 3.0), -3.0) for w in cameras.ray_extent)
     t = torch.rand(
         len(cameras), count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
     uv = t[..., :2] * t.new_tensor(cameras.shape[::-1]) - 0.5
-    w = least + (most - least) * (0.05 + 0.9 * t[..., 2:])
+    w = nearest + (farthest - nearest) * (0.05 + 0.9 * t[..., 2:])
     return torch.cat([uv, w * cameras.distance[:, None, None]], dim=-1)

@@ -1,4 +1,4 @@
-"""The contract of a head."""
+"""Checks that every head must pass."""
 
 from typing import Any
 

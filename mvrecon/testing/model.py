@@ -1,4 +1,4 @@
-"""The contract of a model."""
+"""Checks that every model must pass."""
 
 from typing import Any
 
@@ -81,20 +81,20 @@ def _check_batch(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
 
 
 def _check_gradients(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
-    named = {
-        name: each for name, each in model.named_parameters() if each.requires_grad and each.numel()
-    }
-    if named:
+    parameters = {name: p for name, p in model.named_parameters() if p.requires_grad and p.numel()}
+    if parameters:
         loss = model(views).volume.square().sum()
-        gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
+        gradients = torch.autograd.grad(loss, list(parameters.values()), allow_unused=True)
         idle = [
             name
-            for name, each in zip(named, gradients, strict=True)
-            if each is None or not each.any()
+            for name, gradient in zip(parameters, gradients, strict=True)
+            if gradient is None or not gradient.any()
         ]
         assert not idle, f"no gradient reaches {', '.join(idle)}"
         bad = [
-            name for name, each in zip(named, gradients, strict=True) if not each.isfinite().all()
+            name
+            for name, gradient in zip(parameters, gradients, strict=True)
+            if not gradient.isfinite().all()
         ]
         assert not bad, f"gradients are not finite: {', '.join(bad)}"
 

@@ -1,4 +1,4 @@
-"""The contract of a projector."""
+"""Checks that every projector must pass."""
 
 from dataclasses import replace
 
@@ -82,7 +82,7 @@ def _check_support(A: Projector) -> None:
 
 
 def _check_motion(name: str, grid: Grid, cameras: Cameras, **options) -> None:
-    """Moving the object shows what un-moving the cameras shows."""
+    """Views of the moved object are the views of cameras with the inverse motion."""
     R, t = (
         random_rotation(torch.Generator().manual_seed(0)),
         torch.tensor([30.0, -20.0, 10.0], dtype=torch.float64),

@@ -135,7 +135,7 @@ def test_an_order_depends_on_seed_and_epoch_alone():
 
 def test_a_resumed_epoch_leaves_out_what_was_seen_and_the_next_is_whole():
     sampler = EpochOrder(50, 3)
-    sampler.resume(epoch=1, seen=20)
+    sampler.resume(epoch=1, n_done=20)
     sampler.set_epoch(1)
     assert list(sampler) == order(3, 1)[20:]
     sampler.set_epoch(2)
@@ -173,5 +173,5 @@ def test_what_workers_are_seeded_from_depends_on_seed_and_epoch_alone():
 
     assert seeds([0, 1, 2]) == seeds([2]) != seeds([1])
     resumed = EpochOrder(4, 3)
-    resumed.resume(epoch=2, seen=1)
+    resumed.resume(epoch=2, n_done=1)
     assert list(resumed) == order(3, 2, count=4)[1:], "before Lightning tells the epoch"

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from mvrecon.cameras import rigs
-from mvrecon.engine import record, run_folder
-from mvrecon.engine.archive import check_settings
+from mvrecon.engine import run_folder
+from mvrecon.engine.checkpoint_check import check_settings
 from mvrecon.engine.old_names import RIGS, current
 
 OLD = {"seed": 3, "camera": {"name": "circular", "views": 8, "sid": 400.0}}
@@ -14,8 +14,8 @@ NEW = {"seed": 3, "camera": {"name": "circular", "n_views": 8, "sid": 400.0}}
 
 
 def test_a_run_that_counts_its_views_by_the_old_name_is_read(tmp_path):
-    record.start(tmp_path, OLD)
-    assert record.read_settings(tmp_path) == NEW
+    run_folder.start(tmp_path, OLD)
+    assert run_folder.read_settings(tmp_path) == NEW
     run_folder.check(tmp_path, NEW)
     with pytest.raises(ValueError, match="got camera.n_views=9, expected 8"):
         run_folder.check(tmp_path, {**NEW, "camera": {**NEW["camera"], "n_views": 9}})

@@ -20,7 +20,7 @@ from mvrecon.cameras import files
 from mvrecon.config import compose
 from mvrecon.data import digests
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.engine import agreement, checkpoints, fit, record, run_folder
+from mvrecon.engine import agreement, checkpoints, fit, run_folder
 from mvrecon.engine.checkpoints import Trained
 from mvrecon.engine.evaluation import seen_in_training
 from mvrecon.files.atomic import new_folder
@@ -247,7 +247,7 @@ def test_a_rig_that_has_changed_is_refused(run, kept, tmp_path, capsys):
     by checkpoint.
     """
     folder, _ = run
-    path = Path(record.read_settings(folder)["camera"]["path"])
+    path = Path(run_folder.read_settings(folder)["camera"]["path"])
     expected, whole = digests.of_rig(files.from_file(path)), (folder / "digests.json").read_bytes()
     try:
         if kept == "checkpoint":

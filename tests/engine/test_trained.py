@@ -8,7 +8,7 @@ import yaml
 
 import mvrecon as mv
 from mvrecon.config import compose
-from mvrecon.engine import checkpoints, fit, record
+from mvrecon.engine import checkpoints, fit, run_folder
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,7 @@ def run(tmp_path_factory) -> Path:
     """A run of one step; its other method, SIRT, learns nothing and has no checkpoint."""
     settings = compose("experiment=smoke", "trainer.max_steps=1", "trainer.val_check_interval=1")
     folder = tmp_path_factory.mktemp("run")
-    record.start(folder, settings)
+    run_folder.start(folder, settings)
     fit.fit("cross_view", settings, fit.build_data(settings), folder)
     return folder
 

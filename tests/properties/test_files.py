@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
-from mvrecon.engine import record
+from mvrecon.engine import run_folder
 from mvrecon.files.checks import plain_name
 from mvrecon.geometry.grid import Grid
 from tests.properties.strategies import grids, real, volumes
@@ -27,11 +27,11 @@ SETTINGS = st.dictionaries(
 def test_settings(settings, tmp_path_factory):
     """Any names, numbers and texts: those that YAML would take for something else, too."""
     one, two = (tmp_path_factory.mktemp(name) for name in ("one", "two"))
-    record.start(one, settings)
-    found = record.read_settings(one)
+    run_folder.start(one, settings)
+    found = run_folder.read_settings(one)
     assert found == settings
-    record.start(two, found)
-    assert (one / record.SETTINGS).read_bytes() == (two / record.SETTINGS).read_bytes()
+    run_folder.start(two, found)
+    assert (one / run_folder.SETTINGS).read_bytes() == (two / run_folder.SETTINGS).read_bytes()
 
 
 @given(grid=grids(), data=st.data(), mm=st.tuples(*[real(1e-3, 1e3)] * 3))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.engine.archive import check_archive
+from mvrecon.engine.checkpoint_check import check_archive
 from mvrecon.engine.checkpoints import finished, load, unfinished
 from mvrecon.engine.storage import read_newest
 from mvrecon.files.checks import Refused

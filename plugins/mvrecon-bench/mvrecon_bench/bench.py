@@ -22,14 +22,14 @@ def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
         PermissionError: anything but files and folders is in it.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.engine import record
+    from mvrecon.engine import run_folder
     from mvrecon.files.atomic import claimed
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.benchmarks.kinds import BENCHES
 
     kind = BENCHES.from_config(settings["bench"])
     with claimed(folder):
-        record.start(folder, settings)
+        run_folder.start(folder, settings)
         return runner.run(kind, folder)
 
 

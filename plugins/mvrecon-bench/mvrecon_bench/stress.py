@@ -21,7 +21,7 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
         PermissionError: anything but files and folders is in it.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.engine import record
+    from mvrecon.engine import run_folder
     from mvrecon.files.atomic import claimed
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.stresses.stress import Stress
@@ -29,7 +29,7 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     chosen = (settings["parts"], settings["cases"] or (), settings["device"], settings["dtypes"])
     plan = Stress(*chosen, settings["limit_s"])
     with claimed(folder):
-        record.start(folder, settings)
+        run_folder.start(folder, settings)
         return runner.run(plan, folder)
 
 

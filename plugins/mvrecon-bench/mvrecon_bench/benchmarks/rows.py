@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mvrecon.engine.record import write
+from mvrecon.engine.run_folder import write
 
 Row = dict[str, Any]
 

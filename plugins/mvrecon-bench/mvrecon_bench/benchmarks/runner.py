@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from mvrecon.engine import record
+from mvrecon.engine import run_folder
 from mvrecon.engine.loggers import Board
 from mvrecon_bench.benchmarks import machine
 from mvrecon_bench.benchmarks.rows import Row, Rows
@@ -97,7 +97,7 @@ def report(bench: Bench, rows: Sequence[Row], folder: Path, board: Board) -> Non
     from PIL import Image
 
     for name, text in bench.report(rows, folder).items():
-        record.write(folder / f"{name}.md", text)
+        run_folder.write(folder / f"{name}.md", text)
         board.experiment.add_text(name, text, len(rows))
     for path in sorted(folder.glob("*.png")):
         with Image.open(path) as picture:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mvrecon.engine import record
+from mvrecon.engine import run_folder
 from mvrecon_bench.benchmarks.report import legend, markdown
 from mvrecon_bench.benchmarks.rows import Row
 from mvrecon_bench.stresses import plan
@@ -84,7 +84,7 @@ class Stress:
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """The table, and all rows as JSON."""
-        record.write(folder / "verdicts.json", json.dumps(list(rows), indent=1) + "\n")
+        run_folder.write(folder / "verdicts.json", json.dumps(list(rows), indent=1) + "\n")
         return {"table": table(rows)}
 
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.engine import record
+from mvrecon.engine import run_folder
 from mvrecon.engine.loggers import MetricsFile
 
 
@@ -18,9 +18,9 @@ def test_settings_come_back_plain_and_in_order(tmp_path):
         "grid": {"shape": [1, 2, 3], "spacing": 0.5},
         "resume": None,
     }
-    record.start(tmp_path / "run", settings)
-    assert record.read_settings(tmp_path / "run") == settings
-    assert list(record.read_settings(tmp_path / "run")) == list(settings)
+    run_folder.start(tmp_path / "run", settings)
+    assert run_folder.read_settings(tmp_path / "run") == settings
+    assert list(run_folder.read_settings(tmp_path / "run")) == list(settings)
     assert "torch 2." in (tmp_path / "run" / "versions.txt").read_text()
 
 
@@ -30,16 +30,16 @@ def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
         "scene": {"path": "a.h5", "scenes": [{"path": "/b.h5"}, {"path": None}]},
         "name": "path",
     }
-    found = record.anchored(given)
+    found = run_folder.anchored(given)
     assert found["scene"] == {
         "path": str(tmp_path / "a.h5"),
         "scenes": [{"path": "/b.h5"}, {"path": None}],
     }
-    assert found["name"] == "path" and record.anchored(found) == found
+    assert found["name"] == "path" and run_folder.anchored(found) == found
 
 
 def test_results_are_strict_json_with_versions(tmp_path):
-    record.write_results(
+    run_folder.write_results(
         tmp_path, {"psnr": math.inf, "values": [math.nan, 1.5], "deep": {"x": -math.inf}}
     )
     found = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
@@ -53,20 +53,20 @@ def test_the_version_of_torch_tells_its_build(monkeypatch):
     out.
     """
     monkeypatch.setattr(torch, "__version__", "2.13.0+cu130")
-    monkeypatch.setattr(record.metadata, "version", lambda name: "2.13.0")
-    assert record.versions()["torch"] == "2.13.0+cu130"
+    monkeypatch.setattr(run_folder.metadata, "version", lambda name: "2.13.0")
+    assert run_folder.versions()["torch"] == "2.13.0+cu130"
 
 
 def test_a_failed_write_keeps_the_old_file(tmp_path):
-    record.write(tmp_path / "a.txt", "old")
+    run_folder.write(tmp_path / "a.txt", "old")
     with pytest.raises(UnicodeEncodeError):
-        record.write(tmp_path / "a.txt", "new \udcff")
+        run_folder.write(tmp_path / "a.txt", "new \udcff")
     assert (tmp_path / "a.txt").read_text() == "old"
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"config.yaml in it, got .*elsewhere"):
-        record.read_settings(tmp_path / "elsewhere")
+        run_folder.read_settings(tmp_path / "elsewhere")
 
 
 def test_a_second_logger_adds_to_the_table(tmp_path):

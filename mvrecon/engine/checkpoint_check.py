@@ -1,5 +1,5 @@
-"""What the file of a checkpoint may hold: a plain zip archive of numbers, and a pickle that builds
-nothing else.
+"""Check a checkpoint file before torch reads it: a plain zip archive of tensors, and a pickle that
+can build nothing else.
 """
 
 import pickletools
@@ -29,7 +29,7 @@ KEYS = {"geometry", "model", "loss", "optimizer", "data_range"}
 
 
 def check_archive(path: Path) -> None:
-    """Look through a checkpoint before torch does; nothing of it is unpickled.
+    """Check the archive and the pickle of a checkpoint without unpickling anything.
 
     Raises:
         Refused: not a zip archive as `torch.save` writes it, packed so that it unfolds to more than
