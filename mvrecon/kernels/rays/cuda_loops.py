@@ -1,5 +1,6 @@
-# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false,
-# reportOptionalSubscript=false (numba.cuda declares what kernels see as stubs without types)
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false
+# pyright: reportOptionalSubscript=false
+# (numba.cuda declares what kernels see as stubs without types)
 """The kernels of the CUDA back end, in Python: numba compiles them for a device, its simulator runs
 them without one.
 

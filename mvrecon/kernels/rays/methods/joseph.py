@@ -6,7 +6,7 @@ Imaging 1, 1982.
 `real` and `whole` are the types of weights and of flat indices.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,13 +17,13 @@ from mvrecon.kernels.rays.methods.strides import flat_index
 class Course(NamedTuple):
     """Where a ray runs, see `trace.Ray`, in the type of weights."""
 
-    b: float
-    slope_b: float
-    c: float
-    slope_c: float
-    begin: float
-    end: float
-    centre: float
+    b: Any
+    slope_b: Any
+    c: Any
+    slope_c: Any
+    begin: Any
+    end: Any
+    centre: Any
 
 
 @scalar
@@ -113,13 +113,13 @@ class Slopes(NamedTuple):
     them.
     """
 
-    total: float
-    by_b: float
-    by_slope_b: float
-    by_c: float
-    by_slope_c: float
-    at_begin: float
-    at_end: float
+    total: Any
+    by_b: Any
+    by_slope_b: Any
+    by_c: Any
+    by_slope_c: Any
+    at_begin: Any
+    at_end: Any
 
 
 @scalar

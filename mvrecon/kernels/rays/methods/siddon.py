@@ -9,7 +9,7 @@ no search, no sorting, no state from slab to slab. Cells are half-open: a ray on
 the cell above it. `real` and `whole` are the types of weights and of flat indices.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,15 +21,15 @@ from mvrecon.kernels.rays.methods.strides import flat_index
 class Course(NamedTuple):
     """Where a ray runs, see `trace.Ray`, counted from faces, and one over its slopes."""
 
-    b: float
-    slope_b: float
-    per_b: float
-    c: float
-    slope_c: float
-    per_c: float
-    begin: float
-    end: float
-    centre: float
+    b: Any
+    slope_b: Any
+    per_b: Any
+    c: Any
+    slope_c: Any
+    per_c: Any
+    begin: Any
+    end: Any
+    centre: Any
 
 
 class Crossing(NamedTuple):
@@ -37,14 +37,14 @@ class Crossing(NamedTuple):
     b1 along the far axis, and to that between c0 and c1 along the near one.
     """
 
-    begin: float
-    length: float
-    to_b: float
-    to_c: float
-    b0: int
-    b1: int
-    c0: int
-    c1: int
+    begin: Any
+    length: Any
+    to_b: Any
+    to_c: Any
+    b0: Any
+    b1: Any
+    c0: Any
+    c1: Any
 
 
 @scalar

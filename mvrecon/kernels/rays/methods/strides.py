@@ -1,6 +1,6 @@
 """Flat indices of voxels in padded volumes, see `padding.py`, in any layout."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mvrecon.kernels.compiling import scalar
 
@@ -10,11 +10,11 @@ class Steps(NamedTuple):
     voxel lies behind the volume's in a store of the box alone.
     """
 
-    along: int
-    far: int
-    near: int
-    samples: int
-    origin: int
+    along: Any
+    far: Any
+    near: Any
+    samples: Any
+    origin: Any
 
 
 class Values(NamedTuple):
@@ -22,8 +22,8 @@ class Values(NamedTuple):
     of one.
     """
 
-    values: object
-    size: int
+    values: Any
+    size: Any
 
 
 @scalar
