@@ -4,10 +4,9 @@
 """The kernels of the CUDA back end, in Python: numba compiles them for a device, its simulator runs
 them without one.
 
-Rays and their derivatives are computed by the very functions of the CPU (`rays.py`, `march.py`,
-`loops.py`), the steps along them by `corners.py` and `gather.py`. One thread follows one ray, or
-owns one voxel; several volumes share its index work. A kernel is made for a method, a number of
-volumes and a type of flat indices, which are constants in it.
+Rays and their steps are computed by the very functions of the CPU (`trace.py`, `methods/`). One
+thread follows one ray, or owns one voxel; several volumes share its index work. A kernel is made
+for a method, a number of volumes and a type of flat indices, which are constants in it.
 """
 
 from collections import namedtuple
@@ -17,14 +16,18 @@ import numpy as np
 from numba import cuda
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays import corners, gather, slopes
-from mvrecon.kernels.rays.loops import Steps, pixel, pull_back
-from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, main_axis, trace
+from mvrecon.kernels.rays import gather
+from mvrecon.kernels.rays.loops import pixel, pull_back
+from mvrecon.kernels.rays.methods import joseph, siddon, trilinear
+from mvrecon.kernels.rays.methods.strides import Steps, Values
+from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR, main_axis, trace
 
 #: Threads of a block, and the tile of the detector, columns by rows, that they share.
 BLOCK, TILE = 128, (16, 8)
 #: Volumes that share a thread.
 GROUP = 4
+#: The steps of each method.
+METHODS = {JOSEPH: joseph, SIDDON: siddon, TRILINEAR: trilinear}
 
 #: What a kernel knows of the scene, all numbers: sizes (x, y, z) of the volume; strides (x, y, z)
 #: and size of what is stored of it, padded; detector (rows, columns), tile (columns, rows), window,
@@ -76,8 +79,15 @@ def ray_of(scene, lines, place, method):
     return trace(line, axis, gather.near_of(axis), here, scene, method), here
 
 
-def _corners(method):
-    return {JOSEPH: corners.joseph, SIDDON: corners.siddon}.get(method, corners.trilinear)
+@scalar
+def steps_in(ray, steps, method):
+    """The first step of a ray, and the one behind the last; small integers, which a GPU counts
+    faster. A step is a slab, or a sample and one of its two slabs (trilinear).
+    """
+    if method != TRILINEAR:
+        return np.int32(ray.first), np.int32(ray.last)
+    first, last = trilinear.samples_in(ray, steps.samples)
+    return np.int32(2 * first), np.int32(2 * last)
 
 
 @scalar
@@ -104,7 +114,7 @@ def project_kernel(method, group, whole):
     """Kernel: views [n m v u] from padded volumes, one after the other in `flat`; a thread a
     ray.
     """
-    corners_of, total = _corners(method), _sum3 if method == SIDDON else _sum4
+    corners_of, total = METHODS[method].corners, _sum3 if method == SIDDON else _sum4
 
     @cuda.jit
     def project(flat, lines, scene, views):
@@ -116,7 +126,7 @@ def project_kernel(method, group, whole):
         real = flat.dtype.type
         ray, _ = ray_of(scene, lines, place, method)
         steps = steps_of(scene, ray.axis)
-        low, high = corners.steps_in(ray, steps, method)
+        low, high = steps_in(ray, steps, method)
         totals = cuda.local.array(group, flat.dtype)
         for n in range(group):
             totals[n] = 0
@@ -137,7 +147,7 @@ def scatter_kernel(method, group, whole):
     """Kernel: add views [n m v u] to padded volumes, one after the other in `flat`, in no fixed
     order of addition.
     """
-    corners_of, count = _corners(method), 3 if method == SIDDON else 4
+    corners_of, count = METHODS[method].corners, 3 if method == SIDDON else 4
 
     @cuda.jit
     def scatter(views, lines, scene, flat):
@@ -149,7 +159,7 @@ def scatter_kernel(method, group, whole):
         real = flat.dtype.type
         ray, _ = ray_of(scene, lines, place, method)
         steps = steps_of(scene, ray.axis)
-        low, high = corners.steps_in(ray, steps, method)
+        low, high = steps_in(ray, steps, method)
         for k in range(low, high):
             index, weight = corners_of(ray, steps, k, real, whole)
             for n in range(group):
@@ -229,7 +239,7 @@ def vary_kernel(method):
 
     Thread t of a view adds up every pixel t, t + threads, ..; the caller sums over threads.
     """
-    slopes_of = {JOSEPH: slopes.joseph, SIDDON: slopes.siddon}.get(method, slopes.trilinear)
+    slopes_of = METHODS[method].slopes
 
     @cuda.jit
     def vary(flat, views, lines, scene, change):
@@ -238,7 +248,7 @@ def vary_kernel(method):
         view, start = thread // threads, thread % threads
         if view >= len(lines):
             return
-        own, held = cuda.local.array((4, 3, 3), np.float64), slopes.Values(flat, scene.size)
+        own, held = cuda.local.array((4, 3, 3), np.float64), Values(flat, scene.size)
         own[:] = 0
         for place in range(start, scene.detector[0] * scene.detector[1], threads):
             v, u = place // scene.detector[1], place % scene.detector[1]

@@ -4,8 +4,8 @@ waits for another.
 A voxel X gets something from a ray of main axis a where the ray passes its slab less than a voxel
 from X along both other axes. In a view these rays hit the picture of a square of two voxels about
 X, which stays convex as long as it lies on one side of the source. Every pixel of the picture's box
-is asked for the weight that `joseph.py` gives it, so the result is the exact transpose also where a
-view mixes main axes. Box and weights need nothing but scalars.
+is asked for the weight that `methods/joseph.py` gives it, so the result is the exact transpose also
+where a view mixes main axes. Box and weights need nothing but scalars.
 """
 
 from math import ceil, floor
@@ -13,6 +13,7 @@ from math import ceil, floor
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays.methods.joseph import hat, overlap
 from mvrecon.kernels.rays.trace import JOSEPH, main_axis, trace
 
 #: What is kept of each ray, the last its main axis, or -1 when it misses the volume.
@@ -139,16 +140,10 @@ def box(frame, point, axis, detector, real):
 
 
 @scalar
-def hat(t, one):
-    """A triangle of unit height and reach."""
-    return max(one - one, one - abs(t))
-
-
-@scalar
 def weight(rays, k, s, b, c, real):
     """What the ray in column k gives to the voxel (b, c) of the slab at s; lengths in mm."""
     half, one = real(0.5), real(1)
-    share = min(rays[END, k], s + half) - max(rays[BEGIN, k], s - half)
+    share = overlap(rays[BEGIN, k], rays[END, k], s, half)
     across = hat(rays[B, k] + s * rays[SLOPE_B, k] - b, one) * hat(
         rays[C, k] + s * rays[SLOPE_C, k] - c, one
     )

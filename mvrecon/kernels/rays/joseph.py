@@ -1,7 +1,4 @@
-"""Joseph's method on one ray: in each slab of the main axis, bilinear in the two other axes.
-
-P. M. Joseph, An improved algorithm for reprojecting rays through pixel images, IEEE Trans. Med.
-Imaging 1, 1982.
+"""Joseph's method on one ray of the CPU, its cells in a room; the step is `methods/joseph.py`.
 
 `cells` writes where the ray goes; `sum`, `spread` and `slopes` read it. The two corners of a cell
 that lie beside each other in memory are fetched as one complex number, and all arithmetic is left
@@ -12,6 +9,8 @@ import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.rays.lanes import LANES, between, mix, more, plus, put, take, times
+from mvrecon.kernels.rays.methods import joseph as step
+from mvrecon.kernels.rays.methods.strides import flat_index
 from mvrecon.kernels.rays.summation import fold
 
 
@@ -22,19 +21,12 @@ def cells(ray, count, steps, room):
     """
     index, y, z, share, slab = room.index, room.one, room.two, room.three, room.four
     real, whole = y.dtype.type, index.dtype.type
-    b, slope_b, c, slope_c = real(ray.b), real(ray.slope_b), real(ray.c), real(ray.slope_c)
-    begin, end, half, first = real(ray.begin), real(ray.end), real(0.5), real(ray.centre + 1)
-    along, far, origin = whole(steps.along), whole(steps.far), whole(steps.origin)
+    course, half = step.course_of(ray, real), real(0.5)
     for i in range(np.uint32(count)):
         s = slab[i]
-        py, pz = b + s * slope_b, c + s * slope_c
-        iy, iz = np.int32(py), np.int32(pz)
-        y[i], z[i] = py - real(iy), pz - real(iz)
-        share[i] = min(end, s + half) - max(begin, s - half)
-        k = whole(np.int32(s + first))
-        index[i] = whole(
-            whole(whole(k * along) - origin) + whole(whole(whole(iy) * far) + whole(iz))
-        )
+        iy, iz, y[i], z[i] = step.cell(course, s, real)
+        share[i] = step.overlap(course.begin, course.end, s, half)
+        index[i] = flat_index(steps, np.int32(s + course.centre), iy, iz, whole)
 
 
 @scalar
@@ -114,12 +106,7 @@ def spread_lanes(store, group, steps, count, room):
 
 @scalar
 def slopes(store, n, steps, count, room, ray):
-    """How a ray's `sum` changes with its place.
-
-    Returns:
-        the sum; its derivatives by b, slope_b, c, slope_c; the volume where the ray begins and ends
-        inside the box.
-    """
+    """How a ray's `sum` changes with its place, as `methods.joseph.Slopes`."""
     fetch(store.pairs, n * store.size, steps.far, count, room)
     y, z, share, slab, low, high = (
         room.one,
@@ -130,18 +117,9 @@ def slopes(store, n, steps, count, room, ray):
         room.high_parts,
     )
     real = y.dtype.type
-    half, none, begin, end = real(0.5), real(0), real(ray.begin), real(ray.end)
-    total = by_b = by_slope_b = by_c = by_slope_c = at_begin = at_end = none
+    course, none = step.course_of(ray, real), real(0)
+    sums = step.Slopes(none, none, none, none, none, none, none)
     for i in range(np.uint32(count)):
-        low_z, high_z = low[2 * i + 1] - low[2 * i], high[2 * i + 1] - high[2 * i]
-        lower, upper = low[2 * i] + z[i] * low_z, high[2 * i] + z[i] * high_z
-        value = lower + y[i] * (upper - lower)
-        along_b, along_c = share[i] * (upper - lower), share[i] * (low_z + y[i] * (high_z - low_z))
-        total += share[i] * value
-        by_b += along_b
-        by_slope_b += slab[i] * along_b
-        by_c += along_c
-        by_slope_c += slab[i] * along_c
-        at_begin += value if slab[i] - half < begin else none
-        at_end += value if slab[i] + half > end else none
-    return total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end
+        place = step.face(low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1], y[i], z[i])
+        sums = step.bent(sums, course, slab[i], share[i], place)
+    return step.in_double(sums)

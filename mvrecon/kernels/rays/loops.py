@@ -7,8 +7,11 @@ from collections import namedtuple
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rays import joseph, march, siddon, slopes
+from mvrecon.kernels.rays import joseph, siddon, trilinear
 from mvrecon.kernels.rays.lanes import LANES
+from mvrecon.kernels.rays.methods.siddon import slopes as siddon_slopes
+from mvrecon.kernels.rays.methods.strides import Steps
+from mvrecon.kernels.rays.methods.trilinear import slopes as trilinear_slopes
 from mvrecon.kernels.rays.occupancy import EDGE
 from mvrecon.kernels.rays.packed_volume import Store
 from mvrecon.kernels.rays.summation import visit
@@ -41,9 +44,6 @@ Rig = namedtuple(
         "heights",
     ],
 )
-#: Flat strides along the ray's main, far and near axis; samples a ray; how far the box's first
-#: voxel lies behind the volume's in a store of the box alone.
-Steps = namedtuple("Steps", ["along", "far", "near", "samples", "origin"])
 
 
 @scalar
@@ -110,7 +110,7 @@ def walk(rig, spans, unit):
 @scalar
 def _cells(rig, ray, span, steps, room):
     if rig.method == TRILINEAR:
-        return march.cells(ray, span, steps, room)
+        return trilinear.cells(ray, span, steps, room)
     visited = visit(rig, ray, span, room)
     if rig.method == JOSEPH:
         joseph.cells(ray, visited[0], steps, room)
@@ -264,9 +264,9 @@ def vary_rows(store, rig, room, reads, given, first, last):
                 if rig.method == JOSEPH:
                     change_of = joseph.slopes(store, n, steps, count, room, ray)
                 elif rig.method == TRILINEAR:
-                    change_of = slopes.trilinear(store, n, ray, steps)
+                    change_of = trilinear_slopes(store, n, ray, steps)
                 else:
-                    change_of = slopes.siddon(store, n, ray, steps)
+                    change_of = siddon_slopes(store, n, ray, steps)
                 value = views[n, m, v, u]
                 pull_back(
                     line,

@@ -55,8 +55,8 @@ class Key(NamedTuple):
 
     lines: bytes
     shape: tuple[int, ...]
-    window: tuple[float, float]
-    detector: tuple[int, int]
+    window: tuple[float, ...]
+    detector: tuple[int, ...]
     method: str
     volume: Three
     box: Box

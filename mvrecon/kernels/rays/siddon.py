@@ -1,27 +1,10 @@
-"""Siddon's method on one ray: the exact lengths in the cells that it crosses, taken slab by slab of
-the main axis.
-
-R. L. Siddon, Fast calculation of the exact radiological path for a three-dimensional CT array, Med.
-Phys. 12, 1985.
-
-Within a slab the ray crosses at most one plane of each other axis, so it meets at most three cells:
-no search, no sorting, no state from slab to slab. Cells are half-open: a ray on a face belongs to
-the cell above it.
-"""
+"""Siddon's method on one ray of the CPU, its cells in a room; the step is `methods/siddon.py`."""
 
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays.methods import siddon as step
 from mvrecon.kernels.rays.summation import fold
-
-
-@scalar
-def reach(low, high, before, per_slope, length):
-    """How far into the slab a ray passes from cell `low` to cell `high`; the whole length when it
-    stays.
-    """
-    way = min(max((max(low, high) - before) * per_slope, length * 0), length)
-    return way if low != high else length
 
 
 @scalar
@@ -41,29 +24,14 @@ def cells(ray, count, steps, room):
         room.three,
     )
     real, whole = part0.dtype.type, index0.dtype.type
-    b, slope_b, c, slope_c = ray.b + 0.5, ray.slope_b, ray.c + 0.5, ray.slope_c
-    # a ray without slope stays in its cell, and this is never used
-    per_b, per_c = 1 / ray.slope_b if ray.slope_b else 0.0, 1 / ray.slope_c if ray.slope_c else 0.0
-    begin, end, first = ray.begin, ray.end, ray.centre + 1
-    along, far, origin = whole(steps.along), whole(steps.far), whole(steps.origin)
+    course = step.course_of(ray, np.float64)
     for i in range(np.uint32(count)):
         s = np.float64(room.four[i])
-        s0, s1 = max(begin, s - 0.5), min(end, s + 0.5)
-        length = s1 - s0
-        y0, z0 = b + s0 * slope_b, c + s0 * slope_c
-        b0, b1 = np.int32(y0), np.int32(b + s1 * slope_b)
-        c0, c1 = np.int32(z0), np.int32(c + s1 * slope_c)
-        to_b = reach(np.float64(b0), np.float64(b1), y0, per_b, length)
-        to_c = reach(np.float64(c0), np.float64(c1), z0, per_c, length)
-        one, two = min(to_b, to_c), max(to_b, to_c)
-        part0[i], part1[i], part2[i] = real(one), real(two - one), real(length - two)
-        base = whole(whole(whole(np.int32(s + first)) * along) - origin)
-        along_b0, along_b1 = whole(whole(b0) * far), whole(whole(b1) * far)
-        index0[i] = whole(base + whole(along_b0 + whole(c0)))
-        index1[i] = whole(
-            base + whole(along_b1 + whole(c0) if to_b < to_c else along_b0 + whole(c1))
-        )
-        index2[i] = whole(base + whole(along_b1 + whole(c1)))
+        here = step.crossing(course, s, np.float64)
+        one, two, three = step.lengths(here)
+        part0[i], part1[i], part2[i] = real(one), real(two), real(three)
+        k = np.int32(s + course.centre)
+        index0[i], index1[i], index2[i] = step.three(steps, k, here, whole)
 
 
 @scalar

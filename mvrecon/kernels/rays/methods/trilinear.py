@@ -1,9 +1,9 @@
-"""Trilinear sampling along one ray: a fixed number of samples, each at the middle of its share of
-the ray.
+"""Trilinear sampling, one step of a ray: a fixed number of samples, each at the middle of its share
+of the ray.
 
 The ray runs through the box grown by the kernel's reach, half a voxel on every side, so that no
-weight is cut off. A sample lies between two slabs; in each it is one bilinear cell, so `joseph.sum`
-and `joseph.spread` read these cells.
+weight is cut off. A sample lies between two slabs; in each it is one bilinear cell, that of
+`joseph.py`. `real` and `whole` are the types of weights and of flat indices.
 """
 
 from math import floor
@@ -11,7 +11,7 @@ from math import floor
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.occupancy import EDGE
+from mvrecon.kernels.rays.methods.joseph import Slopes, cell, course_of, face_at, four
 from mvrecon.kernels.rays.trace import FAR, NEAR, OWN
 
 
@@ -31,37 +31,19 @@ def samples_in(ray, count):
 
 
 @scalar
-def cells(ray, span, steps, room):
-    """Two of each sample: flat index of a bilinear cell, place in it towards b and c, weight; no
-    weight beyond span.
-
-    Returns:
-        how many there are; where their terms begin, see `summation.fold`.
-    """
-    at, y, z, share = room.index, room.one, room.two, room.three
-    step = (ray.end - ray.begin) / steps.samples
-    first, last = samples_in(ray, steps.samples)
-    found = 0
-    for j in range(first, last):
-        s = ray.begin + (j + 0.5) * step
-        py, pz, px = ray.b + s * ray.slope_b, ray.c + s * ray.slope_c, s + ray.centre
-        below, iy, iz = int(floor(px)), int(py), int(pz)
-        for slab in range(below, below + 2):
-            held = ray.enter <= s <= ray.leave and span[0] <= slab < span[1]
-            at[found] = (slab + 1) * steps.along + iy * steps.far + iz - steps.origin if held else 0
-            y[found], z[found] = py - iy, pz - iz
-            share[found] = step * (1 - abs(px - slab)) if held else 0
-            found += 1
-    return found, np.uint32(2 * first % EDGE)
-
-
-@scalar
-def face(flat, k, steps, y, z):
-    """The interpolated volume in one slab, and its slopes along the far and the near axis."""
-    above = k + steps.far
-    low_z, high_z = flat[k + steps.near] - flat[k], flat[above + steps.near] - flat[above]
-    lower, upper = flat[k] + z * low_z, flat[above] + z * high_z
-    return lower + y * (upper - lower), upper - lower, low_z + y * (high_z - low_z)
+def corners(ray, steps, k, real, whole):
+    """Flat indices and weights of four of the eight voxels about sample k // 2."""
+    course = course_of(ray, real)
+    step = real((ray.end - ray.begin) / steps.samples)
+    s = course.begin + (real(k // 2) + real(0.5)) * step
+    px = s + course.centre
+    below = max(np.int32(floor(px)), np.int32(-1))
+    x, slab = px - real(below), below + k % 2
+    if not (real(ray.enter) <= s <= real(ray.leave) and ray.first <= slab < ray.last):
+        none, zero = whole(0), real(0)
+        return (none, none, none, none), (zero, zero, zero, zero)
+    iy, iz, y, z = cell(course, s, real)
+    return four(steps, (slab, iy, iz, y, z), step * (x if k % 2 else real(1) - x), whole)
 
 
 @scalar
@@ -71,8 +53,8 @@ def _local(flat, steps, px, py, pz):
     """
     below, iy, iz = int(floor(px)), int(py), int(pz)
     k, x = (below + 1) * steps.along + iy * steps.far + iz * steps.near - steps.origin, px - below
-    low, low_b, low_c = face(flat, k, steps, py - iy, pz - iz)
-    high, high_b, high_c = face(flat, k + steps.along, steps, py - iy, pz - iz)
+    low, low_b, low_c = face_at(flat, k, steps, py - iy, pz - iz)
+    high, high_b, high_c = face_at(flat, k + steps.along, steps, py - iy, pz - iz)
     return (
         low + x * (high - low),
         high - low,
@@ -82,12 +64,9 @@ def _local(flat, steps, px, py, pz):
 
 
 @scalar
-def slopes(store, n, steps, ray):
-    """How a ray's `sum` changes with its place, its samples moving with its ends.
-
-    Returns:
-        the sum; its derivatives by b, slope_b, c, slope_c; what it gains when the ray's own ends
-        move outwards.
+def slopes(store, n, ray, steps):
+    """How a ray's sum changes with its place, its samples moving with its ends, as `joseph.Slopes`:
+    the last two are what it gains when the ray's own ends move outwards.
     """
     flat, count = store.values[n * store.size : (n + 1) * store.size], steps.samples
     step = (ray.end - ray.begin) / count
@@ -110,7 +89,7 @@ def slopes(store, n, steps, ray):
         by_begin += step * (1 - way) * along - value / count
         by_end += step * way * along + value / count
     if ray.first >= ray.last:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return Slopes(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for face, place, change in ((ray.from_, ray.begin, by_begin), (ray.to, ray.end, by_end)):
         # an end on a face b + s slope = constant moves with b and the slope
         if face == FAR:
@@ -120,4 +99,5 @@ def slopes(store, n, steps, ray):
             by_c -= change / ray.slope_c
             by_slope_c -= place * change / ray.slope_c
     at_begin = -by_begin if ray.from_ == OWN else 0.0
-    return total, by_b, by_slope_b, by_c, by_slope_c, at_begin, by_end if ray.to == OWN else 0.0
+    at_end = by_end if ray.to == OWN else 0.0
+    return Slopes(total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end)

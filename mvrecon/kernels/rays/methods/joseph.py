@@ -1,0 +1,166 @@
+"""Joseph's method, one step of a ray: in a slab of the main axis, bilinear in the two other axes.
+
+P. M. Joseph, An improved algorithm for reprojecting rays through pixel images, IEEE Trans. Med.
+Imaging 1, 1982.
+
+`real` and `whole` are the types of weights and of flat indices.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays.methods.strides import flat_index
+
+
+class Course(NamedTuple):
+    """Where a ray runs, see `trace.Ray`, in the type of weights."""
+
+    b: Any
+    slope_b: Any
+    c: Any
+    slope_c: Any
+    begin: Any
+    end: Any
+    centre: Any
+
+
+@scalar
+def course_of(ray, real):
+    """The course of a ray."""
+    b, slope_b, c, slope_c = real(ray.b), real(ray.slope_b), real(ray.c), real(ray.slope_c)
+    return Course(b, slope_b, c, slope_c, real(ray.begin), real(ray.end), real(ray.centre))
+
+
+@scalar
+def overlap(begin, end, s, half):
+    """The length of a ray from begin to end in the slab about s, in voxels; half = 0.5 as a number
+    of their type.
+    """
+    return min(end, s + half) - max(begin, s - half)
+
+
+@scalar
+def split(place, real):
+    """The lower neighbour of a padded place along an axis, and the weight of the upper one."""
+    cell = np.int32(place)
+    return cell, place - real(cell)
+
+
+@scalar
+def cell(course, s, real):
+    """The bilinear cell that a ray meets at s, and the place in it towards b and c."""
+    iy, y = split(course.b + s * course.slope_b, real)
+    iz, z = split(course.c + s * course.slope_c, real)
+    return iy, iz, y, z
+
+
+@scalar
+def four(steps, at, share, whole):
+    """The four corners of the cell at (slab, iy, iz, y, z), and what each gets of a share."""
+    k, iy, iz, y, z = at
+    low = flat_index(steps, k, iy, iz, whole)
+    high, near = whole(low + whole(steps.far)), whole(steps.near)
+    upper = share * y
+    lower = share - upper
+    low_z, high_z = lower * z, upper * z
+    return (low, whole(low + near), high, whole(high + near)), (
+        lower - low_z,
+        low_z,
+        upper - high_z,
+        high_z,
+    )
+
+
+@scalar
+def corners(ray, steps, k, real, whole):
+    """Flat indices and weights of the four voxels of slab k."""
+    course, s = course_of(ray, real), real(k) - real(ray.centre)
+    iy, iz, y, z = cell(course, s, real)
+    share = overlap(course.begin, course.end, s, real(0.5))
+    return four(steps, (k, iy, iz, y, z), share, whole)
+
+
+@scalar
+def hat(t, one):
+    """The weight of a voxel at the distance t along an axis, in voxels: that of `split`."""
+    return max(one - one, one - abs(t))
+
+
+@scalar
+def face(low, beside_low, high, beside_high, y, z):
+    """The bilinear value at the place (y, z) between four corners, and its slopes along the far and
+    the near axis.
+    """
+    low_z, high_z = beside_low - low, beside_high - high
+    lower, upper = low + z * low_z, high + z * high_z
+    return lower + y * (upper - lower), upper - lower, low_z + y * (high_z - low_z)
+
+
+@scalar
+def face_at(flat, k, steps, y, z):
+    """`face` of the cell at the flat index k."""
+    above, near = k + steps.far, steps.near
+    return face(flat[k], flat[k + near], flat[above], flat[above + near], y, z)
+
+
+class Slopes(NamedTuple):
+    """How a ray's sum changes with its place.
+
+    The sum, in voxels of the main axis; its derivatives by b, slope_b, c, slope_c; the volume where
+    the ray begins and ends inside the box. `loops.pull_back` makes derivatives by the geometry of
+    them.
+    """
+
+    total: Any
+    by_b: Any
+    by_slope_b: Any
+    by_c: Any
+    by_slope_c: Any
+    at_begin: Any
+    at_end: Any
+
+
+@scalar
+def bent(sums, course, s, share, place):
+    """Slopes with those of one more slab, at s, of which the ray has a share; place as `face` has
+    it.
+    """
+    value, slope_b, slope_c = place
+    half, none = type(s)(0.5), type(s)(0)
+    along_b, along_c = share * slope_b, share * slope_c
+    return Slopes(
+        sums.total + share * value,
+        sums.by_b + along_b,
+        sums.by_slope_b + s * along_b,
+        sums.by_c + along_c,
+        sums.by_slope_c + s * along_c,
+        sums.at_begin + (value if s - half < course.begin else none),
+        sums.at_end + (value if s + half > course.end else none),
+    )
+
+
+@scalar
+def in_double(sums):
+    """Slopes in double precision, as those of the other methods are."""
+    return Slopes(
+        *(np.float64(sums.total), np.float64(sums.by_b), np.float64(sums.by_slope_b)),
+        *(np.float64(sums.by_c), np.float64(sums.by_slope_c)),
+        *(np.float64(sums.at_begin), np.float64(sums.at_end)),
+    )
+
+
+@scalar
+def slopes(store, n, ray, steps):
+    """How a ray's sum changes with its place, without room for its cells."""
+    flat, real = store.values, store.values.dtype.type
+    course, none, half = course_of(ray, real), real(0), real(0.5)
+    sums, offset = Slopes(none, none, none, none, none, none, none), np.int64(n * store.size)
+    for k in range(ray.first, ray.last):
+        s = real(k) - course.centre
+        iy, iz, y, z = cell(course, s, real)
+        at = offset + np.int64(flat_index(steps, k, iy, iz, np.int64))
+        share = overlap(course.begin, course.end, s, half)
+        sums = bent(sums, course, s, share, face_at(flat, at, steps, y, z))
+    return sums
