@@ -1,6 +1,6 @@
 """Runs every test with the marker `door` and says how it went: `python -m tests.doors [folder]`.
 
-The last line is JSON: a test's fact (the first line of its docstring), and how many of its cases
+The last line is JSON: a test's fact (the first paragraph of its docstring), and how many of its cases
 pass, fail and are left out.
 """
 
@@ -14,8 +14,9 @@ from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, PASS
 
 
 def fact(item: pytest.Item) -> str:
-    """The first line of a test's docstring; without one, its name."""
-    return (inspect.getdoc(getattr(item, "obj", None)) or item.name).splitlines()[0]
+    """The first paragraph of a test's docstring; without one, its name."""
+    text = inspect.getdoc(getattr(item, "obj", None)) or item.name
+    return " ".join(text.partition("\n\n")[0].split())
 
 
 class Verdicts:

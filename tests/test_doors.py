@@ -35,7 +35,7 @@ def test_no_door():
 
 
 def facts(file: Path) -> list[str]:
-    """First lines of the docstrings of a file's doors; a door without one gives its name."""
+    """First paragraphs of the docstrings of a file's doors; a door without one gives its name."""
     functions = [
         node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)
     ]
@@ -44,7 +44,8 @@ def facts(file: Path) -> list[str]:
         for f in functions
         if any(ast.unparse(mark) == "pytest.mark.door" for mark in f.decorator_list)
     ]
-    return [(ast.get_docstring(f) or f.name).splitlines()[0] for f in doors]
+    texts = [(ast.get_docstring(f) or f.name).partition("\n\n")[0] for f in doors]
+    return [" ".join(text.split()) for text in texts]
 
 
 def test_a_door_says_its_fact_in_one_sentence_of_its_own(root):
