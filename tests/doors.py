@@ -1,6 +1,6 @@
 """Runs every test with the marker `door` and says how it went: `python -m tests.doors [folder]`.
 
-The last line is JSON: a test's fact (the first paragraph of its docstring), and how many of its cases
+The last line is JSON: a test's fact (first paragraph of its docstring), and how many of its cases
 pass, fail and are left out.
 """
 
