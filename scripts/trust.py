@@ -158,8 +158,9 @@ def page(found: dict[str, Any], seed: int) -> str:
     text += markdown(("what holds", *VERDICTS), counted)
     text += (
         "\n## Damaged files, reader by reader\n\nWhat has checksums (volume files written by "
-        "mvrecon, packed NIfTI, checkpoints) is refused or has the values that were written. Plain "
-        ".nii, HDF5 of others, JSON and YAML have none: a flipped bit in a value is not noticed.\n\n"
+        "mvrecon, packed NIfTI, checkpoints) is refused or has the values that were written. "
+        "Plain .nii, HDF5 of others, JSON and YAML have none: a flipped bit in a value is not "
+        "noticed.\n\n"
     )
     text += markdown(
         ("reader", "inputs", "read", "failures", "slowest s", "most MB"),
