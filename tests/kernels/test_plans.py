@@ -14,7 +14,7 @@ from mvrecon.kernels.rays.occupancy import Occupancy
 
 SHAPE, DETECTOR = (10, 11, 12), (9, 10)
 PIXELS = {"pixels": [9, 10], "pixel_mm": 2.0}
-GRID = Grid.centred(SHAPE, 1.0)
+GRID = Grid.centred(shape=SHAPE, spacing=1.0)
 LINES = {
     "circular": lines_of(circular(4, 40.0, 70.0, PIXELS, start_degrees=13.0), GRID),
     "dome": lines_of(dome(4, 40.0, 70.0, 50.0, PIXELS), GRID),

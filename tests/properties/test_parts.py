@@ -109,4 +109,6 @@ def test_no_ray_of_several_a_pixel():
     A = case.build(rays_per_pixel=2)
     for B in (ray_subset(A, torch.zeros(5, 8, 5, dtype=torch.bool)), view_subset(A, [])):
         values = B(torch.ones(1, 2, *case.grid.shape))
-        assert values.shape == (1, 2, *B.shape) and not values.numel() and not B.T(values).any()
+        assert (
+            values.shape == (1, 2, *B.range_shape) and not values.numel() and not B.T(values).any()
+        )

@@ -13,10 +13,10 @@ import nibabel
 import numpy as np
 import pytest
 
-from mvrecon import memory
 from mvrecon.cameras.files import from_file, save
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.nifti import read_nifti
+from mvrecon.files import memory
 from mvrecon.files.checks import Refused, plain_name, text_of
 from mvrecon.parts import CAMERAS
 from tests.data.conftest import RIG, stored

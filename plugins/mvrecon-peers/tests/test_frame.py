@@ -53,7 +53,7 @@ def test_the_rays_of_a_framed_rig_measure_the_same(kind: str, tilt: bool):
     inside = Phantom(
         (Solids("ellipsoid", centres, turn, torch.tensor([[2.0, 3, 1], [1, 2, 2]]), torch.ones(2)),)
     )
-    framed_integrals = inside.integrals(*inner.rays(), extent=inner.ray_extent)
+    framed_integrals = inside.integrals(*inner.rays(), ray_extent=inner.ray_extent)
     world = inside.moved(torch.eye(3), GRID.centre).integrals(
         *rig.rays(), ray_extent=rig.ray_extent
     )
