@@ -29,7 +29,8 @@ from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 rig = circular(3, 40.0, 70.0, {"pixels": [5, 6], "pixel_mm": 2.0}, start_degrees=13.0)
-A = PROJECTORS.build("drr", grid=Grid.centred(size=(7, 6, 5), spacing=1.0), cameras=rig, backend="cpu")
+grid = Grid.centred(size=(7, 6, 5), spacing=1.0)
+A = PROJECTORS.build("drr", grid=grid, cameras=rig, backend="cpu")
 views = A(torch.arange(210.0).reshape(1, 1, 5, 6, 7) / 210)
 print(views.double().sum().item().hex(), len(compiled))
 """
