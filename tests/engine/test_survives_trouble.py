@@ -25,7 +25,7 @@ SINGLE = {
         9,
     ),
     "disk": (
-        {"what": "no space", "n": 9, "app": True},
+        {"what": "no space", "n": 13, "app": True},
         "OSError: [Errno 28] No space left on device: '{run}/checkpoints",
         6,
     ),
