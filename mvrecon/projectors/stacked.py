@@ -27,12 +27,18 @@ class Stacked(nn.Module, LinearOperator):
                 f"Stacked operators need one domain and one detector, got {sorted(shapes)}"
             )
         self.parts = list(parts)
+        # registered, too, so that `.to(device)` moves those that are modules
+        self.modules_of_parts = nn.ModuleList(A for A in parts if isinstance(A, nn.Module))
         self.domain_shape = parts[0].domain_shape
         self.range_shape = (sum(A.range_shape[0] for A in parts), *parts[0].range_shape[1:])
 
     @property
     def device(self) -> torch.device:
         return self.parts[0].device
+
+    @property
+    def pose_gradient(self) -> bool:
+        return any(A.pose_gradient for A in self.parts)
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
         return torch.cat([A(x) for A in self.parts], dim=2)

@@ -120,6 +120,10 @@ def test_stacked_operators_see_one_volume(A):
     assert both.range_shape == (8, *A.range_shape[1:])
     torch.testing.assert_close(both(x), torch.cat([A(x), other(x)], dim=2))
     assert_adjoint(both)
+    assert not both.pose_gradient and A in both.modules()
+    moving = replace(CONE, u=CONE.u.clone().requires_grad_())
+    B = PROJECTORS.build("drr", grid=GRID, cameras=moving, backend="reference")
+    assert Stacked([A, B]).pose_gradient
     with pytest.raises(ValueError, match="one domain and one detector"):
         Stacked([A, A.cropped(Box((0, 0, 0), (2, 2, 2)))])
 
