@@ -31,6 +31,11 @@ HEADS = Registry(
     softmax_depth="mvrecon.models.heads:SoftmaxDepth",
     density="mvrecon.models.heads:Density",
 )
+RECONSTRUCTORS = Registry(
+    "reconstructor",
+    sirt="mvrecon.reconstruct.iterative:sirt",
+    mlem="mvrecon.reconstruct.mlem:mlem",
+)
 MODELS = Registry(
     "model",
     cross_view="mvrecon.models.cross_view:CrossView",
@@ -41,4 +46,4 @@ MODELS = Registry(
     sirt="mvrecon.models.baselines:Sirt",
 )
 
-REGISTRIES = {r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, MODELS)}
+REGISTRIES = {r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, RECONSTRUCTORS, MODELS)}
