@@ -47,6 +47,24 @@ class Settings(Measurement):
 
 
 @dataclass
+class ScanSettings:
+    """Every top-level key of `mvrecon-reconstruct`."""
+
+    name: str = MISSING
+    views: Any = None
+    camera: Any = None
+    projector: Any = None
+    grid: Any = MISSING
+    reconstructor: Any = None
+    out: str | None = None
+    unit: str = MISSING
+    stop: Any = None
+    choose: Any = None
+    device: str = "auto"
+    plugins: Any = field(default_factory=list)
+
+
+@dataclass
 class Evaluation:
     """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the camera, are
     not keys.
@@ -62,4 +80,9 @@ class Evaluation:
     plugins: Any = field(default_factory=list)
 
 
-SCHEMAS = {"schema": Settings, "evaluation_schema": Evaluation, "simulation_schema": Simulation}
+SCHEMAS = {
+    "schema": Settings,
+    "evaluation_schema": Evaluation,
+    "simulation_schema": Simulation,
+    "reconstruction_schema": ScanSettings,
+}
