@@ -123,8 +123,8 @@ def _packed(path: Path) -> bool:
 
 
 def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write a volume as NIfTI, float32, in mm, whose first axis is x: the grid's affine goes with it
-    unchanged, as sform and, where the voxel axes are at right angles, as qform.
+    """Write a volume as NIfTI, float32, in mm, whose first axis is x: the grid's affine goes with
+    it unchanged, as sform and, where the voxel axes are at right angles, as qform.
 
     Compressed where the name ends in .gz (the same bytes for the same volume), and replaced whole
     or not at all.
