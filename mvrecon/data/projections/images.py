@@ -1,7 +1,9 @@
 """Projections as images: a folder of TIFF, PNG or DICOM files, or one file of several pages."""
 
 import re
+import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -161,10 +163,17 @@ def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
                 yield np.asarray(image)
 
 
-def _opened(file: Path) -> Any:
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    """An image of Pillow, which warns only where a directory of pages is cut short: an error
+    here.
+    """
     from PIL import Image as Pillow
 
-    return Pillow.open(file, formats=[PILLOW[file.suffix.lower()]])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "Corrupt EXIF|.*[Tt]runcated", UserWarning)
+        with Pillow.open(file, formats=[PILLOW[file.suffix.lower()]]) as image:
+            yield image
 
 
 def _words(head: Header) -> str:
