@@ -139,7 +139,7 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
     image.set_sform(grid.affine.numpy(), SCANNER)
     image.set_qform(grid.affine.numpy(), SCANNER if right_angled(grid) else 0)
     raw = image.to_bytes()
-    packed = gzip.compress(raw, 1, mtime=0) if str(path).endswith(".gz") else raw
+    packed = gzip.compress(raw, 1, mtime=0) if _packed(Path(path)) else raw
     with written_whole(path) as part:
         part.write_bytes(packed)
 
