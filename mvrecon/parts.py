@@ -21,6 +21,11 @@ CAMERAS = Registry(
     parallel="mvrecon.cameras.rigs:parallel",
     from_file="mvrecon.cameras.files:from_file",
     dcspect80="mvrecon.cameras.dcspect80:dcspect80",
+    rtk_xml="mvrecon.cameras.formats.rtk_xml:read",
+    tigre="mvrecon.cameras.formats.tigre:read",
+    astra="mvrecon.cameras.formats.astra:read",
+    angles="mvrecon.cameras.formats.angles:read",
+    matrices="mvrecon.cameras.formats.matrices:read",
 )
 PROJECTORS = Registry(
     "projector",

@@ -44,6 +44,17 @@ def test_an_experiment_file_is_short(name: str):
     assert len((conf_dir() / "experiment" / f"{name}.yaml").read_text().splitlines()) <= 25
 
 
+def needed_in(options: dict, above: str = "") -> list[str]:
+    """The settings that a file leaves to the user, with dots between their names."""
+    inner = [
+        name
+        for key, value in options.items()
+        if isinstance(value, dict)
+        for name in needed_in(value, f"{above}{key}.")
+    ]
+    return inner + [f"{above}{key}" for key, value in options.items() if value == "???"]
+
+
 @pytest.mark.parametrize("group", ["scene", "camera", "projector", "model", "head"])
 def test_every_option_of_a_group_names_a_part_and_composes(group: str):
     from mvrecon.parts import REGISTRIES
@@ -52,9 +63,7 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
     assert files
     for file in files:
         key = "head@model.head" if group == "head" else group
-        needed = [
-            name for name, value in yaml.safe_load(file.read_text()).items() if value == "???"
-        ]
+        needed = needed_in(yaml.safe_load(file.read_text()))
         node = compose(
             f"{key}={file.stem}", *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed)
         )
