@@ -39,6 +39,9 @@ HEADS = Registry(
 )
 RECONSTRUCTORS = Registry(
     "reconstructor",
+    fdk="mvrecon.reconstruct.filtered.fdk:fdk",
+    fbp="mvrecon.reconstruct.filtered.fdk:fbp",
+    trained="mvrecon.engine.trained:trained",
     sirt="mvrecon.reconstruct.iterative:sirt",
     os_sart="mvrecon.reconstruct.os_sart:os_sart",
     cgls="mvrecon.reconstruct.cgls:cgls",
@@ -47,6 +50,11 @@ RECONSTRUCTORS = Registry(
     pdhg_tv="mvrecon.reconstruct.pdhg_tv:pdhg_tv",
     mlem="mvrecon.reconstruct.mlem:mlem",
     osem="mvrecon.reconstruct.mlem:osem",
+)
+#: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
+STREAMED = Registry(
+    "streamed reconstructor",
+    fdk="mvrecon.reconstruct.filtered.streaming:fdk_streamed",
 )
 MODELS = Registry(
     "model",

@@ -23,13 +23,13 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     import_plugins(settings["plugins"])
     from mvrecon.cameras import files
     from mvrecon.data.attenuation import hounsfield
-    from mvrecon.data.volume_files import check_writable, save_volume
+    from mvrecon.data.volume_files import check_ending, save_volume
     from mvrecon.engine import export, run_folder, scan, solve
     from mvrecon.engine.evaluation import device_of
     from mvrecon.viz import montage, rig
 
     out = Path(settings["out"] or folder / "volume.nii.gz").expanduser()
-    check_writable(out)
+    check_ending(out)
     with run_folder.taken(folder, settings):
         case = scan.open_scan(settings)
         files.save(case.cameras, folder / "rig.json")
