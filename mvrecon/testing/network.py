@@ -28,7 +28,7 @@ def check_network(name: str, seed: int = 0, **options: Any) -> None:
     torch.manual_seed(seed)
     config = {"name": name, **options}
     network = network_by_name(config, 2, 3, width=4, zero=1).eval()
-    x = torch.randn(2, 2, 7, 4, 6)
+    x = torch.randn(2, 2, 9, 4, 6)
     with torch.no_grad():
         answer = network(x)
         assert not answer[:, :1].any(), "an output that starts at zero is not zero"
