@@ -13,8 +13,9 @@ from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.kernels.rays import nonzero, plan, reference, skip_policy
-from mvrecon.kernels.rays.nonzero import bricks_of
+from mvrecon.kernels.rays import reference
+from mvrecon.kernels.rays.cpu import nonzero, plan, skip_policy
+from mvrecon.kernels.rays.cpu.nonzero import bricks_of
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy
 from mvrecon.projectors import integrals
 from tests.projectors.cases import Case, curved
