@@ -14,8 +14,10 @@ from mvrecon.kernels.rays.cpu.summation import empty
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
 from mvrecon.kernels.rays.trace import from_centre, main_axis, trace
 
-#: Slabs of all rays from which on it is worth while to look for a volume's box, and for its bricks.
-SOME, MUCH = 2**21, 2**25
+#: Slabs of all rays from which on it is worth while to look for a volume's box; and slabs that the
+#: box must leave, so that bricks gain: below, what a call costs besides its slabs hides what they
+#: save (experiments/05_skip).
+SOME, MUCH = 2**21, 3 * 2**23
 #: Rays on which work is counted.
 RAYS = 1024
 #: What a ray costs before its first slab, and what it costs to ask for one layer of bricks, in
@@ -40,31 +42,25 @@ def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
     if skip == "auto" and scene.slabs(shape) < SOME:
         return Occupancy.whole(shape)
     occupancy = Occupancy(shape, box_of(values))
-    fine = (
-        "trilinear" not in scene.method
-        and occupancy.box.size > 0
-        and (skip != "auto" or scene.slabs(shape) >= MUCH)
-    )
-    if (
-        skip == "box"
-        or not fine
-        or (skip != "brick" and empty_share(values, occupancy.box) < WORTH)
-    ):
+    box = occupancy.box
+    if skip == "box" or "trilinear" in scene.method or not box.size:
         return occupancy
-    bricked = Occupancy(shape, occupancy.box, bricks_of(values, occupancy.box))
     if skip == "brick":
-        return bricked
-    return cheapest(occupancy, bricked, scene)
+        return Occupancy(shape, box, bricks_of(values, box))
+    if scene.slabs(shape) < MUCH or empty_share(values, box) < WORTH:
+        return occupancy
+    return cheapest(occupancy, Occupancy(shape, box, bricks_of(values, box)), scene)
 
 
 def cheapest(occupancy: Occupancy, bricked: Occupancy, scene: Scene) -> Occupancy:
-    """The one of two occupancies by which rays have less to do, with the shares of the work that
-    either leaves.
+    """The bricks of a box if by them rays have so much less to do that it pays, else the box; with
+    the shares of the work that either leaves.
     """
     whole, box, bricks = (
         work(occupied, scene) for occupied in (Occupancy.whole(occupancy.shape), occupancy, bricked)
     )
-    chosen = bricked if bricks < LESS * box else occupancy
+    much = box / whole * scene.slabs(occupancy.shape) >= MUCH
+    chosen = bricked if much and bricks < LESS * box else occupancy
     return Occupancy(occupancy.shape, occupancy.box, chosen.bricks, (box / whole, bricks / whole))
 
 
