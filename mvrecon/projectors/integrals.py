@@ -15,7 +15,7 @@ from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays, tensors_of, writes
 from mvrecon.kernels.rays.occupancy import Occupancy

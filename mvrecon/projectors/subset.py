@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check_floating
 from mvrecon.projectors.integrals import LineIntegrals
 from mvrecon.projectors.operator import Derived, LinearOperator

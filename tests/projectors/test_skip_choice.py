@@ -9,8 +9,9 @@ import torch
 from mvrecon.cameras.rigs import dome
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays import nonzero, plan, reference, skip_policy
-from mvrecon.kernels.rays.nonzero import bricks_of
+from mvrecon.kernels.rays import reference
+from mvrecon.kernels.rays.cpu import nonzero, plan, skip_policy
+from mvrecon.kernels.rays.cpu.nonzero import bricks_of
 from mvrecon.kernels.rays.occupancy import EDGE
 from tests.projectors.cases import Case
 from tests.projectors.sparse import CASES, volumes
@@ -54,6 +55,20 @@ def test_the_choice_is_told_and_follows_the_scene():
         and A.skipped.fractions["brick"] < 0.5 * A.skipped.fractions["box"]
     )
     assert "bricks" in A.skipped.why
+
+
+def test_bricks_are_left_where_the_box_leaves_little_work(monkeypatch):
+    """What a call costs besides its slabs would hide what they save."""
+    grid = Grid.centred((64, 64, 64), 1.0)
+    A = Case(grid, dome(4, 120.0, 60.0, 120.0, {"pixels": [96, 96], "pixel_mm": 0.45})).build()
+    x = torch.zeros(1, 1, 64, 64, 64)
+    x[..., 8:12, 8:12, 8:12] = x[..., 36:40, 36:40, 36:40] = 1
+    views = A(x)
+    assert A.skipped.mode == "brick"
+    scene = plan.Scene(A.lines, A.ray_extent, A.detector, A.kernel)
+    monkeypatch.setattr(skip_policy, "MUCH", scene.slabs(grid.shape))
+    assert torch.equal(A(x), views)
+    assert A.skipped.mode == "box" and "too little to gain" in A.skipped.why
 
 
 def test_small_work_is_not_looked_at(monkeypatch):

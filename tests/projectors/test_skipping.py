@@ -5,7 +5,7 @@ import torch
 
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.kernels.rays import plan
+from mvrecon.kernels.rays.cpu import plan
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.projectors import integrals
 from tests.projectors.cases import Case

@@ -25,14 +25,13 @@ TILE = 16
 
 
 def empty(
-    count: int, sizes: Sequence[int], plan: tuple[int, int], dtype: np.dtype, memory=None
+    count: int, sizes: Sequence[int], near: int, lanes: int, dtype: np.dtype, memory=None
 ) -> np.ndarray:
-    """Nothing, padded, for volumes of `sizes` (x, y, z); plan = (near axis, lanes).
+    """Nothing, padded, for volumes of `sizes` (x, y, z), `lanes` of them side by side.
 
     It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of an array that has
     served, if any.
     """
-    near, lanes = plan
     x, y, z = padded_shape(sizes)
     shape = (-(-count // lanes), *((z, y, x) if near == 0 else (y, x, z)), lanes)
     if memory is None or memory.size < math.prod(shape):
@@ -82,20 +81,20 @@ def fill(volumes, near, into, first):
 
 
 @compiled
-def add(held, near, volumes, first, last):
+def add(padded, near, volumes, first, last):
     """Add rows (along y) first to last of volumes as a store has them to volumes [n d h w]."""
     count, depth, _, width = volumes.shape
-    lanes = held.shape[4]
+    lanes = padded.shape[4]
     for n in range(count):
         g, lane = n // lanes, n % lanes
         for y in range(first, last):
             if near == 0:
                 for z in range(depth):
                     for x in range(width):
-                        volumes[n, z, y, x] += held[g, z, y, x, lane]
+                        volumes[n, z, y, x] += padded[g, z, y, x, lane]
                 continue
             for x0 in range(0, width, TILE):
                 for z0 in range(0, depth, TILE):
                     for z in range(z0, min(z0 + TILE, depth)):
                         for x in range(x0, min(x0 + TILE, width)):
-                            volumes[n, z, y, x] += held[g, y, x, z, lane]
+                            volumes[n, z, y, x] += padded[g, y, x, z, lane]

@@ -15,24 +15,19 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box, Three
 from mvrecon.kernels.padding import padded_shape
-from mvrecon.kernels.rays.footprint import spans_of
-from mvrecon.kernels.rays.lanes import LANES
+from mvrecon.kernels.rays.cpu.footprint import spans_of
+from mvrecon.kernels.rays.cpu.lanes import LANES
+from mvrecon.kernels.rays.cpu.rig import Columns, Reads, Rig, bounds_of, rig_of
+from mvrecon.kernels.rays.cpu.upright import columnar
 from mvrecon.kernels.rays.lines import DIRECTION, START, shifted
-from mvrecon.kernels.rays.loops import Rig
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of, bricks_of_rig
-from mvrecon.kernels.rays.trace import TRILINEAR, numbered
-from mvrecon.kernels.rays.upright import columnar
+from mvrecon.kernels.rays.trace import TRILINEAR
 
 #: Bytes of the copy of a piece of the volume.
 BUDGET = 24 * 2**20
 #: Plans that are kept, and the numbers of lines, and rows or columns of pixels, up to which one is:
 #: beyond, a call takes so long that its plan costs next to nothing.
 PLANS, SMALL = 64, 2**14
-
-
-#: The oblique views, which of them are tall, and the spans of their units, see `loops.walk` and
-#: `footprint.spans_of`.
-Reads = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Scene(NamedTuple):
@@ -46,6 +41,10 @@ class Scene(NamedTuple):
     def slabs(self, shape: Sequence[int]) -> int:
         """Slabs of all rays, at most."""
         return len(self.lines) * math.prod(self.detector) * max(shape)
+
+    def rig(self, occupancy: Occupancy) -> Rig:
+        """The rig as the loops have it, about what a volume may hold."""
+        return rig_of(self.lines, self.window, occupancy, self.detector, self.method)
 
 
 class Key(NamedTuple):
@@ -64,14 +63,20 @@ class Key(NamedTuple):
     parts: int
 
 
+class Layout(NamedTuple):
+    """The near axis of a store, and the main axes of the oblique rays that read it."""
+
+    near: int
+    axes: tuple[bool, bool, bool]
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """Which views are read how; nobody writes to its arrays, which several threads share.
 
     Args:
         rig: what the loops know of the rays.
-        upright: indices of the views whose columns are read as rows of voxels, and the spans of
-            their columns.
+        upright: the views whose columns are read as rows of voxels.
         oblique: indices of the others.
         axes: whether a ray of an oblique view can have each main axis.
         lanes: volumes that lie side by side.
@@ -80,7 +85,7 @@ class Plan:
     """
 
     rig: Rig
-    upright: tuple[np.ndarray, np.ndarray]
+    upright: Columns
     oblique: np.ndarray
     axes: tuple[bool, bool, bool]
     lanes: int
@@ -88,13 +93,16 @@ class Plan:
     pieces: tuple[tuple[slice, Rig], ...]
 
     @property
-    def layouts(self) -> list[tuple[int, tuple[bool, bool, bool]]]:
-        """The near axes of the stores that are needed, each with the main axes of the rays that
-        read it.
-        """
+    def layouts(self) -> list[Layout]:
+        """The layouts of the volume that are needed."""
         x, y, z = self.axes
-        turned = [(2, (x, y, False))] if x or y or len(self.upright[0]) else []
-        return turned + ([(0, (False, False, z))] if z else [])
+        turned = [Layout(2, (x, y, False))] if x or y or len(self.upright.views) else []
+        return turned + ([Layout(0, (False, False, z))] if z else [])
+
+    @property
+    def units(self) -> int:
+        """How many units the oblique views have, see `loops.walk`."""
+        return len(self.oblique) * max(self.rig.detector)
 
     @cached_property
     def reads(self) -> dict[int, Reads]:
@@ -107,90 +115,66 @@ class Plan:
         lines = self.rig.lines[self.oblique]
         steps = np.abs(lines[:, DIRECTION, near]) + np.abs(lines[:, START, near])
         tall = steps[:, 1] > steps[:, 0] if lines.shape[3] == 3 else np.zeros(len(steps), bool)
-        return self.oblique, tall, spans_of(lines, self.rig.detector, tall, self.boxes)
+        return Reads(self.oblique, tall, spans_of(lines, self.rig.detector, tall, self.boxes))
 
 
-def rig_of(
-    lines: Tensor, window: Sequence[float], held: Occupancy, detector: Sequence[int], method: str
-) -> Rig:
-    """What the loops know of the rays, and of the part of the volume that they are to meet."""
-    maps = np.ascontiguousarray(lines.detach().numpy(), dtype=np.float64)
-    ends = (float(window[0]), float(window[1]))
-    sizes = (held.shape[2], held.shape[1], held.shape[0])
-    number, samples = numbered(method)
-    return Rig(
-        maps,
-        ends,
-        sizes,
-        (int(detector[0]), int(detector[1])),
-        number,
-        samples,
-        bounds_of(held),
-        *bricks_of_rig(held),
-    )
-
-
-def bounds_of(held: Occupancy) -> tuple[int, ...]:
-    """The box (x0, y0, z0, x1, y1, z1) that rays are clipped to."""
-    return (*held.read.low[::-1], *held.read.high[::-1])
-
-
-def plan_of(scene: Scene, held: Occupancy, volumes: int, itemsize: int) -> Plan:
+def plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> Plan:
     """The plan for projecting volumes, of numbers of so many bytes, or for back-projecting into
     them.
 
     Those of small scenes are kept: an iteration asks for the same one again and again.
     """
     lanes = LANES if scene.method == "joseph" and volumes > 2 else 1
-    parts = parts_of(scene.method, held.shape, volumes * itemsize)
+    parts = parts_of(scene.method, occupancy.shape, volumes * itemsize)
     units = len(scene.lines) * max(scene.detector)
-    if held.bricks is None and max(units, scene.lines.numel()) <= SMALL:
+    if occupancy.bricks is None and max(units, scene.lines.numel()) <= SMALL:
         maps = np.ascontiguousarray(scene.lines.detach().numpy(), dtype=np.float64)
         first, last = map(float, scene.window)
         rows, columns = map(int, scene.detector)
         key = Key(
             *(maps.tobytes(), maps.shape, (first, last), (rows, columns), scene.method),
-            *(held.shape, held.box, lanes, parts),
+            *(occupancy.shape, occupancy.box, lanes, parts),
         )
         return kept_plan(key)
-    return _made(rig_of(*scene[:2], held, *scene[2:]), held, lanes, parts)
+    return _made(scene.rig(occupancy), occupancy, lanes, parts)
 
 
 def keyed_plan(key: Key) -> Plan:
     """The plan that belongs to a key."""
     lines = torch.from_numpy(np.frombuffer(key.lines).reshape(key.shape).copy())
-    held = Occupancy(key.volume, key.box)
-    return _made(rig_of(lines, key.window, held, *key[3:5]), held, key.lanes, key.parts)
+    scene = Scene(lines, key.window, key.detector, key.method)
+    occupancy = Occupancy(key.volume, key.box)
+    return _made(scene.rig(occupancy), occupancy, key.lanes, key.parts)
 
 
 kept_plan = lru_cache(maxsize=PLANS)(keyed_plan)
 
 
-def ray_plan_of(scene: Scene, held: Occupancy, volumes: int, itemsize: int) -> Plan:
+def ray_plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> Plan:
     """The plan that goes ray by ray, volume by volume, for derivatives in the geometry."""
-    rig = rig_of(*scene[:2], held, *scene[2:])
-    parts = parts_of(scene.method, held.shape, volumes * itemsize)
-    return _plan(rig, held, np.zeros(len(rig.lines), bool), 1, parts)
+    rig = scene.rig(occupancy)
+    parts = parts_of(scene.method, occupancy.shape, volumes * itemsize)
+    return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, parts)
 
 
-def _made(rig: Rig, held: Occupancy, lanes: int, parts: int) -> Plan:
+def _made(rig: Rig, occupancy: Occupancy, lanes: int, parts: int) -> Plan:
     upright = columnar(rig) if rig.method != TRILINEAR else np.zeros(len(rig.lines), bool)
-    return _plan(rig, held, upright, lanes, parts)
+    return _plan(rig, occupancy, upright, lanes, parts)
 
 
 def _plan(
-    rig: Rig, held: Occupancy, upright: Bool[np.ndarray, " m"], lanes: int, parts: int
+    rig: Rig, occupancy: Occupancy, upright: Bool[np.ndarray, " m"], lanes: int, parts: int
 ) -> Plan:
-    oblique, boxes, columns = np.flatnonzero(~upright), boxes_of(held), np.flatnonzero(upright)
+    oblique, boxes, columns = np.flatnonzero(~upright), boxes_of(occupancy), np.flatnonzero(upright)
     tall = np.ones(len(columns), bool)
     return Plan(
         rig,
-        (columns, spans_of(rig.lines[columns], rig.detector, tall, boxes)),
+        Columns(columns, spans_of(rig.lines[columns], rig.detector, tall, boxes)),
         oblique,
         _main_axes(rig, rig.lines[oblique, 0]),
         lanes,
         boxes,
-        tuple(pieces(rig, held, parts)),
+        tuple(pieces(rig, occupancy, parts)),
     )
 
 
@@ -225,13 +209,13 @@ def parts_of(method: str, shape: Sequence[int], itemsize: int) -> int:
     return max(1, -(-math.prod(padded_shape(shape)) * itemsize // BUDGET))
 
 
-def pieces(rig: Rig, held: Occupancy, parts: int) -> Iterator[tuple[slice, Rig]]:
+def pieces(rig: Rig, occupancy: Occupancy, parts: int) -> Iterator[tuple[slice, Rig]]:
     """Ranges of the volume's rows, as many as parts or fewer, each with the rig about its own
     centre.
 
     Weights of both methods are of single voxels, so that the pieces' projections add up to the
-    whole volume's. What is held cuts pieces short, but never moves them, so that sums keep their
-    order.
+    whole volume's. The occupied box cuts pieces short, but never moves them, so that sums keep
+    their order.
     """
     width, height, depth = rig.sizes
     rows = (
@@ -239,7 +223,7 @@ def pieces(rig: Rig, held: Occupancy, parts: int) -> Iterator[tuple[slice, Rig]]
     )  # the first is the greatest, and its memory serves the others
     for low in range(0, height, rows):
         high = min(low + rows, height)
-        part = held.rows(low, high)
+        part = occupancy.rows(low, high)
         if part.box.size:
             lines = shifted(rig.lines, (low + high - height) / 2)
             sizes, bounds = (width, high - low, depth), bounds_of(part)

@@ -14,13 +14,17 @@ from collections import namedtuple
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rays.lanes import LANES, between, mix, more, put, take
-from mvrecon.kernels.rays.loops import Rig, pixel, silent, steps_of
-from mvrecon.kernels.rays.packed_volume import Store
-from mvrecon.kernels.rays.packed_volume import store as store_of
-from mvrecon.kernels.rays.trace import main_axis, slab_length, within
-from mvrecon.kernels.rays.upright import extent, pieces, places, upright, within_held
+from mvrecon.kernels.rays.cpu.lanes import LANES, between, mix, more, put, take
+from mvrecon.kernels.rays.cpu.loops import silent
+from mvrecon.kernels.rays.cpu.packed_volume import Store
+from mvrecon.kernels.rays.cpu.packed_volume import store as store_of
+from mvrecon.kernels.rays.cpu.rig import Rig, steps_of
+from mvrecon.kernels.rays.cpu.upright import extent, pieces, places, upright, within_occupied
+from mvrecon.kernels.rays.trace import from_centre, main_axis, slab_length, within
 
+#: Two rows of voxels along z: flat index of the lower one, their weights, the step from it to the
+#: other.
+Rows = namedtuple("Rows", ["index", "low", "high", "far"])
 #: Rays in turn add to rows of their own, so that no addition waits for the one before.
 ROWS = 4
 
@@ -32,14 +36,21 @@ def _clear(room, group, lanes, span):
 
 
 @scalar
-def _blend(room, store, group, k, weights, span, add):
-    """A group's row of the room = low * (voxels along z at k) + high * (those of the next row),
+def rows_of(room, i, real, steps):
+    """The two rows of voxels of piece i."""
+    low, high = real(room.pieces[0, i]), real(room.pieces[1, i])
+    return Rows(np.int64(room.index[i]), low, high, np.int64(steps.far))
+
+
+@scalar
+def _blend(room, store, group, rows, span, add):
+    """A group's row of the room = low * (voxels along z of a row) + high * (those of the next),
     added where `add`.
     """
-    row, flat, low, high = room.row, store.values, weights[0], weights[1]
+    row, flat, low, high = room.row, store.values, rows.low, rows.high
     first, lanes = np.uint64((group * room.width + 1) * store.lanes), store.lanes
-    below = np.uint64(k * lanes)
-    above = below + np.uint64(weights[2] * lanes)
+    below = np.uint64((group * store.size + rows.index) * lanes)
+    above = below + np.uint64(rows.far * lanes)
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
         blend = low * flat[below + z] + high * flat[above + z]
         row[first + z] = blend + row[first + z] if add else blend
@@ -55,9 +66,9 @@ def _read_lanes(room, group, rays):
         room.shares.dtype.type(1),
     )
     for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
-        below, here = np.uint64(places[v]) * four + start, np.uint64(v) * four
+        below, place = np.uint64(places[v]) * four + start, np.uint64(v) * four
         value = mix(take(row, below), take(row, below + four), shares[v], one - shares[v])
-        put(sums, here, more(take(sums, here), one, value))
+        put(sums, place, more(take(sums, place), one, value))
 
 
 @scalar
@@ -85,24 +96,12 @@ def _read(room, lanes, group, rays):
 
 
 #: Room for one column: flat indices of its pieces, four numbers each, from where to where they are
-#: held; per ray its place in a row of voxels, its share of the upper neighbour, its two neighbours
-#: whole and in their parts; values [g v l]; a blended row [z l]; rows.
+#: occupied; per ray its place in a row of voxels, its share of the upper neighbour, its two
+#: neighbours whole and in their parts; values [g v l]; a blended row [z l]; rows.
 Column = namedtuple(
     "Column",
-    [
-        "index",
-        "pieces",
-        "held",
-        "places",
-        "shares",
-        "pairs",
-        "parts",
-        "values",
-        "blended",
-        "row",
-        "row_pairs",
-        "width",
-    ],
+    ["index", "pieces", "occupied", "places", "shares", "pairs", "parts", "values", "blended"]
+    + ["row", "row_pairs", "width"],
 )
 
 
@@ -113,7 +112,7 @@ def column_of(rig: Rig, store: Store, volumes: int) -> Column:
     pairs = np.empty(height, store.pairs.dtype)
     groups = -(-volumes // lanes)
     row, row_pairs, *_ = store_of(np.zeros((1, 1, 1, max(ROWS, groups) * width, lanes), real), 0)
-    index, pieces, held = (
+    index, pieces, occupied = (
         np.empty(length, store.strides.dtype),
         np.empty((4, length)),
         np.empty((2, length), np.int64),
@@ -121,29 +120,17 @@ def column_of(rig: Rig, store: Store, volumes: int) -> Column:
     places, shares = np.empty(height, np.uint32), np.empty(height, real)
     values, blended = np.empty((groups, height * lanes), real), np.empty(rig.sizes[2] * lanes, real)
     return Column(
-        index,
-        pieces,
-        held,
-        places,
-        shares,
-        pairs,
-        pairs.view(real),
-        values,
-        blended,
-        row,
-        row_pairs,
-        width,
+        *(index, pieces, occupied, places, shares, pairs, pairs.view(real), values, blended),
+        *(row, row_pairs, width),
     )
 
 
 @compiled
 def project_columns(store, rig, room, reads, views, first, last):
-    """Add to views [n m v u] the sums of the volumes along columns first to last, counted in one.
-
-    reads = (chosen views, spans of rows [view u 2]).
+    """Add to views [n m v u] the sums of the volumes along columns first to last, counted through
+    the views of `Columns`, which is in `rig.py`.
     """
-    chosen, spans = reads
-    rows, columns = rig.detector
+    columns = rig.detector[1]
     volumes, groups, lanes, real = (
         len(views),
         len(room.values),
@@ -151,34 +138,32 @@ def project_columns(store, rig, room, reads, views, first, last):
         store.values.dtype.type,
     )
     for column in range(first, last):
-        m, u = chosen[column // columns], column % columns
-        rays = spans[column // columns, u, 0], spans[column // columns, u, 1]
+        m, u = reads.views[column // columns], column % columns
+        rays = reads.spans[column // columns, u, 0], reads.spans[column // columns, u, 1]
         if rays[0] >= rays[1]:
             continue
-        line, here = rig.lines[m], pixel(rig, u, 0)
-        axis = main_axis(line, here[0], here[1])
+        line, pixel = rig.lines[m], from_centre(rig, u, 0)
+        axis = main_axis(line, pixel[0], pixel[1])
         steps = steps_of(rig, store, axis)
         ray, height = upright(rig, line, axis, u)
         count = pieces(rig, ray, (ray.first, ray.last), steps, room)
-        level = height[2] == 0 and height[3] == 0
+        level = height.climb == 0 and height.steeper == 0
         room.values[:] = 0
         for i in range(count):
             span = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
-            some = within_held(rig, room, i, span)
-            weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
+            some = within_occupied(rig, room, i, span)
+            rows = rows_of(room, i, real, steps)
             if not level or i == 0:
                 places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
             for group in range(groups):
                 if rig.heights.size and (not level or i == 0):
                     _clear(room, group, lanes, span)
-                k = group * store.size + np.int64(room.index[i])
-                _blend(
-                    room, store, group, k, weights, some, level and (i > 0 or rig.heights.size > 0)
-                )
+                add = level and (i > 0 or rig.heights.size > 0)
+                _blend(room, store, group, rows, some, add)
                 if not level or i == count - 1:
                     _read(room, lanes, group, rays)
         for v in range(rays[0], rays[1] if count else rays[0]):
-            length = real(slab_length(line, axis, here[0], v - (rows - 1) / 2))
+            length = real(slab_length(line, axis, pixel[0], from_centre(rig, u, v)[1]))
             for n in range(volumes):
                 views[n, m, v, u] += length * room.values[n // lanes, v * lanes + n % lanes]
 
@@ -190,9 +175,9 @@ def _write_lanes(room, group, rays):
     four, width, one = np.uint64(LANES), np.uint32(room.width), room.shares.dtype.type(1)
     for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
         below = np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width) * four
-        given = take(values, np.uint64(v) * four)
-        put(row, below, more(take(row, below), one - shares[v], given))
-        put(row, below + four, more(take(row, below + four), shares[v], given))
+        value = take(values, np.uint64(v) * four)
+        put(row, below, more(take(row, below), one - shares[v], value))
+        put(row, below + four, more(take(row, below + four), shares[v], value))
 
 
 @scalar
@@ -230,20 +215,20 @@ def _gather(room, lanes, span):
 
 
 @scalar
-def _unblend(room, store, k, weights, span):
+def _unblend(room, store, group, rows, span):
     """Add to two rows of voxels their shares of a row: the transpose of `_blend`."""
-    given, flat, low, high, lanes = room.blended, store.values, weights[0], weights[1], store.lanes
-    below = np.uint64(k * lanes)
-    above = below + np.uint64(weights[2] * lanes)
+    values, flat, low, high, lanes = room.blended, store.values, rows.low, rows.high, store.lanes
+    below = np.uint64((group * store.size + rows.index) * lanes)
+    above = below + np.uint64(rows.far * lanes)
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
-        flat[below + z] += low * given[z]
+        flat[below + z] += low * values[z]
     if high != 0:
         for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
-            flat[above + z] += high * given[z]
+            flat[above + z] += high * values[z]
 
 
 @scalar
-def _heard(views, m, u, rays):
+def _not_silent(views, m, u, rays):
     """The rays of a column, from the first to one behind the last, on which a view is not zero."""
     first, last = rays
     while first < last and silent(views, m, first, u):
@@ -254,42 +239,39 @@ def _heard(views, m, u, rays):
 
 
 @compiled
-def backproject_columns(store, rig, room, reads, views, low, high):
-    """Spread views [n m v u] into the slabs [low, high) of the store, for some upright views and
-    one main axis.
-    """
-    chosen, spans, axis = reads
-    rows, columns = rig.detector
+def backproject_columns(store, rig, room, reads, views, slabs):
+    """Spread views [n m v u] into slabs along columns; `Columns` and `Slabs` are in `rig.py`."""
+    axis, columns = slabs.axis, rig.detector[1]
     volumes, lanes, real, steps = (
         len(views),
         store.lanes,
         store.values.dtype.type,
         steps_of(rig, store, axis),
     )
-    for column in range(len(chosen) * columns):
-        m, u = chosen[column // columns], column % columns
-        line, here = rig.lines[m], pixel(rig, u, 0)
-        rays = spans[column // columns, u, 0], spans[column // columns, u, 1]
-        if rays[0] >= rays[1] or main_axis(line, here[0], here[1]) != axis:
+    for column in range(len(reads.views) * columns):
+        m, u = reads.views[column // columns], column % columns
+        line, pixel = rig.lines[m], from_centre(rig, u, 0)
+        rays = reads.spans[column // columns, u, 0], reads.spans[column // columns, u, 1]
+        if rays[0] >= rays[1] or main_axis(line, pixel[0], pixel[1]) != axis:
             continue
         ray, height = upright(rig, line, axis, u)
-        span, rays = within(ray, low, high), _heard(views, m, u, rays)
+        span, rays = within(ray, slabs.low, slabs.high), _not_silent(views, m, u, rays)
         if span[0] >= span[1] or rays[0] >= rays[1]:
             continue
         count = pieces(rig, ray, span, steps, room)
-        level = height[2] == 0 and height[3] == 0
+        level = height.climb == 0 and height.steeper == 0
         room.values[:] = 0
         for v in range(rays[0], rays[1]):
-            length = real(slab_length(line, axis, here[0], v - (rows - 1) / 2))
+            length = real(slab_length(line, axis, pixel[0], from_centre(rig, u, v)[1]))
             for n in range(volumes):
                 room.values[n // lanes, v * lanes + n % lanes] = length * views[n, m, v, u]
         for group in range(len(room.values)):
             for i in range(count):
                 span_z = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
-                some = within_held(rig, room, i, span_z)
-                weights = real(room.pieces[0, i]), real(room.pieces[1, i]), np.int64(steps.far)
+                some = within_occupied(rig, room, i, span_z)
+                rows = rows_of(room, i, real, steps)
                 if not level or i == 0:
                     places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
                     _write(room, lanes, group, rays)
                     _gather(room, lanes, span_z)
-                _unblend(room, store, group * store.size + np.int64(room.index[i]), weights, some)
+                _unblend(room, store, group, rows, some)

@@ -1,4 +1,5 @@
-"""The compiled operators of CUDA devices: the same three as `cpu.py`, on torch's current stream.
+"""The compiled operators of CUDA devices: the same three as those of the CPU, on torch's current
+stream.
 
 Forward and derivative by the geometry are the same to the last bit in every run. So is the adjoint
 where it gathers, voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of
@@ -6,7 +7,8 @@ additions, and so the last digits, vary; under `torch.use_deterministic_algorith
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,10 +18,10 @@ from jaxtyping import Float
 from numba import cuda
 from torch import Tensor
 
-from mvrecon.kernels.backends import wide
 from mvrecon.kernels.padding import INNER, PAD, padded_shape
-from mvrecon.kernels.rays import cuda_loops
-from mvrecon.kernels.rays.cuda_loops import BLOCK, GROUP, TILE, Scene
+from mvrecon.kernels.precision import wide
+from mvrecon.kernels.rays.cuda import loops
+from mvrecon.kernels.rays.cuda.loops import BLOCK, GROUP, TILE, Scene
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.kernels.rays.trace import numbered
 
@@ -38,21 +40,21 @@ def project(
     volume: Float[Tensor, "n d h w"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
-    held: Occupancy,
+    occupancy: Occupancy,
     detector: Sequence[int],
     method: str,
 ) -> Float[Tensor, "n m v u"]:
-    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is what
-    is held.
+    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is the
+    occupied box.
     """
     x = wide(volume)
-    scene = scene_of(window, held, detector, method)
+    scene = scene_of(window, occupancy, detector, method)
     views = x.new_empty(len(x), len(lines), *detector)
-    kernel = cuda_loops.project_kernel(numbered(method)[0], *_shares(len(x), scene))
+    kernel = loops.project_kernel(numbered(method)[0], *_shares(len(x), scene))
     launch(
         kernel,
         (_blocks(scene, len(lines)), _groups(len(x))),
-        padded(x, held),
+        padded(x, occupancy),
         maps(lines),
         scene,
         views,
@@ -64,13 +66,13 @@ def backproject(
     views: Float[Tensor, "n m v u"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
-    held: Occupancy,
+    occupancy: Occupancy,
     method: str,
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project`."""
-    if gathers(held.shape, views.shape[2:], lines.shape[3], method):
-        return gather(views, lines, window, held, method)
-    return scatter(views, lines, window, held, method)
+    if gathers(occupancy.shape, views.shape[2:], lines.shape[3], method):
+        return gather(views, lines, window, occupancy, method)
+    return scatter(views, lines, window, occupancy, method)
 
 
 def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method: str) -> bool:
@@ -97,37 +99,37 @@ def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method:
 
 
 def gather(
-    views: Tensor, lines: Tensor, window: Sequence[float], held: Occupancy, method: str
+    views: Tensor, lines: Tensor, window: Sequence[float], occupancy: Occupancy, method: str
 ) -> Float[Tensor, "n d h w"]:
     """`backproject` of Joseph's method by voxels, the same to the last bit in every run."""
-    y, given = wide(views).contiguous(), maps(lines)
-    scene = scene_of(window, held, views.shape[2:], method)
-    around = held.read
+    y, numbers = wide(views).contiguous(), maps(lines)
+    scene = scene_of(window, occupancy, views.shape[2:], method)
+    around = occupancy.read
     volume = y.new_zeros(len(y), *around.shape)
     pixels, blocks = math.prod(scene.detector), (-(-around.size // BLOCK), _groups(len(y)))
-    record, collect = cuda_loops.record_kernel(), cuda_loops.gather_kernel(_group(len(y)))
+    record, collect = loops.record_kernel(), loops.gather_kernel(_group(len(y)))
     some = max(1, RAYS // pixels)
     for first in range(0, len(lines), some):
         count = min(some, len(lines) - first)
         rays, frames = y.new_empty(8, count * pixels), y.new_empty(count, 3, 4)
         axes = torch.zeros(count, 3, dtype=torch.int32, device=y.device)
-        launch(record, (-(-count * pixels // BLOCK),), given, scene, first, rays, frames, axes)
+        launch(record, (-(-count * pixels // BLOCK),), numbers, scene, first, rays, frames, axes)
         launch(collect, blocks, y.flatten(1), rays, frames, axes, scene, first, volume)
-    return volume[:, *held.box.within(around)]
+    return volume[:, *occupancy.box.within(around)]
 
 
 def scatter(
-    views: Tensor, lines: Tensor, window: Sequence[float], held: Occupancy, method: str
+    views: Tensor, lines: Tensor, window: Sequence[float], occupancy: Occupancy, method: str
 ) -> Float[Tensor, "n d h w"]:
     """`backproject` of any method by rays, with atomic additions."""
     y = wide(views).contiguous()
-    scene = scene_of(window, held, views.shape[2:], method)
+    scene = scene_of(window, occupancy, views.shape[2:], method)
     flat = y.new_zeros(len(y) * scene.size)
-    kernel = cuda_loops.scatter_kernel(numbered(method)[0], *_shares(len(y), scene))
+    kernel = loops.scatter_kernel(numbered(method)[0], *_shares(len(y), scene))
     launch(kernel, (_blocks(scene, len(lines)), _groups(len(y))), y, maps(lines), scene, flat)
-    around = held.read
+    around = occupancy.read
     volume = flat.view(len(y), *padded_shape(around.shape))[:, INNER, INNER, INNER]
-    return volume[:, *held.box.within(around)].contiguous()
+    return volume[:, *occupancy.box.within(around)].contiguous()
 
 
 def lines_vjp(
@@ -135,18 +137,17 @@ def lines_vjp(
     views: Float[Tensor, "n m v u"],
     lines: Float[Tensor, "m 4 3 k"],
     window: Sequence[float],
-    held: Occupancy,
+    occupancy: Occupancy,
     method: str,
 ) -> Float[Tensor, "m 4 3 k"]:
     """The derivative of <views, project(volume, lines)> by the lines; float64."""
     x, y = wide(volume), wide(views).contiguous()
-    scene = scene_of(window, held, views.shape[2:], method)
+    scene = scene_of(window, occupancy, views.shape[2:], method)
     threads = min(math.prod(scene.detector), max(1, THREADS // max(1, len(lines))))
     change = lines.new_zeros(4, 3, lines.shape[3], len(lines), threads, dtype=torch.float64)
-    kernel = cuda_loops.vary_kernel(numbered(method)[0])
-    launch(
-        kernel, (-(-len(lines) * threads // BLOCK),), padded(x, held), y, maps(lines), scene, change
-    )
+    kernel = loops.vary_kernel(numbered(method)[0])
+    blocks = (-(-len(lines) * threads // BLOCK),)
+    launch(kernel, blocks, padded(x, occupancy), y, maps(lines), scene, change)
     return change.sum(dim=4).permute(3, 0, 1, 2).contiguous()
 
 
@@ -156,32 +157,34 @@ def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
     """
     if 0 in blocks:
         return
-    device = next(each.device for each in arguments if isinstance(each, Tensor))
+    device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
     if device.type == "cpu":
-        given = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
-        kernel[blocks, BLOCK](*given)
+        kernel[blocks, BLOCK](*(_shared(argument, Tensor.numpy) for argument in arguments))
         return
     index = torch.cuda.current_device() if device.index is None else device.index
     with torch.cuda.device(index), cuda.gpus[index]:
         stream = cuda.external_stream(torch.cuda.current_stream(index).cuda_stream)
-        given = [
-            cuda.as_cuda_array(each.detach(), sync=False) if isinstance(each, Tensor) else each
-            for each in arguments
-        ]
-        kernel[blocks, BLOCK, stream](*given)
+        kernel[blocks, BLOCK, stream](
+            *(_shared(argument, partial(cuda.as_cuda_array, sync=False)) for argument in arguments)
+        )
+
+
+def _shared(argument: Any, array_of: Callable[[Tensor], Any]) -> Any:
+    """A tensor as an array on the same memory, any other argument as it is."""
+    return array_of(argument.detach()) if isinstance(argument, Tensor) else argument
 
 
 def scene_of(
-    window: Sequence[float], held: Occupancy, detector: Sequence[int], method: str
+    window: Sequence[float], occupancy: Occupancy, detector: Sequence[int], method: str
 ) -> Scene:
     """The numbers of a scene."""
-    around = held.read
+    around = occupancy.read
     depth, height, width = padded_shape(around.shape)
     rows, columns = (int(size) for size in detector)
     low, high = (min(max(float(end), -FAR), FAR) for end in window)
     z, y, x = around.low
     return Scene(
-        sizes=held.shape[::-1],
+        sizes=occupancy.shape[::-1],
         strides=(1, width, width * height),
         size=width * height * depth,
         detector=(rows, columns),
@@ -193,11 +196,11 @@ def scene_of(
     )
 
 
-def padded(volume: Float[Tensor, "n d h w"], held: Occupancy) -> Float[Tensor, " p"]:
-    """Volumes, as much of them as is held, in the box that is read, with their border of nothing,
-    in one row.
+def padded(volume: Float[Tensor, "n d h w"], occupancy: Occupancy) -> Float[Tensor, " p"]:
+    """Volumes, of which only the occupied box exists, in the box that is read, with their border of
+    nothing, in one row.
     """
-    margins = held.box.margins(held.read)
+    margins = occupancy.box.margins(occupancy.read)
     return F.pad(volume, [n + border for n, border in zip(margins, PAD * 3, strict=True)]).flatten()
 
 

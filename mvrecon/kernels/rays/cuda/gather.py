@@ -9,6 +9,7 @@ where a view mixes main axes. Box and weights need nothing but scalars.
 """
 
 from math import ceil, floor
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,21 @@ from mvrecon.kernels.rays.trace import JOSEPH, main_axis, trace
 B, SLOPE_B, C, SLOPE_C, BEGIN, END, LENGTH, AXIS = range(8)
 
 
+class View(NamedTuple):
+    """What one view gives to voxels: its matrix [3 4] from `projection_matrix`; rays [8 p] of
+    `record`, values [n p'] of all pixels, and where the view begins in either; sizes (x, y, z) of
+    the volume; detector (rows, columns).
+    """
+
+    frame: Any
+    rays: Any
+    values: Any
+    first_ray: Any
+    first_value: Any
+    sizes: Any
+    detector: Any
+
+
 @scalar
 def near_of(axis):
     """The axis nearest in memory, in a volume [d h w], of the two across a main axis."""
@@ -27,59 +43,14 @@ def near_of(axis):
 
 
 @scalar
-def cross(matrix, one, two, axis):
-    """A component of the cross product of two columns (kind, column) of a view's maps."""
-    p, q = (axis + 1) % 3, (axis + 2) % 3
-    return (
-        matrix[one[0], p, one[1]] * matrix[two[0], q, two[1]]
-        - matrix[one[0], q, one[1]] * matrix[two[0], p, two[1]]
-    )
-
-
-@scalar
-def camera(line, into):
-    """Write the matrix [3 4] that takes points (x, y, z, 1) of a view to pixels (u, v, 1) up to a
-    factor.
-
-    It solves source + w (U u + V v + A) = X, for parallel beams O + U u + V v + w A = X (Cramer's
-    rule). For explicit rays, and where U, V and A lie in one plane, it takes everything to (0, 0,
-    0).
-    """
-    into[:] = 0
-    if line.shape[2] == 1:
-        return
-    parallel = True
-    for axis in range(3):
-        parallel = parallel and line[0, axis, 0] == 0 and line[0, axis, 1] == 0
-    kind = 2 if parallel else 0
-    U, V, A = (kind, 0), (kind, 1), (0, 2)
-    scale = 0.0
-    for axis in range(3):
-        into[0, axis], into[1, axis] = cross(line, V, A, axis), cross(line, A, U, axis)
-        if parallel:
-            into[2, 3] += cross(line, V, A, axis) * line[kind, axis, 0]
-        else:
-            into[2, axis] = cross(line, U, V, axis)
-        start = line[2, axis, 2]
-        into[0, 3] -= into[0, axis] * start
-        into[1, 3] -= into[1, axis] * start
-        into[2, 3] -= into[2, axis] * start
-        scale += abs(into[2, axis])
-    scale += abs(into[2, 3])
-    for row in range(3):
-        for column in range(4):
-            into[row, column] = into[row, column] / scale if scale > 0 else 0.0
-
-
-@scalar
-def record(line, here, space, into, k):
+def record(line, pixel, space, into, k):
     """Write into column k what `weight` needs of the ray of a pixel, and tell its main axis."""
-    axis = main_axis(line, here[0], here[1])
-    ray = trace(line, axis, near_of(axis), here, space, JOSEPH)
+    axis = main_axis(line, pixel[0], pixel[1])
+    ray = trace(line, axis, near_of(axis), pixel, space, JOSEPH)
     into[B, k], into[SLOPE_B, k] = (
         ray.b - 1,
         ray.slope_b,
-    )  # voxels here are counted without their padding
+    )  # voxels are counted without their padding
     into[C, k], into[SLOPE_C, k] = ray.c - 1, ray.slope_c
     into[BEGIN, k], into[END, k], into[LENGTH, k] = ray.begin, ray.end, ray.length
     into[AXIS, k] = axis if ray.first < ray.last else -1
@@ -104,7 +75,7 @@ def box(frame, point, axis, detector, real):
     a voxel away.
 
     Args:
-        frame: the view's matrix from `camera`, in the type `real`.
+        frame: the view's matrix from `projection_matrix`, in the type `real`.
         point: the voxel (x, y, z), from the volume's centre.
         axis: the rays' main axis.
         detector: pixels (rows, columns).
@@ -155,16 +126,14 @@ def collect(view, voxel, axis, first, totals, real):
     """Add to totals what the rays of one view and one main axis give to a voxel (x, y, z).
 
     Args:
-        view: matrix [3 4] from `camera`; rays [8 p] of `record`; values [n p'] of all pixels; where
-            the view begins in the rays, and where in the values; sizes (x, y, z); detector (rows,
-            columns).
+        view: a `View`.
         voxel: its indices.
         axis: the rays' main axis.
         first: the first of the volumes, of which `totals` has a few.
         totals: a number per volume.
         real: the type to compute in.
     """
-    frame, rays, values, start, begin, sizes, detector = view
+    sizes = view.sizes
     point = (
         voxel[0] - (sizes[0] - 1) / 2,
         voxel[1] - (sizes[1] - 1) / 2,
@@ -172,14 +141,14 @@ def collect(view, voxel, axis, first, totals, real):
     )
     near = near_of(axis)
     s, b, c = real(point[axis]), real(voxel[3 - axis - near]), real(voxel[near])
-    u0, u1, v0, v1 = box(frame, point, axis, detector, real)
+    u0, u1, v0, v1 = box(view.frame, point, axis, view.detector, real)
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
-            place = v * detector[1] + u
-            k, value = np.uint64(start + place), np.uint64(begin + place)
-            if rays[AXIS, k] != axis:
+            place = v * view.detector[1] + u
+            k, pixel = np.uint64(view.first_ray + place), np.uint64(view.first_value + place)
+            if view.rays[AXIS, k] != axis:
                 continue
-            share = weight(rays, k, s, b, c, real)
+            share = weight(view.rays, k, s, b, c, real)
             for n in range(len(totals)):
-                if first + n < len(values):
-                    totals[n] += share * values[np.uint64(first + n), value]
+                if first + n < len(view.values):
+                    totals[n] += share * view.values[np.uint64(first + n), pixel]

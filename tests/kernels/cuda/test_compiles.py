@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("numba")
 from numba import cuda, float32, float64, int32, int64, typeof, types  # noqa: E402
 
-from mvrecon.kernels.rays import cuda as back_end  # noqa: E402
-from mvrecon.kernels.rays import cuda_loops  # noqa: E402
+from mvrecon.kernels.rays.cuda import loops  # noqa: E402
+from mvrecon.kernels.rays.cuda import operators as back_end  # noqa: E402
 from mvrecon.kernels.rays.occupancy import Occupancy  # noqa: E402
 from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR  # noqa: E402
 
@@ -51,7 +51,7 @@ def assembly(kernel, *arguments) -> str:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_project_keeps_all_in_registers(method):
-    kernel = cuda_loops.project_kernel(method, 4, np.uint32)
+    kernel = loops.project_kernel(method, 4, np.uint32)
     text = assembly(kernel, float32[::1], LINES, SCENE, float32[:, :, :, ::1])
     assert "ld.local" not in text and "call" not in text
     assert (
@@ -61,7 +61,7 @@ def test_project_keeps_all_in_registers(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_scatter_adds_atomically(method):
-    kernel = cuda_loops.scatter_kernel(method, 1, np.uint64)
+    kernel = loops.scatter_kernel(method, 1, np.uint64)
     text = assembly(kernel, float32[:, :, :, ::1], LINES, SCENE, float32[::1])
     assert (
         "atom.global.add.f32" in text or "red.global.add.f32" in text
@@ -78,14 +78,14 @@ def test_gather_needs_no_atomics():
         int64,
         float32[:, :, :, ::1],
     )
-    text = assembly(cuda_loops.gather_kernel(4), *arguments)
+    text = assembly(loops.gather_kernel(4), *arguments)
     assert "atom." not in text and "red." not in text and "ld.local" not in text
-    assert assembly(cuda_loops.record_kernel(), LINES, SCENE, int64, *arguments[1:4])
+    assert assembly(loops.record_kernel(), LINES, SCENE, int64, *arguments[1:4])
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_vary_compiles(method):
-    kernel = cuda_loops.vary_kernel(method)
+    kernel = loops.vary_kernel(method)
     assert assembly(
         kernel, float32[::1], float32[:, :, :, ::1], LINES, SCENE, float64[:, :, :, :, ::1]
     )

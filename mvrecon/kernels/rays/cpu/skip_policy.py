@@ -7,16 +7,17 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box
 from mvrecon.kernels.compiling import compiled
-from mvrecon.kernels.rays.footprint import spans_of
-from mvrecon.kernels.rays.loops import pixel
-from mvrecon.kernels.rays.nonzero import box_of, bricks_of, empty_share, readable
+from mvrecon.kernels.rays.cpu.footprint import spans_of
+from mvrecon.kernels.rays.cpu.nonzero import box_of, bricks_of, empty_share, readable
+from mvrecon.kernels.rays.cpu.plan import Scene
+from mvrecon.kernels.rays.cpu.summation import empty
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
-from mvrecon.kernels.rays.plan import Scene, rig_of
-from mvrecon.kernels.rays.summation import empty
-from mvrecon.kernels.rays.trace import main_axis, trace
+from mvrecon.kernels.rays.trace import from_centre, main_axis, trace
 
-#: Slabs of all rays from which on it is worth while to look for a volume's box, and for its bricks.
-SOME, MUCH = 2**21, 2**25
+#: Slabs of all rays from which on it is worth while to look for a volume's box; and slabs that the
+#: box must leave, so that bricks gain: below, what a call costs besides its slabs hides what they
+#: save (experiments/05_skip).
+SOME, MUCH = 2**21, 3 * 2**23
 #: Rays on which work is counted.
 RAYS = 1024
 #: What a ray costs before its first slab, and what it costs to ask for one layer of bricks, in
@@ -40,41 +41,39 @@ def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
     shape = Box.whole(values.shape[1:]).high
     if skip == "auto" and scene.slabs(shape) < SOME:
         return Occupancy.whole(shape)
-    held = Occupancy(shape, box_of(values))
-    fine = (
-        "trilinear" not in scene.method
-        and held.box.size > 0
-        and (skip != "auto" or scene.slabs(shape) >= MUCH)
-    )
-    if skip == "box" or not fine or (skip != "brick" and empty_share(values, held.box) < WORTH):
-        return held
-    bricked = Occupancy(shape, held.box, bricks_of(values, held.box))
+    occupancy = Occupancy(shape, box_of(values))
+    box = occupancy.box
+    if skip == "box" or "trilinear" in scene.method or not box.size:
+        return occupancy
     if skip == "brick":
-        return bricked
-    return cheapest(held, bricked, scene)
+        return Occupancy(shape, box, bricks_of(values, box))
+    if scene.slabs(shape) < MUCH or empty_share(values, box) < WORTH:
+        return occupancy
+    return cheapest(occupancy, Occupancy(shape, box, bricks_of(values, box)), scene)
 
 
-def cheapest(held: Occupancy, bricked: Occupancy, scene: Scene) -> Occupancy:
-    """The one of two occupancies by which rays have less to do, with the shares of the work that
-    either leaves.
+def cheapest(occupancy: Occupancy, bricked: Occupancy, scene: Scene) -> Occupancy:
+    """The bricks of a box if by them rays have so much less to do that it pays, else the box; with
+    the shares of the work that either leaves.
     """
     whole, box, bricks = (
-        work(each, scene) for each in (Occupancy.whole(held.shape), held, bricked)
+        work(occupied, scene) for occupied in (Occupancy.whole(occupancy.shape), occupancy, bricked)
     )
-    chosen = bricked if bricks < LESS * box else held
-    return Occupancy(held.shape, held.box, chosen.bricks, (box / whole, bricks / whole))
+    much = box / whole * scene.slabs(occupancy.shape) >= MUCH
+    chosen = bricked if much and bricks < LESS * box else occupancy
+    return Occupancy(occupancy.shape, occupancy.box, chosen.bricks, (box / whole, bricks / whole))
 
 
-def work(held: Occupancy, scene: Scene) -> float:
+def work(occupancy: Occupancy, scene: Scene) -> float:
     """The mean work on a ray of the detector, in slabs."""
-    rig = rig_of(scene.lines, scene.window, held, scene.detector, scene.method)
+    rig = scene.rig(occupancy)
     # the same few rays each time: a choice must not change from call to call
     places = np.random.default_rng(0).random((RAYS, 3)) * [len(rig.lines), *rig.detector]
     chosen = places.astype(np.int64)
     views, index = np.unique(chosen[:, 0], return_inverse=True)
     chosen[:, 0] = index
     rows = np.zeros(len(views), bool)
-    spans = spans_of(rig.lines[views], rig.detector, rows, boxes_of(held))
+    spans = spans_of(rig.lines[views], rig.detector, rows, boxes_of(occupancy))
     return float(count(rig._replace(lines=rig.lines[views]), spans, chosen)) / RAYS
 
 
@@ -86,9 +85,9 @@ def count(rig, spans, chosen):
         m, v, u = chosen[r]
         if len(rig.lines[m, 0, 0]) == 3 and not spans[m, v, 0] <= u < spans[m, v, 1]:
             continue
-        here = pixel(rig, u, v)
-        axis = main_axis(rig.lines[m], here[0], here[1])
-        ray = trace(rig.lines[m], axis, 0 if axis == 2 else 2, here, rig, rig.method)
+        pixel = from_centre(rig, u, v)
+        axis = main_axis(rig.lines[m], pixel[0], pixel[1])
+        ray = trace(rig.lines[m], axis, 0 if axis == 2 else 2, pixel, rig, rig.method)
         total += SET_UP
         low = ray.first
         while low < ray.last:

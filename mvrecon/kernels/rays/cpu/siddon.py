@@ -3,8 +3,14 @@
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays.cpu.summation import fold
 from mvrecon.kernels.rays.methods import siddon as step
-from mvrecon.kernels.rays.summation import fold
+
+
+@scalar
+def crossed(room):
+    """Of the three cells that a ray may cross in a slab: flat indices, and lengths in them."""
+    return room.index, room.index_b, room.index_c, room.one, room.two, room.three
 
 
 @scalar
@@ -15,23 +21,16 @@ def cells(ray, count, steps, room):
     Crossings are found in float64 and rounded last: a ray that is all but along a plane moves its
     crossing by many times what a place is rounded by.
     """
-    index0, index1, index2, part0, part1, part2 = (
-        room.index,
-        room.index_b,
-        room.index_c,
-        room.one,
-        room.two,
-        room.three,
-    )
+    index0, index1, index2, part0, part1, part2 = crossed(room)
     real, whole = part0.dtype.type, index0.dtype.type
     course = step.course_of(ray, np.float64)
     for i in range(np.uint32(count)):
         s = np.float64(room.four[i])
-        here = step.crossing(course, s, np.float64)
-        one, two, three = step.lengths(here)
+        passage = step.crossing(course, s, np.float64)
+        one, two, three = step.lengths(passage)
         part0[i], part1[i], part2[i] = real(one), real(two), real(three)
         k = np.int32(s + course.centre)
-        index0[i], index1[i], index2[i] = step.three(steps, k, here, whole)
+        index0[i], index1[i], index2[i] = step.three(steps, k, passage, whole)
 
 
 @scalar
@@ -40,14 +39,7 @@ def sum(store, n, visited, room):
     of their terms).
     """
     count, lead = visited
-    index0, index1, index2, part0, part1, part2 = (
-        room.index,
-        room.index_b,
-        room.index_c,
-        room.one,
-        room.two,
-        room.three,
-    )
+    index0, index1, index2, part0, part1, part2 = crossed(room)
     flat, offset, terms = store.values, np.uint64(n * store.size), room.terms[lead:]
     for i in range(np.uint32(count)):
         first, middle = flat[np.uint64(index0[i]) + offset], flat[np.uint64(index1[i]) + offset]
@@ -59,14 +51,7 @@ def sum(store, n, visited, room):
 @scalar
 def spread(store, n, count, room, value):
     """Add a value to volume n along a ray with the weights of `sum`: its transpose."""
-    index0, index1, index2, part0, part1, part2 = (
-        room.index,
-        room.index_b,
-        room.index_c,
-        room.one,
-        room.two,
-        room.three,
-    )
+    index0, index1, index2, part0, part1, part2 = crossed(room)
     flat, offset = store.values, np.uint64(n * store.size)
     for i in range(np.uint32(count)):
         flat[np.uint64(index0[i]) + offset] += part0[i] * value

@@ -16,11 +16,19 @@ import numpy as np
 from numba import cuda
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays import gather
-from mvrecon.kernels.rays.loops import pixel, pull_back
+from mvrecon.kernels.rays.cuda import gather
 from mvrecon.kernels.rays.methods import joseph, siddon, trilinear
 from mvrecon.kernels.rays.methods.strides import Steps, Values
-from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR, main_axis, trace
+from mvrecon.kernels.rays.pose_gradient import pull_back
+from mvrecon.kernels.rays.projection_matrix import projection_matrix
+from mvrecon.kernels.rays.trace import (
+    JOSEPH,
+    SIDDON,
+    TRILINEAR,
+    from_centre,
+    main_axis,
+    trace,
+)
 
 #: Threads of a block, and the tile of the detector, columns by rows, that they share.
 BLOCK, TILE = 128, (16, 8)
@@ -73,10 +81,10 @@ def exists(scene, views, place):
 @scalar
 def ray_of(scene, lines, place, method):
     """The ray of a place (view, column, row), and its pixel from the detector's centre."""
-    here = pixel(scene, place[1], place[2])
+    pixel = from_centre(scene, place[1], place[2])
     line = lines[place[0]]
-    axis = main_axis(line, here[0], here[1])
-    return trace(line, axis, gather.near_of(axis), here, scene, method), here
+    axis = main_axis(line, pixel[0], pixel[1])
+    return trace(line, axis, gather.near_of(axis), pixel, scene, method), pixel
 
 
 @scalar
@@ -186,11 +194,11 @@ def record_kernel():
             return
         view, place = k // (rows * columns), k % (rows * columns)
         line = lines[first + view]
-        here = pixel(scene, place % columns, place // columns)
-        axes[view, gather.record(line, here, scene, rays, k)] = 1
+        pixel = from_centre(scene, place % columns, place // columns)
+        axes[view, gather.record(line, pixel, scene, rays, k)] = 1
         if place == 0:
             exact = cuda.local.array((3, 4), np.float64)
-            gather.camera(line, exact)
+            projection_matrix(line, exact)
             for row in range(3):
                 for column in range(4):
                     frames[view, row, column] = exact[row, column]
@@ -214,17 +222,17 @@ def gather_kernel(group):
             return
         real = volumes.dtype.type
         column, row, slab = voxel % w, voxel // w % h, voxel // (np.int64(w) * h)
-        here = (x + column, y + row, z + slab)
+        place = (x + column, y + row, z + slab)
         totals = cuda.local.array(group, volumes.dtype)
         for n in range(group):
             totals[n] = 0
         pixels = np.int64(scene.detector[0]) * scene.detector[1]
         for m in range(len(frames)):
             start, begin = m * pixels, (first_view + m) * pixels
-            view = (frames[m], rays, values, start, begin, scene.sizes, scene.detector)
+            view = gather.View(frames[m], rays, values, start, begin, scene.sizes, scene.detector)
             for axis in range(3):
                 if axes[m, axis] != 0:
-                    gather.collect(view, here, axis, first, totals, real)
+                    gather.collect(view, place, axis, first, totals, real)
         for n in range(group):
             if first + n < len(volumes):
                 volumes[first + n, slab, row, column] += totals[n]
@@ -248,12 +256,12 @@ def vary_kernel(method):
         view, start = thread // threads, thread % threads
         if view >= len(lines):
             return
-        own, held = cuda.local.array((4, 3, 3), np.float64), Values(flat, scene.size)
+        own, volumes = cuda.local.array((4, 3, 3), np.float64), Values(flat, scene.size)
         own[:] = 0
         for place in range(start, scene.detector[0] * scene.detector[1], threads):
             v, u = place // scene.detector[1], place % scene.detector[1]
-            ray, here = ray_of(scene, lines, (view, u, v), method)
-            steps, p = steps_of(scene, ray.axis), (here[0], here[1], 1.0)
+            ray, pixel = ray_of(scene, lines, (view, u, v), method)
+            steps, p = steps_of(scene, ray.axis), (pixel[0], pixel[1], 1.0)
             for n in range(len(views) if ray.first < ray.last else 0):
                 pull_back(
                     lines[view],
@@ -261,7 +269,7 @@ def vary_kernel(method):
                     p,
                     scene.window,
                     views[n, view, v, u],
-                    slopes_of(held, n, ray, steps),
+                    slopes_of(volumes, n, ray, steps),
                     own,
                 )
         for kind in range(4):

@@ -8,10 +8,11 @@ to loops without gathers, which every CPU vectorises.
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.lanes import LANES, between, mix, more, plus, put, take, times
+from mvrecon.kernels.rays.cpu.lanes import LANES, between, mix, more, plus, put, take, times
+from mvrecon.kernels.rays.cpu.summation import fold
 from mvrecon.kernels.rays.methods import joseph as step
 from mvrecon.kernels.rays.methods.strides import flat_index
-from mvrecon.kernels.rays.summation import fold
+from mvrecon.kernels.rays.pose_gradient import Slopes
 
 
 @scalar
@@ -94,19 +95,19 @@ def spread_lanes(store, group, steps, count, room):
     """Add room.totals to four volumes along a ray: the transpose of `sum_lanes`."""
     index, y, z, share, values = room.index, room.one, room.two, room.three, store.values
     first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
-    far, given, one = np.uint64(steps.far) * four, take(room.totals, np.uint64(0)), y.dtype.type(1)
+    far, totals, one = np.uint64(steps.far) * four, take(room.totals, np.uint64(0)), y.dtype.type(1)
     for i in range(np.uint32(count)):
         k, rest = np.uint64(index[i]) * four + first, one - z[i]
         low, high = share[i] * (one - y[i]), share[i] * y[i]
-        put(values, k, more(take(values, k), low * rest, given))
-        put(values, k + four, more(take(values, k + four), low * z[i], given))
-        put(values, k + far, more(take(values, k + far), high * rest, given))
-        put(values, k + far + four, more(take(values, k + far + four), high * z[i], given))
+        put(values, k, more(take(values, k), low * rest, totals))
+        put(values, k + four, more(take(values, k + four), low * z[i], totals))
+        put(values, k + far, more(take(values, k + far), high * rest, totals))
+        put(values, k + far + four, more(take(values, k + far + four), high * z[i], totals))
 
 
 @scalar
 def slopes(store, n, steps, count, room, ray):
-    """How a ray's `sum` changes with its place, as `methods.joseph.Slopes`."""
+    """How a ray's `sum` changes with its place, as `pose_gradient.Slopes`."""
     fetch(store.pairs, n * store.size, steps.far, count, room)
     y, z, share, slab, low, high = (
         room.one,
@@ -118,7 +119,7 @@ def slopes(store, n, steps, count, room, ray):
     )
     real = y.dtype.type
     course, none = step.course_of(ray, real), real(0)
-    sums = step.Slopes(none, none, none, none, none, none, none)
+    sums = Slopes(none, none, none, none, none, none, none)
     for i in range(np.uint32(count)):
         place = step.face(low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1], y[i], z[i])
         sums = step.bent(sums, course, slab[i], share[i], place)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mvrecon.kernels.compiling import compiled
-from mvrecon.kernels.rays.gather import camera
+from mvrecon.kernels.rays.projection_matrix import projection_matrix
 
 #: Pixels beyond the picture of a box that are taken along.
 MARGIN = 1.0
@@ -36,7 +36,7 @@ def spans_of(
     spans[:, :, 0] = max(rows, columns)
     frames = np.zeros((len(lines), 3, 4))
     for line, frame in zip(lines, frames, strict=True):
-        camera(line, frame)
+        projection_matrix(line, frame)
     cover(frames, np.array(detector), tall, boxes, spans)
     return spans
 

@@ -62,10 +62,10 @@ def _face_holds(volumes, axis, place, low, high):
     for n in range(len(volumes)):
         for z in range(z0, z1):
             for y in range(y0, y1):
-                found = 0
+                nonzero = 0
                 for x in range(x0, x1):
-                    found |= np.int64(volumes[n, z, y, x] != 0)
-                if found:
+                    nonzero |= np.int64(volumes[n, z, y, x] != 0)
+                if nonzero:
                     return True
     return False
 
@@ -79,10 +79,10 @@ def mark(volumes, low, high, bricks):
         for z in range(low[0], high[0]):
             for y in range(low[1], high[1]):
                 for i in range(max(0, low[2] - 1) // EDGE, (high[2] - 1) // EDGE + 1):
-                    found = 0
+                    nonzero = 0
                     for x in range(max(low[2], i * EDGE), min(high[2], i * EDGE + EDGE + 1)):
-                        found |= np.int64(volumes[n, z, y, x] != 0)
-                    if found:
+                        nonzero |= np.int64(volumes[n, z, y, x] != 0)
+                    if nonzero:
                         k, j = z // EDGE, y // EDGE
                         for before_z in range(k - int(z % EDGE == 0 and z > 0), k + 1):
                             for before_y in range(j - int(y % EDGE == 0 and y > 0), j + 1):

@@ -6,49 +6,27 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.library import opcheck
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.cameras.rigs import circular
-from mvrecon.geometry.frustum import depth_edges, depth_index
-from mvrecon.geometry.grid import Grid, pixel_centres, voxel_centres
-from mvrecon.geometry.lattice import Lattice, grid_lattice, lattice_maps, lifted_maps
+from mvrecon.geometry.frustum import depth_edges
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.geometry.sample import normalised, sample
 from mvrecon.kernels.warps import ops as warp_ops
 from mvrecon.kernels.warps.warp import warp
-from tests.projectors.rigs import CONE, GRID, PARALLEL, PINHOLES
-
-BODY = Grid.centred(size=(10, 8, 9), spacing=22.0)
-RIGS = {
-    "cone": (GRID, CONE),
-    "pinholes": (GRID, PINHOLES),
-    "parallel": (GRID, PARALLEL),
-    "dcspect80": (BODY, dcspect80()[::20].binned(8)),
-}
-DEPTH = 7
-
-
-def edges_of(grid: Grid, cameras: Cameras) -> torch.Tensor:
-    return depth_edges(cameras.depth_range(grid), DEPTH)
-
-
-def lattices(grid: Grid, cameras: Cameras) -> tuple[Lattice, Lattice]:
-    return frusta_lattice(cameras, grid, edges_of(grid, cameras)), grid_lattice(grid)
-
-
-def index_in_frusta(cameras: Cameras, edges: torch.Tensor, xyz: torch.Tensor) -> torch.Tensor:
-    uvz = cameras.project(xyz)
-    return torch.cat([uvz[..., :2], depth_index(uvz[..., 2], edges)[..., None]], dim=-1)
-
-
-def bin_centres(cameras: Cameras, edges: torch.Tensor) -> torch.Tensor:
-    z = (edges[:, 1:] + edges[:, :-1]) / 2
-    uv = pixel_centres(cameras.shape)[None, None].expand(len(cameras), z.shape[1], -1, -1, -1)
-    return cameras.unproject(
-        torch.cat([uv, z[:, :, None, None, None].expand(*uv.shape[:-1], 1)], dim=-1)
-    )
+from tests.kernels.warps.scenes import (
+    DEPTH,
+    OTHER,
+    RIGS,
+    SMALL,
+    bin_centres,
+    edges_of,
+    generic,
+    index_in_frusta,
+    lattices,
+)
+from tests.projectors.rigs import CONE, GRID
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -97,113 +75,6 @@ def test_warp_back_is_the_transpose(kind):
             one, two = (Ax * y).sum(), (x * warp_ops.warp_back(y, maps, list(of.shape))).sum()
             assert (one - two).abs() < tolerance * Ax.norm() * y.norm()
             assert Ax.norm() > 0.1 * x.norm()
-
-
-def generic(count: int = 2) -> torch.Tensor:
-    """Homographies between small volumes, no sample on a cell's face."""
-    torch.manual_seed(1)
-    H = torch.eye(4, dtype=torch.float64).repeat(2, count, 1, 1)
-    H[..., :3, :] += 0.15 * torch.randn_like(H[..., :3, :])
-    H[..., 3, :3] += 0.03 * torch.randn_like(H[..., 3, :3])
-    return H
-
-
-SMALL, OTHER = (4, 3, 5), [3, 4, 4]
-
-
-def test_gradients_by_values_and_by_homography():
-    H = generic().requires_grad_()
-    x = torch.randn(1, 2, 2, *SMALL, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x, H: warp(x, lifted_maps(H), OTHER, "cpu"), (x, H))
-    y = torch.randn(1, 2, 2, 2, *OTHER, dtype=torch.float64, requires_grad=True)
-    back = torch.ops.mvrecon.warp_back
-    assert torch.autograd.gradcheck(lambda y, H: back(y, lifted_maps(H), list(SMALL)), (y, H))
-    by_H = [
-        torch.autograd.grad(warp(x, lifted_maps(H), OTHER, b).square().sum(), H)[0]
-        for b in ("cpu", "reference")
-    ]
-    assert torch.allclose(*by_H) and by_H[0].abs().max() > 0.1
-
-
-@pytest.mark.parametrize("kind", ["cone", "parallel"])
-def test_gradients_by_the_lift_reach_the_cameras(kind):
-    grid, cameras = RIGS[kind]
-    edges = edges_of(grid, cameras)
-    x = torch.randn(1, len(cameras), 1, DEPTH, *cameras.shape, dtype=torch.float64)
-    results = []
-    for backend in ("cpu", "reference"):
-        rig = replace(cameras, source=cameras.source.clone().requires_grad_())
-        maps = lattice_maps(frusta_lattice(rig, grid, edges), grid_lattice(grid))
-        results.append(
-            torch.autograd.grad(warp(x, maps, grid.shape, backend).square().sum(), rig.source)[0]
-        )
-    assert torch.allclose(*results) and results[0].abs().max() > 1e-3
-
-
-def test_second_derivatives_in_values_and_maps_are_exact():
-    maps = lifted_maps(generic())
-    x = torch.randn(1, 2, 1, *SMALL, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradgradcheck(lambda x: warp(x, maps, OTHER, "cpu").square(), (x,))
-    maps.requires_grad_()
-    seconds = []
-    for backend in ("cpu", "reference"):
-        (by_maps,) = torch.autograd.grad(
-            warp(x, maps, OTHER, backend).square().sum(), maps, create_graph=True
-        )
-        seconds.append(torch.autograd.grad(by_maps.sum(), maps)[0])
-    assert seconds[1].norm() > 0.1 and torch.allclose(*seconds, rtol=1e-10)
-
-
-def test_only_what_is_asked_for_is_differentiated(monkeypatch):
-    from mvrecon.kernels.warps import cpu as warp_cpu
-
-    monkeypatch.setattr(
-        warp_cpu, "warp_vjp", lambda *_: pytest.fail("no gradient in the maps was asked for")
-    )
-    x = torch.randn(1, 2, 1, *SMALL, requires_grad=True)
-    warp(x, lifted_maps(generic()), OTHER, "cpu").sum().backward()
-    assert x.grad is not None
-
-
-def test_torch_accepts_the_operators():
-    maps = lifted_maps(generic()).requires_grad_()
-    x = torch.randn(2, 2, 1, *SMALL, dtype=torch.float64, requires_grad=True)
-    y = torch.randn(2, 2, 2, 1, *OTHER, dtype=torch.float64, requires_grad=True)
-    checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    opcheck(torch.ops.mvrecon.warp.default, (x, maps, OTHER), test_utils=checks)
-    opcheck(torch.ops.mvrecon.warp_back.default, (y, maps, list(SMALL)), test_utils=checks)
-    opcheck(
-        torch.ops.mvrecon.warp_vjp.default,
-        (x.detach(), y.detach(), maps.detach()),
-        test_utils=checks,
-    )
-
-
-def test_vmap_over_values_and_over_maps_equals_a_loop():
-    maps = torch.stack([lifted_maps(generic()), 1.1 * lifted_maps(generic()) + 0.01])
-    x = torch.randn(3, 2, 2, 1, *SMALL, dtype=torch.float64)
-    mapped = torch.func.vmap(lambda x: warp(x, maps[0], OTHER, "cpu"), in_dims=1)(x.transpose(0, 1))
-    assert torch.equal(mapped, torch.stack([warp(each, maps[0], OTHER, "cpu") for each in x]))
-    both = torch.func.vmap(lambda x, maps: warp(x, maps, OTHER, "cpu"))(x[:2], maps)
-    assert torch.equal(both[1], warp(x[1], maps[1], OTHER, "cpu"))
-
-    x.requires_grad_()
-    one = torch.autograd.grad(
-        torch.func.vmap(lambda x: warp(x, maps[0], OTHER, "cpu"))(x).square().sum(), x
-    )[0]
-    assert torch.allclose(
-        one, torch.autograd.grad(warp(x.flatten(0, 1), maps[0], OTHER).square().sum(), x)[0]
-    )
-
-
-def test_a_compiled_graph_holds_the_warp_whole():
-    maps = lifted_maps(generic())
-    x = torch.randn(1, 2, 1, *SMALL, requires_grad=True)
-    compiled = torch.compile(
-        lambda x: warp(2 * x, maps, OTHER).sin(), fullgraph=True, backend="aot_eager"
-    )
-    expected = torch.autograd.grad(warp(2 * x, maps, OTHER).sin().sum(), x)[0]
-    assert torch.allclose(torch.autograd.grad(compiled(x).sum(), x)[0], expected)
 
 
 def test_threads_change_no_bit(threads, monkeypatch):

@@ -51,23 +51,23 @@ def _reason(device: str, name: str, dtype: torch.dtype, several: bool) -> str | 
     warnings.filterwarnings(
         "ignore", message="Grid size .* will likely result in GPU under-utilization"
     )
-    bound, found = TOLERANCE[dtype], None
+    bound, failure = TOLERANCE[dtype], None
     try:
         for what, error in differences(
             device, f"{name}:8" if name == "trilinear" else name, dtype, 5 if several else 1
         ):
             if not error <= bound:
-                found = (
-                    found
+                failure = (
+                    failure
                     or f"{what} differs from the reference by {error:.1e}, expected at most "
                     f"{bound:.0e}"
                 )
     # a missing package, no driver, no compiler, a kernel that fails: all mean the same
     except Exception as problem:
-        found = f"{type(problem).__name__}: {problem}"
-    if found:
-        logger.warning("The reference computes %s of %s on %s: %s", name, dtype, device, found)
-    return found
+        failure = f"{type(problem).__name__}: {problem}"
+    if failure:
+        logger.warning("The reference computes %s of %s on %s: %s", name, dtype, device, failure)
+    return failure
 
 
 def differences(
@@ -84,10 +84,10 @@ def differences(
 
     if device != "cpu" and getattr(numba_cuda, "implementation", "") == "Built-in":
         raise ImportError("numba-cuda is not installed, pip install mvrecon[cuda]")
-    from mvrecon.kernels.rays import cuda
+    from mvrecon.kernels.rays.cuda import operators as cuda
 
     lines, window, detector, shape = tiny_scene(device)
-    held = Occupancy.whole(shape)
+    occupancy = Occupancy.whole(shape)
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(volumes, *shape, dtype=dtype, generator=generator).to(device)
     y = torch.rand(volumes, len(lines), *detector, dtype=dtype, generator=generator).to(device)
@@ -96,11 +96,11 @@ def differences(
         views = reference.project(x, moving, window, detector, method)
         (change,) = torch.autograd.grad((views * y).sum(), moving)
     volume = reference.backproject(y, lines, window, shape, method)
-    yield "project", _error(cuda.project(x, lines, window, held, detector, method), views)
-    yield "scatter", _error(cuda.scatter(y, lines, window, held, method), volume)
+    yield "project", _error(cuda.project(x, lines, window, occupancy, detector, method), views)
+    yield "scatter", _error(cuda.scatter(y, lines, window, occupancy, method), volume)
     if method == "joseph":
-        yield "gather", _error(cuda.gather(y, lines, window, held, method), volume)
-    yield "lines_vjp", _error(cuda.lines_vjp(x, y, lines, window, held, method), change)
+        yield "gather", _error(cuda.gather(y, lines, window, occupancy, method), volume)
+    yield "lines_vjp", _error(cuda.lines_vjp(x, y, lines, window, occupancy, method), change)
 
 
 def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:
