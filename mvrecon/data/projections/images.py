@@ -171,7 +171,7 @@ def _opened(file: Path) -> Iterator[Any]:
     from PIL import Image as Pillow
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", "Corrupt EXIF|.*[Tt]runcated", UserWarning)
+        warnings.filterwarnings("error", "Corrupt EXIF|Tag data larger|.*[Tt]runcated", UserWarning)
         with Pillow.open(file, formats=[PILLOW[file.suffix.lower()]]) as image:
             yield image
 
