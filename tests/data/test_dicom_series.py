@@ -125,7 +125,11 @@ BROKEN = {
         lambda k, tags: {"PixelSpacing": [1.5, 2.0 + 0.1 * (k == 5)]},
         r"expected \(5, 6\) pixels of \(1\.5, 2\.\d\) mm",
     ),
-    "no intercept": (lambda k, tags: {"RescaleIntercept": None}, "with RescaleIntercept, got none"),
+    "no intercept": (
+        lambda k, tags: {"RescaleIntercept": None},
+        "a finite RescaleIntercept of .*got None",
+    ),
+    "no series": (lambda k, tags: {"SeriesInstanceUID": ""}, "with SeriesInstanceUID, got none"),
     "no place": (
         lambda k, tags: {"ImagePositionPatient": None},
         "expected ImagePositionPatient as 3 finite numbers, got None",

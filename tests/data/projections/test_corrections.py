@@ -5,6 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 import torch
 import yaml
 from PIL import Image as Pillow
@@ -49,6 +50,14 @@ def test_noise_has_the_variance_of_the_photons(tmp_path):
     write_projections(tmp_path / "again", torch.full((4, 100, 100), integral), Exposure(photons))
     again = open_projections(tmp_path / "again").read(0, 4)
     assert torch.equal(again, open_projections(tmp_path / "scan").read(0, 4))
+
+
+def test_simple_itk_reads_the_images_that_are_written(tmp_path):
+    write_projections(tmp_path / "scan", views())
+    for number, view in enumerate(open_projections(tmp_path / "scan").read(0, 3)):
+        image = sitk.ReadImage(str(tmp_path / "scan" / f"view_0000{number}.tif"))
+        assert image.GetPixelIDTypeAsString() == "16-bit unsigned integer"
+        assert np.array_equal(sitk.GetArrayFromImage(image), view.numpy())
 
 
 def test_fields_are_numbers_files_or_the_folders_own(scan, tmp_path):
