@@ -11,6 +11,7 @@ SCENES = Registry(
     mixture="mvrecon.scenes.mixture:Mixture",
     hdf5="mvrecon.data.volumes:Hdf5Volumes",
     nifti="mvrecon.data.volumes:NiftiVolume",
+    volumes="mvrecon.data.volume_scene:Volumes",
 )
 CAMERAS = Registry(
     "camera",
