@@ -33,6 +33,8 @@ HEADS = Registry(
 )
 RECONSTRUCTORS = Registry(
     "reconstructor",
+    fbp="mvrecon.reconstruct.filtered.fdk:fbp",
+    fdk="mvrecon.reconstruct.filtered.fdk:fdk",
     sirt="mvrecon.reconstruct.iterative:sirt",
     mlem="mvrecon.reconstruct.mlem:mlem",
 )

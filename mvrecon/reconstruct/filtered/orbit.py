@@ -41,9 +41,7 @@ class Orbit:
     def angles(self) -> Float[Tensor, " m"]:
         """Each source's angle about the axis in degrees, the first one's being 0."""
         tangent = torch.linalg.cross(self.axis, self.outwards[0])
-        return torch.rad2deg(
-            torch.atan2(self.outwards @ tangent, self.outwards @ self.outwards[0])
-        )
+        return torch.rad2deg(torch.atan2(self.outwards @ tangent, self.outwards @ self.outwards[0]))
 
     def reach(self, grid: Grid) -> float:
         """The radius in mm about the isocentre of the grid's inscribed cylinder along the axis."""
