@@ -37,7 +37,7 @@ def fdk(
             one if the detector's narrow side does not reach around the grid's inscribed cylinder.
         weights_from: the rig that weights and filter belong to, where it is not the one that is
             back-projected with: the ideal geometry of a misaligned scanner (Karolczak and others,
-            Phys. Med. Biol. 46, 2001). None: A's own.
+            Med. Phys. 28, 2001). None: A's own.
 
     Raises:
         ValueError: parallel beams, sources that are not on a circle, angles that do not suffice,
