@@ -1,5 +1,6 @@
 """FDK of cone beams and FBP of parallel and fan beams, by a projector's grid and cameras."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -105,4 +106,6 @@ def _reconstruct(
         return views[:, :, first:last]
 
     volumes = views.shape[0] * views.shape[1]
-    return filtered_backprojection(read, A.cameras, A.grid, volumes, filtering)
+    x = filtered_backprojection(read, A.cameras, A.grid, volumes, filtering)
+    support = getattr(A, "support", None)
+    return x if support is None else torch.where(support, x, 0)
