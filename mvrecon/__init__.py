@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from mvrecon.projectors.drr import Drr as Drr
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
     from mvrecon.projectors.radon import Radon as Radon
+    from mvrecon.reconstruct.filtered.fdk import fbp as fbp
+    from mvrecon.reconstruct.filtered.fdk import fdk as fdk
+    from mvrecon.reconstruct.filtered.streaming import fdk_streamed as fdk_streamed
     from mvrecon.reconstruct.iterative import sirt as sirt
     from mvrecon.reconstruct.mlem import mlem as mlem
 
@@ -44,6 +47,9 @@ _DOOR = {
     "circular": "mvrecon.cameras.rigs:circular",
     "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.cameras.rigs:dome",
+    "fbp": "mvrecon.reconstruct.filtered.fdk:fbp",
+    "fdk": "mvrecon.reconstruct.filtered.fdk:fdk",
+    "fdk_streamed": "mvrecon.reconstruct.filtered.streaming:fdk_streamed",
     "from_file": "mvrecon.cameras.files:from_file",
     "load": "mvrecon.engine.trained:load",
     "mlem": "mvrecon.reconstruct.mlem:mlem",

@@ -40,6 +40,8 @@ NETWORKS = Registry(
 )
 RECONSTRUCTORS = Registry(
     "reconstructor",
+    fbp="mvrecon.reconstruct.filtered.fdk:fbp",
+    fdk="mvrecon.reconstruct.filtered.fdk:fdk",
     sirt="mvrecon.reconstruct.iterative:sirt",
     mlem="mvrecon.reconstruct.mlem:mlem",
 )
