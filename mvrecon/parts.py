@@ -37,10 +37,16 @@ HEADS = Registry(
     softmax_depth="mvrecon.models.heads:SoftmaxDepth",
     density="mvrecon.models.heads:Density",
 )
+NETWORKS = Registry(
+    "network",
+    unet="mvrecon.models.networks:UNet3d",
+    unet3d="mvrecon.models.published:CicekUNet3d",
+    residual_unet3d="mvrecon.models.published:ResidualUNet3d",
+)
 RECONSTRUCTORS = Registry(
     "reconstructor",
-    fdk="mvrecon.reconstruct.filtered.fdk:fdk",
     fbp="mvrecon.reconstruct.filtered.fdk:fbp",
+    fdk="mvrecon.reconstruct.filtered.fdk:fdk",
     trained="mvrecon.engine.trained:trained",
     sirt="mvrecon.reconstruct.iterative:sirt",
     os_sart="mvrecon.reconstruct.os_sart:os_sart",
@@ -66,4 +72,6 @@ MODELS = Registry(
     sirt="mvrecon.models.baselines:Sirt",
 )
 
-REGISTRIES = {r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, RECONSTRUCTORS, MODELS)}
+REGISTRIES = {
+    r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, NETWORKS, RECONSTRUCTORS, MODELS)
+}

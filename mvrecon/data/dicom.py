@@ -10,6 +10,8 @@ from mvrecon.files.checks import EDGE, VOLUME, Refused, blaming
 #: Endings of DICOM files; a file of another name is one if it says so from byte 128 on.
 DICOM = (".dcm", ".dicom", ".ima")
 MAGIC = 128
+#: The one packed transfer syntax that pydicom reads alone.
+RLE = "1.2.840.10008.1.2.5"
 
 
 def dicom_file(path: Path) -> bool:
@@ -52,7 +54,8 @@ def pixels_of(path: Path) -> np.ndarray:
         frames = int(dataset.get("NumberOfFrames") or 1)
         if 4 * frames * int(dataset.Rows) * int(dataset.Columns) > VOLUME:
             raise Refused(f"{path}: expected at most {VOLUME} bytes of pixels, got more")
-        if dataset.file_meta.TransferSyntaxUID.is_encapsulated:
+        syntax = dataset.file_meta.TransferSyntaxUID
+        if syntax.is_encapsulated and syntax != RLE:
             return _decompressed(path, frames)
         slope = float(dataset.get("RescaleSlope", 1))
         values = dataset.pixel_array.astype(np.float32)

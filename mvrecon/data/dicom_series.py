@@ -85,9 +85,13 @@ def _slice(path: Path) -> Slice:
         raise Refused(f"{path}: expected a slice of the modality CT, got {shown(modality)}")
     if int(dataset.get("NumberOfFrames") or 1) > 1:
         raise Refused(f"{path}: expected one slice in each file, got an image of several frames")
-    for name in ("RescaleSlope", "RescaleIntercept", "SeriesInstanceUID"):
-        if dataset.get(name) is None:
-            raise Refused(f"{path}: expected a CT slice with {name}, got none")
+    for name in ("RescaleSlope", "RescaleIntercept"):
+        with blaming(path, f"has a {name} that cannot be read"):
+            value = dataset.get(name)
+            if value is None or not np.isfinite(float(value)):
+                raise Refused(f"{path}: expected a finite {name} of a CT slice, got {value}")
+    if not dataset.get("SeriesInstanceUID"):
+        raise Refused(f"{path}: expected a slice with SeriesInstanceUID, got none")
     corner = _numbers(path, dataset, "ImagePositionPatient", 3)
     axes = _numbers(path, dataset, "ImageOrientationPatient", 6).reshape(2, 3)
     down, right = _numbers(path, dataset, "PixelSpacing", 2).tolist()

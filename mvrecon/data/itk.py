@@ -178,8 +178,8 @@ def _data_file(path: Path) -> tuple[Path, bool]:
 def _entries(lines: Sequence[str], sign: str) -> dict[str, str]:
     entries: dict[str, str] = {}
     for line in lines:
-        key, found, value = line.partition(sign)
-        if found:
+        key, between, value = line.partition(sign)
+        if between:
             entries.setdefault(key.strip().lower(), value.strip())
         if key.strip().lower() == "elementdatafile":
             break  # values follow

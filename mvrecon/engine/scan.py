@@ -1,11 +1,11 @@
 """A measured scan: its views on disk, its rig, and the grid that is reconstructed."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras

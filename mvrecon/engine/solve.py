@@ -1,14 +1,13 @@
 """One reconstruction of a measured scan: the method, its progress, its time and memory."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from inspect import signature
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -18,7 +17,6 @@ from mvrecon.engine.scan import Scan
 from mvrecon.files.memory import peak
 from mvrecon.parts import RECONSTRUCTORS, STREAMED
 from mvrecon.reconstruct.held_out import held_out
-from mvrecon.reconstruct.problem import Iterate
 from mvrecon.reconstruct.stopping import Curve, combined, discrepancy
 
 #: Views whose residual is computed at a time.

@@ -1,5 +1,7 @@
 """Projections as one array: .npy, .mha, .mhd, .nrrd, and the views.h5 of `mvrecon-simulate`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
@@ -84,9 +86,13 @@ class Hdf5Views(ProjectionStack):
             super().__init__(path, names, views.shape[1:], views.dtype)
 
     @staticmethod
-    def _opened(path: Path) -> h5py.File:
-        with blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"):
-            return h5py.File(path, "r", locking="best-effort")
+    @contextmanager
+    def _opened(path: Path) -> Iterator[h5py.File]:
+        with (
+            blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
+            h5py.File(path, "r", locking="best-effort") as file,
+        ):
+            yield file
 
     def _block(self, first: int, last: int) -> np.ndarray:
         with self._opened(self.path) as file:

@@ -72,31 +72,44 @@ def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -
         gaps: see `ordered`.
 
     Raises:
-        Refused: no image, too many, or of several endings.
+        Refused: no image, too many, or of several formats.
     """
     images = _images(folder, pattern)
-    views = [file for file in images if not FIELD.match(file.name)]
-    return ImageFiles(ordered(views if views and not pattern else images, gaps))
+    views = [file for file in images if not FIELD.match(file.name)] or images
+    _check_kind(folder, views, f" named {pattern}" if pattern else "")
+    return ImageFiles(ordered(views, gaps))
 
 
 def field_files(folder: Path, field: str) -> list[Path]:
-    """The images of a folder whose names begin with "dark" or with "flat"."""
-    return sorted(f for f in _images(folder, None) if f.name.lower().startswith(field))
+    """The images of a folder whose names begin with "dark" or with "flat"; perhaps none.
+
+    Raises:
+        Refused: they are of several formats.
+    """
+    files = [file for file in _images(folder) if file.name.lower().startswith(field)]
+    if files:
+        _check_kind(folder, files, f" of the {field} field")
+    return files
 
 
-def _images(folder: Path, pattern: str | None) -> list[Path]:
+def _images(folder: Path, pattern: str | None = None) -> list[Path]:
     files = []
-    for file in sorted(folder.glob(pattern or "*")):
+    with blaming(folder, f"has no names like {pattern!r}", "expected such as scan_*.tif"):
+        inside = sorted(folder.glob(pattern or "*"))
+    for file in inside:
         if file.is_file() and not file.name.startswith(".") and _ending(file):
             files.append(file)
         if len(files) > VIEWS:
             raise Refused(f"{folder}: expected at most {VIEWS} images, got more")
+    return files
+
+
+def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
+    """Refuse no images, or images of several formats."""
     kinds = sorted({_ending(file) for file in files})
     if len(kinds) != 1:
         got = f"those of {' and '.join(kinds)}; choose by pattern=..." if kinds else "none"
-        where = f" named {pattern}" if pattern else ""
-        raise Refused(f"{folder}: expected images{where} (TIFF, PNG or DICOM), got {got}")
-    return files
+        raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
 
 
 def _ending(file: Path) -> str:
@@ -171,7 +184,7 @@ def _opened(file: Path) -> Iterator[Any]:
     from PIL import Image as Pillow
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", "Corrupt EXIF|.*[Tt]runcated", UserWarning)
+        warnings.filterwarnings("error", "Corrupt EXIF|Tag data larger|.*[Tt]runcated", UserWarning)
         with Pillow.open(file, formats=[PILLOW[file.suffix.lower()]]) as image:
             yield image
 

@@ -48,8 +48,8 @@ class Region:
         """
         pair = (binning, binning) if isinstance(binning, int) else tuple(binning)
         kept = [
-            (0, count) if given is None else tuple(given)
-            for given, count in zip((rows, columns), detector, strict=True)
+            (0, count) if ends is None else tuple(ends)
+            for ends, count in zip((rows, columns), detector, strict=True)
         ]
         for name, part, count in zip(("rows", "columns"), kept, detector, strict=True):
             whole = len(part) == 2 and all(type(n) is int for n in part)

@@ -1,14 +1,15 @@
 """FDK of cone beams and FBP of parallel and fan beams, by a projector's grid and cameras."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.projectors.checks import check_views
+from mvrecon.projectors.checks import check
 from mvrecon.projectors.operator import Projector, Scaled
 from mvrecon.reconstruct.filtered.filters import Filter
 from mvrecon.reconstruct.filtered.scan_weights import ScanKind
-from mvrecon.reconstruct.filtered.streaming import filtered_backprojection
+from mvrecon.reconstruct.filtered.streaming import Filtering, filtered_backprojection
 
 
 def fdk(
@@ -37,7 +38,7 @@ def fdk(
             one if the detector's narrow side does not reach around the grid's inscribed cylinder.
         weights_from: the rig that weights and filter belong to, where it is not the one that is
             back-projected with: the ideal geometry of a misaligned scanner (Karolczak and others,
-            Phys. Med. Biol. 46, 2001). None: A's own.
+            Med. Phys. 28, 2001). None: A's own.
 
     Raises:
         ValueError: parallel beams, sources that are not on a circle, angles that do not suffice,
@@ -46,7 +47,7 @@ def fdk(
     cameras = _plain(A, "fdk")
     if cameras.parallel:
         raise ValueError("fdk needs a cone or fan beam, got parallel beams; use fbp")
-    return _reconstruct(A, views, filter, cutoff, scan, weights_from)
+    return _reconstruct(A, views, Filtering(filter, cutoff, scan, weights_from))
 
 
 def fbp(
@@ -79,7 +80,7 @@ def fbp(
             f"fbp needs parallel beams or fans of one row, got a cone beam of {cameras.shape[0]} "
             f"rows; use fdk"
         )
-    return _reconstruct(A, views, filter, cutoff, scan, None)
+    return _reconstruct(A, views, Filtering(filter, cutoff, scan))
 
 
 def _plain(A: Projector, name: str) -> Cameras:
@@ -97,20 +98,14 @@ def _plain(A: Projector, name: str) -> Cameras:
 
 
 def _reconstruct(
-    A: Projector,
-    views: Float[Tensor, "b c m v u"],
-    filter: Filter,
-    cutoff: float,
-    scan: ScanKind,
-    weights_from: Cameras | None,
+    A: Projector, views: Float[Tensor, "b c m v u"], filtering: Filtering
 ) -> Float[Tensor, "b c d h w"]:
-    check_views(views, A.cameras)
-    return filtered_backprojection(
-        lambda first, last: views[:, :, first:last],
-        A.cameras,
-        A.grid,
-        filter,
-        cutoff,
-        scan,
-        weights_from,
-    )
+    check(views, "views [b c m v u]", (len(A.cameras), *A.cameras.shape), views.device)
+
+    def read(first: int, last: int) -> Tensor:
+        return views[:, :, first:last]
+
+    volumes = views.shape[0] * views.shape[1]
+    x = filtered_backprojection(read, A.cameras, A.grid, volumes, filtering)
+    support = getattr(A, "support", None)
+    return x if support is None else torch.where(support, x, 0)

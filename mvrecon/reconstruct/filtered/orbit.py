@@ -41,9 +41,7 @@ class Orbit:
     def angles(self) -> Float[Tensor, " m"]:
         """Each source's angle about the axis in degrees, the first one's being 0."""
         tangent = torch.linalg.cross(self.axis, self.outwards[0])
-        return torch.rad2deg(
-            torch.atan2(self.outwards @ tangent, self.outwards @ self.outwards[0])
-        )
+        return torch.rad2deg(torch.atan2(self.outwards @ tangent, self.outwards @ self.outwards[0]))
 
     def reach(self, grid: Grid) -> float:
         """The radius in mm about the isocentre of the grid's inscribed cylinder along the axis."""
@@ -78,7 +76,13 @@ def orbit_of(cameras: Cameras, grid: Grid) -> Orbit:
 
 def _turn(cameras: Cameras, grid: Grid) -> Orbit:
     look = unit(cameras.origin - cameras.source)
-    axis = torch.linalg.svd(look)[2][2]
+    _, sizes, axes = torch.linalg.svd(look)
+    if len(look) < 2 or sizes[1] < 1e-6 * sizes[0]:
+        raise ValueError(
+            f"FBP needs parallel beams from two directions at least, got {len(look)} views along "
+            f"one line"
+        )
+    axis = axes[2]
     if (leave := (look @ axis).abs().max().item()) > TOLERANCE:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "

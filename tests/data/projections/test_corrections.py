@@ -1,10 +1,13 @@
 """Grey values become the line integrals that they were made of, and geometry follows the pixels."""
 
 import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 import torch
+import yaml
 from PIL import Image as Pillow
 
 from mvrecon.data.projections.corrections import Fields, filled, transmission
@@ -12,7 +15,8 @@ from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.region import Region
 from mvrecon.data.projections.writing import Exposure, write_projections
-from mvrecon.parts import CAMERAS
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, PROJECTORS
 from tests.data.conftest import RIG
 from tests.data.projections.conftest import VIEWS, grey
 
@@ -48,6 +52,14 @@ def test_noise_has_the_variance_of_the_photons(tmp_path):
     assert torch.equal(again, open_projections(tmp_path / "scan").read(0, 4))
 
 
+def test_simple_itk_reads_the_images_that_are_written(tmp_path):
+    write_projections(tmp_path / "scan", views())
+    for number, view in enumerate(open_projections(tmp_path / "scan").read(0, 3)):
+        image = sitk.ReadImage(str(tmp_path / "scan" / f"view_0000{number}.tif"))
+        assert image.GetPixelIDTypeAsString() == "16-bit unsigned integer"
+        assert np.array_equal(sitk.GetArrayFromImage(image), view.numpy())
+
+
 def test_fields_are_numbers_files_or_the_folders_own(scan, tmp_path):
     own = Measured(path=str(scan)).open().whole().views
     expected = -torch.log((torch.from_numpy(grey().astype("f4")) - 100) / 60_000)
@@ -55,11 +67,11 @@ def test_fields_are_numbers_files_or_the_folders_own(scan, tmp_path):
     dark, flat = str(scan / "dark.tif"), str(scan / "flat.tif")
     for options in ({"dark": 100, "flat": 60_100.0}, {"dark": dark, "flat": flat}, {"flat": flat}):
         assert torch.equal(Measured(path=str(scan), **options).open().whole().views, own)
-    fields = tmp_path / "fields"
-    fields.mkdir()
+    flats = tmp_path / "flats"
+    flats.mkdir()
     for k, value in enumerate((60_000, 60_200)):  # their mean is the flat field
-        Pillow.fromarray(np.full((6, 8), value, "u2")).save(fields / f"flat_{k}.tif")
-    averaged = Measured(path=str(scan), flat=str(fields)).open().whole().views
+        Pillow.fromarray(np.full((6, 8), value, "u2")).save(flats / f"flat_{k}.tif")
+    averaged = Measured(path=str(scan), flat=str(flats)).open().whole().views
     assert torch.allclose(averaged, own, atol=1e-6)
 
 
@@ -88,6 +100,26 @@ def test_a_joined_pixel_is_centred_on_the_pixels_it_is_made_of(name):
     for got, whole in zip(region.seen_by(cameras).rays(), cameras.rays(), strict=True):
         expected = whole[:, 1:9, 3:12].reshape(3, 4, 2, 3, 3, 3).mean(dim=(2, 4))
         assert torch.allclose(got, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_what_a_part_of_the_detector_measures_is_what_its_cameras_measure(binning):
+    grid, cameras = Grid.centred(size=(12, 10, 8), spacing=9.0), CAMERAS.from_config(RIG)
+    x = torch.rand(1, 1, *grid.shape, generator=torch.Generator().manual_seed(0)).double()
+    region = Region.of(cameras.shape, rows=[2, 8], columns=[4, 12], binning=binning)
+    whole = PROJECTORS.build("drr", grid=grid, cameras=cameras)(x)[0, 0]
+    part = PROJECTORS.build(
+        "drr", grid=grid, cameras=region.seen_by(cameras), rays_per_pixel=binning
+    )
+    got = region.binned(region.cropped(whole))
+    assert got.shape == (3, *region.shape) and got.max() > 10
+    assert torch.allclose(got, part(x)[0, 0], atol=1e-9)
+
+
+def test_the_settings_are_the_options(root):
+    settings = yaml.safe_load((root / "conf" / "views" / "measured.yaml").read_text())
+    assert settings.pop("path") == "???"
+    assert settings == {f.name: f.default for f in fields(Measured) if f.name != "path"}
 
 
 def test_cameras_are_those_of_the_views_that_are_taken(scan):

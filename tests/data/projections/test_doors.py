@@ -160,6 +160,9 @@ def test_images_of_several_sizes_are_refused(scan, tmp_path):
     Pillow.fromarray(values).save(scan / "view_4.png")
     with pytest.raises(Refused, match="those of PNG and TIFF; choose by pattern="):
         open_projections(scan)
+    Pillow.fromarray(values).save(scan / "view_4.tif")
+    chosen = Measured(path=str(scan), pattern="*.tif").open()  # dark and flat are no views
+    assert chosen.n_views == VIEWS and chosen.whole().views.isfinite().all()
     pages = [Pillow.fromarray(values), Pillow.fromarray(values[:3])]
     pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:])
     with pytest.raises(Refused, match="on every page, got 3 x 8 pixels of uint16 on page 1"):
@@ -213,6 +216,8 @@ def test_nothing_to_read_is_told(tmp_path, monkeypatch):
     with pytest.raises(Refused, match=r"notes\.txt: expected a folder of TIFF"):
         open_projections(tmp_path / "notes.txt")
     images(tmp_path / "scan", grey())
+    with pytest.raises(Refused, match="has no names like '/etc/.*expected such as scan_"):
+        open_projections(tmp_path / "scan", pattern="/etc/*")
     with pytest.raises(Refused, match=r"expected images named b_\* .*got none"):
         open_projections(tmp_path / "scan", pattern="b_*")
     monkeypatch.setattr(image_module, "VIEWS", 5)
