@@ -170,11 +170,13 @@ def _linearised(
     start: Cameras, points: Tensor, uv: Tensor, values: Float[Tensor, "m 9"]
 ) -> tuple[Float[Tensor, "m k"], Float[Tensor, "m k 9"]]:
     """The residual and its derivatives by the nine unknowns of each view (forward mode)."""
-    columns, r = [], None
-    for direction in torch.eye(9, dtype=torch.float64):
-        r, column = torch.func.jvp(
-            lambda x: _residual(start, points, uv, x), (values,), (direction.expand_as(values),)
-        )
-        columns.append(column)
-    assert r is not None
-    return r, torch.stack(columns, dim=-1)
+
+    def residual(x: Tensor) -> Tensor:
+        return _residual(start, points, uv, x)
+
+    directions = torch.eye(9, dtype=torch.float64)
+    columns = [
+        torch.func.jvp(residual, (values,), (direction.expand_as(values),))[1]
+        for direction in directions
+    ]
+    return residual(values), torch.stack(columns, dim=-1)  # type: ignore[arg-type]
