@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.culling import views_that_see
+from mvrecon.cameras.detector import detector_centre
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 
@@ -27,10 +28,8 @@ def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
     Raises:
         ValueError: beams of one direction alone, which meet nowhere in particular.
     """
-    rows, columns = cameras.shape
     if cameras.parallel:
-        shift = cameras.u * (columns - 1) / 2 + cameras.v * (rows - 1) / 2
-        start, way = cameras.source + shift, unit(cameras.origin - cameras.source)
+        start, way = detector_centre(cameras), unit(cameras.origin - cameras.source)
     else:
         start, way = cameras.source, unit(torch.linalg.cross(cameras.u, cameras.v))
     across = torch.eye(3).to(way) - way[:, :, None] * way[:, None, :]
@@ -88,8 +87,8 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
             f"{sees(rig, centre[None]).double().mean().item():.0%}; are detector offsets and axes "
             f"right?"
         )
-    ends = torch.cat(rig.rays(), dim=0).reshape(-1, 3) - centre
-    high = torch.full_like(low, ends.norm(dim=-1).max().item())
+    ends = torch.stack([rig.source, detector_centre(rig)]) - centre
+    high = torch.full_like(low, 2 * ends.norm(dim=-1).max().item())
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         inside = enough(middle)

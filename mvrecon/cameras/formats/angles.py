@@ -11,12 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.detector import Detector
+from mvrecon.cameras.detector import Detector, detector_centre
 from mvrecon.cameras.formats.text import (
     VIEWS,
     check_degrees,
     check_distances,
-    detector_centre,
     number,
     save_lines,
     square_pixels,

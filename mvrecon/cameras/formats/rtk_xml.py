@@ -12,12 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.detector import Detector
+from mvrecon.cameras.detector import Detector, detector_centre
 from mvrecon.cameras.formats.text import (
     VIEWS,
     check_degrees,
     check_distances,
-    detector_centre,
     number,
     square_pixels,
 )
@@ -139,8 +138,9 @@ def _cameras(table: Float[Tensor, "m 9"], plate: Detector) -> Cameras:
     looking = axes * axes.new_tensor([1, -1, -1])[:, None]
     source = torch.stack([x if parallel else source_x, y if parallel else source_y, sid], dim=-1)
     centre = torch.stack([x, y, -sid if parallel else sid - sdd], dim=-1)
-    ends = ((axes.mT @ point[..., None])[..., 0] for point in (source, centre))
-    return plate.carried(*ends, looking, parallel, "line" if parallel else "segment")
+    source, centre = ((axes.mT @ point[..., None])[..., 0] for point in (source, centre))
+    extent = "line" if parallel else "segment"
+    return plate.carried(source, centre, looking, parallel, extent)
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:

@@ -139,9 +139,3 @@ def square_pixels(cameras: Cameras, who: str) -> tuple[float, float]:
             f"cosine {skew:.3g} and sizes that differ by {100 * spread:.3g} %"
         )
     return v[0].item(), u[0].item()
-
-
-def detector_centre(cameras: Cameras) -> Float[Tensor, "m 3"]:
-    """Where the middle of each detector is, in mm."""
-    rows, columns = cameras.shape
-    return cameras.origin + cameras.u * (columns - 1) / 2 + cameras.v * (rows - 1) / 2

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.detector import Detector
-from mvrecon.cameras.formats.text import VIEWS, check_distances, detector_centre, square_pixels
+from mvrecon.cameras.detector import Detector, detector_centre
+from mvrecon.cameras.formats.text import VIEWS, check_distances, square_pixels
 from mvrecon.cameras.formats.world import from_world, into_world
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import Refused, blaming, shown, text_of

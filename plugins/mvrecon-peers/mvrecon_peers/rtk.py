@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.cameras.detector import detector_centre
 from mvrecon.cameras.formats.rtk_xml import gantry_angles
 from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Paired, load
@@ -52,7 +53,7 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
                 f"mm"
             )
     axes = torch.stack([u, v, torch.linalg.cross(u, v)], dim=1)
-    centre = rig.origin + rig.u * (columns - 1) / 2 + rig.v * (rows - 1) / 2
+    centre = detector_centre(rig)
     across, down, depth = (axes * centre[:, None]).sum(dim=-1).unbind(dim=-1)
     x, y, z = (axes * rig.source[:, None]).sum(dim=-1).unbind(dim=-1)
     below = z - depth
