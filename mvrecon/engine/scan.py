@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.cameras.field import auto_grid, check_rig_sees
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import MeasuredViews
@@ -57,14 +58,18 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     """The scan that the settings `views`, `camera`, `grid` and `projector` describe.
 
     Args:
-        settings: `views` are options of `Measured`; a camera's detector without pixels has those of
-            the views on disk; `grid` is "auto", `{like: <volume>}`, or options of `Grid.centred`.
+        settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
+            counts them from the other end (`flip_rows`); a camera's detector without pixels has those of
+            the views on disk; `grid` has size, spacing and centre, or like; without any of them it
+            is `auto_grid`'s.
 
     Raises:
         ValueError: another number of cameras than of views, a rig that does not see the grid, a
             grid that does not fit into memory; what the parts raise.
     """
-    measured = Measured(**settings["views"]).open()
+    flipped = settings["views"]["flip_rows"] or flips_rows(settings["camera"])
+    views = {**settings["views"], "flip_rows": flipped}
+    measured = Measured(**views).open()
     rig = CAMERAS.from_config(_with_pixels(settings["camera"], measured.stack.shape))
     cameras = measured.cameras(rig)
     grid = _grid(settings["grid"], cameras)
@@ -75,23 +80,27 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
 
 
 def _with_pixels(camera: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Any]:
-    """A camera's settings with the number of pixels of the views, where it has none."""
-    detector = camera.get("detector")
-    if not isinstance(detector, Mapping) or detector.get("pixels") is not None:
-        return dict(camera)
-    return {**camera, "detector": {**detector, "pixels": list(shape)}}
+    """A camera's settings with the number of pixels of the views, where `pixels` is null."""
+    filled = {**camera}
+    if isinstance(detector := camera.get("detector"), Mapping):
+        filled["detector"] = _with_pixels(detector, shape)
+    if camera.get("pixels", shape) is None:
+        filled["pixels"] = list(shape)
+    return filled
 
 
-def _grid(options: str | Mapping[str, Any], cameras: Cameras) -> Grid:
-    if options == "auto":
+def _grid(options: Mapping[str, Any], cameras: Cameras) -> Grid:
+    if (like := options["like"]) is not None:
+        if options["size"] is not None or options["spacing"] is not None:
+            raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")
+        return read_volume(like)[1]
+    if options["size"] is None and options["spacing"] is None:
         return auto_grid(cameras)
-    if not isinstance(options, Mapping):
+    if options["size"] is None or options["spacing"] is None:
         raise ValueError(
-            f"Expected the grid as auto, {{like: <volume>}} or {{size: [x, y, z], spacing: mm}}, "
-            f"got {options!r}"
+            f"Expected grid.size (voxels) and grid.spacing (mm) together, got size "
+            f"{options['size']} and spacing {options['spacing']}"
         )
-    if "like" in options:
-        if others := sorted(set(options) - {"like"}):
-            raise ValueError(f"A grid like a volume takes no other options, got {others}")
-        return read_volume(options["like"])[1]
-    return Grid.centred(**options)
+    return Grid.centred(
+        size=options["size"], spacing=options["spacing"], centre=options["centre"]
+    )
