@@ -9,14 +9,13 @@ from mvrecon.data.module import SceneData
 from tests.data.conftest import RIG
 
 GRID = {"shape": [6, 6, 6], "spacing": 8.0}
+MEASUREMENT = {"grid": GRID, "camera": RIG}
 RANDOM = {"name": "ellipsoids"}
 
 
 def build(scene=RANDOM, test_scene=None, seed=0, **sizes):
     scenes = {"train": scene, "test": test_scene or scene}
-    return SceneData(
-        scenes, GRID, RIG, {"train": 5, "val": 2, "test": 3, **sizes}, batch_size=2, seed=seed
-    )
+    return SceneData(scenes, MEASUREMENT, {"train": 5, "val": 2, "test": 3, **sizes}, 2, seed=seed)
 
 
 def names(loader):
@@ -121,8 +120,7 @@ def test_wrong_settings_are_refused():
     with pytest.raises(ValueError, match="spacing must be positive"):
         SceneData(
             {"train": RANDOM, "test": RANDOM},
-            {"shape": [4, 4, 4], "spacing": -1.0},
-            RIG,
+            {"grid": {"shape": [4, 4, 4], "spacing": -1.0}, "camera": RIG},
             dict.fromkeys(("train", "val", "test"), 1),
         )
 

@@ -20,7 +20,7 @@ from mvrecon.cameras import files
 from mvrecon.config import compose
 from mvrecon.data import digests
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.engine import agreement, checkpoints, fit, run_folder
+from mvrecon.engine import checkpoints, fit, run_folder
 from mvrecon.engine.checkpoints import Trained
 from mvrecon.engine.evaluation import seen_in_training
 from mvrecon.files.atomic import new_folder
@@ -379,26 +379,3 @@ def test_data_that_have_changed_are_refused(patients, tmp_path, capsys):
         assert f"{path}: got sha256 {got[:16]}, expected {expected[:16]}" in capsys.readouterr().err
     path.write_bytes(whole)
     assert call(mvrecon.eval, f"checkpoint={patients}/run", f"hydra.run.dir={tmp_path}/again") == 0
-
-
-@pytest.mark.parametrize(("projector", "warned"), [("drr", False), ("halved", True)])
-def test_a_projector_that_does_not_make_the_views_is_told(projector, warned, recwarn):
-    """A run whose projector makes something else of the truth than the scene measures says so,
-    once.
-    """
-    from mvrecon.parts import PROJECTORS
-    from mvrecon.projectors.drr import Drr
-
-    @PROJECTORS.register("halved")
-    class Halved(Drr):
-        def forward(self, volume):
-            return super().forward(volume) / 2
-
-    settings = compose(*OPTIONS)
-    settings["projector"] = {"name": projector}
-    agreement.warn_of_other_views(settings, fit.build_data(settings))
-    lines = [str(w.message) for w in recwarn if "add up to" in str(w.message)]
-    assert len(lines) == warned
-    assert all(
-        "projector=halved" in line and "line integrals (drr, radon)" in line for line in lines
-    )
