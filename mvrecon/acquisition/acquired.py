@@ -18,7 +18,7 @@ from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.pixel_integral import PixelIntegral
 from mvrecon.scenes.analytic import case_numbers, generator, mixed
-from mvrecon.scenes.sample import Sample, Scene, Thin, finer
+from mvrecon.scenes.sample import Placing, Sample, Scene, Thin, finer
 
 #: The series of the detector's random numbers, apart from those that draw the objects.
 NOISE = 0x6E6F6973
@@ -86,6 +86,19 @@ class Acquired:
     def thinnest(self, grid: Grid) -> float:
         """The least width in mm of any body in any case on `grid`; infinite where none is known."""
         return self.scene.thinnest(grid) if isinstance(self.scene, Thin) else math.inf
+
+    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"] | None:
+        """The affine map in mm that carries points of the file's world to the case's; None where
+        the scene reads no file.
+        """
+        return self.scene.placement(index, seed, grid) if isinstance(self.scene, Placing) else None
+
+    def unit_of_views(self, grid: Grid, cameras: Cameras) -> str:
+        """Unit of the views: that of line integrals, or the projector's own."""
+        source = self._source_of(grid, cameras)
+        if isinstance(source, Lines) and bool((source.pixel.weight == 1).all()):
+            return f"{self.unit} * mm"
+        return f"{(self.projector or {}).get('name')} of {self.unit}"
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Any) -> Sample:
         """The case `index` of the series `seed`, measured by `cameras`, with its truth on `grid`.

@@ -23,3 +23,12 @@ def attenuation(hu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     outside of their field of view (-1024, -2048) becomes air, 0.
     """
     return WATER * (1 + hu.clamp(-1000, 0) / 1000) + (BONE - WATER) * hu.clamp(min=0) / 1000
+
+
+def hounsfield(mu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Hounsfield units of a linear attenuation in 1/mm: the inverse of `attenuation`.
+
+    HU = 1000 (mu - WATER) / WATER up to water, 1000 (mu - WATER) / (BONE - WATER) above.
+    """
+    above = mu - WATER
+    return 1000 * (above.clamp(max=0) / WATER + above.clamp(min=0) / (BONE - WATER))

@@ -75,6 +75,15 @@ class Thin(Protocol):
 
 
 @runtime_checkable
+class Placing(Protocol):
+    """A scene that moves the objects of its files to where its cases are."""
+
+    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"]:
+        """The affine map in mm that carries points of the file's world to the case's."""
+        ...
+
+
+@runtime_checkable
 class Finer(Protocol):
     """A scene that gives the object of a case on a finer grid without its views."""
 
