@@ -4,6 +4,7 @@ config.
 
 import re
 import sys
+from dataclasses import asdict
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -60,6 +61,17 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
         )
         part = node["model"]["head"] if group == "head" else node[group]
         assert part["name"] in REGISTRIES[group].names()
+
+
+def test_every_file_of_acquisitions_sets_every_option():
+    from mvrecon.acquisition.settings import Acquisition
+
+    files = sorted((conf_dir() / "acquisition").glob("*.yaml"))
+    assert files
+    for file in files:
+        node = compose(f"acquisition={file.stem}")["acquisition"]
+        assert asdict(Acquisition.of(node)) == node
+    assert Acquisition.of(compose()["acquisition"]) == Acquisition()
 
 
 def test_the_head_is_chosen_on_the_command_line():

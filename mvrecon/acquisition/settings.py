@@ -10,7 +10,7 @@ from mvrecon.registry import hint
 
 @dataclass(frozen=True, kw_only=True)
 class Acquisition:
-    """Acquisition describes the detector, with lengths in mm on it and noise in photons or counts.
+    """The acquisition describes a detector, with lengths in mm and noise in photons or counts.
 
     The default is a perfect detector: views are what the projector makes of the object. With
     `photons` blur and scatter act on the intensity exp(-y); else on the views y.
@@ -20,9 +20,9 @@ class Acquisition:
             reconstruction's, at least 2. Projectors of line integrals do without: an analytic
             phantom has them in closed form, a file's scene has its own option `fine`.
         blur_mm: of the detector, full width at half maximum of a Gaussian.
-        scatter: scattered part of what is detected, per primary. Emission: a blurred share of the
-            primary, added. With `photons`: of the primary I times its line integral y, so that air
-            has none.
+        scatter: share of the primary that is added, blurred. With `photons` it is a share of the
+            intensity times its line integral, y exp(-y), so that air has none (Ohnesorge, Flohr,
+            Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563, convolve weighted projections likewise).
         scatter_mm: blur of the scattered part, full width at half maximum of a Gaussian.
         photons: on a pixel without an object in the beam (I0); the views are -log of Poisson
             numbers per I0, half a photon at least. inf: no noise. None: views are not intensities.
