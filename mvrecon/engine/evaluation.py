@@ -117,7 +117,7 @@ def results(
         "seed": settings["seed"],
         "scenes": names,
         "seen_in_training": seen_in_training(trained.values(), names, truths),
-        "overlap": data.overlap,
+        "overlap": data.overlap and data.scenes["test"].length is not None,
         "projector": settings["projector"],
         "acquisition": asdict(data.acquisition),
         "data_range": data.data_range,
