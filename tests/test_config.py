@@ -5,6 +5,7 @@ config.
 import inspect
 import re
 import sys
+from dataclasses import asdict
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -75,6 +76,17 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
         )
         part = node["model"][group] if group in NESTED else node[group]
         assert part["name"] in REGISTRIES[group].names()
+
+
+def test_every_file_of_acquisitions_sets_every_option():
+    from mvrecon.acquisition.settings import Acquisition
+
+    files = sorted((conf_dir() / "acquisition").glob("*.yaml"))
+    assert files
+    for file in files:
+        node = compose(f"acquisition={file.stem}")["acquisition"]
+        assert asdict(Acquisition.of(node)) == node
+    assert Acquisition.of(compose()["acquisition"]) == Acquisition()
 
 
 def test_head_and_networks_are_chosen_on_the_command_line():

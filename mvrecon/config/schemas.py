@@ -10,13 +10,15 @@ from omegaconf import MISSING
 
 @dataclass
 class Measurement:
-    """The top-level keys that all apps share: what is measured, and by which rig."""
+    """The top-level keys that the apps share: what is measured, by which rig, and how."""
 
     name: str = MISSING
     seed: int = 0
     grid: Any = None
     scene: Any = None
     camera: Any = None
+    projector: Any = None
+    acquisition: Any = None
     plugins: Any = field(default_factory=list)
 
 
@@ -34,7 +36,6 @@ class Settings(Measurement):
     """
 
     test_scene: Any = None
-    projector: Any = None
     model: Any = None
     compare: Any = field(default_factory=dict)
     loss: Any = field(default_factory=dict)
@@ -73,6 +74,7 @@ class Evaluation:
     name: str = MISSING
     checkpoint: str = MISSING
     test_scene: Any = None
+    acquisition: Any = None
     data: Any = None
     compare: Any = field(default_factory=dict)
     device: str = "auto"

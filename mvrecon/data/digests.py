@@ -1,10 +1,15 @@
-"""SHA-256 digests of a run's measurement: of the rig, and of the files that its scenes read."""
+"""SHA-256 digests of a run's measurement: of the rig, of the files that its scenes read, and of the
+volumes that it trains on.
+"""
 
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
 
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.files.checks import Refused
@@ -26,6 +31,12 @@ def of_rig(cameras: Cameras) -> str:
         "extent": cameras.extent,
     }
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def of_volume(volume: Float[Tensor, "*c d h w"]) -> str:
+    """Digest of a volume's float32 values, by which a case is known again under another name."""
+    values = volume.detach().cpu().float().contiguous().numpy()
+    return hashlib.sha256(values.tobytes()).hexdigest()
 
 
 def of_file(path: str | Path) -> str:

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.cameras.field import auto_grid, check_rig_sees
+from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.volume_files import read_volume
@@ -59,8 +59,8 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
 
     Args:
         settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
-            counts them from the other end (`flip_rows`); a camera's detector without pixels has those of
-            the views on disk; `grid` has size, spacing and centre, or like; without any of them it
+            counts them from the other end (`flip_rows`); a camera's detector without pixels has
+            those of the views on disk; `grid` has size, spacing and centre, or like; without any of them it
             is `auto_grid`'s.
 
     Raises:
@@ -101,6 +101,4 @@ def _grid(options: Mapping[str, Any], cameras: Cameras) -> Grid:
             f"Expected grid.size (voxels) and grid.spacing (mm) together, got size "
             f"{options['size']} and spacing {options['spacing']}"
         )
-    return Grid.centred(
-        size=options["size"], spacing=options["spacing"], centre=options["centre"]
-    )
+    return Grid.centred(size=options["size"], spacing=options["spacing"], centre=options["centre"])
