@@ -64,6 +64,9 @@ def shared_misalignment(
     """Detector offset (pixels) and axis tilt (degrees) that all views share, from the measured
     views alone.
 
+    A tilt needs a grid fine enough for the object: errors of sharp edges on a coarse one outweigh
+    it (experiments/08_calibration).
+
     Args:
         operator_of: the operator of a rig, such as `partial(Drr, grid)`; the grid must hold the
             whole object.

@@ -38,7 +38,6 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
         ValueError: detectors that are not rectangular, pixels that differ between views, or
             parallel beams that are not square to their detector.
     """
-    rows, columns = rig.shape
     u, v = (torch.nn.functional.normalize(step, dim=-1) for step in (rig.u, rig.v))
     if (skew := (u * v).sum(-1).abs().max().item()) > 1e-6:
         raise ValueError(
