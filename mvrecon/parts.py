@@ -50,6 +50,7 @@ MODELS = Registry(
     geometry_free="mvrecon.models.baselines:GeometryFree",
     backprojection="mvrecon.models.baselines:Backprojection",
     sirt="mvrecon.models.baselines:Sirt",
+    classical="mvrecon.models.classical:Classical",
 )
 
 REGISTRIES = {r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, RECONSTRUCTORS, MODELS)}
