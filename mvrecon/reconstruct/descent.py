@@ -52,7 +52,7 @@ def descend(
         if momentum == "restarted":
             t = torch.where(_turns_back(ahead, x, last), 1, t)
         root = 1 + 4 * t * t
-        root = math.sqrt(root) if isinstance(root, float) else root.sqrt()
+        root = root.sqrt() if isinstance(root, Tensor) else math.sqrt(root)
         t, before = (1 + root) / 2, t
         beta = (before - 1) / t
         ahead = x + beta * (x - last)
