@@ -23,9 +23,9 @@ from tests.reconstruct.methods import Dense, gap
 STEPS = (1.5, 2.0, 0.5)
 
 
-def slice_operator(views: int = 8):
-    """A slice of 24 x 24 voxels and a fan of few views."""
-    grid = Grid.centred(size=(24, 24, 1), spacing=2.0)
+def slice_operator(views: int = 8, size: int = 24):
+    """A square slice and a fan of few views."""
+    grid = Grid.centred(size=(size, size, 1), spacing=2.0)
     rig = circular(views, 200.0, 400.0, {"pixels": [1, 40], "pixel_mm": 3.0})
     return PROJECTORS.build("drr", grid=grid, cameras=rig)
 
@@ -104,19 +104,18 @@ def test_constant_pieces_from_few_views_come_back_by_total_variation_and_not_by_
     A = slice_operator(7)
     y = A(blocks)
     plain = gap(sirt(A, y, 300, momentum=True), blocks)
-    assert gap(fista_tv(A, y, 300, 1e-4), blocks) < 0.3 * plain
+    assert gap(fista_tv(A, y, 200, 1e-4), blocks) < 0.3 * plain
 
 
-@pytest.mark.parametrize("weight", [1e-3, 1e-2])
-def test_all_ways_to_the_minimum_agree(blocks, weight):
+def test_all_ways_to_the_minimum_agree(blocks):
     torch.manual_seed(0)
-    A = slice_operator()
+    A, blocks, weight = slice_operator(size=14), blocks[..., 4:18, 4:18], 3e-3
     y = A(blocks)
     y = y + 0.01 * y.max() * torch.randn_like(y)
     ways = [
-        fista_tv(A, y, 300, weight, inner=20),
-        fista_tv(A, y, 300, weight, inner=20, preconditioned=False),
-        pdhg_tv(A, y, 2500, weight, balance=0.1 if weight < 5e-3 else 0.3),
+        fista_tv(A, y, 100, weight, inner=10),
+        fista_tv(A, y, 100, weight, inner=10, preconditioned=False),
+        pdhg_tv(A, y, 500, weight, balance=0.2),
     ]
     values = torch.stack([tv_objective(A, y, x, weight).squeeze() for x in ways])
     assert (values.max() - values.min()) / values.min() < 1e-3
