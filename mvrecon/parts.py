@@ -70,6 +70,7 @@ MODELS = Registry(
     geometry_free="mvrecon.models.baselines:GeometryFree",
     backprojection="mvrecon.models.baselines:Backprojection",
     sirt="mvrecon.models.baselines:Sirt",
+    classical="mvrecon.models.classical:Classical",
 )
 
 REGISTRIES = {
