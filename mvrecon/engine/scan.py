@@ -1,5 +1,6 @@
 """A measured scan: its views on disk, its rig, and the grid that is reconstructed."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
