@@ -15,7 +15,8 @@ from pathlib import Path
 from mvrecon.parts import REGISTRIES
 from mvrecon.registry import installed, locate
 
-GIVEN = {"self", "grid", "cameras", "projector"}  # what the apps pass in, not options
+#: What the apps and the models pass in, no options.
+GIVEN = {"self", "grid", "cameras", "projector", "inputs", "outputs"}
 
 Definition = ast.ClassDef | ast.FunctionDef
 

@@ -31,6 +31,12 @@ HEADS = Registry(
     softmax_depth="mvrecon.models.heads:SoftmaxDepth",
     density="mvrecon.models.heads:Density",
 )
+NETWORKS = Registry(
+    "network",
+    unet="mvrecon.models.networks:UNet3d",
+    unet3d="mvrecon.models.published:CicekUNet3d",
+    residual_unet3d="mvrecon.models.published:ResidualUNet3d",
+)
 RECONSTRUCTORS = Registry(
     "reconstructor",
     sirt="mvrecon.reconstruct.iterative:sirt",
@@ -46,4 +52,6 @@ MODELS = Registry(
     sirt="mvrecon.models.baselines:Sirt",
 )
 
-REGISTRIES = {r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, RECONSTRUCTORS, MODELS)}
+REGISTRIES = {
+    r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, NETWORKS, RECONSTRUCTORS, MODELS)
+}

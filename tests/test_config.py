@@ -2,6 +2,7 @@
 config.
 """
 
+import inspect
 import re
 import sys
 from importlib.metadata import EntryPoint
@@ -17,6 +18,7 @@ from mvrecon import config
 from mvrecon.config import compose, conf_dir, help_text
 from mvrecon.config.plugins import import_plugins
 from mvrecon.config.targets import instantiate
+from mvrecon.parts import NETWORKS
 from mvrecon.registry import GROUP
 
 EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))
@@ -44,26 +46,45 @@ def test_an_experiment_file_is_short(name: str):
     assert len((conf_dir() / "experiment" / f"{name}.yaml").read_text().splitlines()) <= 25
 
 
-@pytest.mark.parametrize("group", ["scene", "camera", "projector", "model", "head"])
+#: Groups whose part is an option of the model.
+NESTED = {"head": "head@model.head", "network": "network@model.network"}
+
+
+@pytest.mark.parametrize("group", ["scene", "camera", "projector", "model", *NESTED])
 def test_every_option_of_a_group_names_a_part_and_composes(group: str):
     from mvrecon.parts import REGISTRIES
 
     files = sorted((conf_dir() / group).glob("*.yaml"))
     assert files
     for file in files:
-        key = "head@model.head" if group == "head" else group
+        key = NESTED.get(group, group)
         needed = [
             name for name, value in yaml.safe_load(file.read_text()).items() if value == "???"
         ]
         node = compose(
             f"{key}={file.stem}", *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed)
         )
-        part = node["model"]["head"] if group == "head" else node[group]
+        part = node["model"][group] if group in NESTED else node[group]
         assert part["name"] in REGISTRIES[group].names()
 
 
-def test_the_head_is_chosen_on_the_command_line():
+def test_head_and_networks_are_chosen_on_the_command_line():
     assert compose("head@model.head=density")["model"]["head"]["name"] == "density"
+    unchanged, model = compose()["model"], compose("network@model.opinion.network=unet")["model"]
+    assert "network" not in {*unchanged, *unchanged["opinion"], *model}
+    assert model["opinion"] == {
+        **unchanged["opinion"],
+        "network": {"name": "unet", "width": 16, "levels": 3},
+    }
+
+
+@pytest.mark.parametrize("name", ["unet", "unet3d", "residual_unet3d"])
+def test_a_network_s_file_says_every_option(name: str):
+    options = inspect.signature(NETWORKS.get(name)).parameters.keys() - {"inputs", "outputs"}
+    assert set(yaml.safe_load((conf_dir() / "network" / f"{name}.yaml").read_text())) == {
+        "name",
+        *options,
+    }
 
 
 @pytest.fixture

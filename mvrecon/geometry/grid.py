@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mvrecon.files.checks import check_memory
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.rigid import check_rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +129,21 @@ class Grid:
             *[torch.tensor([-0.5, n - 0.5], dtype=torch.float64) for n in sizes.tolist()]
         )
         return self.to_world(ends)
+
+    def moved(self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> "Grid":
+        """Grid after the rigid motion X -> R X + t of the world, t in mm.
+
+        Raises:
+            ValueError: R is not a rotation, or t is not finite.
+        """
+        R, t = rotation.to(self.affine), translation.to(self.affine)
+        check_rotation(R)
+        if not t.isfinite().all():
+            raise ValueError(f"A translation must be finite mm, got {t.tolist()}")
+        affine = self.affine.clone()
+        affine[:3] = R @ affine[:3]
+        affine[:3, 3] += t
+        return Grid(self.shape, affine)
 
     def cropped(self, box: Box) -> "Grid":
         """The voxels in a box, where they are.

@@ -20,7 +20,7 @@ from mvrecon.models.cropping import Cropping
 from mvrecon.models.cross_view import CrossView
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
-from mvrecon.models.networks import UNet3d
+from mvrecon.models.network import network_by_name
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.checks import check_views
@@ -66,10 +66,11 @@ class BackprojectionUNet(nn.Module):
 
     Args:
         projector: holds the grid and the rig.
-        width: channels of the finest level.
+        width: channels of the finest level, where the options name no network.
         start: SIRT iterations of the classical start.
         consistency: learned gradient steps towards the data at the end.
-        options: of `Options` (support, masked, ...): what is left out; nothing by default.
+        options: of `Options`: what is left out (support, masked, ...), nothing by default, and the
+            network.
 
     Raises:
         ValueError: `refine_where`, since no opinions could disagree.
@@ -88,7 +89,7 @@ class BackprojectionUNet(nn.Module):
         _refuse_where(self.options)
         self.cropping = Cropping(projector, self.options)
         self.iterations = start
-        self.net = UNet3d(3, 1, width, zero=True)
+        self.net = network_by_name(self.options.network, 3, 1, width, zero=1)
         self.consistency = Consistency(consistency)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
@@ -122,17 +123,20 @@ class GeometryFree(nn.Module):
 
     Args:
         projector: holds the grid and the rig.
-        width: channels of the finest level.
+        width: channels of the finest level, where no network is named.
+        network: by name, `{"name": ..., **options}`; none for `UNet3d`.
     """
 
-    def __init__(self, projector: Projector, width: int = 18):
+    def __init__(
+        self, projector: Projector, width: int = 18, network: Mapping[str, Any] | None = None
+    ):
         super().__init__()
         self.projector = projector
         self.chord = typical_chord(projector.grid)
-        self.net = UNet3d(len(projector.cameras), 1, width)
+        self.net = network_by_name(network, len(projector.cameras), 1, width)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        views = admitted(views, self.projector.cameras, self.net.last.weight)
+        views = admitted(views, self.projector.cameras, next(self.net.parameters()))
         views = views.contiguous()  # other strides are rounded in another order
         scale = content_scale(views) / self.chord
         depth, *across = self.projector.grid.shape

@@ -17,8 +17,8 @@ from mvrecon.models.consistency import Consistency, normalised
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
-from mvrecon.models.networks import UNet3d
-from mvrecon.models.opinion import Opinions
+from mvrecon.models.network import network_by_name
+from mvrecon.models.opinion import DepthNetwork, Opinions
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.pooling import deviation, disagreement, pooled
@@ -32,17 +32,19 @@ class CrossView(nn.Module):
     Args:
         projector: holds the grid and the rig.
         head: the head's name and options.
-        opinion: options of `Opinions` (width, features, binning, shared, prior).
+        opinion: fields of `DepthNetwork` (width, features, binning, shared, prior, network).
         fusion: "weighted" by a U-Net, or the plain "mean" over the cameras that see a voxel.
-        refine: channels of the U-Net that corrects the fused volume, 0 for none: a weighted mean
-            cannot create what no camera holds.
+        refine: channels of the U-Net that corrects the fused volume, 0 for no correction: a
+            weighted mean cannot create what no camera holds.
         start: SIRT iterations of the classical start.
         consistency: learned gradient steps towards the data at the end.
-        options: of `Options` (support, masked, ...): what is left out; nothing by default.
+        options: of `Options`: what is left out (support, masked, ...), nothing by default, and the
+            network that corrects the fused volume.
 
     Raises:
         TypeError: an option that there is not.
-        ValueError: an unknown fusion; views that `admitted` refuses (at the call).
+        ValueError: an unknown fusion; a network where `refine` is 0; views that `admitted`
+            refuses (at the call).
     """
 
     def __init__(
@@ -61,11 +63,21 @@ class CrossView(nn.Module):
             raise ValueError(f"fusion must be 'weighted' or 'mean', got {fusion!r}")
         self.options = Options.of(type(self), options)
         self.iterations = start
-        self.opinions = Opinions(projector, head, **(opinion or {}))
+        self.opinions = Opinions(projector, head, DepthNetwork(**(opinion or {})))
         self.cropping = Cropping(projector, self.options, self.opinions.binning)
         self.weighting = Weighting(5) if fusion == "weighted" else None
-        self.refine = UNet3d(5 + self.opinions.features, 1, refine, zero=True) if refine else None
+        self.refine = self._refinement(refine)
         self.consistency = Consistency(consistency)
+
+    def _refinement(self, width: int) -> nn.Module | None:
+        network = self.options.network
+        if width:
+            return network_by_name(network, 5 + self.opinions.features, 1, width, zero=1)
+        if network is not None:
+            raise ValueError(
+                f"A network corrects the fused volume, which refine=0 leaves out, got {network}"
+            )
+        return None
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         views = admitted(views, self.cropping.cameras, self.consistency.lengths)

@@ -31,8 +31,9 @@ ALONE = 20480
 
 
 class UNet3d(nn.Module):
-    """Encoder and decoder over `levels` scales; any spatial size, since an axis of one voxel stays
-    one when halved.
+    """3-D U-Net with additive skips maps volumes of any size, and can keep to the voxels of a mask.
+
+    Encoder and decoder over `levels` scales; an axis of one voxel stays one when halved.
 
     With a mask the network is another one, of the same weights: after every convolution the
     features are zero outside the mask (max-pooled on coarser levels), and normalisation, pooling
@@ -45,12 +46,11 @@ class UNet3d(nn.Module):
         outputs: channels out; a last 1x1x1 convolution without bias makes them.
         width: channels of the finest level; each coarser level has twice as many.
         levels: scales, the finest included.
-        zero: start with an output of exactly zero, for a network that corrects something.
     """
 
-    def __init__(
-        self, inputs: int, outputs: int, width: int = 16, levels: int = LEVELS, zero: bool = False
-    ):
+    takes_mask = True
+
+    def __init__(self, inputs: int, outputs: int, width: int = 16, levels: int = LEVELS):
         super().__init__()
         widths = [width * 2**level for level in range(levels)]
         self.down = nn.ModuleList(
@@ -61,8 +61,6 @@ class UNet3d(nn.Module):
         )
         self.up = nn.ModuleList(ConvBlock(a, a) for a in widths[:-1])
         self.last = nn.Conv3d(width, outputs, 1, bias=False)
-        if zero:
-            nn.init.zeros_(self.last.weight)
 
     def forward(
         self, x: Float[Tensor, "n i d h w"], mask: Bool[Tensor, "n 1 d h w"] | None = None

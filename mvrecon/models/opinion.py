@@ -3,6 +3,7 @@ cameras, and the measured integrals placed along their rays.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -11,7 +12,8 @@ from torch import Tensor, nn
 
 from mvrecon.models.consistency import typical_chord
 from mvrecon.models.geometry import Geometry
-from mvrecon.models.networks import UNet3d, upsampled
+from mvrecon.models.network import network_by_name
+from mvrecon.models.networks import upsampled
 from mvrecon.models.pooling import leave_one_out
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
@@ -21,6 +23,38 @@ Prior = Literal["learned", "uniform"]
 #: The depth network counts lengths in so many parts of the grid's own: numbers of the size that it
 #: was tuned with.
 PARTS = 128
+
+
+@dataclass(frozen=True)
+class DepthNetwork:
+    """Where along a ray its measurement lies: the network of the cameras' opinions, and its frusta.
+
+    Args:
+        width: channels of the pixels' features, and of the depth U-Net's finest level where no
+            network is named.
+        features: channels that each camera hands on to the refinement besides its density.
+        binning: detector pixels joined, along each axis, for the depth network.
+        shared: one network for all cameras, or one for each.
+        prior: "learned": network on top of the classical start; "uniform": no network, all depths
+            equally likely.
+        network: by name, `{"name": ..., **options}`; none for `UNet3d`.
+
+    Raises:
+        ValueError: an unknown prior; a network where "uniform" has none.
+    """
+
+    width: int = 8
+    features: int = 4
+    binning: int = 3
+    shared: bool = True
+    prior: Prior = "learned"
+    network: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.prior not in ("learned", "uniform"):
+            raise ValueError(f"depth prior must be 'learned' or 'uniform', got {self.prior!r}")
+        if self.prior == "uniform" and self.network is not None:
+            raise ValueError(f"prior='uniform' has no network, got {dict(self.network)}")
 
 
 class Opinions(nn.Module):
@@ -33,40 +67,28 @@ class Opinions(nn.Module):
     Args:
         projector: holds the grid and the rig.
         head: the head's name and options.
-        width: channels of the depth U-Net's finest level.
-        features: channels that each camera hands on to the refinement besides its density.
-        binning: detector pixels joined, along each axis, for the depth U-Net.
-        shared: one U-Net for all cameras, or one for each.
-        prior: "learned": U-Net on top of the classical start; "uniform": no network, all depths
-            equally likely.
+        depth: the network that places measurements along their rays.
     """
 
     def __init__(
         self,
         projector: Projector,
         head: Mapping[str, Any],
-        width: int = 8,
-        features: int = 4,
-        binning: int = 3,
-        shared: bool = True,
-        prior: Prior = "learned",
+        depth: DepthNetwork,
     ):
         super().__init__()
-        if prior not in ("learned", "uniform"):
-            raise ValueError(f"depth prior must be 'learned' or 'uniform', got {prior!r}")
-        self.binning, self.unit = binning, typical_chord(projector.grid) / PARTS
+        self.binning, self.unit = depth.binning, typical_chord(projector.grid) / PARTS
         self.head = HEADS.from_config(head)
-        self.learned = prior == "learned"
-        self.features = features if self.learned else 0
+        self.learned = depth.prior == "learned"
+        self.features = depth.features if self.learned else 0
         if self.learned:
-            self.pixels = nn.Conv2d(2, width, binning, stride=binning)
-            nets = [
-                UNet3d(width + 6, 1 + features, width)
-                for _ in range(1 if shared else len(projector.cameras))
-            ]
-            for net in nets:
-                nn.init.zeros_(net.last.weight[:1])  # start from the prior
-            self.nets = nn.ModuleList(nets)
+            width = depth.width
+            self.pixels = nn.Conv2d(2, width, depth.binning, stride=depth.binning)
+            self.nets = nn.ModuleList(
+                # the first answer, logits, is zero at the start: the prior alone
+                network_by_name(depth.network, width + 6, 1 + depth.features, width, zero=1)
+                for _ in range(1 if depth.shared else len(projector.cameras))
+            )
 
     def forward(
         self,

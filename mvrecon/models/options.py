@@ -1,4 +1,4 @@
-"""Options of a model that save work, checked once: all are off by default."""
+"""Options that models share, checked once: what saves work, all off by default, and the network."""
 
 import inspect
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ HALO = 4
 
 @dataclass(frozen=True)
 class Options:
-    """Which work is left out.
+    """Which work a model leaves out, and by which network it corrects a volume.
 
     Args:
         support: where the density may differ from zero, from the views: the visual "hull", its
@@ -31,6 +31,8 @@ class Options:
         refine_where: "all" of the support, or bricks of "disagreement" between the opinions.
         tolerance: the opinions' standard deviation, relative to the content's scale, from which on
             they disagree.
+        network: in the world, that corrects the volume: `{"name": ..., **options}`; none for
+            `UNet3d` of as many channels as the model says.
 
     Raises:
         ValueError: an unknown choice, a halo below 1, a sigma or a tolerance that is not positive.
@@ -43,6 +45,7 @@ class Options:
     sigma: float | None = None
     refine_where: Literal["all", "disagreement"] = "all"
     tolerance: float = 0.1
+    network: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         known = {"support": KINDS, "refine_where": ("all", "disagreement")}

@@ -25,10 +25,10 @@ def pooled(
         volumes: one volume for each camera.
         visible: which voxels each camera sees, [m 1 d h w].
     """
-    seen = visible.to(volumes.dtype)
-    count = seen.sum(dim=0, keepdim=True).clamp_min(1)
-    mean = (volumes * seen).sum(dim=1, keepdim=True) / count
-    variance = ((volumes - mean).square() * seen).sum(dim=1, keepdim=True) / count
+    visibility = visible.to(volumes.dtype)
+    count = visibility.sum(dim=0, keepdim=True).clamp_min(1)
+    mean = (volumes * visibility).sum(dim=1, keepdim=True) / count
+    variance = ((volumes - mean).square() * visibility).sum(dim=1, keepdim=True) / count
     return mean, variance
 
 
@@ -39,10 +39,10 @@ def leave_one_out(
 
     Sums are formed about the mean over all cameras, so that the subtraction cancels no digits.
     """
-    seen = visible.to(volumes.dtype)
+    visibility = visible.to(volumes.dtype)
     centre, _ = pooled(volumes, visible)
-    about = (volumes - centre) * seen
-    count = seen.sum(dim=0, keepdim=True) - seen
+    about = (volumes - centre) * visibility
+    count = visibility.sum(dim=0, keepdim=True) - visibility
     others = count.clamp_min(1)
     first = (about.sum(dim=1, keepdim=True) - about) / others
     second = (about.square().sum(dim=1, keepdim=True) - about.square()) / others

@@ -60,7 +60,8 @@ class Weighting(nn.Module):
 
     def __init__(self, inputs: int, width: int = 8):
         super().__init__()
-        self.net = UNet3d(inputs, 1, width, levels=2, zero=True)
+        self.net = UNet3d(inputs, 1, width, levels=2)
+        nn.init.zeros_(self.net.last.weight)  # start from the plain mean
 
     def forward(
         self, features: Float[Tensor, "b m c d h w"], mask: Bool[Tensor, "b 1 d h w"] | None = None

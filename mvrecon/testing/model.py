@@ -41,7 +41,7 @@ def check_model(name: str, projector: Projector, seed: int = 0, **options: Any) 
         _check_scale(model, views)
         _check_batch(model, views)
         _check_refusals(model, views)
-    _check_gradients(model, views)
+    check_gradients(model, model(views).volume)
 
 
 def _check_volume(
@@ -80,23 +80,21 @@ def _check_batch(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
     )
 
 
-def _check_gradients(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
-    parameters = {name: p for name, p in model.named_parameters() if p.requires_grad and p.numel()}
-    if parameters:
-        loss = model(views).volume.square().sum()
-        gradients = torch.autograd.grad(loss, list(parameters.values()), allow_unused=True)
-        idle = [
-            name
-            for name, gradient in zip(parameters, gradients, strict=True)
-            if gradient is None or not gradient.any()
-        ]
-        assert not idle, f"no gradient reaches {', '.join(idle)}"
-        bad = [
-            name
-            for name, gradient in zip(parameters, gradients, strict=True)
-            if not gradient.isfinite().all()
-        ]
-        assert not bad, f"gradients are not finite: {', '.join(bad)}"
+def check_gradients(network: nn.Module, answer: Tensor) -> None:
+    """Raise AssertionError unless gradients of an answer reach every parameter, and are finite."""
+    parameters = {
+        name: p for name, p in network.named_parameters() if p.requires_grad and p.numel()
+    }
+    if not parameters:
+        return
+    values = torch.autograd.grad(
+        answer.square().sum(), list(parameters.values()), allow_unused=True
+    )
+    gradients = dict(zip(parameters, values, strict=True))
+    idle = [name for name, value in gradients.items() if value is None or not value.any()]
+    assert not idle, f"no gradient reaches {', '.join(idle)}"
+    bad = [name for name, value in gradients.items() if not value.isfinite().all()]
+    assert not bad, f"gradients are not finite: {', '.join(bad)}"
 
 
 def _check_refusals(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:

@@ -87,11 +87,8 @@ def _check_motion(name: str, grid: Grid, cameras: Cameras, **options) -> None:
         random_rotation(torch.Generator().manual_seed(0)),
         torch.tensor([30.0, -20.0, 10.0], dtype=torch.float64),
     )
-    affine = grid.affine.clone()
-    affine[:3] = R @ affine[:3]
-    affine[:3, 3] += t
     x = torch.rand(1, 1, *grid.shape, dtype=torch.float64)
-    moved = PROJECTORS.build(name, grid=Grid(grid.shape, affine), cameras=cameras, **options)(x)
+    moved = PROJECTORS.build(name, grid=grid.moved(R, t), cameras=cameras, **options)(x)
     back = PROJECTORS.build(name, grid=grid, cameras=cameras.moved(R.mT, -R.mT @ t), **options)(x)
     assert close(moved, back, 1e-9), "moving the object is not un-moving the cameras"
 

@@ -39,10 +39,7 @@ def test_the_mirrored_object_is_seen_as_the_partners_see_the_object(name):
     cameras, axis = CASES[name]
     torch.manual_seed(0)
     R, t = random_rotation(torch.Generator().manual_seed(1)), torch.tensor([3.0, -5.0, 70.0])
-    affine = GRID.affine.clone()
-    affine[:3] = R @ affine[:3]
-    affine[:3, 3] += t
-    for grid, rig in ((GRID, cameras), (Grid(GRID.shape, affine), cameras.moved(R, t))):
+    for grid, rig in ((GRID, cameras), (GRID.moved(R, t), cameras.moved(R, t))):
         mirror = mirror_pairs(rig, grid)
         assert mirror is not None and mirror.axis == axis
         A = RayTransform(grid, rig, backend="reference")

@@ -21,11 +21,8 @@ def plane(grid):
 
 
 def turned(grid, degrees):
-    affine = grid.affine.clone()
     rotation = euler_rotation(degrees, "xyz")
-    affine[:3, :3] = rotation @ affine[:3, :3]
-    affine[:3, 3] = rotation @ (affine[:3, 3] - grid.centre) + grid.centre
-    return Grid(grid.shape, affine)
+    return grid.moved(rotation, grid.centre - rotation @ grid.centre)
 
 
 @pytest.mark.parametrize("spacing", [0.9, 2.0, 3.1, 4.5, 7.0])

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid, pixel_centres, voxel_centres
+from mvrecon.geometry.rigid import random_rotation
 from mvrecon.geometry.sample import normalised, sample
 
 
@@ -158,3 +159,26 @@ def test_memory_at_hand_is_no_more_than_a_limit_leaves(run_python):
     )
     done = run_python("-c", code)
     assert done.returncode == 1 and "ValueError: This needs 6.0 GiB of memory; " in done.stderr
+
+
+def test_a_moved_grid_carries_its_voxels_along():
+    grid = Grid.centred(size=(5, 4, 3), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
+    rng = torch.Generator().manual_seed(0)
+    R, t = random_rotation(rng), 100 * torch.randn(3, generator=rng, dtype=torch.float64)
+    index = 10 * torch.rand(20, 3, generator=rng, dtype=torch.float64)
+    there = grid.moved(R, t)
+    assert torch.allclose(there.to_world(index), grid.to_world(index) @ R.T + t, atol=1e-12)
+    assert there.spacing == pytest.approx(grid.spacing) and there.shape == grid.shape
+    assert torch.allclose(there.moved(R.T, -R.T @ t).affine, grid.affine, atol=1e-12)
+
+
+@pytest.mark.door
+def test_a_grid_is_moved_by_a_rotation_alone():
+    """A grid's motion by a matrix that is no rotation, or by a shift that is not finite, is
+    refused.
+    """
+    grid = Grid.centred(4, spacing=1.0)
+    with pytest.raises(ValueError, match="R must be rotations"):
+        grid.moved(2 * torch.eye(3), torch.zeros(3))
+    with pytest.raises(ValueError, match="finite mm, got .*nan"):
+        grid.moved(torch.eye(3), torch.tensor([0.0, torch.nan, 0.0]))

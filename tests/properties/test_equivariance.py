@@ -40,20 +40,13 @@ def check_same(
     assert ((views - others).abs().double() <= apart)[..., steady].all()
 
 
-def moved(grid: Grid, R: Tensor, t: Tensor) -> Grid:
-    affine = grid.affine.clone()
-    affine[:3] = R @ affine[:3]
-    affine[:3, 3] += t
-    return Grid(grid.shape, affine)
-
-
 @given(**ANY, R=ROTATIONS, shift=vectors(-10, 10))
 def test_moving_everything_changes_nothing_and_moving_the_object_unmoves_the_cameras(
     case, method, data, R, shift
 ):
     x, t = data.draw(volumes(case.grid.shape)), shift * radius(case.grid)
     views = case.build(method=method)(x)
-    both = Case(moved(case.grid, R, t), case.rays.moved(R, t))
+    both = Case(case.grid.moved(R, t), case.rays.moved(R, t))
     check_same(both.build(method=method)(x), views, x, case, both)
     object_alone = replace(both, rays=case.rays)
     cameras_back = replace(case, rays=case.rays.moved(R.T, -R.T @ t))

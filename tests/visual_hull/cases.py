@@ -59,14 +59,7 @@ def random_world(kind: str, seed: int) -> World:
         (Solids("ellipsoid", centres, random_rotation(rng, count), axes, torch.ones(count)),)
     )
     turn, shift = random_rotation(rng), 50 * torch.randn(3, generator=rng, dtype=torch.float64)
-    return World(moved(grid, turn, shift), cameras.moved(turn, shift), phantom.moved(turn, shift))
-
-
-def moved(grid: Grid, R: torch.Tensor, t: torch.Tensor) -> Grid:
-    """A grid after the rigid motion X -> R X + t."""
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[:3, :3], motion[:3, 3] = R, t
-    return Grid(grid.shape, motion @ grid.affine)
+    return World(grid.moved(turn, shift), cameras.moved(turn, shift), phantom.moved(turn, shift))
 
 
 def _axes(rng: torch.Generator, thinnest: float, largest: float) -> torch.Tensor:

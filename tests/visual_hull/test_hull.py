@@ -16,7 +16,7 @@ from mvrecon.scenes.voxelise import voxelise
 from mvrecon.visual_hull import hull
 from mvrecon.visual_hull.footprints import Bricks, footprints
 from mvrecon.visual_hull.hull import expand, visual_hull
-from tests.visual_hull.cases import KINDS, World, moved, operator, random_world
+from tests.visual_hull.cases import KINDS, World, operator, random_world
 
 BRICKS = (1, 3, 4)
 EDGE = 3
@@ -97,7 +97,7 @@ def test_it_moves_with_the_world(kind: str):
     world, rng = random_world(kind, 7), torch.Generator().manual_seed(2)
     R, t = random_rotation(rng), 300 * torch.randn(3, generator=rng, dtype=torch.float64)
     moved_world = World(
-        moved(world.grid, R, t), world.cameras.moved(R, t), world.phantom.moved(R, t)
+        world.grid.moved(R, t), world.cameras.moved(R, t), world.phantom.moved(R, t)
     )
     assert torch.equal(kept(moved_world, world.views), kept(world))
 

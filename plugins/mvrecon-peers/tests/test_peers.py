@@ -28,10 +28,8 @@ SQUARE = Grid.centred(size=(29, 27, 21), spacing=(1.1, 1.1, 1.3), centre=CENTRE.
 
 def tilted(grid: Grid) -> Grid:
     """The same voxels about the same centre, in no direction of the world."""
-    R, affine = random_rotation(torch.Generator().manual_seed(3)), grid.affine.clone()
-    affine[:3, :3] = R @ affine[:3, :3]
-    affine[:3, 3] = grid.centre - affine[:3, :3] @ grid.centre_index
-    return Grid(grid.shape, affine)
+    R = random_rotation(torch.Generator().manual_seed(3))
+    return grid.moved(R, grid.centre - R @ grid.centre)
 
 
 def about(rig: Cameras, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Cameras:

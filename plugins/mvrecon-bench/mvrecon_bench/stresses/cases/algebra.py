@@ -60,24 +60,15 @@ def moved(subject: ProjectorSubject) -> float:
     views, rng, worst = subject.projector(GRID, rig)(volume), torch.Generator().manual_seed(0), 0.0
     for _ in range(5):
         R, t = random_rotation(rng), 100 * torch.randn(3, generator=rng, dtype=torch.float64)
-        affine = GRID.affine.clone()
-        affine[:3] = R @ affine[:3]
-        affine[:3, 3] += t
-        worst = greatest(
-            [
-                worst,
-                gap(subject.projector(Grid(GRID.shape, affine), rig.moved(R, t))(volume), views),
-            ]
-        )
+        moved_views = subject.projector(GRID.moved(R, t), rig.moved(R, t))(volume)
+        worst = greatest([worst, gap(moved_views, views)])
     return worst
 
 
 def _turned(grid: Grid, rng: torch.Generator) -> Grid:
     """The same voxels about the same centre, in any direction."""
-    R, affine = random_rotation(rng), grid.affine.clone()
-    affine[:3, :3] = R @ affine[:3, :3]
-    affine[:3, 3] = grid.centre - affine[:3, :3] @ grid.centre_index
-    return Grid(grid.shape, affine)
+    R = random_rotation(rng)
+    return grid.moved(R, grid.centre - R @ grid.centre)
 
 
 CASES = (

@@ -56,11 +56,9 @@ def far_away(subject: ProjectorSubject) -> float:
     views, worst = subject.projector(GRID, rig)(volume), 0.0
     for distance in (1.0, 1e2, 1e4, 1e5, 1e6):
         shift = distance * torch.tensor([1.0, -0.7, 0.3], dtype=torch.float64)
-        affine = GRID.affine.clone()
-        affine[:3, 3] += shift
-        moved_views = subject.projector(Grid(GRID.shape, affine), rig.moved(torch.eye(3), shift))(
-            volume
-        )
+        unturned = torch.eye(3)
+        A = subject.projector(GRID.moved(unturned, shift), rig.moved(unturned, shift))
+        moved_views = A(volume)
         worst = greatest([worst, gap(moved_views, views)])
     return worst
 

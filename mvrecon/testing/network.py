@@ -1,0 +1,46 @@
+"""Checks that every network of a model must pass."""
+
+from typing import Any
+
+import torch
+
+from mvrecon.models.network import network_by_name
+from mvrecon.testing.model import check_gradients
+from mvrecon.testing.projector import close
+
+#: Relative, of float32 sums of some thousand products a voxel.
+TOLERANCE = 1e-5
+
+
+def check_network(name: str, seed: int = 0, **options: Any) -> None:
+    """Raise AssertionError unless the named network can serve in a model.
+
+    A finite answer of the input's size, odd sizes included unless the network tells a `multiple`;
+    a start at zero where it is asked for; in evaluation the same bits when it is called twice, and
+    a sample's answer that does not depend on the others; zero outside a mask; gradients that reach
+    every parameter.
+
+    Args:
+        name: of the network.
+        seed: of weights and input.
+        options: of the network.
+    """
+    torch.manual_seed(seed)
+    config = {"name": name, **options}
+    network = network_by_name(config, 2, 3, width=4, zero=1).eval()
+    x = torch.randn(2, 2, 9, 4, 6)
+    with torch.no_grad():
+        answer = network(x)
+        assert not answer[:, :1].any(), "an output that starts at zero is not zero"
+        assert answer[:, 1:].any(), "outputs that need not start at zero are all zero"
+        for parameter in network.parameters():
+            parameter += 0.05 * torch.randn_like(parameter)
+        answer = network(x)
+        assert answer.isfinite().all(), "the answer is not finite"
+        assert torch.equal(network(x), answer), "not the same bits when called twice"
+        assert close(network(x[1:]), answer[1:], TOLERANCE), (
+            "an answer depends on the others of its batch"
+        )
+        mask = torch.rand(2, 1, *x.shape[2:]) > 0.5
+        assert not (network(x, mask) * ~mask).any(), "the answer is not zero outside a mask"
+    check_gradients(network, network(x))
