@@ -28,8 +28,15 @@ if TYPE_CHECKING:
     from mvrecon.projectors.drr import Drr as Drr
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
     from mvrecon.projectors.radon import Radon as Radon
+    from mvrecon.reconstruct.cgls import cgls as cgls
+    from mvrecon.reconstruct.fista_tv import fista_tv as fista_tv
+    from mvrecon.reconstruct.held_out import held_out as held_out
     from mvrecon.reconstruct.iterative import sirt as sirt
     from mvrecon.reconstruct.mlem import mlem as mlem
+    from mvrecon.reconstruct.mlem import osem as osem
+    from mvrecon.reconstruct.os_sart import os_sart as os_sart
+    from mvrecon.reconstruct.pdhg_tv import pdhg_tv as pdhg_tv
+    from mvrecon.reconstruct.tikhonov import tikhonov as tikhonov
 
 __version__ = "0.1.0"
 
@@ -41,16 +48,23 @@ _DOOR = {
     "LinearOperator": "mvrecon.projectors.operator:LinearOperator",
     "Radon": "mvrecon.projectors.radon:Radon",
     "arc": "mvrecon.cameras.rigs:arc",
+    "cgls": "mvrecon.reconstruct.cgls:cgls",
     "circular": "mvrecon.cameras.rigs:circular",
     "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.cameras.rigs:dome",
+    "fista_tv": "mvrecon.reconstruct.fista_tv:fista_tv",
     "from_file": "mvrecon.cameras.files:from_file",
+    "held_out": "mvrecon.reconstruct.held_out:held_out",
     "load": "mvrecon.engine.trained:load",
     "mlem": "mvrecon.reconstruct.mlem:mlem",
+    "os_sart": "mvrecon.reconstruct.os_sart:os_sart",
+    "osem": "mvrecon.reconstruct.mlem:osem",
     "parallel": "mvrecon.cameras.rigs:parallel",
+    "pdhg_tv": "mvrecon.reconstruct.pdhg_tv:pdhg_tv",
     "read_volume": "mvrecon.data.volume_files:read_volume",
     "save_volume": "mvrecon.data.volume_files:save_volume",
     "sirt": "mvrecon.reconstruct.iterative:sirt",
+    "tikhonov": "mvrecon.reconstruct.tikhonov:tikhonov",
 }
 
 

@@ -40,7 +40,13 @@ NETWORKS = Registry(
 RECONSTRUCTORS = Registry(
     "reconstructor",
     sirt="mvrecon.reconstruct.iterative:sirt",
+    os_sart="mvrecon.reconstruct.os_sart:os_sart",
+    cgls="mvrecon.reconstruct.cgls:cgls",
+    tikhonov="mvrecon.reconstruct.tikhonov:tikhonov",
+    fista_tv="mvrecon.reconstruct.fista_tv:fista_tv",
+    pdhg_tv="mvrecon.reconstruct.pdhg_tv:pdhg_tv",
     mlem="mvrecon.reconstruct.mlem:mlem",
+    osem="mvrecon.reconstruct.mlem:osem",
 )
 MODELS = Registry(
     "model",

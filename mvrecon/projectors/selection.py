@@ -2,6 +2,7 @@
 them back among zeros.
 """
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -91,3 +92,22 @@ def ordered_subsets(count: int, subsets: int) -> list[range]:
             f"{subsets}"
         )
     return [range(first, count, subsets) for first in range(subsets)]
+
+
+def distant_order(count: int) -> list[int]:
+    """An order of `count` ordered subsets in which one is far from those just before it.
+
+    Steps of the golden section of their number (Kohler, IEEE Nucl. Sci. Symp. 2004), made coprime
+    to it, so that every subset comes once.
+    """
+    golden = count * (math.sqrt(5) - 1) / 2
+    coprime = [step for step in range(1, count + 1) if math.gcd(step, count) == 1]
+    step = min(coprime, key=lambda n: abs(n - golden))
+    return [number * step % count for number in range(count)]
+
+
+def usual_subsets(count: int) -> int:
+    """A number of ordered subsets that suits `count` cameras, their square root: 6 of 32, 19 of
+    360.
+    """
+    return max(1, round(math.sqrt(count)))

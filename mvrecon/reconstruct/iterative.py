@@ -1,15 +1,15 @@
 """SIRT, the simultaneous iterative reconstruction technique, with any linear operator."""
 
-import math
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.views import check_finite
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import ViewSelection
+from mvrecon.reconstruct.descent import descend
+from mvrecon.reconstruct.problem import Common, posed
 
 
 class SirtWeights(NamedTuple):
@@ -53,21 +53,20 @@ def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def correction(
-    A: LinearOperator, residual: Float[Tensor, "b c m v u"], weights: tuple[Tensor, Tensor]
+    A: LinearOperator, residual: Float[Tensor, "b c m v u"], weights: SirtWeights
 ) -> Float[Tensor, "b c d h w"]:
-    """The SIRT step C A^T R r of residual views r, in the unit of the volume; weights (R, C)."""
-    row, column = weights
-    return column * A.T(row * residual)
+    """The SIRT step C A^T R r of residual views r, in the unit of the volume."""
+    return weights.column * A.T(weights.row * residual)
 
 
 def sirt(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
-    iterations: int,
-    start: Float[Tensor, "b c d h w"] | None = None,
+    iterations: int = 50,
     nonnegative: bool = True,
-    weights: tuple[Tensor, Tensor] | None = None,
     momentum: bool = False,
+    weights: SirtWeights | None = None,
+    **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Simultaneous iterative reconstruction: x <- x + C A^T R (y - A x), in the unit of the volume.
 
@@ -79,23 +78,22 @@ def sirt(
         A: the operator.
         views: measured integrals.
         iterations: how many.
-        start: the first volume; zero by default.
         nonnegative: clip each iterate at zero.
-        weights: (R, C) from `sirt_weights`, where they are known already.
         momentum: carry each step on into the next.
+        weights: of `sirt_weights`, where they are known already.
+        common: start, support, monitor: see `Common`.
 
     Raises:
-        ValueError: views that are not finite, such as logarithms of no intensity.
+        ValueError: views that are not finite, such as logarithms of no intensity, and what else
+            `posed` refuses.
     """
-    check_finite(views)
-    weights = weights or sirt_weights(
-        A, views.dtype if views.dtype == torch.float64 else torch.float32
-    )
-    x = weights[0].new_zeros(*views.shape[:2], *A.domain_shape) if start is None else start
-    ahead, t = x, 1.0
-    for _ in range(iterations):
-        last, x = x, ahead + correction(A, views - A(ahead), weights)
-        x = x.clamp_min(0) if nonnegative else x
-        t, before = (1 + math.sqrt(1 + 4 * t * t)) / 2, t
-        ahead = x + (before - 1) / t * (x - last) if momentum else x
-    return x
+    problem = posed(sirt, A, views, common)
+    known = weights or sirt_weights(problem.A, problem.views.dtype)
+
+    def step(residual: Tensor) -> Tensor:
+        return correction(problem.A, residual, known)
+
+    def proximal(volume: Tensor) -> Tensor:
+        return volume.clamp_min(0) if nonnegative else volume
+
+    return descend(problem, step, proximal, iterations, momentum)

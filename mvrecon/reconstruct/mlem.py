@@ -2,23 +2,27 @@
 of the cameras.
 """
 
+from functools import partial
+from typing import Unpack
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
-from mvrecon.projectors.selection import ordered_subsets
+from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
 from mvrecon.reconstruct.poisson import PoissonLikelihood
+from mvrecon.reconstruct.problem import Common, Watch, supported
 
 
 def mlem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
-    iterations: int,
+    iterations: int = 50,
     background: float | Float[Tensor, "b c m v u"] = 0.0,
-    start: Float[Tensor, "b c d h w"] | None = None,
     subsets: int = 1,
     skip_zero_bins: bool = True,
+    **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Maximum likelihood of Poisson counts by expectation maximisation: x <- x / s A^T (y / (A x +
     r)).
@@ -37,28 +41,63 @@ def mlem(
         iterations: over all counts.
         background: expected counts of other origin, one number or views that broadcast to the
             counts.
-        start: the first volume; by default uniform where a ray passes, with as many counts as are
-            measured.
         subsets: of the cameras, for OSEM.
         skip_zero_bins: leave out the rays of bins without counts where that pays; the volume is the
             same.
+        common: start, support, monitor: see `Common`. The start is uniform by default where a ray
+            passes, with as many counts as are measured. A monitor costs one projection an
+            iteration.
 
     Raises:
         ValueError: as `PoissonLikelihood`; counts that the start does not allow, a start that is
             negative somewhere or not finite, a number of subsets that is below one or above that of
             the cameras.
     """
+    A = supported(mlem, A, common)
     dealt = ordered_subsets(A.range_shape[0], subsets)
-    parts = [PoissonLikelihood(A, counts, background, views, skip_zero_bins) for views in dealt]
     with torch.no_grad():
-        return _expectation_maximised(parts, iterations, start)
+        parts = [
+            PoissonLikelihood(A, counts, background, dealt[subset], skip_zero_bins)
+            for subset in distant_order(subsets)
+        ]
+        sums = [part.sensitivity(parts[0].counts.dtype) for part in parts]
+        x, watch = _admitted(parts, sums, common.get("start")), Watch(common.get("monitor"))
+        for number in range(1, iterations + 1):
+            for part, s in zip(parts, sums, strict=True):
+                # a voxel that these views do not see, though others do, is left to the others
+                x = torch.where(s > 0, x * (part.explained(x) / torch.where(s > 0, s, 1)), x)
+            if watch.ends(number, x, partial(_unexplained, A, counts, background, x)):
+                break
+        return x
 
 
-def _expectation_maximised(
-    parts: list[PoissonLikelihood], iterations: int, start: Float[Tensor, "b c d h w"] | None
+def osem(
+    A: LinearOperator,
+    counts: Float[Tensor, "b c m v u"],
+    iterations: int = 10,
+    subsets: int | None = None,
+    background: float | Float[Tensor, "b c m v u"] = 0.0,
+    skip_zero_bins: bool = True,
+    **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
-    dtype = parts[0].counts.dtype if start is None else start.dtype
-    sums = [part.sensitivity(dtype) for part in parts]
+    """MLEM over ordered subsets of the cameras, x <- x / s_k A_k^T (y_k / (A_k x + r)), in the unit
+    of the volume.
+
+    Args:
+        A, counts, iterations, background, skip_zero_bins, common: as for `mlem`.
+        subsets: into which the cameras are dealt; None: the square root of their number.
+
+    Raises:
+        ValueError: as `mlem`.
+    """
+    subsets = usual_subsets(A.range_shape[0]) if subsets is None else subsets
+    return mlem(A, counts, iterations, background, subsets, skip_zero_bins, **common)
+
+
+def _admitted(
+    parts: list[PoissonLikelihood], sums: list[Tensor], start: Float[Tensor, "b c d h w"] | None
+) -> Float[Tensor, "b c d h w"]:
+    """The start, which must allow every count."""
     every = torch.stack(sums).sum(dim=0)
     x = _uniform(parts, every) if start is None else start
     if bool((~(x >= 0) | ~x.isfinite()).any()):
@@ -69,11 +108,13 @@ def _expectation_maximised(
     x = x * (every > 0)
     for part in parts:
         part.expected(x)
-    for _ in range(iterations):
-        for part, s in zip(parts, sums, strict=True):
-            # a voxel that these views do not see, though others do, is left to the others
-            x = torch.where(s > 0, x * (part.explained(x) / torch.where(s > 0, s, 1)), x)
     return x
+
+
+def _unexplained(
+    A: LinearOperator, counts: Tensor, background: float | Tensor, x: Tensor
+) -> Float[Tensor, "b c m v u"]:
+    return counts - (A(x) + background)
 
 
 def _uniform(

@@ -1,0 +1,100 @@
+"""OS-SART: SIRT's step for one ordered subset of the views after the other."""
+
+from functools import partial
+from typing import NamedTuple, Unpack
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.projectors.operator import LinearOperator
+from mvrecon.projectors.selection import (
+    ViewSelection,
+    distant_order,
+    ordered_subsets,
+    usual_subsets,
+)
+from mvrecon.reconstruct.iterative import inverse_sums
+from mvrecon.reconstruct.problem import Common, Problem, Watch, posed
+
+
+class Subset(NamedTuple):
+    """One ordered subset of the views: its operator A_k, R_k and y_k."""
+
+    A: LinearOperator
+    row: Float[Tensor, "1 1 k v u"]
+    views: Float[Tensor, "b c k v u"]
+
+
+@torch.no_grad()
+def os_sart(
+    A: LinearOperator,
+    views: Float[Tensor, "b c m v u"],
+    iterations: int = 10,
+    subsets: int | None = None,
+    relaxation: float = 1.0,
+    reduction: float = 1.0,
+    nonnegative: bool = True,
+    **common: Unpack[Common],
+) -> Float[Tensor, "b c d h w"]:
+    """Ordered-subset SART: x <- x + l C A_k^T R_k (y_k - A_k x) for every subset k of the views in
+    turn, in the unit of the volume.
+
+    One iteration goes through all views, and does the work of as many SIRT iterations as there are
+    subsets. C is the inverse of the greatest column sum that any subset has, so that every step is
+    stable: for views that agree no step brings x farther from any solution, in the norm of C^-1
+    (Censor and Elfving, SIAM J. Matrix Anal. Appl. 24, 2002; SART: Andersen and Kak, Ultrason.
+    Imaging 6, 1984). For noisy views the iterates end in a cycle around the weighted least-squares
+    solution; it shrinks with a relaxation that is reduced. There is no momentum, since with subsets
+    it may diverge (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34, 2015).
+
+    Args:
+        A: the operator.
+        views: measured integrals.
+        iterations: over all views.
+        subsets: into which the views are dealt, taken in an order in which neighbours are far from
+            each other; None: the square root of the number of views. 1 is SIRT, as many as views
+            SART.
+        relaxation: l, above 0 and below 2.
+        reduction: factor on l after every iteration, at most 1.
+        nonnegative: clip at zero after every step.
+        common: start, support, monitor: see `Common`. A monitor costs one projection an iteration.
+
+    Raises:
+        ValueError: as `posed`; a relaxation or reduction out of its range, fewer than one subset,
+            or more than there are views.
+    """
+    if not (0 < relaxation < 2 and 0 < reduction <= 1):
+        raise ValueError(
+            f"Expected 0 < relaxation < 2 and 0 < reduction <= 1, got {relaxation} and {reduction}"
+        )
+    problem = posed(os_sart, A, views, common)
+    parts, column = _subsets(problem, usual_subsets(len(views[0, 0])) if subsets is None else subsets)
+    x, watch = problem.start, Watch(problem.monitor)
+    for number in range(1, iterations + 1):
+        for part in parts:
+            residual = part.views - part.A(x)
+            x = torch.addcmul(x, column, part.A.T(residual.mul_(part.row)), value=relaxation)
+            x = x.clamp_min_(0) if nonnegative else x
+        relaxation *= reduction
+        if watch.ends(number, x, partial(_residual, problem, x)):
+            break
+    return x
+
+
+def _subsets(problem: Problem, count: int) -> tuple[list[Subset], Float[Tensor, "1 1 d h w"]]:
+    """The subsets in their order, and C."""
+    A, views, *_ = problem
+    dealt = ordered_subsets(A.range_shape[0], count)
+    ones = views.new_ones(1, 1, *A.domain_shape)
+    rows, greatest, parts = inverse_sums(A(ones)), torch.zeros_like(ones), []
+    for subset in distant_order(count):
+        selection = ViewSelection(A.range_shape, dealt[subset])
+        part = Subset(A.subset(selection), selection(rows), selection(views))
+        greatest = torch.maximum(greatest, part.A.T(torch.ones_like(part.row)))
+        parts.append(part)
+    return parts, inverse_sums(greatest)
+
+
+def _residual(problem: Problem, x: Tensor) -> Tensor:
+    return problem.views - problem.A(x)

@@ -1,0 +1,159 @@
+"""What every reconstruction method is asked: an operator, views, a start, a support, and a monitor
+that looks at each iterate.
+"""
+
+import inspect
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypedDict
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.cameras.views import check_finite
+from mvrecon.kernels.backends import wide
+from mvrecon.projectors.operator import LinearOperator
+from mvrecon.registry import hint
+
+
+class Iterate(NamedTuple):
+    """An iterate x_n of a method, as a monitor sees it; its tensors must not be written into.
+
+    Args:
+        number: n, from 1.
+        volume: x_n, in the unit of the volume.
+        residual: y - A x_n, in the unit of the views.
+    """
+
+    number: int
+    volume: Float[Tensor, "b c d h w"]
+    residual: Float[Tensor, "b c m v u"]
+
+
+#: Looks at every iterate; the method ends with the one for which it returns true.
+Monitor = Callable[[Iterate], bool | None]
+
+
+class Common(TypedDict, total=False):
+    """Options that every iterative method has.
+
+    Args:
+        start: the first volume [b c d h w], in the unit of the volume; zero by default.
+        support: the voxels that may be anything but zero, a mask [d h w].
+        monitor: called after every iteration; the method ends where it returns true.
+    """
+
+    start: Float[Tensor, "b c d h w"] | None
+    support: Bool[Tensor, "d h w"] | None
+    monitor: Monitor | None
+
+
+class Problem(NamedTuple):
+    """Views to be explained, y = A x, after the checks at the door.
+
+    Args:
+        A: the operator, with the support in it.
+        views: y, float32 or float64.
+        start: the first volume, zero outside the support; same dtype.
+        monitor: looks at every iterate.
+    """
+
+    A: LinearOperator
+    views: Float[Tensor, "b c m v u"]
+    start: Float[Tensor, "b c d h w"]
+    monitor: Monitor | None = None
+
+
+def posed(
+    method: Callable[..., Tensor], A: LinearOperator, views: Tensor, options: Common
+) -> Problem:
+    """The problem that a method is given, checked.
+
+    Raises:
+        TypeError: an option that the method does not have; the message gives the nearest and all.
+        ValueError: views or a start of another shape than the operator's, on another device, or
+            with values that are not finite; a support that is no mask of the volume's shape.
+    """
+    within = supported(method, A, options)
+    _check(views, "views", A.range_shape, A.device)
+    check_finite(views)
+    views, support, start = wide(views), options.get("support"), options.get("start")
+    if start is None:
+        start = views.new_zeros(*views.shape[:2], *A.domain_shape)
+    else:
+        _check(start, "start", A.domain_shape, A.device)
+        if start.shape[:2] != views.shape[:2] or not start.isfinite().all():
+            raise ValueError(
+                f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
+                f"{tuple(start.shape)} with {int((~start.isfinite()).sum())} values that are not "
+                f"finite"
+            )
+        start = start.to(views.dtype)
+    if support is not None:
+        start = start * support.to(start.device)
+    return Problem(within, views, start, options.get("monitor"))
+
+
+def supported(
+    method: Callable[..., Tensor], A: LinearOperator, options: Common
+) -> LinearOperator:
+    """A diag(support), after the check of the options' names.
+
+    Raises:
+        TypeError: an option that the method does not have.
+        ValueError: a support that is no mask of the volume's shape.
+    """
+    parameters = inspect.signature(method).parameters.values()
+    known = {p.name for p in parameters if p.kind is not p.VAR_KEYWORD} | set(Common.__annotations__)
+    for option in options:
+        if option not in Common.__annotations__:
+            raise TypeError(f"{method.__name__} has no option {option!r}{hint(option, known)}")
+    support = options.get("support")
+    if support is None:
+        return A
+    if support.dtype != torch.bool or tuple(support.shape) != tuple(A.domain_shape):
+        got = f"{support.dtype} {tuple(support.shape)}"
+        raise ValueError(f"Expected a support, a mask of {tuple(A.domain_shape)}, got {got}")
+    return A.with_support(support)
+
+
+class Watch:
+    """Shows a monitor the iterates of a method whose steps begin at x + beta (x - last).
+
+    The residual at that point gives the one at x by linearity, so that no iterate is projected for
+    the monitor but the last. Without a monitor nothing is kept.
+    """
+
+    def __init__(self, monitor: Monitor | None):
+        self.monitor = monitor
+        self.residual: Tensor | None = None
+
+    def ends(
+        self, number: int, volume: Tensor, residual: Callable[[], Tensor], beta: float = 0.0
+    ) -> bool:
+        """Whether the method ends with iterate `number`.
+
+        Args:
+            number: of the iterate; 0, the start, is not shown.
+            volume: x.
+            residual: y - A (x + beta (x - last)), asked for only where a monitor looks.
+            beta: how far the step begins beyond x.
+        """
+        if self.monitor is None:
+            return False
+        own = residual()
+        if beta and self.residual is not None:
+            own = (own + beta * self.residual) / (1 + beta)
+        self.residual = own
+        return number > 0 and bool(self.monitor(Iterate(number, volume, own)))
+
+
+def _check(tensor: Any, what: str, sizes: tuple[int, ...], device: torch.device) -> None:
+    if not isinstance(tensor, Tensor):
+        raise TypeError(f"Expected {what} as a tensor, got {type(tensor).__name__}")
+    if tensor.ndim != 2 + len(sizes) or tuple(tensor.shape[2:]) != tuple(sizes):
+        raise ValueError(
+            f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}"
+        )
+    if tensor.device != device:
+        raise ValueError(f"Expected {what} on {device}, where the operator is, got {tensor.device}")

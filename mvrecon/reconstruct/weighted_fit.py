@@ -1,0 +1,45 @@
+"""The data term that the penalised methods share, so that a weight means the same in all of them."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.projectors.operator import LinearOperator
+from mvrecon.reconstruct.iterative import SirtWeights, sirt_weights
+
+
+class WeightedFit(NamedTuple):
+    """The data term |y - A x|^2_R / (2 c), in the square of the unit of the volume, summed over
+    voxels.
+
+    R are the inverse row sums of A, as in SIRT, and c is the mean column sum of the voxels that a
+    ray meets. So it is about half the squared error of the volume, summed over its voxels, whatever
+    the number of views, pixels and voxels: a penalty's weight means the same on every rig.
+
+    Args:
+        weights: R and C of `sirt_weights`.
+        level: c, rays through a voxel times their length in it, in mm.
+    """
+
+    weights: SirtWeights
+    level: float
+
+    @classmethod
+    def of(cls, A: LinearOperator, dtype: torch.dtype) -> "WeightedFit":
+        """The data term of an operator."""
+        weights = sirt_weights(A, dtype)
+        met = weights.column > 0
+        return cls(weights, (1 / weights.column[met]).mean().item() if met.any() else 1.0)
+
+    @property
+    def columns(self) -> Float[Tensor, "1 1 d h w"]:
+        """The column sums of A, in mm."""
+        column = self.weights.column
+        return torch.where(column > 0, 1 / column, 0)
+
+    def __call__(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c"]:
+        """The data term of residual views."""
+        squares = self.weights.row * residual.square()
+        return squares.flatten(2).sum(dim=2) / (2 * self.level)
