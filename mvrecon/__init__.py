@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
     from mvrecon.projectors.radon import Radon as Radon
     from mvrecon.reconstruct.cgls import cgls as cgls
+    from mvrecon.reconstruct.filtered.fdk import fbp as fbp
+    from mvrecon.reconstruct.filtered.fdk import fdk as fdk
+    from mvrecon.reconstruct.filtered.streaming import fdk_streamed as fdk_streamed
     from mvrecon.reconstruct.fista_tv import fista_tv as fista_tv
     from mvrecon.reconstruct.held_out import held_out as held_out
     from mvrecon.reconstruct.iterative import sirt as sirt
@@ -52,6 +55,9 @@ _DOOR = {
     "circular": "mvrecon.cameras.rigs:circular",
     "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.cameras.rigs:dome",
+    "fbp": "mvrecon.reconstruct.filtered.fdk:fbp",
+    "fdk": "mvrecon.reconstruct.filtered.fdk:fdk",
+    "fdk_streamed": "mvrecon.reconstruct.filtered.streaming:fdk_streamed",
     "fista_tv": "mvrecon.reconstruct.fista_tv:fista_tv",
     "from_file": "mvrecon.cameras.files:from_file",
     "held_out": "mvrecon.reconstruct.held_out:held_out",

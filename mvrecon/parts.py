@@ -41,6 +41,8 @@ NETWORKS = Registry(
 )
 RECONSTRUCTORS = Registry(
     "reconstructor",
+    fbp="mvrecon.reconstruct.filtered.fdk:fbp",
+    fdk="mvrecon.reconstruct.filtered.fdk:fdk",
     sirt="mvrecon.reconstruct.iterative:sirt",
     os_sart="mvrecon.reconstruct.os_sart:os_sart",
     cgls="mvrecon.reconstruct.cgls:cgls",

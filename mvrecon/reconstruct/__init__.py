@@ -1,1 +1,1 @@
-"""Classical iterative reconstruction with any linear operator: SIRT, MLEM, OSEM."""
+"""Classical reconstruction: filtered back-projection, and iterations with any linear operator."""

@@ -8,6 +8,7 @@ import torch
 from mvrecon.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.kernels.voxels import ops as voxel_ops
+from mvrecon.kernels.voxels.columns import upright
 from mvrecon.projectors.voxel_driven import backproject, image_maps
 from tests.projectors.cases import gap
 from tests.projectors.rigs import CENTRAL, CONE, GRID, PARALLEL, PINHOLES
@@ -31,6 +32,42 @@ def test_compiled_equals_the_reference_and_its_transpose_is_exact(kind, weight):
             0, (2, 2)
         )
         assert ((seen * x).sum() - (y * back).sum()).abs() < tolerance * seen.norm() * x.norm()
+
+
+TALL = Grid.centred(size=(19, 5, 12), spacing=(1.0, 1.2, 0.9))
+WIDE = {"pixels": [11, 12], "pixel_mm": [1.6, 2.0], "offset_mm": [1.4, -3.3]}
+UPRIGHT = {
+    "cone": circular(5, 40.0, 70.0, WIDE, start_degrees=13.0),
+    "inside": circular(4, 6.0, 30.0, WIDE),
+    "parallel": parallel(4, WIDE, 60.0, start_degrees=11.0),
+    "upside down": circular(5, 40.0, 70.0, WIDE).moved(
+        torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.zeros(3)
+    ),
+    "far rows": circular(3, 40.0, 70.0, {**WIDE, "offset_mm": [12.0, 0.0]}),
+}
+
+
+@pytest.mark.parametrize("weight", ["none", "distance"])
+@pytest.mark.parametrize("kind", UPRIGHT)
+def test_upright_columns_equal_the_reference_and_their_transpose_is_exact(kind, weight):
+    """Alone, and beside a tilted view that is looked up row by row."""
+    torch.manual_seed(0)
+    rig, tilt = UPRIGHT[kind], UPRIGHT[kind].v[-1:] + 0.02 * UPRIGHT[kind].u[-1:]
+    assert upright(image_maps(rig, TALL).numpy(), TALL.shape).all()
+    mixed = replace(rig, v=torch.cat([rig.v[:-1], tilt]))
+    assert upright(image_maps(mixed, TALL).numpy(), TALL.shape).tolist()[-2:] == [True, False]
+    for cameras in (rig, mixed):
+        for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 2e-6)):
+            y = torch.randn(2, 1, len(rig), *rig.shape, dtype=dtype)
+            seen = backproject(y, cameras, TALL, weight, "cpu")
+            exact = backproject(y, cameras, TALL, weight, "reference")
+            assert exact.norm() > 0.1 and (seen - exact).norm() < tolerance * exact.norm()
+        x = torch.randn(2, *TALL.shape, dtype=torch.float64)
+        arguments = list(rig.ray_extent), weight == "distance", list(rig.shape)
+        back = voxel_ops.show(x, image_maps(cameras, TALL), *arguments)
+        seen = backproject(y.double(), cameras, TALL, weight, "cpu")[:, 0]
+        total = (y.double()[:, 0] * back).sum()
+        assert ((seen * x).sum() - total).abs() < 1e-12 * seen.norm() * x.norm()
 
 
 @pytest.mark.parametrize("rig", [CONE, PINHOLES, PARALLEL], ids=["cone", "pinholes", "parallel"])
@@ -164,8 +201,11 @@ def test_threads_change_no_bit(monkeypatch):
         torch.set_num_threads(count)
         back = voxel_ops.show(x, maps, window, True, list(CONE.shape))
         results.append((backproject(y, CONE, GRID, "distance", "cpu"), back))
+        tall = torch.linspace(0, 1, 4 * 11 * 12).sin().reshape(1, 1, 4, 11, 12)
+        results[-1] += (backproject(tall, UPRIGHT["cone"][:4], TALL, "distance", "cpu"),)
     torch.set_num_threads(before)
-    for seen, back in results[1:]:
+    for seen, back, columns in results[1:]:
+        assert torch.equal(columns, results[0][2])
         assert torch.equal(seen, results[0][0]) and torch.equal(back, results[0][1])
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mvrecon.kernels.padding import padded, room, steps
 from mvrecon.kernels.threads import share
+from mvrecon.kernels.voxels.columns import look_up_columns, room_of, turned, upright
 from mvrecon.kernels.voxels.loops import Sight, look_up, show_rows
 
 
@@ -34,14 +35,33 @@ def look(
 ) -> Float[Tensor, "n d h w"]:
     """What every voxel sees in all views; see `voxel_reference.look`."""
     sight = _sight(maps, views.shape[2:], window, weighted)
-    volumes = np.zeros([len(views), *shape], dtype=views.numpy().dtype)
-    flat, samples = padded(views.numpy(), 2), volumes.size * len(maps)
+    depth, height, width = map(int, shape)
+    volumes = np.zeros([len(views), depth, height, width], dtype=views.numpy().dtype)
+    chosen = upright(sight.maps, (depth, height, width))
+    for some, by_columns in ((~chosen, False), (chosen, True)):
+        if some.any():
+            part = sight._replace(maps=np.ascontiguousarray(sight.maps[some]))
+            seen = views.numpy() if some.all() else views.numpy()[:, some]
+            (_add_by_columns if by_columns else _add_by_rows)(seen, part, volumes)
+    return torch.from_numpy(volumes)
+
+
+def _add_by_rows(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> None:
+    flat, (_, depth, _, width) = padded(views, 2), volumes.shape
 
     def work(first: int, last: int) -> None:
-        look_up(flat, sight, room(int(shape[2]), sight.steps, flat.dtype), volumes, first, last)
+        look_up(flat, sight, room(width, sight.steps, flat.dtype), volumes, first, last)
 
-    share(work, int(shape[0]), samples, 4)
-    return torch.from_numpy(volumes)
+    share(work, depth, volumes.size * len(sight.maps), 4)
+
+
+def _add_by_columns(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> None:
+    columns, (_, depth, height, _) = turned(views), volumes.shape
+
+    def work(first: int, last: int) -> None:
+        look_up_columns(columns, sight, room_of(columns, depth), volumes, first, last)
+
+    share(work, height, volumes.size * len(sight.maps), 4)
 
 
 def show(

@@ -4,11 +4,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.projectors.checks import check_views
+from mvrecon.projectors.checks import check
 from mvrecon.projectors.operator import Projector, Scaled
 from mvrecon.reconstruct.filtered.filters import Filter
 from mvrecon.reconstruct.filtered.scan_weights import ScanKind
-from mvrecon.reconstruct.filtered.streaming import filtered_backprojection
+from mvrecon.reconstruct.filtered.streaming import Filtering, filtered_backprojection
 
 
 def fdk(
@@ -46,7 +46,7 @@ def fdk(
     cameras = _plain(A, "fdk")
     if cameras.parallel:
         raise ValueError("fdk needs a cone or fan beam, got parallel beams; use fbp")
-    return _reconstruct(A, views, filter, cutoff, scan, weights_from)
+    return _reconstruct(A, views, Filtering(filter, cutoff, scan, weights_from))
 
 
 def fbp(
@@ -79,7 +79,7 @@ def fbp(
             f"fbp needs parallel beams or fans of one row, got a cone beam of {cameras.shape[0]} "
             f"rows; use fdk"
         )
-    return _reconstruct(A, views, filter, cutoff, scan, None)
+    return _reconstruct(A, views, Filtering(filter, cutoff, scan))
 
 
 def _plain(A: Projector, name: str) -> Cameras:
@@ -97,20 +97,12 @@ def _plain(A: Projector, name: str) -> Cameras:
 
 
 def _reconstruct(
-    A: Projector,
-    views: Float[Tensor, "b c m v u"],
-    filter: Filter,
-    cutoff: float,
-    scan: ScanKind,
-    weights_from: Cameras | None,
+    A: Projector, views: Float[Tensor, "b c m v u"], filtering: Filtering
 ) -> Float[Tensor, "b c d h w"]:
-    check_views(views, A.cameras)
-    return filtered_backprojection(
-        lambda first, last: views[:, :, first:last],
-        A.cameras,
-        A.grid,
-        filter,
-        cutoff,
-        scan,
-        weights_from,
-    )
+    check(views, "views [b c m v u]", (len(A.cameras), *A.cameras.shape), views.device)
+
+    def read(first: int, last: int) -> Tensor:
+        return views[:, :, first:last]
+
+    volumes = views.shape[0] * views.shape[1]
+    return filtered_backprojection(read, A.cameras, A.grid, volumes, filtering)

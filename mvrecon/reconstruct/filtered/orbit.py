@@ -41,9 +41,7 @@ class Orbit:
     def angles(self) -> Float[Tensor, " m"]:
         """Each source's angle about the axis in degrees, the first one's being 0."""
         tangent = torch.linalg.cross(self.axis, self.outwards[0])
-        return torch.rad2deg(
-            torch.atan2(self.outwards @ tangent, self.outwards @ self.outwards[0])
-        )
+        return torch.rad2deg(torch.atan2(self.outwards @ tangent, self.outwards @ self.outwards[0]))
 
     def reach(self, grid: Grid) -> float:
         """The radius in mm about the isocentre of the grid's inscribed cylinder along the axis."""
@@ -97,10 +95,12 @@ def _circle(cameras: Cameras) -> Orbit:
         raise ValueError(
             f"FDK needs at least three sources on a circle, got {count} on a line; use sirt"
         )
-    flat = places @ axes[:2].T
+    extent = places.norm(dim=1).max()  # without it the fit's digits depend on the unit of length
+    flat = places / extent @ axes[:2].T
     system = torch.cat([2 * flat, torch.ones_like(flat[:, :1])], dim=1)
     fit = torch.linalg.lstsq(system, flat.square().sum(dim=1, keepdim=True)).solution[:, 0]
-    radius = (fit[2] + fit[:2].square().sum()).sqrt().item()
+    radius = (extent * (fit[2] + fit[:2].square().sum()).sqrt()).item()
+    flat, fit = extent * flat, extent * fit
     out = flat - fit[:2]
     off = torch.hypot(places @ axes[2], out.norm(dim=1) - radius).max().item()
     if not off <= TOLERANCE * radius:

@@ -15,8 +15,8 @@ the part of the motion across the ray in the plane of the row, over the distance
 the row. This holds for every flat detector, however it is turned in the fan's plane: the ramp's
 degree, h(c t) = h(t) / c^2, takes the turn up. A detector across the central ray has W = R / |q| =
 (R / D) cos: the cosine weight of Feldkamp, Davis and Kress, JOSA A 1, 1984, eq. 28, whose other
-factor (R / D) belongs to its virtual detector at the axis. Rows of a cone beam are taken for fans in
-their tilted planes, as theirs are. For parallel rays W = 1 / T.U.
+factor (R / D) belongs to its virtual detector at the axis. Rows of a cone beam are taken for fans
+in their tilted planes, as theirs are. For parallel rays W = 1 / T.U.
 """
 
 import torch

@@ -179,7 +179,8 @@ def along(
 ) -> Float[Tensor, "m v u"]:
     """(start + u U + v V) . direction of pixels (u, v), with the digits of u."""
     first, by_u, by_v = (
-        (step * direction).sum(dim=-1)[:, None, None].to(u) for step in (start, cameras.u, cameras.v)
+        (step * direction).sum(dim=-1)[:, None, None].to(u)
+        for step in (start, cameras.u, cameras.v)
     )
     return first + by_v * v[:, None] + by_u * u
 

@@ -1,7 +1,8 @@
 """Filtered back-projection block by block, so that views may be larger than memory."""
 
+import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -25,44 +26,53 @@ BLOCK_PIXELS = 2**24
 Read = Callable[[int, int], Tensor]
 
 
+@dataclass(frozen=True, eq=False)
+class Filtering:
+    """How views are weighted and filtered; see `fdk`."""
+
+    filter: Filter = "ram-lak"
+    cutoff: float = 1.0
+    scan: ScanKind = "auto"
+    weights_from: Cameras | None = None
+
+
 def filtered_backprojection(
-    read: Read,
-    cameras: Cameras,
-    grid: Grid,
-    filter: Filter = "ram-lak",
-    cutoff: float = 1.0,
-    scan: ScanKind = "auto",
-    weights_from: Cameras | None = None,
+    read: Read, cameras: Cameras, grid: Grid, volumes: int, filtering: Filtering
 ) -> Float[Tensor, "b c d h w"]:
-    """FBP or FDK of views [b c m v u] that are read in blocks; see `fdk` for the options.
+    """FBP or FDK of views [b c m v u] that are read in blocks.
+
+    Args:
+        read: gives a block of views.
+        cameras: the rig, of all views.
+        grid: the voxels.
+        volumes: b c, for the size of the blocks.
+        filtering: the options.
 
     Raises:
         ValueError: a rig, option or block of views that does not fit.
     """
-    ideal = cameras if weights_from is None else weights_from
+    ideal = cameras if filtering.weights_from is None else filtering.weights_from
     if (len(ideal), ideal.shape) != (len(cameras), cameras.shape):
         raise ValueError(
             f"Expected weights_from as a rig of {len(cameras)} views of {cameras.shape}, got "
             f"{len(ideal)} of {ideal.shape}"
         )
-    plan = scan_of(ideal, grid, scan)
+    plan = scan_of(ideal, grid, filtering.scan)
     target = _widened(cameras, *plan.columns)
-    response = ramp_response(target.shape[1], filter, cutoff)
-    count, volume, first = len(cameras), None, 0
-    size = 1  # of the first block: how many volumes there are is not known before
-    while first < count:
-        part = slice(first, min(first + size, count))
+    response = ramp_response(target.shape[1], filtering.filter, filtering.cutoff)
+    size = max(1, BLOCK_PIXELS // (volumes * math.prod(target.shape)))
+    total = None
+    for first in range(0, len(cameras), size):
+        part = slice(first, min(first + size, len(cameras)))
         views = read(part.start, part.stop)
         check_views(views, cameras[part])
         check_floating(views, "views")
-        views = wide(views)
-        weights = pixel_weights(ideal, plan, part, views.dtype).to(views.device)
-        rows = filter_rows(pad(views * weights, plan.columns), response)
-        result = backproject(rows, target[part], grid, "distance")
-        volume = result if volume is None else volume.add_(result)
-        first, size = part.stop, block_size(views)
-    assert volume is not None  # a rig has at least one camera
-    return volume
+        weights = pixel_weights(ideal, plan, part, wide(views).dtype).to(views.device)
+        rows = filter_rows(pad(wide(views) * weights, plan.columns), response)
+        volume = backproject(rows, target[part], grid, "distance")
+        total = volume if total is None else total.add_(volume)
+    assert total is not None  # a rig has at least one camera
+    return total
 
 
 def _widened(cameras: Cameras, before: int, behind: int) -> Cameras:
@@ -70,11 +80,6 @@ def _widened(cameras: Cameras, before: int, behind: int) -> Cameras:
     shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
     source = cameras.source - shift if cameras.parallel else cameras.source
     return replace(cameras, source=source, origin=cameras.origin - shift, shape=shape)
-
-
-def block_size(views: Float[Tensor, "b c m v u"]) -> int:
-    """How many views like these are filtered and back-projected at a time."""
-    return max(1, BLOCK_PIXELS // views[:, :, 0].numel())
 
 
 def fdk_streamed(
@@ -89,7 +94,7 @@ def fdk_streamed(
     """FDK of views that are read block by block, in (unit of the views) / mm.
 
     Memory: twice the volume, and a block of about 16 million pixels. The blocks come in order, each
-    view once; the first is one view.
+    view once.
 
     Args:
         read: read(first, last) gives the views first to last - 1 as an array [m v u].
@@ -105,4 +110,5 @@ def fdk_streamed(
         return torch.as_tensor(read(first, last))[None, None]
 
     with torch.no_grad():
-        return filtered_backprojection(block, cameras, grid, filter, cutoff, scan, weights_from)
+        filtering = Filtering(filter, cutoff, scan, weights_from)
+        return filtered_backprojection(block, cameras, grid, 1, filtering)
