@@ -42,8 +42,8 @@ def volume_metrics(
     """PSNR in dB (infinite for equal volumes), SSIM and NRMSE of one volume, over all of it and
     inside the object.
 
-    A volume of one slice has the SSIM of an image. SSIM inside is the mean of the SSIM map over the object's voxels. Without any voxel inside,
-    those figures are nan.
+    A volume of one slice has the SSIM of an image. SSIM inside is the mean of the SSIM map over the
+    object's voxels. Without any voxel inside, those figures are nan.
 
     Raises:
         ValueError: shapes that differ, fewer than 6 voxels along an axis, or a data range that is
