@@ -62,9 +62,9 @@ def volume_metrics(
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     volume, truth = volume.detach().double(), truth.double()
-    pair = [v[None, :, 0] if shape[0] == 1 else v[None] for v in (volume, truth)]
+    one, other = (v[None, :, 0] if shape[0] == 1 else v[None] for v in (volume, truth))
     similarity, local = structural_similarity_index_measure(
-        *pair, data_range=data_range, return_full_image=True
+        one, other, data_range=data_range, return_full_image=True
     )
     whole = {
         "psnr": _psnr(volume, truth, data_range),

@@ -75,16 +75,18 @@ class ConvBlock2d(nn.Module):
         super().__init__()
         self.first = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
         self.second = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
-        self.norms = nn.ModuleList(nn.GroupNorm(gcd(GROUPS, outputs), outputs) for _ in range(2))
+        groups = gcd(GROUPS, outputs)
+        self.first_norm = nn.GroupNorm(groups, outputs)
+        self.second_norm = nn.GroupNorm(groups, outputs)
 
     def forward(self, x: Float[Tensor, "n i h w"]) -> Float[Tensor, "n o h w"]:
-        x = self._normalised(0, self.first(x))
-        return x + self._normalised(1, self.second(x))
+        x = _normalised(self.first_norm, self.first(x))
+        return x + _normalised(self.second_norm, self.second(x))
 
-    def _normalised(self, number: int, x: Tensor) -> Tensor:
-        norm = self.norms[number]
-        # not the module's own call: it refuses a group of one value, of which the shift is left
-        return F.silu(torch.group_norm(x, norm.num_groups, norm.weight, norm.bias, norm.eps))
+
+def _normalised(norm: nn.GroupNorm, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+    # not the module's own call: it refuses a group of one value, of which the shift is left
+    return F.silu(torch.group_norm(x, norm.num_groups, norm.weight, norm.bias, norm.eps))
 
 
 def by_slices(

@@ -19,8 +19,10 @@ class ItNet(nn.Module):
     """Iterations of a network and a filtered back-projection of the residual: x <- x + U(x), then
     x <- x + lambda_k FBP(y - A x).
 
-    The first x is FBP(y), the last operation a step towards the data; the lengths lambda_k are
-    learned. The network hands a few channels on to its next call (Genzel, Guehring, Macdonald
+    The first x is FBP(y), the last operation a step towards the data. The lengths lambda_k are
+    learned, in units of 1 / growth, the greatest factor by which FBP A amplifies a volume: it is
+    far above one where views are few, since filtered back-projection then overshoots near the axis.
+    The network hands a few channels on to its next call (Genzel, Guehring, Macdonald
     and Maerz, Near-exact recovery for tomographic inverse problems via deep learning, ICML 2022).
 
     Args:
@@ -51,7 +53,9 @@ class ItNet(nn.Module):
                 f"iterations {iterations}, memory {memory}"
             )
         scan_of(projector.cameras, projector.grid)  # refuses other rigs
-        self.projector, self.memory, self.filter = projector, memory, filter
+        self.projector, self.memory = projector, memory
+        self.filter: Filter = filter
+        self.growth = growth(projector, filter)
         self.lengths = nn.Parameter(torch.ones(iterations))
         self.nets = nn.ModuleList(
             corrector(network, 1 + memory, 1 + memory, zero=1)
@@ -75,7 +79,25 @@ class ItNet(nn.Module):
         views: Float[Tensor, "b 1 m v u"],
         length: Float[Tensor, ""],
     ) -> Float[Tensor, "b 1 d h w"]:
-        """A step towards the data, x + length FBP(y - A x)."""
-        return volume + length * filtered(
-            self.projector, views - self.projector(volume), self.filter
-        )
+        """A step towards the data, x + length / growth FBP(y - A x)."""
+        residual = views - self.projector(volume)
+        return volume + length / self.growth * filtered(self.projector, residual, self.filter)
+
+
+@torch.no_grad()
+def growth(A: Projector, filter: Filter = "ram-lak", iterations: int = 15) -> float:
+    """The greatest factor by which FBP A amplifies a volume, without unit, by the power method; one
+    where it is less.
+
+    With steps of at most 2 / growth the iteration x <- x + step FBP(y - A x) stays bounded.
+    """
+    random = torch.Generator().manual_seed(0)
+    x = torch.rand(1, 1, *A.domain_shape, generator=random).to(A.device)
+    factor = torch.ones(())
+    for _ in range(iterations):
+        image = filtered(A, A(x), filter)
+        factor = image.norm() / x.norm()
+        if not factor > 0:  # views that show nothing of the grid
+            break
+        x = image / image.norm()
+    return max(1.0, factor.item())

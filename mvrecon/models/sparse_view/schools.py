@@ -71,7 +71,8 @@ class _School(nn.Module):
     def __init__(self, projector: Projector, filter: Filter):
         super().__init__()
         scan_of(projector.cameras, projector.grid)  # refuses other rigs
-        self.projector, self.filter = projector, filter
+        self.projector = projector
+        self.filter: Filter = filter
         self.completion: SinogramCompletion | None = None
         self.net: nn.Module | None = None
 
