@@ -23,14 +23,15 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     Raises:
         FileNotFoundError: no checkpoint or no run is there.
         RuntimeError: another process is at work in the folder.
-        ValueError: the run was made with another rig or other data; the folder is another
-            evaluation's; settings for a method that the run has trained, which its checkpoint
-            decides.
+        ValueError: an unknown device; the run was made with another rig or other data; the folder
+            is another evaluation's; settings for a method that the run has trained, which its
+            checkpoint decides.
         FileExistsError: the folder is a run's own.
     """
     import_plugins(options["plugins"])
     from mvrecon.engine import agreement, checkpoints, evaluation, export, fit, run_folder
 
+    device = evaluation.device_of(options["device"])
     run = checkpoints.run_folder(options["checkpoint"])
     described = (label for label, model in options["compare"].items() if model)
     if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
@@ -48,9 +49,7 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     run_folder.compare_measurement(run, data.digests("test"))
     with run_folder.taken(folder, options, run_folder.EVALUATION):
         agreement.warn_of_other_views(settings, data)
-        table = evaluation.results(
-            settings, run, data, evaluation.device_of(options["device"]), see
-        )
+        table = evaluation.results(settings, run, data, device, see)
         table["checkpoint"] = str(run)
         run_folder.write_results(folder, table)
     return table

@@ -12,6 +12,7 @@ SCENES = Registry(
     breast="mvrecon.data.breast:BreastSlices",
     hdf5="mvrecon.data.volumes:Hdf5Volumes",
     nifti="mvrecon.data.volumes:NiftiVolume",
+    volumes="mvrecon.data.volume_scene:Volumes",
 )
 CAMERAS = Registry(
     "camera",

@@ -51,3 +51,40 @@ def test_the_median_file_is_short():
         n for f in (ROOT / "mvrecon").rglob("*.py") if (n := len(f.read_text().splitlines()))
     )
     assert lengths[len(lengths) // 2] <= 120
+
+
+def mixed_tuples(source: str) -> list[str]:
+    """Parameters of public functions that are annotated as a tuple of three or more members of
+    different types: several parameters in one.
+    """
+    bundles = []
+    for function in ast.walk(ast.parse(source)):
+        if not isinstance(function, ast.FunctionDef) or function.name.startswith("_"):
+            continue
+        arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+        bundles += [
+            f"{function.name}({argument.arg})"
+            for argument in arguments
+            for node in ast.walk(argument.annotation or ast.Constant(None))
+            if isinstance(node, ast.Subscript)
+            and ast.unparse(node.value) in ("tuple", "Tuple")
+            and isinstance(node.slice, ast.Tuple)
+            and len(node.slice.elts) > 2
+            and len({ast.unparse(member) for member in node.slice.elts}) > 1
+        ]
+    return bundles
+
+
+def test_a_tuple_that_bundles_parameters_is_recognised():
+    assert mixed_tuples("def f(a: int, b: tuple[int, str, float] | None): ...") == ["f(b)"]
+    assert mixed_tuples("class A:\n    def g(self, *, c: list[tuple[int, int, str]]): ...") == [
+        "g(c)"
+    ]
+    assert not mixed_tuples("def f(a: tuple[int, int, int], b: tuple[int, ...]): ...")
+
+
+@pytest.mark.parametrize(
+    "file", sorted((ROOT / "mvrecon").rglob("*.py")), ids=lambda f: str(f.relative_to(ROOT))
+)
+def test_no_parameter_is_a_tuple_of_several(file: Path):
+    assert mixed_tuples(file.read_text()) == []

@@ -211,18 +211,36 @@ class Cameras:
         z = self.project(grid.corners().to(self.source))[..., 2]
         return torch.stack(z.aminmax(dim=-1), dim=-1)
 
-    def binned(self, factor: int) -> "Cameras":
-        """The same detectors with `factor` x `factor` pixels joined into one."""
-        if factor < 1 or any(n % factor for n in self.shape):
+    def binned(self, factor: int | tuple[int, int]) -> "Cameras":
+        """The same detectors with `factor` x `factor` pixels joined into one, or with (rows,
+        columns) of them.
+        """
+        rows, columns = (factor, factor) if isinstance(factor, int) else factor
+        if min(rows, columns) < 1 or self.shape[0] % rows or self.shape[1] % columns:
             raise ValueError(
                 f"Binning by {factor} needs a positive factor that divides the detector, got "
                 f"{self.shape}"
             )
-        shift = (self.u + self.v) * (factor - 1) / 2
-        shape = (self.shape[0] // factor, self.shape[1] // factor)
+        shift = (self.u * (columns - 1) + self.v * (rows - 1)) / 2
+        shape = (self.shape[0] // rows, self.shape[1] // columns)
         source = self.source + shift if self.parallel else self.source
-        u, v = self.u * factor, self.v * factor
+        u, v = self.u * columns, self.v * rows
         return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
+
+    def cropped(self, rows: tuple[int, int], columns: tuple[int, int]) -> "Cameras":
+        """The same detectors without the pixels outside of rows and columns `first` to `last - 1`;
+        each pixel stays where it is.
+        """
+        for (first, last), count in zip((rows, columns), self.shape, strict=True):
+            if not 0 <= first < last <= count:
+                raise ValueError(
+                    f"Expected rows and columns inside the detector {self.shape}, got {rows} and "
+                    f"{columns}"
+                )
+        shift = self.u * columns[0] + self.v * rows[0]
+        shape = (rows[1] - rows[0], columns[1] - columns[0])
+        source = self.source + shift if self.parallel else self.source
+        return replace(self, source=source, origin=self.origin + shift, shape=shape)
 
     def refined(self, factor: int) -> "Cameras":
         """The same detectors with every pixel cut into `factor` x `factor`; undone by `binned`."""

@@ -39,11 +39,15 @@ def of_file(path: str | Path) -> str:
 
 
 def files_in(settings: Any) -> Iterator[str]:
-    """The files that a part's settings name: every `path` in them at which a file is."""
+    """The files that a part's settings name: every `path` in them at which a file is, or a folder
+    of files.
+    """
     if isinstance(settings, Mapping):
         path = settings.get("path")
         if isinstance(path, str) and Path(path).is_file():
             yield path
+        elif isinstance(path, str) and Path(path).is_dir():
+            yield from sorted(str(file) for file in Path(path).rglob("*") if file.is_file())
         settings = list(settings.values())
     if isinstance(settings, list | tuple):
         for item in settings:

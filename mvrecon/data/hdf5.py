@@ -1,14 +1,14 @@
 """Volume files: CT volumes of one shape in one HDF5 file, axes z, y, x.
 
-    ct        [n d h w]  Hounsfield units, any integer or float type; compressed chunks of planes,
+    ct        [n d h w]  values in `units`, any integer or float type; compressed chunks of planes,
     of up to 32 MiB spacing   [n 3]      mm between voxels along z, y, x
     id        [n]        name of each volume, UTF-8, of fixed length; one that can be a file's, and
     no other's label     [n d h w]  optional, uint8: structures, 0 outside all of them; not read by
     the scenes
 
-Attributes of the file: `axes` = "z, y, x" and `units` = "HU"; optional `orientation`, three letters
-that say towards which side of the patient (L or R, P or A, I or S) the axes x, y, z run; others
-(`labels`, `source`) are for the reader.
+Attributes of the file: `axes` = "z, y, x" and `units` = "HU", "1/mm" or "activity"; optional
+`orientation`, three letters that say towards which side of the patient (L or R, P or A, I or S) the
+axes x, y, z run; others (`labels`, `source`) are for the reader.
 
 What mvrecon writes has checksums throughout, so that a damaged file is refused: of every chunk, and
 of the layout (the format of HDF5 1.10). A file that others wrote has those that they chose, often
@@ -27,6 +27,7 @@ import h5py
 import numpy as np
 import torch
 
+from mvrecon.data.attenuation import UNITS, StoredUnit
 from mvrecon.data.slabs import Slab, Slabs, planes
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.data.texts import texts_of, variable
@@ -37,12 +38,12 @@ from mvrecon.files.checks import NAME, SPACING, Refused, blaming, plain_name, sh
 CHUNK = 2**25
 #: Versions of HDF5 whose format is written: the first with checksums of the layout.
 FORMAT = ("v110", "v110")
-LAYOUT = {"axes": "z, y, x", "units": "HU"}
+LAYOUT = {"axes": ("z, y, x",), "units": UNITS}
 Texts = dict[str, list[str]]
 Spacing = tuple[float, float, float]
 EXPECTED = (
-    "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU, spacing [n 3] in mm, "
-    "id [n], axes z, y, x"
+    "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU (or 1/mm, activity), spacing "
+    "[n 3] in mm, id [n], axes z, y, x"
 )
 
 
@@ -52,7 +53,7 @@ class Stored:
 
     Args:
         name: of the volume.
-        ct: Hounsfield units [d h w].
+        ct: values [d h w]: Hounsfield units, or what the file's `units` say.
         spacing: mm along (z, y, x).
         label: structures [d h w], or none.
     """
@@ -65,15 +66,17 @@ class Stored:
 
 def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str) -> int:
     """Write a volume file whole, or not at all; returns how many volumes it holds. `attributes` go
-    with the file.
+    with the file; `units` among them is "HU" unless it is given.
 
     Raises:
-        ValueError: volumes of different shapes, only some with labels, or none; a name that cannot
-            be a file's, or that two volumes have.
+        ValueError: other units, volumes of different shapes, only some with labels, or none; a name
+            that cannot be a file's, or that two volumes have.
     """
     count, names = 0, []
+    attributes = {"axes": "z, y, x", "units": "HU", **attributes}
+    _check_layout(path, attributes)
     with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
-        for key, value in {**LAYOUT, **attributes}.items():
+        for key, value in attributes.items():
             text = value.encode()
             file.attrs.create(key, text, dtype=h5py.string_dtype("utf-8", max(1, len(text))))
         for count, volume in enumerate(volumes, start=1):  # noqa: B007 (counted for the caller)
@@ -151,6 +154,11 @@ class VolumeFile:
         return dataset_in(self.path, self.file, name, EXPECTED)
 
     @property
+    def unit(self) -> StoredUnit:
+        """Unit of the values: HU, 1/mm or activity."""
+        return self._checked()[1]["@units"][0]  # type: ignore[return-value]
+
+    @property
     def orientation(self) -> str | None:
         """Towards which sides of the patient the axes x, y, z run; none where the file does not
         say.
@@ -171,7 +179,7 @@ class VolumeFile:
         return Stored(name, parts, spacing)
 
     def slabs(self, index: int) -> tuple[str, Slabs, Spacing]:
-        """Name, Hounsfield units and spacing (z, y, x) of a volume that is read at every pass, a
+        """Name, values and spacing (z, y, x) of a volume that is read at every pass, a
         chunk at a time.
 
         Raises:
@@ -237,9 +245,7 @@ def _check(path: Path, file: h5py.File) -> Texts:
         check_chunks(path, dataset)
     texts = _texts(path, file, names)
     _check_names(path, texts["id"])
-    layout = {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT}
-    if layout != LAYOUT:
-        raise Refused(f"{path}: has the attributes {shown(layout)}, expected {LAYOUT}: {EXPECTED}")
+    _check_layout(path, {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT})
     mm = spacing[:]
     bad = ~((mm >= SPACING[0]) & (mm <= SPACING[1])).all(axis=1)
     if bad.any():
@@ -247,6 +253,12 @@ def _check(path: Path, file: h5py.File) -> Texts:
         got = f"volume {first} has the spacing {mm[first].tolist()}"
         raise Refused(f"{path}: {got}, expected positive mm from {SPACING[0]} to {SPACING[1]}")
     return texts
+
+
+def _check_layout(path: Path | str, attributes: Mapping[str, str | None]) -> None:
+    if any(attributes[key] not in values for key, values in LAYOUT.items()):
+        got = {key: attributes[key] for key in LAYOUT}
+        raise Refused(f"{path}: has the attributes {shown(got)}, expected {LAYOUT}: {EXPECTED}")
 
 
 def _check_names(path: Path | str, names: Sequence[str]) -> None:

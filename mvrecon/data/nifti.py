@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.data.slabs import Slab, Slabs, planes
+from mvrecon.data.orientation import Planes, oriented, right_angled
+from mvrecon.data.slabs import Slabs, planes
 from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import DEFLATE, EDGE, SPACING, TEXT, VOLUME, Refused, blaming
+from mvrecon.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, blaming
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
@@ -24,6 +25,8 @@ ENDING = re.compile(r"\.nii(\.gz)?$", re.IGNORECASE)
 MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
 #: The bytes of a header, which begins with their number, by NIfTI's version.
 HEADERS = {348: "Nifti1", 540: "Nifti2"}
+#: NIfTI's code of a world that is the scanner's; of no world: 0.
+SCANNER = 1
 SILENT = logging.Logger("nibabel's remarks", logging.CRITICAL)
 
 
@@ -51,27 +54,18 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
             header is told by the passes of the slabs.
     """
     nibabel = _nibabel(path)
-    from nibabel.orientations import inv_ornt_aff, io_orientation
-
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
     with blaming(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"):
         header = _header(path, nibabel)
         shape = _shape(path, header)
-        axes = io_orientation(header.get_best_affine())
-        affine = torch.from_numpy(header.get_best_affine() @ inv_ornt_aff(axes, shape)).double()
+        affine = header.get_best_affine()
         affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
-        turned = tuple(shape[int(k)] for k in axes[:, 0].argsort())
-        grid = Grid(turned[::-1], affine)  # type: ignore[arg-type]
-        if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
-            raise Refused(
-                f"{path}: has voxels of {grid.spacing} mm, expected {SPACING[0]} to {SPACING[1]}"
-            )
         slope, intercept = header.get_slope_inter()
         scale = (1.0, 0.0) if slope is None else (slope, intercept)
         stored = Stored(shape, header.get_data_dtype(), int(header["vox_offset"]), *scale)
-        return Slabs(grid.shape, 2 - int(axes[2, 0]), lambda: _slabs(path, stored, axes)), grid
+        return oriented(path, shape, affine, lambda: _passes(path, stored))
 
 
 class Stored(NamedTuple):
@@ -86,10 +80,9 @@ class Stored(NamedTuple):
     intercept: float
 
 
-def _slabs(path: Path, stored: Stored, axes: np.ndarray) -> Iterator[Slab]:
+def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
     """One pass over a file, whose last axis varies slowest: planes of equal place along it."""
     from nibabel.arrayproxy import ArrayProxy
-    from nibabel.orientations import apply_orientation
 
     i, j, k = stored.shape
     step = planes(i * j)
@@ -103,9 +96,7 @@ def _slabs(path: Path, stored: Stored, axes: np.ndarray) -> Iterator[Slab]:
                 stored.offset + first * i * j * stored.dtype.itemsize,
             )
             part = ArrayProxy(file, stored._replace(shape=(i, j, count), offset=place), mmap=False)
-            # reversed axes are strides backwards, which torch does not take
-            values = apply_orientation(np.asanyarray(part, dtype="float32"), axes).T.copy()
-            yield (k - first - count if axes[2, 1] < 0 else first), torch.from_numpy(values)
+            yield first, np.asanyarray(part, dtype="float32")
         _finish(path, file)
 
 
@@ -132,8 +123,8 @@ def _packed(path: Path) -> bool:
 
 
 def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write a volume as NIfTI, float32, whose first axis is x: the grid's affine goes with it
-    unchanged.
+    """Write a volume as NIfTI, float32, in mm, whose first axis is x: the grid's affine goes with
+    it unchanged, as sform and, where the voxel axes are at right angles, as qform.
 
     Compressed where the name ends in .gz (the same bytes for the same volume), and replaced whole
     or not at all.
@@ -143,8 +134,12 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
     """
     nibabel = _nibabel(path)
     values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
-    raw = nibabel.Nifti1Image(values, grid.affine.numpy()).to_bytes()
-    packed = gzip.compress(raw, 1, mtime=0) if str(path).endswith(".gz") else raw
+    image = nibabel.Nifti1Image(values, grid.affine.numpy())
+    image.header.set_xyzt_units("mm")
+    image.set_sform(grid.affine.numpy(), SCANNER)
+    image.set_qform(grid.affine.numpy(), SCANNER if right_angled(grid) else 0)
+    raw = image.to_bytes()
+    packed = gzip.compress(raw, 1, mtime=0) if _packed(Path(path)) else raw
     with written_whole(path) as part:
         part.write_bytes(packed)
 

@@ -1,27 +1,51 @@
-"""Volumes in files of their own, by the file's ending."""
+"""Volumes in files of their own, by what the path leads to."""
 
+import re
 from pathlib import Path
 
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.data.nifti import read_nifti, save_nifti
+from mvrecon.data import dicom, dicom_series, itk, nifti
+from mvrecon.data.slabs import Slabs
 from mvrecon.files.checks import Refused
 from mvrecon.geometry.grid import Grid
 
-ENDINGS = (".nii", ".nii.gz")
+READ, WRITTEN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"), (".nii", ".nii.gz", ".mha", ".nrrd")
+ENDING = re.compile(r"\.(nii(\.gz)?|mha|mhd|nrrd)$", re.IGNORECASE)
 
 
 def read_volume(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
-    """The values of a volume as they are stored (CT: HU), float32, and where its voxels lie in mm.
+    """The values of a volume as they are stored (CT: HU), float32, and where its voxels lie in mm;
+    see `open_volume`.
+    """
+    slabs, grid = open_volume(path)
+    return slabs.whole(), grid
+
+
+def open_volume(path: str | Path) -> tuple[Slabs, Grid]:
+    """The values of a volume as they are stored, slab by slab, and where its voxels lie in world mm
+    (RAS).
+
+    Args:
+        path: NIfTI, MHA, MHD or NRRD by its ending, or a folder with one DICOM CT series.
 
     Raises:
-        ImportError: nibabel is not installed.
+        ImportError: a library of the extra `io` is not installed.
         FileNotFoundError: nothing is there.
-        ValueError: another ending than .nii and .nii.gz, or a file that cannot be read; see
-            `data.nifti.read_nifti`.
+        ValueError: another ending, or a file that cannot be read; see `data.nifti.open_nifti`,
+            `data.itk.open_itk` and `data.dicom_series.open_series`.
     """
-    return read_nifti(_checked(path))
+    path = Path(path).expanduser()
+    if path.is_dir():
+        return dicom_series.open_series(path)
+    ending = _ending(path)
+    if ending not in READ:
+        raise Refused(
+            f"{path}: expected a volume whose name ends in {' or '.join(READ)}, or the folder of a "
+            f"DICOM CT series"
+        )
+    return nifti.open_nifti(path) if ending.startswith(".nii") else itk.open_itk(path)
 
 
 def save_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
@@ -29,19 +53,59 @@ def save_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) ->
     or not at all.
 
     Raises:
-        ImportError: nibabel is not installed.
-        ValueError: another ending than .nii and .nii.gz, or a volume that is not the grid's.
+        ImportError: a library of the extra `io` is not installed.
+        ValueError: another ending than .nii, .nii.gz, .mha and .nrrd, a volume that is not the
+            grid's, or a grid that MHA and NRRD cannot keep.
     """
+    path = Path(path).expanduser()
     if tuple(volume.shape) != grid.shape:
         raise ValueError(
             f"Expected one volume [d h w] of the grid's {grid.shape} voxels, got "
             f"{tuple(volume.shape)}; volumes[0, 0] is the first of a batch"
         )
-    save_nifti(_checked(path), volume, grid)
+    if (ending := _ending(path)) not in WRITTEN:
+        raise Refused(f"{path}: expected a volume whose name ends in {' or '.join(WRITTEN)}")
+    save = nifti.save_nifti if ending.startswith(".nii") else itk.save_itk
+    save(path, volume, grid)
 
 
-def _checked(path: str | Path) -> Path:
+def volumes_in(path: str | Path) -> list[Path]:
+    """The volumes that a path leads to, sorted by name: a file, a DICOM series, or a folder of
+    either.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: a folder without volumes, or with single DICOM files beside other volumes.
+    """
     path = Path(path).expanduser()
-    if not path.name.endswith(ENDINGS):
-        raise Refused(f"{path}: expected a volume whose name ends in {' or '.join(ENDINGS)}")
-    return path
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder; expected a volume or several")
+    if not path.is_dir():
+        return [path]
+    inside = [item for item in sorted(path.iterdir()) if not item.name.startswith(".")]
+    volumes = [item for item in inside if item.is_file() and ENDING.search(item.name)]
+    series = [item for item in inside if item.is_dir() and _has_dicom(item)]
+    if _has_dicom(path):
+        if volumes or series:
+            raise Refused(f"{path}: expected DICOM slices alone, got other volumes beside them")
+        return [path]
+    if not volumes and not series:
+        raise Refused(f"{path}: expected volumes ({', '.join(READ)}) or DICOM series, got none")
+    return sorted([*volumes, *series])
+
+
+def name_of(path: Path) -> str:
+    """The name of a volume: its file's without the ending, or its folder's."""
+    return ENDING.sub("", path.name)
+
+
+def _has_dicom(folder: Path) -> bool:
+    return any(
+        item.is_file() and not ENDING.search(item.name) and dicom.dicom_file(item)
+        for item in folder.iterdir()
+    )
+
+
+def _ending(path: Path) -> str:
+    match = ENDING.search(path.name)
+    return match[0].lower() if match else path.suffix

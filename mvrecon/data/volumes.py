@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.data.attenuation import WATER, attenuation
+from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.nifti import ENDING, open_nifti
@@ -57,10 +57,12 @@ class FileScene(ABC):
         vary: beyond the last case, count on with copies that are mirrored left to right, turned,
             scaled and shifted at random, others every time round.
         data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to
-            1000 HU.
+            1000 HU. Of activity, in its unit.
+        stored_unit: of the numbers in the file: HU (made attenuation by `data.attenuation`), 1/mm,
+            or activity, which are projected as they are. None: HU.
 
     Raises:
-        ValueError: an unknown crop, or numbers that are too small.
+        ValueError: an unknown crop or unit, or numbers that are too small.
     """
 
     path: str
@@ -69,9 +71,13 @@ class FileScene(ABC):
     rays: int = 2
     vary: bool = False
     data_range: float = 0.04
+    stored_unit: StoredUnit | None = None
     unit: str = field(default="1/mm", init=False)
 
     def __post_init__(self) -> None:
+        if self.stored not in UNITS:
+            raise ValueError(f"stored_unit must be one of {UNITS}, got {self.stored_unit!r}")
+        self.unit = "activity" if self.stored == "activity" else "1/mm"
         if self.crop not in ("body", "none"):
             raise ValueError(f"crop must be 'body' or 'none', got {self.crop!r}")
         if (self.fine is not None and self.fine < 2) or self.rays < 1 or not self.data_range > 0:
@@ -81,6 +87,11 @@ class FileScene(ABC):
                 f"{got}"
             )
         self._operator: tuple[Grid, Cameras, Any] | None = None
+
+    @property
+    def stored(self) -> StoredUnit:
+        """Unit of the numbers in the file."""
+        return self.stored_unit or "HU"
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_operator": None}
@@ -92,7 +103,7 @@ class FileScene(ABC):
 
     @abstractmethod
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
-        """Name, Hounsfield units and grid of a case as it lies in the file."""
+        """Name, values in the stored unit and grid of a case as it lies in the file."""
 
     def factor(self, grid: Grid) -> int:
         """How many times finer than `grid` the grid is that views are projected from."""
@@ -108,7 +119,7 @@ class FileScene(ABC):
         """
         name, fine = self.finely(index, seed, grid)
         truth = F.avg_pool3d(fine[None], self.factor(grid))
-        inside = enclosed(body(truth[0], TISSUE))
+        inside = enclosed(body(truth[0], self._above(TISSUE)))
         return Sample(self._views(fine, grid, cameras), truth, inside[None], name)
 
     def finely(self, index: int, seed: int, grid: Grid) -> tuple[str, Float[Tensor, "e i j"]]:
@@ -125,7 +136,7 @@ class FileScene(ABC):
             )
         name, hu, source = self.case(case)
         fine = grid.refined(self.factor(grid))
-        mu = hu.mapped(lambda slab: attenuation(self._finite(name, slab)))
+        mu = hu.mapped(lambda slab: self._physical(name, slab))
         rng = generator(seed, index) if turn else None
         if rng is not None and uniform(rng, 0, 1) < 0.5:
             mu = mu.flipped([2])
@@ -138,21 +149,23 @@ class FileScene(ABC):
 
     def _pivot(self, name: str, mu: Slabs, source: Grid) -> Float[Tensor, "3"]:
         """World mm of the centre of the patient's box."""
-        patient = body_box(mu, SKIN)
+        patient = body_box(mu, self._above(SKIN))
         if not patient.size:
             raise ValueError(
-                f"{self.path}: {name} shows no patient: expected values above -400 HU, all are "
-                f"below"
+                f"{self.path}: {name} shows no patient: expected values above "
+                f"{'0' if self.unit == 'activity' else '-400 HU'}, all are below"
             )
         return source.cropped(patient).centre
 
-    def _finite(self, name: str, hu: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
-        if not hu.isfinite().all():
-            raise ValueError(
-                f"{self.path}: {name} has {int((~hu.isfinite()).sum())} values that are not "
-                f"finite HU"
-            )
-        return hu
+    def _physical(self, name: str, values: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
+        try:
+            return physical(values, self.stored)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {name} {error}") from error
+
+    def _above(self, threshold: float) -> float:
+        """A threshold in 1/mm; of activity, zero."""
+        return 0.0 if self.unit == "activity" else threshold
 
     @torch.no_grad()
     def _views(
@@ -226,10 +239,17 @@ class Hdf5Volumes(FileScene):
         return len(self._file)
 
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
-        """Name, Hounsfield units and grid of a volume, centred on the origin, its axes running to
-        RAS.
+        """Name, values and grid of a volume, centred on the origin, its axes running to RAS.
+
+        Raises:
+            ValueError: the file says another unit than `stored_unit`.
         """
         name, hu, spacing = self._file.slabs(index)
+        if self._file.unit != self.stored:
+            raise ValueError(
+                f"{self.path}: expected the scene's stored_unit to be the file's, "
+                f"{self._file.unit!r}, got {self.stored!r}"
+            )
         axes = reversed_axes(self.orientation or self._file.orientation or "RAS")
         grid = Grid.centred(size=hu.shape[::-1], spacing=spacing[::-1])
         return name, hu.flipped(axes), grid
@@ -253,9 +273,7 @@ def reversed_axes(orientation: str) -> list[int]:
 
 @dataclass(kw_only=True)
 class NiftiVolume(FileScene):
-    """One NIfTI volume in Hounsfield units, in world mm (RAS) by its affine. Options: see
-    `FileScene`.
-    """
+    """One NIfTI volume, in world mm (RAS) by its affine. Options: see `FileScene`."""
 
     @property
     def length(self) -> int:
@@ -263,5 +281,5 @@ class NiftiVolume(FileScene):
         return 1
 
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
-        """Name, Hounsfield units and grid of the volume, its axes running roughly to RAS."""
+        """Name, values and grid of the volume, its axes running roughly to RAS."""
         return ENDING.sub("", Path(self.path).name), *open_nifti(self.path)

@@ -19,8 +19,12 @@ from mvrecon.engine.fit import build_module, methods, trainable
 from mvrecon.engine.module import Settings
 from mvrecon.metrics import UNITS, view_metrics, volume_metrics
 from mvrecon.projectors.operator import Projector
+from mvrecon.registry import hint
 
 Scores = dict[str, list[dict[str, float]]]
+#: Where evaluation can run, by Lightning's names.
+ACCELERATORS = ("auto", "cpu", "gpu", "cuda")
+
 See = Callable[[dict[str, Any], dict[str, Tensor]], None]
 
 
@@ -144,8 +148,17 @@ def seen_in_training(methods: Iterable[Trained], names: Iterable[str]) -> list[s
 
 
 def device_of(accelerator: str) -> str:
-    """The device that evaluation runs on, for Lightning's name of an accelerator."""
-    return "cuda" if accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available() else "cpu"
+    """The device that evaluation runs on, for Lightning's name of an accelerator.
+
+    Raises:
+        ValueError: a name that is not known, or a GPU where torch sees none.
+    """
+    if accelerator not in ACCELERATORS:
+        raise ValueError(f"Unknown device {accelerator!r}{hint(str(accelerator), ACCELERATORS)}")
+    available = torch.cuda.is_available()
+    if accelerator in ("gpu", "cuda") and not available:
+        raise ValueError(f"Expected a GPU for device {accelerator!r}, but torch sees none here")
+    return "cuda" if accelerator != "cpu" and available else "cpu"
 
 
 def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:

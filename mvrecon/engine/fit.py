@@ -25,7 +25,7 @@ def methods(settings: Settings) -> dict[str, Settings]:
 
     Raises:
         ValueError: the main model's label is taken twice, or a label is no plain name: files are
-            called by it.
+            called by it. "truth" is refused: its file is the truth's own.
     """
     main = settings["model"]
     others = {label: model for label, model in settings["compare"].items() if model}
@@ -33,10 +33,13 @@ def methods(settings: Settings) -> dict[str, Settings]:
         raise ValueError(
             f"compare holds {main['name']!r}, which is the main model's own label; give it another"
         )
-    return {
-        plain_name(label, "a method"): model
-        for label, model in {main["name"]: main, **others}.items()
-    }
+    labelled = {main["name"]: main, **others}
+    # whatever the case: some file systems do not tell it
+    if taken := [label for label in labelled if str(label).casefold() == "truth"]:
+        raise ValueError(
+            f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another label"
+        )
+    return {plain_name(label, "a method"): model for label, model in labelled.items()}
 
 
 def build_data(settings: Settings) -> SceneData:

@@ -3,18 +3,12 @@
 from importlib.util import find_spec
 from types import ModuleType
 
-import torch
 from torch import Tensor
 
 from mvrecon.kernels.rays import ops, reference
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 COMPILED = find_spec("numba") is not None
-
-
-def wide(tensor: Tensor) -> Tensor:
-    """The tensor in the precision of arithmetic: float64 as such, all else as float32."""
-    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
 def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tuple[str, ModuleType]:
@@ -32,8 +26,8 @@ def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tupl
     """
     if backend not in BACKENDS:
         raise ValueError(f"Unknown backend {backend!r}. Known: {', '.join(BACKENDS)}")
-    here = tensor.device.type
-    if backend in ("cpu", "cuda") and here != backend:
+    device = tensor.device.type
+    if backend in ("cpu", "cuda") and device != backend:
         memory = "main memory" if backend == "cpu" else "a GPU's memory"
         raise ValueError(
             f"backend {backend!r} needs tensors in {memory}, got {tensor.device}; use 'auto' or "
@@ -41,10 +35,9 @@ def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tupl
         )
     if backend == "reference" or not COMPILED:
         return "reference", reference
-    if here == "cuda":
-        from mvrecon.kernels.rays import (
-            selfcheck,
-        )  # it brings torch's compiler, which takes longer than torch
+    if device == "cuda":
+        # it brings torch's compiler, which takes longer than torch
+        from mvrecon.kernels.rays.cuda import selfcheck
 
         volumes = tensor.shape[0] * tensor.shape[1]
         why = (
@@ -55,4 +48,4 @@ def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tupl
         if why and backend == "cuda":
             raise RuntimeError(f"backend 'cuda' cannot be used on {tensor.device}: {why}")
         return ("reference", reference) if why else ("cuda", ops)
-    return ("cpu", ops) if here == "cpu" else ("reference", reference)
+    return ("cpu", ops) if device == "cpu" else ("reference", reference)

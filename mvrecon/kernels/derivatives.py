@@ -9,6 +9,7 @@ the operator, of its tensors, in plain torch.
 import logging
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from inspect import signature
 from typing import Any
 
 import torch
@@ -97,6 +98,8 @@ def derivable(
                 [next(tensors) if one is None else one[0] for one in ctx.others], changes
             )
 
+    # torch asks for it in every call, and looking for it takes nine times as long
+    operator.__signature__ = signature(operator)
     rule = mapped(call)
     acts = {
         "forward": operator,

@@ -18,8 +18,8 @@ def batched(operator: Callable[..., Tensor]) -> Mapped:
         if of_geometry is None:
             moved = values.movedim(where, 0)
             return operator(moved.flatten(0, 1), geometry, *rest).unflatten(0, moved.shape[:2]), 0
-        each = values.unbind(where) if where is not None else [values] * info.batch_size
-        pairs = zip(each, geometry.unbind(of_geometry), strict=True)
+        copies = values.unbind(where) if where is not None else [values] * info.batch_size
+        pairs = zip(copies, geometry.unbind(of_geometry), strict=True)
         return torch.stack([operator(*pair, *rest) for pair in pairs]), 0
 
     return mapped
@@ -29,12 +29,12 @@ def looped(operator: Callable[..., Tensor], tensors: int) -> Mapped:
     """How `torch.func.vmap` maps an operator whose result sums over the batch: one call each."""
 
     def mapped(info, in_dims, *inputs):
-        each = [
-            given.unbind(dim) if dim is not None else [given] * info.batch_size
-            for given, dim in zip(inputs[:tensors], in_dims, strict=False)
+        copies = [
+            tensor.unbind(dim) if dim is not None else [tensor] * info.batch_size
+            for tensor, dim in zip(inputs[:tensors], in_dims, strict=False)
         ]
         return torch.stack(
-            [operator(*one, *inputs[tensors:]) for one in zip(*each, strict=True)]
+            [operator(*one, *inputs[tensors:]) for one in zip(*copies, strict=True)]
         ), 0
 
     return mapped

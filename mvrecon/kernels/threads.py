@@ -59,5 +59,5 @@ def share(work: Callable[[int, int], None], count: int, samples: int, per_thread
         work(0, count)
         return
     ranges = [(count * i // parts, count * (i + 1) // parts) for i in range(parts)]
-    for done in [_pool(threads, os.getpid()).submit(work, *each) for each in ranges]:
+    for done in [_pool(threads, os.getpid()).submit(work, *ends) for ends in ranges]:
         done.result()

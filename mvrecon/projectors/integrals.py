@@ -15,7 +15,7 @@ from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays, tensors_of, writes
 from mvrecon.kernels.rays.occupancy import Occupancy
@@ -42,6 +42,7 @@ class LineIntegrals(Projector):
         support: Bool[Tensor, "d h w"] | None = None,
     ):
         super().__init__()
+        self.check_rig(cameras)
         names = {"method": METHODS, "backend": backends.BACKENDS, "skip": SKIPS}
         for what, name in (
             ("method", method.partition(":")[0]),
@@ -66,6 +67,15 @@ class LineIntegrals(Projector):
         self.register_buffer("support", mask, persistent=False)
         self._support_code, self._support_box = self._occupied_by_support()
         self._last: Tensor | None = None
+
+    @staticmethod
+    def check_rig(cameras: Cameras | ExplicitRays) -> None:
+        """Check of the rays before the operator is built; a subclass refuses those that it does
+        not take.
+
+        Raises:
+            ValueError: rays that the operator does not take.
+        """
 
     @property
     def device(self) -> torch.device:

@@ -93,16 +93,26 @@ class Projector(nn.Module, LinearOperator):
     cameras: Cameras
 
 
-class Transposed(LinearOperator):
+class Derived(LinearOperator):
+    """An operator made of another one, A: on its device, and with a gradient by its cameras."""
+
+    A: Any
+
+    @property
+    def device(self) -> torch.device:
+        return self.A.device
+
+    @property
+    def pose_gradient(self) -> bool:
+        return self.A.pose_gradient
+
+
+class Transposed(Derived):
     """The adjoint of an operator as an operator."""
 
     def __init__(self, A: LinearOperator):
         self.A = A
         self.domain_shape, self.range_shape = A.range_shape, A.domain_shape
-
-    @property
-    def device(self) -> torch.device:
-        return self.A.device
 
     @property
     def T(self) -> LinearOperator:
@@ -145,21 +155,13 @@ class Composed(nn.Module, LinearOperator):
         return self.B.adjoint(self.A.adjoint(y))
 
 
-class Wrapped(Projector):
-    """What an operator made of another one takes over: shapes, device, grid and cameras."""
+class Wrapped(Derived, Projector):
+    """A projector made of another operator: with its shapes, device, grid and cameras."""
 
     def __init__(self, A: LinearOperator):
         super().__init__()
-        self.A: Any = A
+        self.A = A
         self.domain_shape, self.range_shape = A.domain_shape, A.range_shape
-
-    @property
-    def device(self) -> torch.device:
-        return self.A.device
-
-    @property
-    def pose_gradient(self) -> bool:
-        return self.A.pose_gradient
 
     @property
     def grid(self) -> Grid:

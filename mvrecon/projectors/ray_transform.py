@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.cameras.symmetry import Mirror, mirror_pairs
 from mvrecon.geometry.box import Box
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.integrals import LineIntegrals
 from mvrecon.projectors.operator import LinearOperator, Projector

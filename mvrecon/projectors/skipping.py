@@ -57,6 +57,8 @@ def skip_report(code: Tensor | None, skip: str, shape: Sequence[int]) -> Skipped
             f"on a few rays the box leaves {fractions['box']:.1%} of the work, bricks "
             f"{fractions['brick']:.1%}"
         )
+        if mode != "brick" and fractions["brick"] < fractions["box"]:
+            why += ", too little to gain by them"
     elif skip in ("box", "brick"):
         why = f"{skip!r} was asked for"
     else:

@@ -8,14 +8,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check_floating
 from mvrecon.projectors.integrals import LineIntegrals
-from mvrecon.projectors.operator import LinearOperator
+from mvrecon.projectors.operator import Derived, LinearOperator
 from mvrecon.projectors.selection import RaySelection, ViewSelection
 
 
-class SomeRays(LinearOperator):
+class SomeRays(Derived):
     """Some rows of a ray transform: the chosen entries of A x, and the matched adjoint.
 
     Differentiable as the transform is, in the cameras' tensors too, and on its device. The values
@@ -44,14 +44,6 @@ class SomeRays(LinearOperator):
     def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]:
         """The rays' lines."""
         raise NotImplementedError
-
-    @property
-    def device(self) -> torch.device:
-        return self.A.device
-
-    @property
-    def pose_gradient(self) -> bool:
-        return self.A.pose_gradient
 
     @property
     def lines(self) -> Float[Tensor, "n 4 3 k"]:

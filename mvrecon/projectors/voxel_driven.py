@@ -12,7 +12,8 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
-from mvrecon.kernels.backends import kernels_for, wide
+from mvrecon.kernels.backends import kernels_for
+from mvrecon.kernels.precision import wide
 from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.kernels.voxels import reference as voxel_reference
 from mvrecon.projectors.checks import check

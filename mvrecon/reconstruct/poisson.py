@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import RaySelection, ViewSelection

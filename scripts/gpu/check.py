@@ -75,7 +75,7 @@ def machine() -> dict[str, Any]:
 
 def self_checks(results: Results) -> None:
     """What the back end says of itself."""
-    from mvrecon.kernels.rays import selfcheck
+    from mvrecon.kernels.rays.cuda import selfcheck
 
     for method in METHODS:
         for dtype in (torch.float32, torch.float64):

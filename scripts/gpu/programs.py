@@ -51,7 +51,7 @@ def ours(grid: mv.Grid, rig: mv.Cameras, device: str, **options: Any) -> Program
 
 def scattered(grid: mv.Grid, rig: mv.Cameras, device: str) -> Program:
     """Our adjoint ray by ray, with atomic additions."""
-    from mvrecon.kernels.rays import cuda
+    from mvrecon.kernels.rays.cuda import operators as cuda
     from mvrecon.kernels.rays.occupancy import Occupancy
 
     A, whole = mv.Drr(grid, rig).to(device), Occupancy.whole(grid.shape)

@@ -21,7 +21,7 @@ from measuring import reason
 import mvrecon as mv
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_module
-from mvrecon.kernels.rays import selfcheck
+from mvrecon.kernels.rays.cuda import selfcheck
 from mvrecon.metrics import volume_metrics
 from mvrecon.models import frusta
 from mvrecon.projectors.selection import ray_subset, view_subset

@@ -121,7 +121,7 @@ def test_what_a_gpu_refuses_would_be_seen(taken_for_a_gpu):
 
 @pytest.mark.parametrize("detector", [(4, 4), (400, 400)])
 def test_the_adjoint_of_a_gpu_adds_up_in_a_fixed_order_or_not_at_all(detector, strict):
-    from mvrecon.kernels.rays.cuda import gathers
+    from mvrecon.kernels.rays.cuda.operators import gathers
 
     shape = (8, 8, 8)
     assert gathers(shape, detector, 3, "joseph")

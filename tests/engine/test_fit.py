@@ -142,6 +142,14 @@ def test_a_label_is_used_once(settings):
     assert list(fit.methods({**settings, "compare": {"sirt": None}})) == ["cross_view"]
 
 
+@pytest.mark.door
+def test_no_method_is_labelled_as_the_truth(settings):
+    """A method labelled "truth", whose volume would overwrite the true one, is refused."""
+    for label in ("truth", "Truth"):
+        with pytest.raises(ValueError, match=f"labelled '{label}' would overwrite truth.nii.gz"):
+            fit.methods({**settings, "compare": {label: {"name": "sirt"}}})
+
+
 def test_an_unfinished_method_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"mine.ckpt: did the training of 'mine' end\?"):
         checkpoints.load(checkpoints.finished(tmp_path, "mine"))

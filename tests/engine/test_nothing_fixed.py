@@ -74,7 +74,7 @@ def test_a_training_step_projects_as_often_as_the_model_says_and_never_asks_for_
 @pytest.mark.parametrize("moves", [False, True])
 def test_the_gradient_of_the_poses_is_taken_for_poses_that_want_one(moves, monkeypatch):
     monkeypatch.setattr(
-        "mvrecon.kernels.rays.cpu.lines_vjp",
+        "mvrecon.kernels.rays.cpu.operators.lines_vjp",
         lambda volume, views, lines, *_: torch.zeros_like(lines),
     )
     grid, rig = small_rig()

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import torch
 import yaml
@@ -14,10 +15,15 @@ import yaml
 from mvrecon.cameras.files import from_file, save
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.nifti import read_nifti
+from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.pytorch3dunet import Example, read_example, write_example
+from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.engine.checkpoints import load
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.files.checks import yaml_of
+from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS
+from tests.data.projections.conftest import dicom_image
 from tests.faults.hostile import pickle_of, saved, with_pickle
 
 Wrap = Callable[[bytes], bytes]
@@ -66,6 +72,12 @@ def read_volumes(path: Path) -> list[Stored]:
     return [file.read(index) for index in range(len(file)) if file.orientation != "none"]
 
 
+def read_views(path: Path) -> torch.Tensor:
+    """Every view of a stack."""
+    stack = open_projections(path)
+    return stack.read(0, stack.n_views)
+
+
 def samples(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, str]]:
     """By reader: how it reads, what is damaged, what is put around the damaged bytes, and the
     file's ending.
@@ -84,11 +96,60 @@ def samples(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap,
     return {
         "HDF5 volumes": (read_volumes, hdf5, whole, ".h5"),
         **(_nifti(folder) if find_spec("nibabel") else {}),
+        **(_itk(folder) if find_spec("nibabel") and find_spec("SimpleITK") else {}),
+        **_views(folder),
         "cameras": (from_file, rig, whole, ".json"),
         "settings": (yaml_of, settings, whole, ".yaml"),
         "checkpoint": (load, archive, whole, ".ckpt"),
         "checkpoint's pickle": (load, pickle_of(archive), partial(with_pickle, archive), ".ckpt"),
     }
+
+
+def _views(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, str]]:
+    from PIL import Image as Pillow
+
+    pages = [Pillow.fromarray(plane.astype("u2")) for plane in HU]
+    pages[0].save(folder / "v.tif", save_all=True, append_images=pages[1:])
+    pages[0].save(folder / "v.png")
+    np.save(folder / "v.npy", HU)
+    if find_spec("pydicom"):
+        dicom_image(folder / "v.dcm", HU.astype("u2"), RescaleSlope=2, RescaleIntercept=-1024)
+    write_example(folder / "e.h5", Example(HU))
+    with h5py.File(folder / "v.h5", "w") as file:
+        file.create_dataset("views", data=HU.astype("f4"), compression="gzip", shuffle=True)
+    return {
+        "pytorch-3dunet": (read_example, (folder / "e.h5").read_bytes(), bytes, ".h5"),
+        **{
+            f"views, {name}": (
+                read_views,
+                (folder / f"v.{ending}").read_bytes(),
+                bytes,
+                f".{ending}",
+            )
+            for name, ending in (
+                ("TIFF", "tif"),
+                ("PNG", "png"),
+                ("NumPy", "npy"),
+                ("HDF5", "h5"),
+                ("DICOM", "dcm"),
+            )
+            if (folder / f"v.{ending}").exists()
+        },
+    }
+
+
+def _itk(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, str]]:
+    grid = Grid.centred(size=HU.shape[::-1], spacing=(2.0, 2.0, 3.0))
+    samples = {}
+    for ending in (".mha", ".nrrd"):
+        save_volume(folder / f"a{ending}", torch.from_numpy(HU).float(), grid)
+        samples[ending[1:].upper()] = (
+            read_volume,
+            (folder / f"a{ending}").read_bytes(),
+            bytes,
+            ending,
+        )
+    return samples
 
 
 def _nifti(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, str]]:

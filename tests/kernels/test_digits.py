@@ -70,7 +70,7 @@ def test_halves_are_stored_and_summed_in_float32(kind, option, dtype, monkeypatc
     assert one.dtype == dtype and torch.equal(one, two.to(dtype))
     back = A.T(views.detach().to(dtype))
     assert back.dtype == torch.float32 and torch.equal(back, A.T(views.detach().to(dtype).float()))
-    monkeypatch.setattr("mvrecon.kernels.rays.plan.BUDGET", 1)
+    monkeypatch.setattr("mvrecon.kernels.rays.cpu.plan.BUDGET", 1)
     assert gap(A(x), expected) < (1e-5 if option == "siddon" else 1e-6)
 
 

@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
+from mvrecon.geometry.lattice import lifted_maps
 from mvrecon.kernels.warps.warp import warp
 from mvrecon.projectors.voxel_driven import backproject
-from tests.kernels.test_warp import OTHER, SMALL, generic, lifted_maps
+from tests.kernels.warps.scenes import OTHER, SMALL, generic
 from tests.projectors.cases import DIFFERENTIABLE, METHODS, gap, noise
 
 

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
+from mvrecon.geometry.lattice import lifted_maps
 from mvrecon.kernels.warps.warp import warp
 from mvrecon.projectors.voxel_driven import backproject
-from tests.kernels.test_warp import OTHER, SMALL, generic, lifted_maps
+from tests.kernels.warps.scenes import OTHER, SMALL, generic
 from tests.projectors.cases import DIFFERENTIABLE, METHODS, Case, gap, noise
 
 Loss = Callable[[Tensor], Tensor]

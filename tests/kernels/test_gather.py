@@ -13,8 +13,9 @@ from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import ops
-from mvrecon.kernels.rays.gather import camera, collect, record
+from mvrecon.kernels.rays.cuda.gather import View, collect, record
 from mvrecon.kernels.rays.lines import lines_of
+from mvrecon.kernels.rays.projection_matrix import projection_matrix
 from mvrecon.kernels.rays.trace import Space
 from tests.projectors.rigs import AXIAL, CONE, GRID, INSIDE, PARALLEL, PINHOLES
 
@@ -42,11 +43,11 @@ RIGS = {
 def record_all(lines, window, sizes, detector, rays, frames):
     space = Space(window, sizes, (0, 0, 0, sizes[0], sizes[1], sizes[2]))
     for m in range(len(lines)):
-        camera(lines[m], frames[m])
+        projection_matrix(lines[m], frames[m])
         for v in range(detector[0]):
             for u in range(detector[1]):
-                here = (u - (detector[1] - 1) / 2, v - (detector[0] - 1) / 2)
-                record(lines[m], here, space, rays, (m * detector[0] + v) * detector[1] + u)
+                pixel = (u - (detector[1] - 1) / 2, v - (detector[0] - 1) / 2)
+                record(lines[m], pixel, space, rays, (m * detector[0] + v) * detector[1] + u)
 
 
 @njit
@@ -57,7 +58,7 @@ def collect_all(rays, frames, values, sizes, detector, volume):
             for y in range(sizes[1]):
                 for x in range(sizes[0]):
                     for axis in range(3):
-                        view = (frames[m], rays, values, start, start, sizes, detector)
+                        view = View(frames[m], rays, values, start, start, sizes, detector)
                         collect(view, (x, y, z), axis, 0, volume[z, y, x], np.float64)
 
 
@@ -102,7 +103,7 @@ def test_a_camera_takes_every_point_of_a_ray_to_its_pixel(kind):
     lines = lines_of(cameras, grid).numpy()
     for line in lines:
         frame = np.zeros((3, 4))
-        camera(line, frame)
+        projection_matrix(line, frame)
         for p in np.array([[0.0, 0, 1], [1.5, -2, 1], [-3, 0.25, 1]]):
             start, direction = line[2] @ p, line[0] @ p
             for way in (0.3, 1.0, 4.0):

@@ -9,8 +9,11 @@ import torch
 
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays import columns, cpu, ops, packed_volume, plan, reference, upright
-from mvrecon.kernels.rays.loops import backproject_slabs, project_rows, room_of
+from mvrecon.kernels.rays import ops, reference
+from mvrecon.kernels.rays.cpu import columns, packed_volume, plan, upright
+from mvrecon.kernels.rays.cpu import operators as cpu
+from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room_of
+from mvrecon.kernels.rays.cpu.rig import Reads, Slabs, Units, rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.parts import PROJECTORS
 from mvrecon_bench.benchmarks.measure import threads, with_memory
@@ -38,9 +41,10 @@ def test_upright_columns_are_walked_once_for_all_of_their_rays(monkeypatch):
     walked: dict[str, int] = {}
 
     def counted(name: str, loop):
-        def run(store, rig, room, reads, views, first, last):
+        def run(store, rig, room, reads, views, *part):
+            first, last = part[0][1:] if len(part) == 1 else part  # units, slabs; columns
             walked[name] = walked.get(name, 0) + last - first
-            return loop(store, rig, room, reads, views, first, last)
+            return loop(store, rig, room, reads, views, *part)
 
         return run
 
@@ -74,8 +78,8 @@ def least(call):
     """What a call returns, and the least of the MB that it needed twice: what else the process does
     only adds.
     """
-    (found, once), (_, again) = (with_memory(call, "cpu") for _ in range(2))
-    return found, min(once, again)
+    (result, once), (_, again) = (with_memory(call, "cpu") for _ in range(2))
+    return result, min(once, again)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark cannot be reset")
@@ -119,9 +123,9 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
     narrow = results()
 
     def wide(volumes, near):
-        held = packed_volume.store(volumes, near)
-        assert held.strides.dtype == np.int32
-        return held._replace(strides=held.strides.astype(np.int64))
+        narrow = packed_volume.store(volumes, near)
+        assert narrow.strides.dtype == np.int32
+        return narrow._replace(strides=narrow.strides.astype(np.int64))
 
     monkeypatch.setattr(cpu, "store", wide)
     assert all(torch.equal(one, other) for one, other in zip(results(), narrow, strict=True))
@@ -136,20 +140,20 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
         torch.eye(3), torch.tensor([0, 3599.5, 3499.5])
     )
     A = Case(grid, rig).build()
-    held = plan.rig_of(A.lines, A.ray_extent, Occupancy.whole(grid.shape), [1, 1], method)
+    rays = rig_of(A.lines, A.ray_extent, Occupancy.whole(grid.shape), [1, 1], method)
     file = np.memmap(tmp_path / "holes", np.float32, "w+", shape=(1, 7203, 43, 7003, 1))
     volume = packed_volume.store(file.view(np.ndarray), near=2)
     assert volume.size > 2**31 and volume.strides.dtype == np.int64
-    reads = np.arange(1), np.zeros(1, bool), np.array([[[0, 1]]], np.int32)
+    reads = Reads(np.arange(1), np.zeros(1, bool), np.array([[[0, 1]]], np.int32))
+    units, slabs = Units((True, False, False), 0, 1), Slabs(0, 0, 40)
     row = file.view(np.ndarray)[0, 7200, 1:41, 7000, 0]
     row[:] = np.arange(40)
     views = np.zeros((1, 1, 1, 1), np.float32)
-    project_rows(volume, held, room_of(held, volume), (*reads, (True, False, False)), views, 0, 1)
+    project_rows(volume, rays, room_of(rays, volume), reads, views, units)
     assert views.item() == pytest.approx(row.sum(), rel=1e-5)
     row[:] = 0
-    backproject_slabs(
-        volume, held, room_of(held, volume), (*reads, 0), np.full_like(views, 2), 0, 40
-    )
+    twos = np.full_like(views, 2)
+    backproject_slabs(volume, rays, room_of(rays, volume), reads, twos, slabs)
     assert np.allclose(row, 2, rtol=1e-5)
 
 

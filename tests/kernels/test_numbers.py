@@ -50,7 +50,7 @@ def test_the_disk_cache_knows_every_source_file():
     the loops' file.
     """
     from mvrecon.kernels import compiling
-    from mvrecon.kernels.rays import loops
+    from mvrecon.kernels.rays.cpu import loops
 
     for loop in (loops.project_rows, loops.backproject_slabs, loops.vary_rows):
         assert loop._cache._cache_file._source_stamp == compiling.SOURCES

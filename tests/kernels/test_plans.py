@@ -7,8 +7,8 @@ import torch
 
 from mvrecon.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays import plan
-from mvrecon.kernels.rays.cpu import backproject, project
+from mvrecon.kernels.rays.cpu import plan
+from mvrecon.kernels.rays.cpu.operators import backproject, project
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 
@@ -31,8 +31,8 @@ def scene(lines: torch.Tensor, method: str = "joseph") -> plan.Scene:
     return plan.Scene(lines, [0.0, 1.0], DETECTOR, method)
 
 
-def plan_of(lines: torch.Tensor, method: str = "joseph", volumes: int = 1, held=None) -> plan.Plan:
-    return plan.plan_of(scene(lines, method), held or Occupancy.whole(SHAPE), volumes, 4)
+def plan_of(lines: torch.Tensor, method: str = "joseph", volumes: int = 1, part=None) -> plan.Plan:
+    return plan.plan_of(scene(lines, method), part or Occupancy.whole(SHAPE), volumes, 4)
 
 
 def test_a_plan_belongs_to_the_content_of_lines():
@@ -51,7 +51,7 @@ def test_a_plan_belongs_to_all_that_it_depends_on(monkeypatch):
     lines, box = LINES["dome"], Occupancy.whole(SHAPE).box
     part = Occupancy(SHAPE, type(box)((1, 1, 1), (5, 6, 7)))
     plans = [plan_of(lines), plan_of(lines, "siddon"), plan_of(lines, volumes=3)]
-    plans += [plan_of(lines, held=part)]
+    plans += [plan_of(lines, part=part)]
     monkeypatch.setattr(plan, "BUDGET", 1)
     plans += [plan_of(lines)]
     assert len({id(one) for one in plans}) == 5
@@ -65,9 +65,9 @@ def test_kept_plans_change_no_bit(kind, method, monkeypatch):
     x = torch.rand(2, *SHAPE, generator=torch.Generator().manual_seed(0))
 
     def results() -> list[torch.Tensor]:
-        there, rest = Occupancy.whole(SHAPE), ([0.0, 1.0],)
-        views = project(x, LINES[kind], *rest, there, DETECTOR, method)
-        return [views, backproject(views, LINES[kind], *rest, there, method)]
+        whole, rest = Occupancy.whole(SHAPE), ([0.0, 1.0],)
+        views = project(x, LINES[kind], *rest, whole, DETECTOR, method)
+        return [views, backproject(views, LINES[kind], *rest, whole, method)]
 
     made, kept = results(), results()
     assert plan.kept_plan.cache_info().hits == 3
@@ -91,5 +91,5 @@ def test_threads_share_plans():
     """Many threads that ask at once get equal plans, and one of them from then on."""
     with ThreadPoolExecutor(8) as pool:
         plans = list(pool.map(lambda _: plan_of(LINES["circular"]), range(64)))
-    assert len({tuple(one.oblique) + tuple(one.upright[0]) for one in plans}) == 1
+    assert len({tuple(one.oblique) + tuple(one.upright.views) for one in plans}) == 1
     assert plan_of(LINES["circular"]) is plan_of(LINES["circular"])

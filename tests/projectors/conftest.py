@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mvrecon.kernels.rays import skip_policy
+from mvrecon.kernels.rays.cpu import skip_policy
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays import plan, upright
+from mvrecon.kernels.rays.cpu import plan, upright
+from mvrecon.kernels.rays.cpu.rig import rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.projectors.cases import CASES, OPTIONS, UPRIGHT, Case, gap, noise
 
@@ -29,9 +30,7 @@ def oblique(monkeypatch):
 def test_the_cases_stand_upright_where_they_say_so():
     for kind, case in CASES.items():
         A = case.build()
-        rig = plan.rig_of(
-            A.lines, A.ray_extent, Occupancy.whole(case.grid.shape), A.detector, "joseph"
-        )
+        rig = rig_of(A.lines, A.ray_extent, Occupancy.whole(case.grid.shape), A.detector, "joseph")
         assert upright.columnar(rig).tolist() == [case.upright] * len(A.lines), kind
 
 
@@ -93,7 +92,7 @@ def test_pieces_of_the_volume_add_up(kind, option, monkeypatch):
     for budget in (1, 4 * 8 * (whole[1][:1, :1].numel() + 300) // 2):
         monkeypatch.setattr(plan, "BUDGET", budget)
         held = Occupancy.whole(case.grid.shape)
-        rig = plan.rig_of(A.lines, A.ray_extent, held, A.detector, A.kernel)
+        rig = rig_of(A.lines, A.ray_extent, held, A.detector, A.kernel)
         parts = plan.parts_of(A.kernel, held.shape, 4 * 8)
         assert len(list(plan.pieces(rig, held, parts))) > 1 or "trilinear" in A.kernel
         assert gap(A(x), whole[0]) < 1e-12 and gap(A.T(y), whole[1]) < 1e-12

@@ -5,7 +5,7 @@ import torch
 
 from mvrecon.geometry.box import Box
 from mvrecon.projectors.ray_transform import RayTransform
-from tests.projectors.test_skipping import CASES, volumes
+from tests.projectors.sparse import CASES, volumes
 
 
 @pytest.mark.usefixtures("nothing_is_too_little")

@@ -5,7 +5,8 @@ asked for.
 import pytest
 import torch
 
-from mvrecon.kernels.rays import cpu, plan
+from mvrecon.kernels.rays.cpu import operators as cpu
+from mvrecon.kernels.rays.cpu import plan
 from tests.projectors.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, Case, gap, noise
 
 

@@ -123,7 +123,7 @@ def test_stacked_operators_see_one_volume(A):
     assert not both.pose_gradient and A in both.modules()
     moving = replace(CONE, u=CONE.u.clone().requires_grad_())
     B = PROJECTORS.build("drr", grid=GRID, cameras=moving, backend="reference")
-    assert Stacked([A, B]).pose_gradient
+    assert Stacked([A, B]).pose_gradient and B.T.pose_gradient and not A.T.pose_gradient
     with pytest.raises(ValueError, match="one domain and one detector"):
         Stacked([A, A.cropped(Box((0, 0, 0), (2, 2, 2)))])
 

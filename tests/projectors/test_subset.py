@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.kernels.rays import cpu
+from mvrecon.kernels.rays.cpu import operators as cpu
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.selection import (
     RaySelection,

@@ -6,7 +6,7 @@ import torch
 from mvrecon.cameras.rigs import dome
 from mvrecon.geometry.grid import Grid
 from tests.projectors.cases import Case
-from tests.projectors.test_skipping import CASES, GRID, METHODS, volumes
+from tests.projectors.sparse import CASES, GRID, METHODS, volumes
 
 
 def support() -> torch.Tensor:

@@ -44,12 +44,12 @@ def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
     none = torch.zeros_like(U)
     if cameras.parallel:
         world, direction, start = (none, none, look), (none, none, axis), (U, V, source)
-        moment = tuple(torch.linalg.cross(each, axis) for each in start)
+        moment = tuple(torch.linalg.cross(vector, axis) for vector in start)
     else:
         # source x (detector - source) = source x detector
         detector = (cameras.origin - centre + middle) @ voxel.T
         world, direction, start = (cameras.u, cameras.v, look), (U, V, axis), (none, none, source)
-        moment = tuple(torch.linalg.cross(source, each) for each in (U, V, detector))
+        moment = tuple(torch.linalg.cross(source, vector) for vector in (U, V, detector))
     maps = [torch.stack(columns, dim=-1) for columns in (direction, moment, start, world)]
     return torch.stack(maps, dim=1)
 

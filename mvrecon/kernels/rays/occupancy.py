@@ -50,13 +50,13 @@ class Occupancy:
 
     @property
     def read(self) -> Box:
-        """The box that rays are clipped to: a voxel larger than what is held, as rounding may move
-        them a little.
+        """The box that rays are clipped to: a voxel larger than the occupied one, as rounding may
+        move them a little.
         """
         return self.box.grown(1, self.shape)
 
     def rows(self, low: int, high: int) -> "Occupancy":
-        """What is held of the rows (along y) from `low`, a multiple of a brick's edge, to one
+        """The occupancy of the rows (along y) from `low`, a multiple of a brick's edge, to one
         behind the last.
         """
         if (low, high) == (0, self.shape[1]):
@@ -91,10 +91,10 @@ class Occupancy:
 
     @classmethod
     def _of(cls, numbers: np.ndarray) -> "Occupancy":
-        d, h, w, z0, y0, x0, z1, y1, x1, one, two, told_apart = numbers[:HEAD].tolist()
+        d, h, w, z0, y0, x0, z1, y1, x1, one, two, by_bricks = numbers[:HEAD].tolist()
         bricks = (
             numbers[HEAD:].astype(np.uint8).reshape(bricks_along((d, h, w), EDGE))
-            if told_apart
+            if by_bricks
             else None
         )
         shares = (
@@ -109,36 +109,36 @@ def code_size(shape: Sequence[int]) -> int:
     return HEAD + math.prod(bricks_along(shape, EDGE))
 
 
-def bricks_of_rig(held: Occupancy) -> tuple[np.ndarray, Three, np.ndarray]:
+def bricks_of_rig(occupancy: Occupancy) -> tuple[np.ndarray, Three, np.ndarray]:
     """The bricks in one row, their strides (x, y, z), and from where to where along z a column [y x
     2] of them holds.
 
     All are empty where bricks are not told apart.
     """
-    if held.bricks is None:
+    if occupancy.bricks is None:
         return np.zeros(0, np.uint8), (0, 0, 0), np.zeros((0, 0, 2), np.int32)
-    bricks = np.ascontiguousarray(held.bricks)
+    bricks = np.ascontiguousarray(occupancy.bricks)
     layers, rows, columns = bricks.shape
-    found = bricks.max(axis=0)
+    filled = bricks.max(axis=0)
     first, last = bricks.argmax(axis=0), layers - 1 - bricks[::-1].argmax(axis=0)
     # a brick counts for the voxel just behind it
-    heights = np.stack([first * EDGE, last * EDGE + EDGE + 1], axis=-1) * found[..., None]
+    heights = np.stack([first * EDGE, last * EDGE + EDGE + 1], axis=-1) * filled[..., None]
     return bricks.reshape(-1), (1, columns, columns * rows), heights.astype(np.int32)
 
 
-def boxes_of(held: Occupancy) -> Float[np.ndarray, "n 6"] | None:
+def boxes_of(occupancy: Occupancy) -> Float[np.ndarray, "n 6"] | None:
     """Boxes (x0, y0, z0, x1, y1, z1), in voxels from the volume's centre, beside which a ray meets
     nothing.
 
     None: the box is the whole volume.
     """
-    if held.bricks is None and held.box == Box.whole(held.shape):
+    if occupancy.bricks is None and occupancy.box == Box.whole(occupancy.shape):
         return None
-    low, high = np.array([held.box.low]), np.array([held.box.high]) - 1
-    if held.bricks is not None:
-        first = np.argwhere(held.bricks) * EDGE
+    low, high = np.array([occupancy.box.low]), np.array([occupancy.box.high]) - 1
+    if occupancy.bricks is not None:
+        first = np.argwhere(occupancy.bricks) * EDGE
         low, high = np.maximum(first, low), np.minimum(first + EDGE, high)
-    centre = (np.array(held.shape) - 1) / 2
+    centre = (np.array(occupancy.shape) - 1) / 2
     return np.concatenate(
         [(low - centre - REACH)[:, ::-1], (high - centre + REACH)[:, ::-1]], axis=1
     )

@@ -1,10 +1,10 @@
 """The compiled kernels as torch operators: opaque to `torch.compile`, each one's derivative made of
 the others.
 
-`held` says that a volume is the part of a larger one that alone may be there, see `occupancy.py`:
-the operators are then those of this part. `occupied` says where a volume is not zero: only that is
-read, and derivatives stay dense. Second derivatives in volume and views are made of the same
-operators; those in the geometry are the reference's.
+Two codes of an occupancy, see `occupancy.py`. `support`: a volume is the box of a larger one
+outside of which all is zero, and the operators are those of this box. `occupied`: where a volume is
+not zero; only that is read, and derivatives stay dense. Second derivatives in volume and views are
+made of the same operators; those in the geometry are the reference's.
 """
 
 from collections.abc import Sequence
@@ -28,16 +28,16 @@ def _project(
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
-    held: Tensor | None = None,
+    support: Tensor | None = None,
     occupied: Tensor | None = None,
 ) -> Tensor:
     """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`. Half volumes
     give float32.
     """
-    from mvrecon.kernels.rays import cpu
+    from mvrecon.kernels.rays.cpu import operators as cpu
 
-    part, there = _read(volume, held, occupied)
-    return cpu.project(part, lines, window, there, detector, method)
+    part, occupancy = _read(volume, support, occupied)
+    return cpu.project(part, lines, window, occupancy, detector, method)
 
 
 @torch.library.custom_op("mvrecon::backproject", mutates_args=(), device_types="cpu")
@@ -47,13 +47,13 @@ def _backproject(
     window: Sequence[float],
     shape: Sequence[int],
     method: str,
-    held: Tensor | None = None,
+    support: Tensor | None = None,
 ) -> Tensor:
     """The exact transpose of `project`: views [n m v u] to volumes [n d h w]."""
-    from mvrecon.kernels.rays import cpu
+    from mvrecon.kernels.rays.cpu import operators as cpu
 
-    there = Occupancy.whole(shape) if held is None else Occupancy.decoded(held)
-    return cpu.backproject(views, lines, window, there, method)
+    occupancy = Occupancy.whole(shape) if support is None else Occupancy.decoded(support)
+    return cpu.backproject(views, lines, window, occupancy, method)
 
 
 @torch.library.custom_op("mvrecon::lines_vjp", mutates_args=(), device_types="cpu")
@@ -63,14 +63,14 @@ def _lines_vjp(
     lines: Tensor,
     window: Sequence[float],
     method: str,
-    held: Tensor | None = None,
+    support: Tensor | None = None,
     occupied: Tensor | None = None,
 ) -> Tensor:
     """The derivative of <views, project(volume, lines)> by the lines [m 4 3 3]."""
-    from mvrecon.kernels.rays import cpu
+    from mvrecon.kernels.rays.cpu import operators as cpu
 
-    part, there = _read(volume, held, occupied)
-    return cpu.lines_vjp(part, views, lines, window, there, method)
+    part, occupancy = _read(volume, support, occupied)
+    return cpu.lines_vjp(part, views, lines, window, occupancy, method)
 
 
 @torch.library.custom_op("mvrecon::occupied", mutates_args=(), device_types="cpu")
@@ -83,8 +83,8 @@ def occupied(
     skip: str,
 ) -> Tensor:
     """Where volumes [n d h w] are not zero, in code; see `skip_policy.occupancy_of`."""
-    from mvrecon.kernels.rays.plan import Scene
-    from mvrecon.kernels.rays.skip_policy import occupancy_of
+    from mvrecon.kernels.rays.cpu.plan import Scene
+    from mvrecon.kernels.rays.cpu.skip_policy import occupancy_of
 
     return occupancy_of(volume, Scene(lines, window, detector, method), skip).encoded()
 
@@ -100,59 +100,61 @@ def _(volume, lines, window, detector, method, skip):
     return torch.empty(code_size(volume.shape[1:]), dtype=torch.int32)
 
 
-def _read(volume: Tensor, held: Tensor | None, occupied: Tensor | None) -> tuple[Tensor, Occupancy]:
+def _read(
+    volume: Tensor, support: Tensor | None, occupied: Tensor | None
+) -> tuple[Tensor, Occupancy]:
     """What is to be read of volumes, and where it lies in the whole."""
-    if held is not None:
-        return volume, Occupancy.decoded(held)
+    if support is not None:
+        return volume, Occupancy.decoded(support)
     if occupied is None:
         return volume, Occupancy.whole(volume.shape[1:])
-    there = Occupancy.decoded(occupied)
-    return volume[:, *there.box.slices], there
+    occupancy = Occupancy.decoded(occupied)
+    return volume[:, *occupancy.box.slices], occupancy
 
 
 @_project.register_kernel("cuda")
-def _(volume, lines, window, detector, method, held=None, occupied=None):
-    from mvrecon.kernels.rays import cuda
+def _(volume, lines, window, detector, method, support=None, occupied=None):
+    from mvrecon.kernels.rays.cuda import operators as cuda
 
-    part, there = _read(volume, held, occupied)
-    return cuda.project(part, lines, window, there, detector, method)
+    part, occupancy = _read(volume, support, occupied)
+    return cuda.project(part, lines, window, occupancy, detector, method)
 
 
 @_backproject.register_kernel("cuda")
-def _(views, lines, window, shape, method, held=None):
-    from mvrecon.kernels.rays import cuda
+def _(views, lines, window, shape, method, support=None):
+    from mvrecon.kernels.rays.cuda import operators as cuda
 
-    there = Occupancy.whole(shape) if held is None else Occupancy.decoded(held)
-    return cuda.backproject(views, lines, window, there, method)
+    occupancy = Occupancy.whole(shape) if support is None else Occupancy.decoded(support)
+    return cuda.backproject(views, lines, window, occupancy, method)
 
 
 @_lines_vjp.register_kernel("cuda")
-def _(volume, views, lines, window, method, held=None, occupied=None):
-    from mvrecon.kernels.rays import cuda
+def _(volume, views, lines, window, method, support=None, occupied=None):
+    from mvrecon.kernels.rays.cuda import operators as cuda
 
-    part, there = _read(volume, held, occupied)
-    return cuda.lines_vjp(part, views, lines, window, there, method)
+    part, occupancy = _read(volume, support, occupied)
+    return cuda.lines_vjp(part, views, lines, window, occupancy, method)
 
 
 @_project.register_fake
-def _(volume, lines, window, detector, method, held=None, occupied=None):
+def _(volume, lines, window, detector, method, support=None, occupied=None):
     wide = torch.float64 if volume.dtype == torch.float64 else torch.float32
     return volume.new_empty(volume.shape[0], lines.shape[0], *detector, dtype=wide)
 
 
 @_backproject.register_fake
-def _(views, lines, window, shape, method, held=None):
+def _(views, lines, window, shape, method, support=None):
     return views.new_empty(views.shape[0], *shape)
 
 
 @_lines_vjp.register_fake
-def _(volume, views, lines, window, method, held=None, occupied=None):
+def _(volume, views, lines, window, method, support=None, occupied=None):
     return lines.new_empty(lines.shape)
 
 
 def _keep(ctx, inputs, output):
-    first, lines, ctx.window, ctx.size, ctx.method, *there = inputs
-    ctx.held, ctx.occupied = (*there, None, None)[:2]
+    first, lines, ctx.window, ctx.size, ctx.method, *codes = inputs
+    ctx.support, ctx.occupied = (*codes, None, None)[:2]
     ctx.save_for_backward(first if ctx.needs_input_grad[1] else None, lines)
     ctx.shape, ctx.dtype = first.shape, first.dtype
 
@@ -163,10 +165,12 @@ def _project_back(ctx, views):
     by_volume = by_lines = None
     if needs_volume:
         by_volume = backproject(
-            views, lines, ctx.window, list(ctx.shape[1:]), ctx.method, ctx.held
+            views, lines, ctx.window, list(ctx.shape[1:]), ctx.method, ctx.support
         ).to(ctx.dtype)
     if needs_lines:
-        by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method, ctx.held, ctx.occupied)
+        by_lines = lines_vjp(
+            volume, views, lines, ctx.window, ctx.method, ctx.support, ctx.occupied
+        )
     return by_volume, by_lines, None, None, None, None, None
 
 
@@ -175,31 +179,31 @@ def _backproject_back(ctx, volume):
     needs_views, needs_lines = ctx.needs_input_grad[:2]
     by_views = by_lines = None
     if needs_views:
-        by_views = project(volume, lines, ctx.window, list(ctx.shape[2:]), ctx.method, ctx.held)
+        by_views = project(volume, lines, ctx.window, list(ctx.shape[2:]), ctx.method, ctx.support)
     if needs_lines:
-        by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method, ctx.held)
+        by_lines = lines_vjp(volume, views, lines, ctx.window, ctx.method, ctx.support)
     return by_views, by_lines, None, None, None, None
 
 
-def _in_torch(volume, lines, window, detector, method, held=None, occupied=None):
-    there = None if held is None else Occupancy.unwrapped(held)
+def _in_torch(volume, lines, window, detector, method, support=None, occupied=None):
+    occupancy = None if support is None else Occupancy.unwrapped(support)
 
     def act(volume, lines):
         values = volume if volume.dtype == torch.float64 else volume.float()
-        whole = values if there is None else placed(values, there.box, there.shape)
+        whole = values if occupancy is None else placed(values, occupancy.box, occupancy.shape)
         return reference.project(whole, lines, window, detector, method)
 
     return act
 
 
-def _back_in_torch(views, lines, window, shape, method, held=None):
+def _back_in_torch(views, lines, window, shape, method, support=None):
     return transposed(
-        _in_torch(None, lines, window, views.shape[2:], method, held), (len(views), *shape)
+        _in_torch(None, lines, window, views.shape[2:], method, support), (len(views), *shape)
     )
 
 
-def _vjp_in_torch(volume, views, lines, window, method, held=None, occupied=None):
-    return bent(_in_torch(volume, lines, window, views.shape[2:], method, held))
+def _vjp_in_torch(volume, views, lines, window, method, support=None, occupied=None):
+    return bent(_in_torch(volume, lines, window, views.shape[2:], method, support))
 
 
 project = linear(_project, _in_torch, _keep, _project_back, lasting=6)

@@ -41,6 +41,13 @@ def numbered(method: str) -> tuple[int, int]:
 
 
 @scalar
+def from_centre(rig, u, v):
+    """A pixel (u, v), counted from the detector's centre."""
+    rows, columns = rig.detector
+    return u - (columns - 1) / 2, v - (rows - 1) / 2
+
+
+@scalar
 def at(line, kind, axis, u, v):
     """Component `axis` of one of a view's four linear maps, at the pixel (u, v) counted from the
     detector's centre.

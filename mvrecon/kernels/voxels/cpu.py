@@ -73,22 +73,22 @@ def show(
 ) -> Float[Tensor, "n m v u"]:
     """The exact transpose of `look`."""
     sight = _sight(maps, detector, window, weighted)
-    given, rows = np.ascontiguousarray(volumes.numpy()), int(detector[0])
+    values, rows = np.ascontiguousarray(volumes.numpy()), int(detector[0])
     views = volumes.new_empty(len(volumes), len(maps), *detector)
 
     def work(first: int, last: int) -> None:
         for m in range(first // rows, (last - 1) // rows + 1):
             low, high = max(0, first - m * rows), min(rows, last - m * rows)
-            own = (len(given), (high - low + 2) * int(sight.steps[1]))
+            own = (len(values), (high - low + 2) * int(sight.steps[1]))
             show_rows(
-                given,
+                values,
                 sight,
-                room(given.shape[3], sight.steps, given.dtype, own),
+                room(values.shape[3], sight.steps, values.dtype, own),
                 views.numpy(),
                 m,
                 low,
                 high,
             )
 
-    share(work, len(maps) * rows, given.size * len(maps))
+    share(work, len(maps) * rows, values.size * len(maps))
     return views

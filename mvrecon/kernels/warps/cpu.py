@@ -45,16 +45,16 @@ def warp_back(
 ) -> Float[Tensor, "n s c d h w"]:
     """The exact transpose of `warp`."""
     plan = _warp(maps, shape, values.shape[4:])
-    given = np.ascontiguousarray(values.numpy())
+    samples = np.ascontiguousarray(values.numpy())
     volumes = values.new_empty(*values.shape[:2], values.shape[3], *shape)
     slabs = int(shape[0])
 
     def work(first: int, last: int) -> None:
         for s in range(first // slabs, (last - 1) // slabs + 1):
             low, high = max(0, first - s * slabs), min(slabs, last - s * slabs)
-            own = (given.shape[0], given.shape[3], (high - low + 2) * int(plan.steps[2]))
-            held = room(plan.shape[2], plan.steps, given.dtype, own)
-            spread_slabs(given, plan, held, volumes.numpy(), s, low, high)
+            own = (samples.shape[0], samples.shape[3], (high - low + 2) * int(plan.steps[2]))
+            rows = room(plan.shape[2], plan.steps, samples.dtype, own)
+            spread_slabs(samples, plan, rows, volumes.numpy(), s, low, high)
 
     share(work, len(maps) * slabs, values.numel())
     return volumes
@@ -67,13 +67,13 @@ def warp_vjp(
 ) -> Float[Tensor, "s k 5 2 3"]:
     """The derivative of <values, warp(volumes, maps)> by the maps, by hand; float64."""
     plan = _warp(maps, volumes.shape[3:], values.shape[4:])
-    flat, given = padded(volumes.numpy(), 3), np.ascontiguousarray(values.numpy())
+    flat, samples = padded(volumes.numpy(), 3), np.ascontiguousarray(values.numpy())
     planes = np.zeros([*maps.shape[:2], plan.shape[0], 5, 2, 3])
     count = planes.shape[0] * planes.shape[1] * planes.shape[2]
 
     def work(first: int, last: int) -> None:
-        held = room(plan.shape[2], plan.steps, flat.dtype, (3, plan.shape[2]))
-        vary_planes(flat, plan, held, given, planes, first, last)
+        rows = room(plan.shape[2], plan.steps, flat.dtype, (3, plan.shape[2]))
+        vary_planes(flat, plan, rows, samples, planes, first, last)
 
     share(work, count, values.numel(), 4)
     return torch.from_numpy(planes.sum(axis=2))

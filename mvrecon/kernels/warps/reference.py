@@ -35,5 +35,5 @@ def warp(
     """
     points = normalised_places(maps, volumes.shape[3:], shape).to(volumes.dtype)  # [s k d h w 3]
     pairs = points.expand(len(volumes), *points.shape).flatten(0, 2)
-    given = volumes[:, :, None].expand(-1, -1, maps.shape[1], -1, -1, -1, -1).flatten(0, 2)
-    return sample(given, pairs).unflatten(0, (*volumes.shape[:2], maps.shape[1]))
+    sources = volumes[:, :, None].expand(-1, -1, maps.shape[1], -1, -1, -1, -1).flatten(0, 2)
+    return sample(sources, pairs).unflatten(0, (*volumes.shape[:2], maps.shape[1]))

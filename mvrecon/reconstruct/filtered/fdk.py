@@ -1,5 +1,6 @@
 """FDK of cone beams and FBP of parallel and fan beams, by a projector's grid and cameras."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -37,7 +38,7 @@ def fdk(
             one if the detector's narrow side does not reach around the grid's inscribed cylinder.
         weights_from: the rig that weights and filter belong to, where it is not the one that is
             back-projected with: the ideal geometry of a misaligned scanner (Karolczak and others,
-            Phys. Med. Biol. 46, 2001). None: A's own.
+            Med. Phys. 28, 2001). None: A's own.
 
     Raises:
         ValueError: parallel beams, sources that are not on a circle, angles that do not suffice,
@@ -105,4 +106,6 @@ def _reconstruct(
         return views[:, :, first:last]
 
     volumes = views.shape[0] * views.shape[1]
-    return filtered_backprojection(read, A.cameras, A.grid, volumes, filtering)
+    x = filtered_backprojection(read, A.cameras, A.grid, volumes, filtering)
+    support = getattr(A, "support", None)
+    return x if support is None else torch.where(support, x, 0)

@@ -76,7 +76,13 @@ def orbit_of(cameras: Cameras, grid: Grid) -> Orbit:
 
 def _turn(cameras: Cameras, grid: Grid) -> Orbit:
     look = unit(cameras.origin - cameras.source)
-    axis = torch.linalg.svd(look)[2][2]
+    _, sizes, axes = torch.linalg.svd(look)
+    if len(look) < 2 or sizes[1] < 1e-6 * sizes[0]:
+        raise ValueError(
+            f"FBP needs parallel beams from two directions at least, got {len(look)} views along "
+            f"one line"
+        )
+    axis = axes[2]
     if (leave := (look @ axis).abs().max().item()) > TOLERANCE:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "

@@ -27,6 +27,8 @@ KINDS = ("auto", "full", "short", "offset")
 GAP = 3.5
 #: Parallel beams that leave out so many degrees and more than four mean steps are no full turn.
 WEDGE = 15.0
+#: Two views across each other are the fewest, but for rounding and a little.
+FEW = 100.0
 #: A detector is offset if one side of it reaches so many times as far as the other.
 ASYMMETRY = 1.2
 
@@ -122,7 +124,7 @@ def _periodic(order: Tensor, gaps: Tensor) -> Float[Tensor, " m"]:
 
 def _half_turn(orbit: Orbit, angles: Float[Tensor, " m"]) -> Scan:
     order, gaps = _gaps(angles, math.pi)
-    if (gap := math.degrees(gaps.max())) > max(WEDGE, 4 * 180 / len(angles)):
+    if (gap := math.degrees(gaps.max())) > max(WEDGE, min(4 * 180 / len(angles), FEW)):
         raise ValueError(
             f"FBP of parallel beams needs angles over 180 degrees, got a gap of {gap:.4g} degrees "
             f"between {len(angles)} views; use sirt"

@@ -17,7 +17,7 @@ from torch.autograd.forward_ad import make_dual, unpack_dual
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import Projector
 from mvrecon_peers.frame import framed, near, wants_gradient

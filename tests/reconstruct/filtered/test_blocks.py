@@ -74,3 +74,9 @@ def test_a_reader_that_gives_too_few_views_is_refused():
 def test_the_weights_of_the_same_rig_change_nothing():
     views = torch.rand(1, 1, *A.range_shape)
     assert torch.equal(fdk(A, views, weights_from=RIG), fdk(A, views))
+
+
+def test_nothing_is_outside_of_the_support():
+    views, support = torch.rand(1, 1, *A.range_shape), torch.rand(SMALL.shape) > 0.5
+    x = fdk(A, views)
+    assert torch.equal(fdk(A.with_support(support), views), torch.where(support, x, 0))

@@ -59,6 +59,8 @@ REFUSED = {
     "two": (fdk, CONES["full"][:2], "at least three sources on a circle, got 2"),
     "short of fan": (fdk, CONES["full"][:58], "A short scan needs 180 degrees and the fan angle"),
     "limited": (fbp, parallel(60, LINE, arc_degrees=120.0, **RAYS), "got a gap of 62 degrees"),
+    "two close": (fbp, parallel(2, LINE, arc_degrees=20.0, **RAYS), "got a gap of 170 degrees"),
+    "one": (fbp, parallel(1, LINE, **RAYS), "two directions at least, got 1 views"),
     "cone": (fbp, CONES["full"], "got a cone beam of 32 rows; use fdk"),
     "parallel": (fdk, parallel(60, LINE, **RAYS), "got parallel beams; use fbp"),
     "beside": (

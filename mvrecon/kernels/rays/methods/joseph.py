@@ -12,6 +12,18 @@ import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.rays.methods.strides import flat_index
+from mvrecon.kernels.rays.pose_gradient import Slopes
+
+
+class Cell(NamedTuple):
+    """A bilinear cell: its lower corner along the far and the near axis, and the place in it
+    towards the upper one.
+    """
+
+    iy: Any
+    iz: Any
+    y: Any
+    z: Any
 
 
 class Course(NamedTuple):
@@ -50,21 +62,20 @@ def split(place, real):
 
 @scalar
 def cell(course, s, real):
-    """The bilinear cell that a ray meets at s, and the place in it towards b and c."""
+    """The bilinear cell that a ray meets at s."""
     iy, y = split(course.b + s * course.slope_b, real)
     iz, z = split(course.c + s * course.slope_c, real)
-    return iy, iz, y, z
+    return Cell(iy, iz, y, z)
 
 
 @scalar
-def four(steps, at, share, whole):
-    """The four corners of the cell at (slab, iy, iz, y, z), and what each gets of a share."""
-    k, iy, iz, y, z = at
-    low = flat_index(steps, k, iy, iz, whole)
+def four(steps, k, cell, share, whole):
+    """The four corners of a cell in slab k, and what each gets of a share."""
+    low = flat_index(steps, k, cell.iy, cell.iz, whole)
     high, near = whole(low + whole(steps.far)), whole(steps.near)
-    upper = share * y
+    upper = share * cell.y
     lower = share - upper
-    low_z, high_z = lower * z, upper * z
+    low_z, high_z = lower * cell.z, upper * cell.z
     return (low, whole(low + near), high, whole(high + near)), (
         lower - low_z,
         low_z,
@@ -77,9 +88,8 @@ def four(steps, at, share, whole):
 def corners(ray, steps, k, real, whole):
     """Flat indices and weights of the four voxels of slab k."""
     course, s = course_of(ray, real), real(k) - real(ray.centre)
-    iy, iz, y, z = cell(course, s, real)
     share = overlap(course.begin, course.end, s, real(0.5))
-    return four(steps, (k, iy, iz, y, z), share, whole)
+    return four(steps, k, cell(course, s, real), share, whole)
 
 
 @scalar
@@ -103,23 +113,6 @@ def face_at(flat, k, steps, y, z):
     """`face` of the cell at the flat index k."""
     above, near = k + steps.far, steps.near
     return face(flat[k], flat[k + near], flat[above], flat[above + near], y, z)
-
-
-class Slopes(NamedTuple):
-    """How a ray's sum changes with its place.
-
-    The sum, in voxels of the main axis; its derivatives by b, slope_b, c, slope_c; the volume where
-    the ray begins and ends inside the box. `loops.pull_back` makes derivatives by the geometry of
-    them.
-    """
-
-    total: Any
-    by_b: Any
-    by_slope_b: Any
-    by_c: Any
-    by_slope_c: Any
-    at_begin: Any
-    at_end: Any
 
 
 @scalar

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.methods.joseph import Slopes
 from mvrecon.kernels.rays.methods.strides import flat_index
+from mvrecon.kernels.rays.pose_gradient import Slopes
 
 
 class Course(NamedTuple):
@@ -32,7 +32,7 @@ class Course(NamedTuple):
     centre: Any
 
 
-class Crossing(NamedTuple):
+class Passage(NamedTuple):
     """Where a ray begins in a slab, its length there, its way to the plane between the cells b0 and
     b1 along the far axis, and to that between c0 and c1 along the near one.
     """
@@ -84,28 +84,28 @@ def crossing(course, s, real):
     c0, c1 = np.int32(z), np.int32(course.c + s1 * course.slope_c)
     to_b = reach(real(b0), real(b1), y, course.per_b, length)
     to_c = reach(real(c0), real(c1), z, course.per_c, length)
-    return Crossing(s0, length, to_b, to_c, b0, b1, c0, c1)
+    return Passage(s0, length, to_b, to_c, b0, b1, c0, c1)
 
 
 @scalar
-def lengths(here):
+def lengths(passage):
     """A ray's lengths in the cells that it crosses, in order."""
-    one, two = min(here.to_b, here.to_c), max(here.to_b, here.to_c)
-    return one, two - one, here.length - two
+    one, two = min(passage.to_b, passage.to_c), max(passage.to_b, passage.to_c)
+    return one, two - one, passage.length - two
 
 
 @scalar
-def three(steps, k, here, whole):
+def three(steps, k, passage, whole):
     """Flat indices of the cells that a ray crosses in slab k, in order."""
     middle = (
-        flat_index(steps, k, here.b1, here.c0, whole)
-        if here.to_b < here.to_c
-        else flat_index(steps, k, here.b0, here.c1, whole)
+        flat_index(steps, k, passage.b1, passage.c0, whole)
+        if passage.to_b < passage.to_c
+        else flat_index(steps, k, passage.b0, passage.c1, whole)
     )
     return (
-        flat_index(steps, k, here.b0, here.c0, whole),
+        flat_index(steps, k, passage.b0, passage.c0, whole),
         middle,
-        flat_index(steps, k, here.b1, here.c1, whole),
+        flat_index(steps, k, passage.b1, passage.c1, whole),
     )
 
 
@@ -114,20 +114,20 @@ def corners(ray, steps, k, real, whole):
     """Flat indices of the at most three cells that a ray crosses in slab k, and its lengths in
     them.
     """
-    here = crossing(course_of(ray, real), real(k) - real(ray.centre), real)
-    return three(steps, k, here, whole), lengths(here)
+    passage = crossing(course_of(ray, real), real(k) - real(ray.centre), real)
+    return three(steps, k, passage, whole), lengths(passage)
 
 
 @scalar
 def slopes(store, n, ray, steps):
-    """How a ray's sum changes with its place, as `joseph.Slopes`: at each plane by the difference
-    of the two cells.
+    """How a ray's sum changes with its place, as `pose_gradient.Slopes`: at each plane by the
+    difference of the two cells.
     """
     flat, offset, course = store.values, np.int64(n * store.size), course_of(ray, np.float64)
     total = by_b = by_slope_b = by_c = by_slope_c = at_begin = at_end = 0.0
     for k in range(ray.first, ray.last):
-        here = crossing(course, k - ray.centre, np.float64)
-        index, parts = three(steps, k, here, np.int64), lengths(here)
+        passage = crossing(course, k - ray.centre, np.float64)
+        index, parts = three(steps, k, passage, np.int64), lengths(passage)
         first_cell, middle, last_cell = (
             flat[offset + index[0]],
             flat[offset + index[1]],
@@ -136,11 +136,11 @@ def slopes(store, n, ray, steps):
         total += parts[0] * first_cell + parts[1] * middle + parts[2] * last_cell
         # without a crossing both cells are the same
         first, last = middle - first_cell, last_cell - middle
-        jump_b, jump_c = (first, last) if here.to_b < here.to_c else (last, first)
+        jump_b, jump_c = (first, last) if passage.to_b < passage.to_c else (last, first)
         by_b += jump_b * course.per_b
-        by_slope_b += (here.begin + here.to_b) * jump_b * course.per_b
+        by_slope_b += (passage.begin + passage.to_b) * jump_b * course.per_b
         by_c += jump_c * course.per_c
-        by_slope_c += (here.begin + here.to_c) * jump_c * course.per_c
+        by_slope_c += (passage.begin + passage.to_c) * jump_c * course.per_c
         at_begin += first_cell if k - ray.centre - 0.5 < ray.begin else 0.0
         at_end += last_cell if k - ray.centre + 0.5 > ray.end else 0.0
     return Slopes(total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end)

@@ -7,12 +7,39 @@ weight is cut off. A sample lies between two slabs; in each it is one bilinear c
 """
 
 from math import floor
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.methods.joseph import Slopes, cell, course_of, face_at, four
+from mvrecon.kernels.rays.methods.joseph import Cell, cell, course_of, face_at, four, hat
+from mvrecon.kernels.rays.methods.strides import flat_index
+from mvrecon.kernels.rays.pose_gradient import Slopes
 from mvrecon.kernels.rays.trace import FAR, NEAR, OWN
+
+
+class Sample(NamedTuple):
+    """Where a sample lies: its coordinate along the main axis, the slab before it, its cell in
+    either slab.
+    """
+
+    x: Any
+    slab: Any
+    cell: Cell
+
+
+@scalar
+def sample_at(course, s, real):
+    """The sample at s of a ray's course."""
+    x = s + course.centre
+    # only rounding carries a sample in front of slab -1, where the volume's values end
+    return Sample(x, max(np.int32(floor(x)), np.int32(-1)), cell(course, s, real))
+
+
+@scalar
+def share(sample, slab, real):
+    """What the voxels of a slab get of a sample: what is left to the slab beside it."""
+    return hat(sample.x - real(slab), real(1))
 
 
 @scalar
@@ -36,25 +63,23 @@ def corners(ray, steps, k, real, whole):
     course = course_of(ray, real)
     step = real((ray.end - ray.begin) / steps.samples)
     s = course.begin + (real(k // 2) + real(0.5)) * step
-    px = s + course.centre
-    below = max(np.int32(floor(px)), np.int32(-1))
-    x, slab = px - real(below), below + k % 2
+    sample = sample_at(course, s, real)
+    slab = sample.slab + k % 2
     if not (real(ray.enter) <= s <= real(ray.leave) and ray.first <= slab < ray.last):
         none, zero = whole(0), real(0)
         return (none, none, none, none), (zero, zero, zero, zero)
-    iy, iz, y, z = cell(course, s, real)
-    return four(steps, (slab, iy, iz, y, z), step * (x if k % 2 else real(1) - x), whole)
+    return four(steps, slab, sample.cell, step * share(sample, slab, real), whole)
 
 
 @scalar
-def _local(flat, steps, px, py, pz):
-    """The interpolated volume at a place, and its slopes along the main, the far and the near
+def _local(flat, steps, sample):
+    """The interpolated volume at a sample, and its slopes along the main, the far and the near
     axis.
     """
-    below, iy, iz = int(floor(px)), int(py), int(pz)
-    k, x = (below + 1) * steps.along + iy * steps.far + iz * steps.near - steps.origin, px - below
-    low, low_b, low_c = face_at(flat, k, steps, py - iy, pz - iz)
-    high, high_b, high_c = face_at(flat, k + steps.along, steps, py - iy, pz - iz)
+    place, x = sample.cell, sample.x - sample.slab
+    k = flat_index(steps, sample.slab, place.iy, place.iz, np.int64)
+    low, low_b, low_c = face_at(flat, k, steps, place.y, place.z)
+    high, high_b, high_c = face_at(flat, k + steps.along, steps, place.y, place.z)
     return (
         low + x * (high - low),
         high - low,
@@ -65,21 +90,22 @@ def _local(flat, steps, px, py, pz):
 
 @scalar
 def slopes(store, n, ray, steps):
-    """How a ray's sum changes with its place, its samples moving with its ends, as `joseph.Slopes`:
-    the last two are what it gains when the ray's own ends move outwards.
+    """How a ray's sum changes with its place, its samples moving with its ends, as
+    `pose_gradient.Slopes`: the last two are what it gains when the ray's own ends move outwards.
     """
     flat, count = store.values[n * store.size : (n + 1) * store.size], steps.samples
-    step = (ray.end - ray.begin) / count
+    course, step = course_of(ray, np.float64), (ray.end - ray.begin) / count
     total = by_b = by_slope_b = by_c = by_slope_c = by_begin = by_end = 0.0
     first, last = samples_in(ray, count)
     for j in range(first, last):
         way = (j + 0.5) / count
         s = ray.begin + (ray.end - ray.begin) * way
-        below = int(floor(s + ray.centre))
-        if not (ray.enter <= s <= ray.leave and ray.first <= below + 1 and below < ray.last):
+        sample = sample_at(course, s, np.float64)
+        if not (
+            ray.enter <= s <= ray.leave and ray.first <= sample.slab + 1 and sample.slab < ray.last
+        ):
             continue
-        py, pz = ray.b + s * ray.slope_b, ray.c + s * ray.slope_c
-        value, along_a, along_b, along_c = _local(flat, steps, s + ray.centre, py, pz)
+        value, along_a, along_b, along_c = _local(flat, steps, sample)
         along = along_a + ray.slope_b * along_b + ray.slope_c * along_c
         total += step * value
         by_b += step * along_b

@@ -1,0 +1,186 @@
+"""MHA, MHD and NRRD images through SimpleITK, the extra `io`.
+
+Convention: ITK's world is LPS (x to the patient's left, y to the back), ours is RAS as in NIfTI: x
+and y change their signs.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.data.orientation import oriented, right_angled
+from mvrecon.data.slabs import Slabs, planes
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import DEFLATE, EDGE, VOLUME, Refused, blaming, plain_name, shown
+from mvrecon.geometry.grid import Grid
+
+IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}
+#: Bytes of a header at most.
+HEADER = 2**16
+#: From ITK's world (LPS) to ours (RAS).
+RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+#: SimpleITK's names of pixel types, and numpy's.
+TYPES = {
+    **{f"{bits}-bit signed integer": f"i{bits // 8}" for bits in (8, 16, 32, 64)},
+    **{f"{bits}-bit unsigned integer": f"u{bits // 8}" for bits in (8, 16, 32, 64)},
+    **{"32-bit float": "f4", "64-bit float": "f8"},
+}
+
+
+class ItkImage(NamedTuple):
+    """An image whose header has been checked: pixels along (x, y, z), their type, and the affine
+    from their index to ITK's world in mm.
+    """
+
+    path: Path
+    size: tuple[int, int, int]
+    dtype: np.dtype
+    affine: np.ndarray
+
+    def read(self, first: int, last: int) -> np.ndarray:
+        """Planes `first` to `last - 1` along z, as [z y x]."""
+        reader = _reader(self.path)
+        reader.SetExtractIndex([0, 0, first])
+        reader.SetExtractSize([*self.size[:2], last - first])
+        with blaming(self.path, f"planes {first} to {last - 1} cannot be read"):
+            return simple_itk(self.path).GetArrayFromImage(reader.Execute())
+
+
+def itk_image(path: Path) -> ItkImage:
+    """The header of an image of three axes, believed no further than the file's size.
+
+    Raises:
+        ImportError: SimpleITK is not installed.
+        FileNotFoundError: nothing is there.
+        Refused: damaged, cut short, not three axes, several values a pixel, or data in a file that
+            does not lie beside it.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected {', '.join(IO)}")
+    data, packed = _data_file(path)
+    reader = _reader(path)
+    with blaming(path, "cannot be read"):
+        reader.ReadImageInformation()
+        size, kind = reader.GetSize(), simple_itk(path).GetPixelIDValueAsString(reader.GetPixelID())
+        if len(size) != 3 or kind not in TYPES or max(size) > EDGE:
+            raise Refused(
+                f"{path}: expected three axes of at most {EDGE} and one number a voxel, got "
+                f"{size} of {kind}"
+            )
+        dtype = np.dtype(TYPES[kind])
+        needed, room = math.prod(size) * dtype.itemsize, data.stat().st_size
+        if needed > room * (DEFLATE if packed else 1) or needed > VOLUME:
+            raise Refused(
+                f"{path}: declares {needed} bytes, where {data.name} has {room} and {VOLUME} are "
+                f"allowed; is it cut short?"
+            )
+        affine = np.eye(4)
+        direction = np.array(reader.GetDirection()).reshape(3, 3)
+        affine[:3, :3], affine[:3, 3] = direction * reader.GetSpacing(), reader.GetOrigin()
+    return ItkImage(path, size, dtype, affine)
+
+
+def open_itk(path: str | Path) -> tuple[Slabs, Grid]:
+    """Values of an image as they are stored, and where its voxels lie in world mm (RAS).
+
+    Axes are swapped and reversed (values stay at their places) until x, y, z run roughly to the
+    patient's right, front and head.
+
+    Raises:
+        ImportError, FileNotFoundError, Refused: see `itk_image`.
+    """
+    image = itk_image(Path(path).expanduser())
+    step = planes(image.size[0] * image.size[1])
+
+    def passes():
+        for first in range(0, image.size[2], step):
+            yield first, image.read(first, min(first + step, image.size[2])).T
+
+    return oriented(image.path, image.size, RAS @ image.affine, passes)
+
+
+def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
+    """Write a volume as MHA or NRRD, float32, with the place of its voxels in ITK's world (LPS),
+    whole or not at all.
+
+    Raises:
+        ImportError: SimpleITK is not installed.
+        ValueError: a grid whose axes are not at right angles, which such files cannot say.
+    """
+    path = Path(path)
+    if not right_angled(grid):
+        raise ValueError(
+            f"{path}: expected voxel axes at right angles, got the affine {grid.affine.tolist()}; "
+            f"NIfTI keeps it"
+        )
+    affine = RAS @ grid.affine.numpy()
+    itk = simple_itk(path)
+    image = itk.GetImageFromArray(volume.detach().cpu().float().contiguous().numpy())
+    image.SetSpacing(grid.spacing)
+    image.SetOrigin(affine[:3, 3].tolist())
+    image.SetDirection((affine[:3, :3] / grid.spacing).flatten().tolist())
+    with written_whole(path) as part:
+        whole = part.with_name(part.name + path.suffix.lower())  # ITK goes by the ending
+        try:
+            itk.WriteImage(image, str(whole))
+            os.replace(whole, part)
+        finally:
+            whole.unlink(missing_ok=True)
+
+
+def simple_itk(path: Path) -> Any:
+    """SimpleITK.
+
+    Raises:
+        ImportError: it is not installed; the message names the file that needs it.
+    """
+    try:
+        import SimpleITK
+    except ImportError as error:
+        raise ImportError(f"{path}: needs SimpleITK: pip install 'mvrecon[io]'") from error
+    return SimpleITK
+
+
+def _reader(path: Path) -> Any:
+    reader = simple_itk(path).ImageFileReader()
+    reader.SetImageIO(IO[path.suffix.lower()])
+    reader.SetFileName(str(path))
+    return reader
+
+
+def _data_file(path: Path) -> tuple[Path, bool]:
+    """The file that the values are in, which must lie beside the header, and whether it is
+    packed.
+    """
+    with path.open("rb") as file:
+        lines = file.read(HEADER).decode("latin-1").splitlines()
+    if IO[path.suffix.lower()] == "NrrdImageIO":
+        entries = _entries(lines[: lines.index("") if "" in lines else len(lines)], ":")
+        if not lines or not lines[0].startswith("NRRD") or {"data file", "datafile"} & set(entries):
+            raise Refused(f"{path}: expected NRRD with its values in the same file")
+        return path, entries.get("encoding") not in ("raw",)
+    entries = _entries(lines, "=")
+    name = entries.get("elementdatafile")
+    if name is None:
+        raise Refused(f"{path}: expected a MetaImage header with ElementDataFile, got none")
+    data = path if name == "LOCAL" else path.with_name(plain_name(name, path))
+    if not data.is_file():
+        raise FileNotFoundError(f"{path}: its values should be in {shown(name)}, which is missing")
+    return data, entries.get("compresseddata", "").lower() == "true"
+
+
+def _entries(lines: Sequence[str], sign: str) -> dict[str, str]:
+    entries: dict[str, str] = {}
+    for line in lines:
+        key, between, value = line.partition(sign)
+        if between:
+            entries.setdefault(key.strip().lower(), value.strip())
+        if key.strip().lower() == "elementdatafile":
+            break  # values follow
+    return entries

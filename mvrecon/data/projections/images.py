@@ -1,0 +1,193 @@
+"""Projections as images: a folder of TIFF, PNG or DICOM files, or one file of several pages."""
+
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mvrecon.data.dicom import dicom_file, header_of, pixels_of
+from mvrecon.data.projections.order import ordered
+from mvrecon.data.projections.stack import VIEWS, ProjectionStack
+from mvrecon.files.checks import EDGE, Refused, blaming
+
+#: Formats of Pillow by a file's ending.
+PILLOW = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
+#: Pixel types by Pillow's mode, and by the bits and the sign that a TIFF declares.
+MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4", "F": "f4"}
+WHITE_IS_ZERO, PHOTOMETRIC = 0, 262
+#: How names of dark and flat fields begin that lie among the views.
+FIELD = re.compile(r"(dark|flat)", re.IGNORECASE)
+
+
+class Header(NamedTuple):
+    """What a file of images declares: rows and columns, type of the pixels, pages."""
+
+    shape: tuple[int, int]
+    dtype: np.dtype
+    pages: int
+
+
+class ImageFiles(ProjectionStack):
+    """Views as images, one in each file, or all in one file of several pages.
+
+    Args:
+        files: in the order of the views.
+
+    Raises:
+        Refused: images of several sizes or types, colours, or a file that is damaged.
+    """
+
+    def __init__(self, files: Sequence[Path]):
+        headers = [header(file) for file in files]
+        for file, other in zip(files, headers, strict=True):
+            if other[:2] != headers[0][:2]:
+                raise Refused(
+                    f"{file}: expected {_words(headers[0])} as {files[0].name}, got {_words(other)}"
+                )
+            if len(files) > 1 and other.pages > 1:
+                raise Refused(f"{file}: expected one image in each file, got {other.pages}")
+        self.files = list(files)
+        single = len(files) == 1
+        names = [f"{files[0].stem} {k}" for k in range(headers[0].pages)] if single else []
+        names = names if len(names) > 1 else [file.stem for file in files]
+        super().__init__(files[0] if single else files[0].parent, names, *headers[0][:2])
+
+    def _block(self, first: int, last: int) -> np.ndarray:
+        if len(self.files) == 1:
+            return np.stack(list(_pages(self.files[0], first, last)))
+        return np.stack([next(_pages(file, 0, 1)) for file in self.files[first:last]])
+
+
+def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -> ImageFiles:
+    """The images of a folder in the order of their numbers, without dark and flat fields.
+
+    Args:
+        folder: whose images are views; those whose names begin with dark or flat are none, unless
+            all do. Other files are left alone.
+        pattern: of the names of the views, such as "scan_*.tif"; none: all images.
+        gaps: see `ordered`.
+
+    Raises:
+        Refused: no image, too many, or of several formats.
+    """
+    images = _images(folder, pattern)
+    views = [file for file in images if not FIELD.match(file.name)] or images
+    _check_kind(folder, views, f" named {pattern}" if pattern else "")
+    return ImageFiles(ordered(views, gaps))
+
+
+def field_files(folder: Path, field: str) -> list[Path]:
+    """The images of a folder whose names begin with "dark" or with "flat"; perhaps none.
+
+    Raises:
+        Refused: they are of several formats.
+    """
+    files = [file for file in _images(folder) if file.name.lower().startswith(field)]
+    if files:
+        _check_kind(folder, files, f" of the {field} field")
+    return files
+
+
+def _images(folder: Path, pattern: str | None = None) -> list[Path]:
+    files = []
+    with blaming(folder, f"has no names like {pattern!r}", "expected such as scan_*.tif"):
+        inside = sorted(folder.glob(pattern or "*"))
+    for file in inside:
+        if file.is_file() and not file.name.startswith(".") and _ending(file):
+            files.append(file)
+        if len(files) > VIEWS:
+            raise Refused(f"{folder}: expected at most {VIEWS} images, got more")
+    return files
+
+
+def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
+    """Refuse no images, or images of several formats."""
+    kinds = sorted({_ending(file) for file in files})
+    if len(kinds) != 1:
+        got = f"those of {' and '.join(kinds)}; choose by pattern=..." if kinds else "none"
+        raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
+
+
+def _ending(file: Path) -> str:
+    """TIFF, PNG or DICOM; empty for other files."""
+    return PILLOW.get(file.suffix.lower()) or ("DICOM" if dicom_file(file) else "")
+
+
+def header(file: Path) -> Header:
+    """What an image declares, checked on every page; no pixel is read.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: not such an image, in colour, or with pages of several sizes.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: no such file; expected an image (TIFF, PNG or DICOM)")
+    with blaming(file, "cannot be read as an image"):
+        if file.suffix.lower() not in PILLOW:
+            dataset = header_of(file)
+            return Header((dataset.Rows, dataset.Columns), np.dtype("f4"), _frames(dataset))
+        with _opened(file) as image:
+            pages = getattr(image, "n_frames", 1)
+            if pages > VIEWS:
+                raise Refused(f"{file}: expected at most {VIEWS} pages, got {pages}")
+            heads = []
+            for page in range(pages):
+                image.seek(page)
+                heads.append(_head(file, image, pages))
+                if heads[-1] != heads[0]:
+                    raise Refused(
+                        f"{file}: expected {_words(heads[0])} on every page, got "
+                        f"{_words(heads[-1])} on page {page}"
+                    )
+            return heads[0]
+
+
+def _frames(dataset: Any) -> int:
+    return int(dataset.get("NumberOfFrames") or 1)
+
+
+def _head(file: Path, image: Any, pages: int) -> Header:
+    kind = MODES.get(image.mode)
+    columns, rows = image.size
+    tags = getattr(image, "tag_v2", {})
+    if kind is None or max(rows, columns) > EDGE:
+        raise Refused(
+            f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got {rows} x "
+            f"{columns} of the type {image.mode}"
+        )
+    if image.mode == "L" and tags.get(PHOTOMETRIC) == WHITE_IS_ZERO:
+        raise Refused(f"{file}: expected black as 0 (BlackIsZero), got white as 0 (WhiteIsZero)")
+    return Header((rows, columns), np.dtype(kind), pages)
+
+
+def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
+    with blaming(file, f"pages {first} to {last - 1} cannot be read"):
+        if file.suffix.lower() not in PILLOW:
+            values = pixels_of(file)
+            yield from values.reshape(-1, *values.shape[-2:])[first:last]
+            return
+        with _opened(file) as image:
+            for page in range(first, last):
+                image.seek(page)
+                yield np.asarray(image)
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    """An image of Pillow, which warns only where a directory of pages is cut short: an error
+    here.
+    """
+    from PIL import Image as Pillow
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "Corrupt EXIF|Tag data larger|.*[Tt]runcated", UserWarning)
+        with Pillow.open(file, formats=[PILLOW[file.suffix.lower()]]) as image:
+            yield image
+
+
+def _words(head: Header) -> str:
+    return f"{head.shape[0]} x {head.shape[1]} pixels of {head.dtype}"

@@ -1,0 +1,223 @@
+"""Measured views as line integrals, corrected when they are read, on the part of the detector that
+is used.
+"""
+
+import math
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.data.projections.arrays import Hdf5Views
+from mvrecon.data.projections.corrections import Fields, fields, integrals, transmission
+from mvrecon.data.projections.opening import field_beside, open_projections
+from mvrecon.data.projections.region import Region
+from mvrecon.data.projections.stack import PIXELS, ProjectionStack
+from mvrecon.files.checks import Refused, check_memory
+
+if TYPE_CHECKING:
+    from mvrecon.data.projections.measured import Measured
+
+Kind = Literal["integrals", "intensities"]
+Field = str | float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """Views as line integrals.
+
+    Args:
+        views: line integrals, float32 (or what was stored, where it is no grey value).
+        mask: pixels that were measured: none of their parts was dead or saturated.
+        saturated: number of saturated pixels, before binning.
+        floored: number of pixels whose transmission was at most the floor.
+    """
+
+    views: Float[Tensor, "m v u"]
+    mask: Bool[Tensor, "m v u"]
+    saturated: int = 0
+    floored: int = 0
+
+
+class MeasuredViews:
+    """Views of one measurement as line integrals, corrected when they are read.
+
+    Args:
+        options: how they are corrected.
+        stack: as they are on disk.
+    """
+
+    def __init__(self, options: "Measured", stack: ProjectionStack):
+        self.options, self.stack = options, stack
+        self.region = Region.of(stack.shape, options.rows, options.columns, options.binning)
+        self.kind: Kind = _kind(options, stack)
+        self.saturation = options.saturation or stack.top or math.inf
+        if self.kind == "intensities":
+            self._warn_of_dead(self.fields)
+
+    @cached_property
+    def fields(self) -> Fields:
+        """Dark field and contrast of the kept pixels in grey values."""
+        dark, flat = (
+            self.region.cropped(self._field(name, value))
+            for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
+        )
+        return fields(dark, flat, self.options.path, self.options.dead, self.saturation)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the views that are taken."""
+        return list(self.stack.names[:: self.options.every])
+
+    @property
+    def n_views(self) -> int:
+        """Number of views that are taken."""
+        return len(self.names)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns after cropping and binning."""
+        return self.region.shape
+
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """The cameras of all views on disk as those of the views here: each n-th, cropped, binned.
+
+        Raises:
+            ValueError: another number of cameras than of views on disk, or another detector.
+        """
+        if len(cameras) != self.stack.n_views:
+            raise ValueError(
+                f"{self.options.path}: expected one camera for each of {self.stack.n_views} views, "
+                f"got {len(cameras)}"
+            )
+        return self.region.seen_by(cameras[:: self.options.every])
+
+    def read(self, first: int, last: int) -> Corrected:
+        """Views `first` to `last - 1`, of those that are taken, as line integrals.
+
+        Raises:
+            IndexError, Refused: see `ProjectionStack.read`; a view without any light.
+        """
+        every = self.options.every
+        if every == 1:
+            raw = self.stack.read(first, last)
+        else:
+            raw = torch.cat([self.stack.read(k * every, k * every + 1) for k in range(first, last)])
+        raw = self.region.cropped(raw)
+        if self.kind == "integrals":
+            views = self.region.binned(raw)
+            return Corrected(views, torch.ones_like(views, dtype=torch.bool))
+        saturated = (raw >= self.saturation) & self.fields.alive
+        mask = self.region.all_binned(self.fields.alive & ~saturated)
+        light = self.region.binned(transmission(raw, self.fields))
+        views, low = integrals(light, self.options.floor)
+        if (blank := low.flatten(1).all(dim=1)).any():
+            name = self.names[first + int(blank.int().argmax())]
+            raise Refused(
+                f"{self.options.path}: expected light in every view, got none above the dark field "
+                f"in {name} (shutter closed, or dark and flat swapped?)"
+            )
+        return Corrected(views, mask, int(saturated.sum()), int(low.sum()))
+
+    def chunks(self, pixels: int = PIXELS) -> Iterator[Corrected]:
+        """All views in order, as many at a time as have a number of pixels on disk.
+
+        Warns:
+            UserWarning: after the last, how many pixels were saturated or at the floor.
+        """
+        step = max(1, pixels // math.prod(self.stack.shape))
+        saturated = floored = 0
+        for first in range(0, self.n_views, step):
+            part = self.read(first, min(first + step, self.n_views))
+            saturated, floored = saturated + part.saturated, floored + part.floored
+            yield part
+        self._warn_of_values(saturated, floored)
+
+    def whole(self) -> Corrected:
+        """All views in memory.
+
+        Warns:
+            UserWarning: see `chunks`.
+
+        Raises:
+            ValueError: more than fits into memory; and see `read`.
+        """
+        rows, columns = self.shape
+        check_memory(5 * self.n_views * rows * columns, f"All views of {self.options.path}")
+        views = torch.empty(self.n_views, rows, columns)
+        mask = torch.empty(self.n_views, rows, columns, dtype=torch.bool)
+        first, saturated, floored = 0, 0, 0
+        for part in self.chunks():
+            last = first + len(part.views)
+            views[first:last], mask[first:last] = part.views, part.mask
+            first, saturated, floored = last, saturated + part.saturated, floored + part.floored
+        return Corrected(views, mask, saturated, floored)
+
+    def _field(self, name: str, value: Field) -> Float[Tensor, "v u"]:
+        """A field in grey values: a number, the mean of images, or the folder's own."""
+        if isinstance(value, int | float):
+            return torch.full(self.stack.shape, float(value))
+        where = Path(self.options.path).expanduser()
+        stack = open_projections(value) if value is not None else field_beside(where, name)
+        if stack is None and name == "dark":
+            return torch.zeros(self.stack.shape)
+        if stack is None:
+            raise Refused(
+                f"{where}: expected a flat field for intensities; give flat=<path or grey value>, "
+                f"or kind=integrals"
+            )
+        if stack.shape != self.stack.shape:
+            raise Refused(
+                f"{stack.path}: expected a {name} field of the views' {self.stack.shape} pixels, "
+                f"got {stack.shape}"
+            )
+        return stack.mean()
+
+    def _warn_of_dead(self, known: Fields) -> None:
+        if count := int((~known.alive).sum()):
+            warnings.warn(
+                f"{self.options.path}: {count} of {known.alive.numel()} pixels are dead (flat - "
+                f"dark at most {self.options.dead:g} of its median, or a saturated flat field); "
+                f"they are filled from their neighbours and left out of the mask",
+                stacklevel=4,
+            )
+
+    def _warn_of_values(self, saturated: int, floored: int) -> None:
+        if saturated:
+            warnings.warn(
+                f"{self.options.path}: {saturated} pixels of {self.n_views} views are "
+                f"saturated (grey value {self.saturation:g} or more); they are left out of the "
+                f"mask",
+                stacklevel=3,
+            )
+        if floored:
+            warnings.warn(
+                f"{self.options.path}: {floored} pixels of {self.n_views} views have a "
+                f"transmission of at most {self.options.floor:g}; they count as "
+                f"{-math.log(self.options.floor):.3g}",
+                stacklevel=3,
+            )
+
+
+def _kind(options: "Measured", stack: ProjectionStack) -> Kind:
+    whole = stack.dtype.kind != "f"
+    if options.kind == "integrals" and whole:
+        raise Refused(
+            f"{options.path}: expected floats for line integrals, got pixels of {stack.dtype}; "
+            f"kind=intensities is for grey values"
+        )
+    if options.kind is not None:
+        return options.kind
+    if not whole and not isinstance(stack, Hdf5Views):
+        raise Refused(
+            f"{options.path}: expected kind=integrals or kind=intensities for pixels of "
+            f"{stack.dtype}, which may be either; got none"
+        )
+    return "intensities" if whole else "integrals"

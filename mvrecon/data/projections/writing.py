@@ -1,0 +1,130 @@
+"""A scan as a detector stores it: 16-bit TIFF images with a dark and a flat field, from line
+integrals.
+"""
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.data.projections.stack import VIEWS
+from mvrecon.files.checks import Refused
+
+#: The largest grey value of 16 bits.
+TOP = 2**16 - 1
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How a detector turns line integrals into 16-bit grey values.
+
+    Args:
+        photons: of a pixel without an object (I0), with Poisson noise; None: without noise.
+        dark: grey value without a beam.
+        flat: grey value without an object; the rest up to 65535 is for noise.
+        seed: of the noise.
+
+    Raises:
+        ValueError: grey values that do not fit into 16 bits, or no photons.
+    """
+
+    photons: float | None = 1e4
+    dark: int = 100
+    flat: int = 50_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.dark < self.flat <= TOP:
+            raise ValueError(
+                f"Expected 0 <= dark < flat <= {TOP} grey values, got {self.dark} and {self.flat}"
+            )
+        if self.photons is not None and not 0 < self.photons < np.inf:
+            raise ValueError(f"Expected a positive number of photons, got {self.photons}")
+
+    def grey(
+        self, integrals: Float[Tensor, "v u"], generator: torch.Generator
+    ) -> Float[Tensor, "v u"]:
+        """Grey values of a view, rounded: dark + (flat - dark) N / I0, N of Poisson's law."""
+        light = (-integrals.double()).exp()
+        if self.photons is not None:
+            light = torch.poisson(self.photons * light, generator) / self.photons
+        return (self.dark + (self.flat - self.dark) * light).round().clamp(max=TOP)
+
+
+def write_projections(
+    folder: str | Path,
+    integrals: Float[Tensor, "m v u"] | Iterable[Float[Tensor, "v u"]],
+    exposure: Exposure | None = None,
+) -> Path:
+    """Write line integrals as a folder of 16-bit TIFF images: view_00000.tif and so on, dark.tif
+    and flat.tif without noise. The folder is there whole or not at all.
+
+    `Measured(path=folder)` reads it.
+
+    Args:
+        folder: new, or empty.
+        integrals: of the views, one in memory at a time where they come one by one.
+        exposure: photons and grey values; None: 1e4 photons.
+
+    Raises:
+        FileExistsError: something is in the folder.
+        Refused: integrals that are not finite, views of several sizes, no view, or too many.
+    """
+    folder = Path(folder).expanduser()
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder}: expected a new or an empty folder for projections")
+    exposure = exposure or Exposure()
+    generator = torch.Generator().manual_seed(exposure.seed)
+    with _folder_written_whole(folder) as part:
+        shape = None
+        for number, view in enumerate(integrals):
+            shape = shape or tuple(view.shape)
+            _check(folder, number, view, shape)
+            _write(part / f"view_{number:05d}.tif", exposure.grey(view.detach().cpu(), generator))
+        if shape is None:
+            raise Refused(f"{folder}: expected at least one view to write, got none")
+        for name in ("dark", "flat"):
+            _write(part / f"{name}.tif", torch.full(shape, float(getattr(exposure, name))))
+    return folder
+
+
+def _check(folder: Path, number: int, view: Tensor, shape: tuple[int, ...]) -> None:
+    if number >= VIEWS:
+        raise Refused(f"{folder}: expected at most {VIEWS} views, got more")
+    if view.ndim != 2 or tuple(view.shape) != shape:
+        raise Refused(
+            f"{folder}: expected views [v u] of the size {shape}, got {tuple(view.shape)} of view "
+            f"{number}"
+        )
+    if not view.isfinite().all():
+        raise Refused(
+            f"{folder}: expected finite line integrals, got {int((~view.isfinite()).sum())} that "
+            f"are not in view {number}"
+        )
+
+
+def _write(path: Path, grey: Float[Tensor, "v u"]) -> None:
+    from PIL import Image as Pillow
+
+    Pillow.fromarray(grey.numpy().astype(np.uint16)).save(path, format="TIFF")
+
+
+@contextmanager
+def _folder_written_whole(folder: Path) -> Iterator[Path]:
+    """Context with a folder beside `folder` that takes its name after all is written."""
+    part = folder.with_name(f".{folder.name}.{os.getpid()}.unfinished")
+    part.mkdir(parents=True)
+    try:
+        yield part
+        if folder.exists():
+            folder.rmdir()
+        os.replace(part, folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)

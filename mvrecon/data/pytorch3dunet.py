@@ -1,0 +1,86 @@
+"""HDF5 files of pytorch-3dunet: `raw` [z y x] or [c z y x], and `label` of the same voxels.
+
+Layout after the project's README (github.com/wolny/pytorch-3dunet): axes z, y, x, channels first;
+spacing is not kept.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+
+from mvrecon.data.storage import check_chunks, dataset_in
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import VOLUME, Refused, blaming
+
+EXPECTED = "a file of pytorch-3dunet: HDF5 with raw [z y x] or [c z y x], and optionally label"
+#: Axes of one volume, and of several channels.
+AXES = (3, 4)
+
+
+class Example(NamedTuple):
+    """One volume to learn from.
+
+    Args:
+        raw: values [d h w] or [c d h w].
+        label: what is wanted for the same voxels, [d h w] or [c d h w]; none to predict.
+    """
+
+    raw: np.ndarray
+    label: np.ndarray | None = None
+
+
+def read_example(path: str | Path) -> Example:
+    """Values and labels of a file of pytorch-3dunet, in the type they are stored in.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: not HDF5, another layout, damaged, or values and labels of different voxels.
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
+    with (
+        blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
+        h5py.File(path, "r", locking="best-effort") as file,
+    ):
+        arrays = {
+            name: _read(path, file, name)
+            for name in ("raw", "label")
+            if name == "raw" or name in file
+        }
+    return _checked(path, Example(arrays["raw"], arrays.get("label")))
+
+
+def write_example(path: str | Path, example: Example) -> None:
+    """Write a file for pytorch-3dunet, packed, whole or not at all.
+
+    Raises:
+        Refused: other axes, or values and labels of different voxels.
+    """
+    _checked(path, example)
+    with written_whole(path) as part, h5py.File(part, "w") as file:
+        for name, values in example._asdict().items():
+            if values is not None:
+                file.create_dataset(name, data=values, compression="gzip", shuffle=True)
+
+
+def _read(path: Path, file: h5py.File, name: str) -> np.ndarray:
+    dataset = dataset_in(path, file, name, EXPECTED)
+    if dataset.nbytes > VOLUME:
+        raise Refused(f"{path}: expected {name!r} of at most {VOLUME} bytes, got {dataset.nbytes}")
+    check_chunks(path, dataset)
+    return dataset[:]
+
+
+def _checked(path: str | Path, example: Example) -> Example:
+    for name, values in example._asdict().items():
+        if values is not None and (values.ndim not in AXES or values.dtype.kind not in "iuf"):
+            raise Refused(f"{path}: has {name!r} as {values.dtype} {values.shape}; {EXPECTED}")
+    raw, label = example
+    if label is not None and label.shape[-3:] != raw.shape[-3:]:
+        raise Refused(
+            f"{path}: expected labels of the voxels {raw.shape[-3:]} of raw, got {label.shape[-3:]}"
+        )
+    return example

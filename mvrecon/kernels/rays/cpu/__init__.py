@@ -1,0 +1,1 @@
+"""The CPU's back end: numba's loops over rays, on torch's number of threads."""

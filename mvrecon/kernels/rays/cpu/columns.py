@@ -1,0 +1,277 @@
+"""Detector columns that stand upright over the volume: their rays share all but z, so slabs are
+read as whole rows.
+
+When a step from one detector row to the next runs along the volume's z axis (every circular orbit
+about it, every stack of slices), the rays of one detector column lie in one upright plane. In a
+slab they all meet the same two rows of voxels along z (joseph) or the same one or two (siddon).
+These rows are blended once, as contiguous vectors, and each ray then takes one pair of neighbours
+out of the blend: a third of the work of `loops.py`, in the level plane not even that, with the same
+weights. The volume must be turned so that z is contiguous, see `packed_volume.py`.
+"""
+
+from collections import namedtuple
+
+import numpy as np
+
+from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon.kernels.rays.cpu.lanes import LANES, between, mix, more, put, take
+from mvrecon.kernels.rays.cpu.loops import silent
+from mvrecon.kernels.rays.cpu.packed_volume import Store
+from mvrecon.kernels.rays.cpu.packed_volume import store as store_of
+from mvrecon.kernels.rays.cpu.rig import Rig, steps_of
+from mvrecon.kernels.rays.cpu.upright import extent, pieces, places, upright, within_occupied
+from mvrecon.kernels.rays.trace import from_centre, main_axis, slab_length, within
+
+#: Two rows of voxels along z: flat index of the lower one, their weights, the step from it to the
+#: other.
+Rows = namedtuple("Rows", ["index", "low", "high", "far"])
+#: Rays in turn add to rows of their own, so that no addition waits for the one before.
+ROWS = 4
+
+
+@scalar
+def _clear(room, group, lanes, span):
+    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+        room.row[np.uint64((group * room.width + 1) * lanes) + z] = 0
+
+
+@scalar
+def rows_of(room, i, real, steps):
+    """The two rows of voxels of piece i."""
+    low, high = real(room.pieces[0, i]), real(room.pieces[1, i])
+    return Rows(np.int64(room.index[i]), low, high, np.int64(steps.far))
+
+
+@scalar
+def _blend(room, store, group, rows, span, add):
+    """A group's row of the room = low * (voxels along z of a row) + high * (those of the next),
+    added where `add`.
+    """
+    row, flat, low, high = room.row, store.values, rows.low, rows.high
+    first, lanes = np.uint64((group * room.width + 1) * store.lanes), store.lanes
+    below = np.uint64((group * store.size + rows.index) * lanes)
+    above = below + np.uint64(rows.far * lanes)
+    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+        blend = low * flat[below + z] + high * flat[above + z]
+        row[first + z] = blend + row[first + z] if add else blend
+
+
+@scalar
+def _read_lanes(room, group, rays):
+    """`_read` of four volumes side by side."""
+    places, row, shares, sums = room.places, room.row, room.shares, room.values[group]
+    four, start, one = (
+        np.uint64(LANES),
+        np.uint64(group * room.width * LANES),
+        room.shares.dtype.type(1),
+    )
+    for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
+        below, place = np.uint64(places[v]) * four + start, np.uint64(v) * four
+        value = mix(take(row, below), take(row, below + four), shares[v], one - shares[v])
+        put(sums, place, more(take(sums, place), one, value))
+
+
+@scalar
+def _read(room, lanes, group, rays):
+    """Add to a group's values each ray's share of its two neighbours in the group's row."""
+    if lanes > 1:
+        _read_lanes(room, group, rays)
+        return
+    first = group * room.width
+    start, count = (
+        rays[0],
+        np.uint32(rays[1] - rays[0]),
+    )  # loops from zero on: compilers make vectors of these
+    places, pairs, row, parts = (
+        room.places[start:],
+        room.pairs[start:],
+        room.row_pairs,
+        room.parts[2 * start :],
+    )
+    shares, sums, one = room.shares[start:], room.values[group][start:], room.shares.dtype.type(1)
+    for v in range(count):
+        pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
+    for v in range(count):
+        sums[v] += between(parts[2 * v], parts[2 * v + 1], shares[v], one - shares[v])
+
+
+#: Room for one column: flat indices of its pieces, four numbers each, from where to where they are
+#: occupied; per ray its place in a row of voxels, its share of the upper neighbour, its two
+#: neighbours whole and in their parts; values [g v l]; a blended row [z l]; rows.
+Column = namedtuple(
+    "Column",
+    ["index", "pieces", "occupied", "places", "shares", "pairs", "parts", "values", "blended"]
+    + ["row", "row_pairs", "width"],
+)
+
+
+def column_of(rig: Rig, store: Store, volumes: int) -> Column:
+    """Room for one column of a thread, its padded rows empty."""
+    real, lanes, height = store.values.dtype, store.lanes, rig.detector[0]
+    length, width = 2 * max(rig.sizes[:2]), rig.sizes[2] + 3
+    pairs = np.empty(height, store.pairs.dtype)
+    groups = -(-volumes // lanes)
+    row, row_pairs, *_ = store_of(np.zeros((1, 1, 1, max(ROWS, groups) * width, lanes), real), 0)
+    index, pieces, occupied = (
+        np.empty(length, store.strides.dtype),
+        np.empty((4, length)),
+        np.empty((2, length), np.int64),
+    )
+    places, shares = np.empty(height, np.uint32), np.empty(height, real)
+    values, blended = np.empty((groups, height * lanes), real), np.empty(rig.sizes[2] * lanes, real)
+    return Column(
+        *(index, pieces, occupied, places, shares, pairs, pairs.view(real), values, blended),
+        *(row, row_pairs, width),
+    )
+
+
+@compiled
+def project_columns(store, rig, room, reads, views, first, last):
+    """Add to views [n m v u] the sums of the volumes along columns first to last, counted through
+    the views of `Columns`, which is in `rig.py`.
+    """
+    columns = rig.detector[1]
+    volumes, groups, lanes, real = (
+        len(views),
+        len(room.values),
+        store.lanes,
+        store.values.dtype.type,
+    )
+    for column in range(first, last):
+        m, u = reads.views[column // columns], column % columns
+        rays = reads.spans[column // columns, u, 0], reads.spans[column // columns, u, 1]
+        if rays[0] >= rays[1]:
+            continue
+        line, pixel = rig.lines[m], from_centre(rig, u, 0)
+        axis = main_axis(line, pixel[0], pixel[1])
+        steps = steps_of(rig, store, axis)
+        ray, height = upright(rig, line, axis, u)
+        count = pieces(rig, ray, (ray.first, ray.last), steps, room)
+        level = height.climb == 0 and height.steeper == 0
+        room.values[:] = 0
+        for i in range(count):
+            span = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
+            some = within_occupied(rig, room, i, span)
+            rows = rows_of(room, i, real, steps)
+            if not level or i == 0:
+                places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
+            for group in range(groups):
+                if rig.heights.size and (not level or i == 0):
+                    _clear(room, group, lanes, span)
+                add = level and (i > 0 or rig.heights.size > 0)
+                _blend(room, store, group, rows, some, add)
+                if not level or i == count - 1:
+                    _read(room, lanes, group, rays)
+        for v in range(rays[0], rays[1] if count else rays[0]):
+            length = real(slab_length(line, axis, pixel[0], from_centre(rig, u, v)[1]))
+            for n in range(volumes):
+                views[n, m, v, u] += length * room.values[n // lanes, v * lanes + n % lanes]
+
+
+@scalar
+def _write_lanes(room, group, rays):
+    """`_write` of four volumes side by side."""
+    places, row, shares, values = room.places, room.row, room.shares, room.values[group]
+    four, width, one = np.uint64(LANES), np.uint32(room.width), room.shares.dtype.type(1)
+    for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
+        below = np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width) * four
+        value = take(values, np.uint64(v) * four)
+        put(row, below, more(take(row, below), one - shares[v], value))
+        put(row, below + four, more(take(row, below + four), shares[v], value))
+
+
+@scalar
+def _write(room, lanes, group, rays):
+    """Spread a group's values over `ROWS` rows of neighbours in turn: the transpose of `_read`."""
+    if lanes > 1:
+        _write_lanes(room, group, rays)
+        return
+    start, count = rays[0], np.uint32(rays[1] - rays[0])
+    places, pairs, row, parts = (
+        room.places[start:],
+        room.pairs[start:],
+        room.row_pairs,
+        room.parts[2 * start :],
+    )
+    shares, values = room.shares[start:], room.values[group][start:]
+    one, width, lane = room.shares.dtype.type(1), np.uint32(room.width), np.uint32(start)
+    for v in range(count):
+        parts[2 * v], parts[2 * v + 1] = values[v] * (one - shares[v]), values[v] * shares[v]
+    for v in range(count):
+        row[np.uint64(places[v] + np.uint32(np.uint32(v + lane) % np.uint32(ROWS)) * width)] += (
+            pairs[v]
+        )
+
+
+@scalar
+def _gather(room, lanes, span):
+    """The sum of the `ROWS` rows, without their padding; they are empty then."""
+    flat, blended, width = room.row[lanes:], room.blended, room.width * lanes
+    one, two, three, four = flat, flat[width:], flat[2 * width :], flat[3 * width :]
+    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+        blended[z] = (one[z] + two[z]) + (three[z] + four[z])
+    for z in range(np.uint32(ROWS * width)):
+        room.row[z] = 0
+
+
+@scalar
+def _unblend(room, store, group, rows, span):
+    """Add to two rows of voxels their shares of a row: the transpose of `_blend`."""
+    values, flat, low, high, lanes = room.blended, store.values, rows.low, rows.high, store.lanes
+    below = np.uint64((group * store.size + rows.index) * lanes)
+    above = below + np.uint64(rows.far * lanes)
+    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+        flat[below + z] += low * values[z]
+    if high != 0:
+        for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+            flat[above + z] += high * values[z]
+
+
+@scalar
+def _not_silent(views, m, u, rays):
+    """The rays of a column, from the first to one behind the last, on which a view is not zero."""
+    first, last = rays
+    while first < last and silent(views, m, first, u):
+        first += 1
+    while first < last and silent(views, m, last - 1, u):
+        last -= 1
+    return first, last
+
+
+@compiled
+def backproject_columns(store, rig, room, reads, views, slabs):
+    """Spread views [n m v u] into slabs along columns; `Columns` and `Slabs` are in `rig.py`."""
+    axis, columns = slabs.axis, rig.detector[1]
+    volumes, lanes, real, steps = (
+        len(views),
+        store.lanes,
+        store.values.dtype.type,
+        steps_of(rig, store, axis),
+    )
+    for column in range(len(reads.views) * columns):
+        m, u = reads.views[column // columns], column % columns
+        line, pixel = rig.lines[m], from_centre(rig, u, 0)
+        rays = reads.spans[column // columns, u, 0], reads.spans[column // columns, u, 1]
+        if rays[0] >= rays[1] or main_axis(line, pixel[0], pixel[1]) != axis:
+            continue
+        ray, height = upright(rig, line, axis, u)
+        span, rays = within(ray, slabs.low, slabs.high), _not_silent(views, m, u, rays)
+        if span[0] >= span[1] or rays[0] >= rays[1]:
+            continue
+        count = pieces(rig, ray, span, steps, room)
+        level = height.climb == 0 and height.steeper == 0
+        room.values[:] = 0
+        for v in range(rays[0], rays[1]):
+            length = real(slab_length(line, axis, pixel[0], from_centre(rig, u, v)[1]))
+            for n in range(volumes):
+                room.values[n // lanes, v * lanes + n % lanes] = length * views[n, m, v, u]
+        for group in range(len(room.values)):
+            for i in range(count):
+                span_z = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
+                some = within_occupied(rig, room, i, span_z)
+                rows = rows_of(room, i, real, steps)
+                if not level or i == 0:
+                    places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
+                    _write(room, lanes, group, rays)
+                    _gather(room, lanes, span_z)
+                _unblend(room, store, group, rows, some)

@@ -1,0 +1,95 @@
+"""Which pixels of a view see a box: along every row, or column, of its detector the first of them
+and one behind.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mvrecon.kernels.compiling import compiled
+from mvrecon.kernels.rays.projection_matrix import projection_matrix
+
+#: Pixels beyond the picture of a box that are taken along.
+MARGIN = 1.0
+
+
+def spans_of(
+    lines: Float[np.ndarray, "m 4 3 k"],
+    detector: tuple[int, int],
+    tall: Bool[np.ndarray, " m"],
+    boxes: Float[np.ndarray, "n 6"] | None,
+) -> Int[np.ndarray, "m unit 2"]:
+    """The pixels of every unit that may see a box.
+
+    Args:
+        lines: the views' rays.
+        detector: pixels (rows, columns).
+        tall: views whose units are columns; those of the others are rows.
+        boxes: first and last corner (x0, y0, z0, x1, y1, z1) in voxels from the volume's centre;
+            None: all is seen.
+    """
+    rows, columns = detector
+    spans = np.zeros((len(lines), max(rows, columns), 2), np.int32)
+    if boxes is None or lines.shape[3] != 3:
+        spans[tall, :columns, 1] = rows
+        spans[~tall, :rows, 1] = columns
+        return spans
+    spans[:, :, 0] = max(rows, columns)
+    frames = np.zeros((len(lines), 3, 4))
+    for line, frame in zip(lines, frames, strict=True):
+        projection_matrix(line, frame)
+    cover(frames, np.array(detector), tall, boxes, spans)
+    return spans
+
+
+@compiled
+def cover(frames, detector, tall, boxes, spans):
+    """Widen spans by the pictures of boxes, given the views' matrices [m 3 4]."""
+    rows, columns = detector
+    for m in range(len(frames)):
+        frame = frames[m]
+        for n in range(len(boxes)):
+            u0 = v0 = np.inf
+            u1 = v1 = -np.inf
+            side = 0
+            for corner in range(8):
+                i, j, k = corner & 1, corner >> 1 & 1, corner >> 2
+                x, y, z = boxes[n, 3 * i], boxes[n, 1 + 3 * j], boxes[n, 2 + 3 * k]
+                w = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3]
+                reach = (
+                    abs(frame[2, 0] * x)
+                    + abs(frame[2, 1] * y)
+                    + abs(frame[2, 2] * z)
+                    + abs(frame[2, 3])
+                )
+                if abs(w) > 1e-9 * reach:
+                    side += 1 if w > 0 else -1
+                    u = (frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3]) / w
+                    v = (frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z + frame[1, 3]) / w
+                    u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+            if abs(side) < 8:  # the source's plane cuts the box: its picture has no bounds
+                u0 = v0 = -np.inf
+                u1 = v1 = np.inf
+            first_u, last_u = _pixels(u0, u1, columns)
+            first_v, last_v = _pixels(v0, v1, rows)
+            if first_u >= last_u or first_v >= last_v:
+                continue
+            if tall[m]:
+                for u in range(first_u, last_u):
+                    spans[m, u, 0], spans[m, u, 1] = (
+                        min(spans[m, u, 0], first_v),
+                        max(spans[m, u, 1], last_v),
+                    )
+            else:
+                for v in range(first_v, last_v):
+                    spans[m, v, 0], spans[m, v, 1] = (
+                        min(spans[m, v, 0], first_u),
+                        max(spans[m, v, 1], last_u),
+                    )
+
+
+@compiled
+def _pixels(low, high, count):
+    centre = (count - 1) / 2
+    first = min(max(np.ceil(low + centre - MARGIN), 0.0), float(count))
+    last = min(max(np.floor(high + centre + MARGIN) + 1, 0.0), float(count))
+    return int(first), int(last)

@@ -1,0 +1,194 @@
+"""The compiled operators of the CPU: no compiler on the user's machine, as many threads as torch
+has.
+
+Every result is the same to the last bit for any number of threads: each ray's sum belongs to one
+thread, and so does each voxel of the adjoint (a thread owns a range of slabs, one main axis at a
+time, and meets the rays in one order).
+
+Rays read copies of the volume, see `packed_volume.py`, made piece by piece so that little is added
+to the caller's memory.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.kernels.precision import wide
+from mvrecon.kernels.rays.cpu.columns import backproject_columns, column_of, project_columns
+from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room_of, vary_rows
+from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, fill, part_of, store
+from mvrecon.kernels.rays.cpu.plan import Plan, Scene, plan_of, ray_plan_of
+from mvrecon.kernels.rays.cpu.rig import Columns, Reads, Rig, Slabs, Units
+from mvrecon.kernels.rays.lines import unshifted
+from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.kernels.threads import share
+
+#: Rows of a volume of half precision that are widened at a time.
+TOGETHER = 8
+
+
+class Copy(NamedTuple):
+    """A piece of volumes in one layout: the rig about it, the main axes of the rays that read it,
+    the rows (along y) of the whole volume that it is.
+    """
+
+    store: Store
+    rig: Rig
+    axes: tuple[bool, bool, bool]
+    rows: slice
+
+
+def _piece_sizes(piece: Rig) -> tuple[int, int, int]:
+    x, y, z = (high - low for low, high in zip(piece.box[:3], piece.box[3:], strict=True))
+    return x, y, z
+
+
+def _overlap(
+    occupancy: Occupancy, rows: slice, piece: Rig
+) -> tuple[slice, tuple[slice, slice, slice]]:
+    """The occupied rows (along y) that lie in a piece, counted from the box; and where they lie in
+    the store.
+    """
+    box = occupancy.box
+    first, last = max(box.low[1], rows.start), min(box.high[1], rows.stop)
+    low = box.low[2] - piece.box[0], first - rows.start - piece.box[1], box.low[0] - piece.box[2]
+    size = (box.shape[2], last - first, box.shape[0])
+    x, y, z = (slice(start, start + n) for start, n in zip(low, size, strict=True))
+    return slice(first - box.low[1], last - box.low[1]), (x, y, z)
+
+
+def _copies(volume: Tensor, occupancy: Occupancy, plan: Plan) -> Iterator[Copy]:
+    """Pieces of volumes in each layout that the plan needs; `volume` is the occupied box."""
+    # grad mode belongs to a thread: in the pool's threads it would be on
+    volume = volume.detach()
+    into, real = None, wide(volume[:0]).numpy().dtype
+    for near, axes in plan.layouts:
+        for rows, piece in plan.pieces:
+            into = empty(len(volume), _piece_sizes(piece), near, plan.lanes, real, into)
+            some, where = _overlap(occupancy, rows, piece)
+            to, values = part_of(into, near, where), volume[:, :, some]
+
+            def copy(first: int, last: int, to=to, near=near, values=values) -> None:
+                for row in range(first, last, TOGETHER):
+                    fill(wide(values[:, :, row : min(row + TOGETHER, last)]).numpy(), near, to, row)
+
+            share(copy, values.shape[2], values.numel(), 4)
+            yield Copy(store(into, near), piece, axes, rows)
+
+
+def project(
+    volume: Float[Tensor, "n d h w"],
+    lines: Float[Tensor, "m 4 3 k"],
+    window: Sequence[float],
+    occupancy: Occupancy,
+    detector: Sequence[int],
+    method: str,
+) -> Float[Tensor, "n m v u"]:
+    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is the
+    occupied box.
+    """
+    real = wide(volume[:0]).numpy().dtype
+    plan = plan_of(Scene(lines, window, detector, method), occupancy, len(volume), real.itemsize)
+    sizes, reads, columns = plan.rig.sizes, plan.reads, plan.upright
+    views = np.zeros((len(volume), len(lines), *plan.rig.detector), real)
+    upright = len(columns.views) * plan.rig.detector[1]
+    for copy in _copies(volume, occupancy, plan):
+
+        def add_rows(first: int, last: int, copy=copy) -> None:
+            room, units = room_of(copy.rig, copy.store), Units(copy.axes, first, last)
+            project_rows(copy.store, copy.rig, room, reads[copy.store.near], views, units)
+
+        def add_columns(first: int, last: int, copy=copy) -> None:
+            room = column_of(copy.rig, copy.store, len(views))
+            project_columns(copy.store, copy.rig, room, columns, views, first, last)
+
+        share(add_rows, plan.units, views.size * max(sizes), 4)
+        share(add_columns, upright if copy.store.near == 2 else 0, views.size * max(sizes), 4)
+    return torch.from_numpy(views)
+
+
+def backproject(
+    views: Float[Tensor, "n m v u"],
+    lines: Float[Tensor, "m 4 3 k"],
+    window: Sequence[float],
+    occupancy: Occupancy,
+    method: str,
+) -> Float[Tensor, "n d h w"]:
+    """The exact transpose of `project`, the same to the last bit for any number of threads."""
+    values = np.ascontiguousarray(views.numpy())
+    scene = Scene(lines, window, views.shape[2:], method)
+    plan = plan_of(scene, occupancy, len(views), values.itemsize)
+    volume, into = np.zeros((len(views), *occupancy.box.shape), values.dtype), None
+    for near, axes in plan.layouts:
+        for rows, piece in plan.pieces:
+            into = empty(len(views), _piece_sizes(piece), near, plan.lanes, values.dtype, into)
+            some, where = _overlap(occupancy, rows, piece)
+            source, part = part_of(into, near, where), volume[:, :, some]
+            for axis in range(3):
+                if axes[axis]:
+                    _spread_rows(store(into, near), piece, axis, plan.reads[near], values)
+                if near == 2 and axis < 2 and len(plan.upright.views):
+                    _spread_columns(store(into, near), piece, axis, plan.upright, values)
+            share(
+                lambda a, b, source=source, to=part, near=near: add(source, near, to, a, b),
+                part.shape[2],
+                part.size,
+            )
+    return torch.from_numpy(volume)
+
+
+def _spread_rows(values: Store, piece: Rig, axis: int, reads: Reads, views: np.ndarray) -> None:
+    """Spread oblique views along the rays of one main axis, slab by slab."""
+
+    def add_slabs(low: int, high: int) -> None:
+        slabs = Slabs(axis, piece.box[axis] + low, piece.box[axis] + high)
+        backproject_slabs(values, piece, room_of(piece, values), reads, views, slabs)
+
+    share(add_slabs, _piece_sizes(piece)[axis], views.size * max(piece.sizes))
+
+
+def _spread_columns(
+    values: Store, piece: Rig, axis: int, columns: Columns, views: np.ndarray
+) -> None:
+    """Spread upright views along the columns of one main axis, slab by slab."""
+
+    def add_slabs(low: int, high: int) -> None:
+        room = column_of(piece, values, len(views))
+        slabs = Slabs(axis, piece.box[axis] + low, piece.box[axis] + high)
+        backproject_columns(values, piece, room, columns, views, slabs)
+
+    share(add_slabs, _piece_sizes(piece)[axis], views.size * max(piece.sizes))
+
+
+def lines_vjp(
+    volume: Float[Tensor, "n d h w"],
+    views: Float[Tensor, "n m v u"],
+    lines: Float[Tensor, "m 4 3 k"],
+    window: Sequence[float],
+    occupancy: Occupancy,
+    method: str,
+) -> Float[Tensor, "m 4 3 k"]:
+    """The derivative of <views, project(volume, lines)> by the lines, all methods by hand;
+    float64.
+    """
+    values = np.ascontiguousarray(views.numpy())
+    scene = Scene(lines, window, views.shape[2:], method)
+    plan = ray_plan_of(scene, occupancy, len(volume), wide(volume[:0]).element_size())
+    sizes, reads = plan.rig.sizes, plan.reads
+    total = torch.zeros(lines.shape, dtype=torch.float64)
+    for copy in _copies(volume, occupancy, plan):
+        # a row or column of pixels has its own sum, so that threads change no bit
+        change = np.zeros((len(lines), max(plan.rig.detector), *lines.shape[1:]))
+
+        def vary(first: int, last: int, copy=copy, change=change) -> None:
+            room, units = room_of(copy.rig, copy.store), Units(copy.axes, first, last)
+            vary_rows(copy.store, copy.rig, room, reads[copy.store.near], values, change, units)
+
+        share(vary, plan.units, values.size * max(sizes), 4)
+        middle = (copy.rows.start + copy.rows.stop - sizes[1]) / 2
+        total += unshifted(torch.from_numpy(change).sum(dim=1), middle)
+    return total

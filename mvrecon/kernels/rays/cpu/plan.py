@@ -1,0 +1,233 @@
+"""How the loops share out a rig: which views are read how, and the volume in which layout, piece by
+piece.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.geometry.box import Box, Three
+from mvrecon.kernels.padding import padded_shape
+from mvrecon.kernels.rays.cpu.footprint import spans_of
+from mvrecon.kernels.rays.cpu.lanes import LANES
+from mvrecon.kernels.rays.cpu.rig import Columns, Reads, Rig, bounds_of, rig_of
+from mvrecon.kernels.rays.cpu.upright import columnar
+from mvrecon.kernels.rays.lines import DIRECTION, START, shifted
+from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of, bricks_of_rig
+from mvrecon.kernels.rays.trace import TRILINEAR
+
+#: Bytes of the copy of a piece of the volume.
+BUDGET = 24 * 2**20
+#: Plans that are kept, and the numbers of lines, and rows or columns of pixels, up to which one is:
+#: beyond, a call takes so long that its plan costs next to nothing.
+PLANS, SMALL = 64, 2**14
+
+
+class Scene(NamedTuple):
+    """The rays that a volume is met by, as the operators have them."""
+
+    lines: Tensor
+    window: Sequence[float]
+    detector: Sequence[int]
+    method: str
+
+    def slabs(self, shape: Sequence[int]) -> int:
+        """Slabs of all rays, at most."""
+        return len(self.lines) * math.prod(self.detector) * max(shape)
+
+    def rig(self, occupancy: Occupancy) -> Rig:
+        """The rig as the loops have it, about what a volume may hold."""
+        return rig_of(self.lines, self.window, occupancy, self.detector, self.method)
+
+
+class Key(NamedTuple):
+    """All that a plan depends on, by its content; `lines` are the bytes of float64 numbers [m 4 3
+    k].
+    """
+
+    lines: bytes
+    shape: tuple[int, ...]
+    window: tuple[float, ...]
+    detector: tuple[int, ...]
+    method: str
+    volume: Three
+    box: Box
+    lanes: int
+    parts: int
+
+
+class Layout(NamedTuple):
+    """The near axis of a store, and the main axes of the oblique rays that read it."""
+
+    near: int
+    axes: tuple[bool, bool, bool]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Which views are read how; nobody writes to its arrays, which several threads share.
+
+    Args:
+        rig: what the loops know of the rays.
+        upright: the views whose columns are read as rows of voxels.
+        oblique: indices of the others.
+        axes: whether a ray of an oblique view can have each main axis.
+        lanes: volumes that lie side by side.
+        boxes: what the rays are to meet, see `footprint.spans_of`.
+        pieces: see `pieces`.
+    """
+
+    rig: Rig
+    upright: Columns
+    oblique: np.ndarray
+    axes: tuple[bool, bool, bool]
+    lanes: int
+    boxes: Float[np.ndarray, "n 6"] | None
+    pieces: tuple[tuple[slice, Rig], ...]
+
+    @property
+    def layouts(self) -> list[Layout]:
+        """The layouts of the volume that are needed."""
+        x, y, z = self.axes
+        turned = [Layout(2, (x, y, False))] if x or y or len(self.upright.views) else []
+        return turned + ([Layout(0, (False, False, z))] if z else [])
+
+    @property
+    def units(self) -> int:
+        """How many units the oblique views have, see `loops.walk`."""
+        return len(self.oblique) * max(self.rig.detector)
+
+    @cached_property
+    def reads(self) -> dict[int, Reads]:
+        """How the oblique views are read for each near axis: those are tall for a near axis whose
+        greatest steps are from row to row.
+        """
+        return {near: self._reads(near) for near, _ in self.layouts}
+
+    def _reads(self, near: int) -> Reads:
+        lines = self.rig.lines[self.oblique]
+        steps = np.abs(lines[:, DIRECTION, near]) + np.abs(lines[:, START, near])
+        tall = steps[:, 1] > steps[:, 0] if lines.shape[3] == 3 else np.zeros(len(steps), bool)
+        return Reads(self.oblique, tall, spans_of(lines, self.rig.detector, tall, self.boxes))
+
+
+def plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> Plan:
+    """The plan for projecting volumes, of numbers of so many bytes, or for back-projecting into
+    them.
+
+    Those of small scenes are kept: an iteration asks for the same one again and again.
+    """
+    lanes = LANES if scene.method == "joseph" and volumes > 2 else 1
+    parts = parts_of(scene.method, occupancy.shape, volumes * itemsize)
+    units = len(scene.lines) * max(scene.detector)
+    if occupancy.bricks is None and max(units, scene.lines.numel()) <= SMALL:
+        maps = np.ascontiguousarray(scene.lines.detach().numpy(), dtype=np.float64)
+        first, last = map(float, scene.window)
+        rows, columns = map(int, scene.detector)
+        key = Key(
+            *(maps.tobytes(), maps.shape, (first, last), (rows, columns), scene.method),
+            *(occupancy.shape, occupancy.box, lanes, parts),
+        )
+        return kept_plan(key)
+    return _made(scene.rig(occupancy), occupancy, lanes, parts)
+
+
+def keyed_plan(key: Key) -> Plan:
+    """The plan that belongs to a key."""
+    lines = torch.from_numpy(np.frombuffer(key.lines).reshape(key.shape).copy())
+    scene = Scene(lines, key.window, key.detector, key.method)
+    occupancy = Occupancy(key.volume, key.box)
+    return _made(scene.rig(occupancy), occupancy, key.lanes, key.parts)
+
+
+kept_plan = lru_cache(maxsize=PLANS)(keyed_plan)
+
+
+def ray_plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> Plan:
+    """The plan that goes ray by ray, volume by volume, for derivatives in the geometry."""
+    rig = scene.rig(occupancy)
+    parts = parts_of(scene.method, occupancy.shape, volumes * itemsize)
+    return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, parts)
+
+
+def _made(rig: Rig, occupancy: Occupancy, lanes: int, parts: int) -> Plan:
+    upright = columnar(rig) if rig.method != TRILINEAR else np.zeros(len(rig.lines), bool)
+    return _plan(rig, occupancy, upright, lanes, parts)
+
+
+def _plan(
+    rig: Rig, occupancy: Occupancy, upright: Bool[np.ndarray, " m"], lanes: int, parts: int
+) -> Plan:
+    oblique, boxes, columns = np.flatnonzero(~upright), boxes_of(occupancy), np.flatnonzero(upright)
+    tall = np.ones(len(columns), bool)
+    return Plan(
+        rig,
+        Columns(columns, spans_of(rig.lines[columns], rig.detector, tall, boxes)),
+        oblique,
+        _main_axes(rig, rig.lines[oblique, 0]),
+        lanes,
+        boxes,
+        tuple(pieces(rig, occupancy, parts)),
+    )
+
+
+def _main_axes(rig: Rig, direction: Float[np.ndarray, "m 3 k"]) -> tuple[bool, bool, bool]:
+    rows, columns = rig.detector
+    corners = np.array([[u, v, 1] for u in (-1, 1) for v in (-1, 1)]) * [
+        (columns - 1) / 2,
+        (rows - 1) / 2,
+        1,
+    ]
+    corners = (
+        corners[:1] if direction.shape[2] == 1 else corners
+    )  # a ray given by itself is its own corner
+    # [corner axis view], so that numpy goes through many views in one loop
+    ends = np.stack(
+        [direction.transpose(1, 0, 2) @ corner for corner in corners[:, -direction.shape[2] :]]
+    )
+    # the ray of a pixel lies between those of the corners
+    least = np.where(ends.min(axis=0) * ends.max(axis=0) > 0, np.abs(ends).min(axis=0), 0)
+    x, y, z = (np.abs(ends).max(axis=0) * (1 + 1e-9) >= least.max(axis=0)).any(axis=1)
+    return bool(x), bool(y), bool(z)
+
+
+def parts_of(method: str, shape: Sequence[int], itemsize: int) -> int:
+    """In how many pieces volumes [d h w] are read, whose voxels have so many bytes each.
+
+    The samples of "trilinear" are spaced along the ray's way through the whole volume: it is one
+    piece.
+    """
+    if "trilinear" in method:
+        return 1
+    return max(1, -(-math.prod(padded_shape(shape)) * itemsize // BUDGET))
+
+
+def pieces(rig: Rig, occupancy: Occupancy, parts: int) -> Iterator[tuple[slice, Rig]]:
+    """Ranges of the volume's rows, as many as parts or fewer, each with the rig about its own
+    centre.
+
+    Weights of both methods are of single voxels, so that the pieces' projections add up to the
+    whole volume's. The occupied box cuts pieces short, but never moves them, so that sums keep
+    their order.
+    """
+    width, height, depth = rig.sizes
+    rows = (
+        -(-height // (parts * EDGE)) * EDGE
+    )  # the first is the greatest, and its memory serves the others
+    for low in range(0, height, rows):
+        high = min(low + rows, height)
+        part = occupancy.rows(low, high)
+        if part.box.size:
+            lines = shifted(rig.lines, (low + high - height) / 2)
+            sizes, bounds = (width, high - low, depth), bounds_of(part)
+            yield (
+                slice(low, high),
+                Rig(lines, *rig[1:2], sizes, *rig[3:6], bounds, *bricks_of_rig(part)),
+            )

@@ -1,0 +1,125 @@
+"""Whether the CUDA back end may be trusted on a device: each operator is tried once against the
+reference.
+"""
+
+import logging
+import warnings
+from collections.abc import Iterator
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from mvrecon.kernels.rays import reference
+from mvrecon.kernels.rays.occupancy import Occupancy
+
+logger = logging.getLogger(__name__)
+
+#: The greatest difference to the reference, by its greatest value: rounding, and where a ray falls
+#: on an edge.
+TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
+
+
+@torch.compiler.assume_constant_result
+def reason(
+    device: torch.device | str,
+    method: str = "joseph",
+    dtype: torch.dtype = torch.float32,
+    volumes: int = 1,
+) -> str | None:
+    """Why the kernels for some input cannot be used on a device, or None. Tried once, which
+    compiles them; logged once.
+
+    Args:
+        device: a CUDA device.
+        method: "joseph", "siddon" or "trilinear:samples".
+        dtype: of the volumes or views; all but float64 is computed in float32.
+        volumes: how many there are: one has kernels of its own.
+    """
+    place = torch.device(device)
+    if place.type == "cuda" and place.index is None:
+        place = torch.device(
+            "cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0
+        )
+    computed = torch.float64 if dtype == torch.float64 else torch.float32
+    return _reason(str(place), method.partition(":")[0], computed, volumes > 1)
+
+
+@cache
+def _reason(device: str, name: str, dtype: torch.dtype, several: bool) -> str | None:
+    # a tiny grid of blocks is no mistake of ours
+    warnings.filterwarnings(
+        "ignore", message="Grid size .* will likely result in GPU under-utilization"
+    )
+    bound, failure = TOLERANCE[dtype], None
+    try:
+        for what, error in differences(
+            device, f"{name}:8" if name == "trilinear" else name, dtype, 5 if several else 1
+        ):
+            if not error <= bound:
+                failure = (
+                    failure
+                    or f"{what} differs from the reference by {error:.1e}, expected at most "
+                    f"{bound:.0e}"
+                )
+    # a missing package, no driver, no compiler, a kernel that fails: all mean the same
+    except Exception as problem:
+        failure = f"{type(problem).__name__}: {problem}"
+    if failure:
+        logger.warning("The reference computes %s of %s on %s: %s", name, dtype, device, failure)
+    return failure
+
+
+def differences(
+    device: str, method: str, dtype: torch.dtype, volumes: int
+) -> Iterator[tuple[str, float]]:
+    """What was tried on a tiny scene, and its greatest difference to the reference, by the
+    reference's greatest value.
+
+    Raises:
+        ImportError: numba is missing, or on a device numba-cuda: what numba itself brings cannot
+            compile the kernels.
+    """
+    from numba import cuda as numba_cuda
+
+    if device != "cpu" and getattr(numba_cuda, "implementation", "") == "Built-in":
+        raise ImportError("numba-cuda is not installed, pip install mvrecon[cuda]")
+    from mvrecon.kernels.rays.cuda import operators as cuda
+
+    lines, window, detector, shape = tiny_scene(device)
+    occupancy = Occupancy.whole(shape)
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(volumes, *shape, dtype=dtype, generator=generator).to(device)
+    y = torch.rand(volumes, len(lines), *detector, dtype=dtype, generator=generator).to(device)
+    moving = lines.clone().requires_grad_()
+    with torch.enable_grad():
+        views = reference.project(x, moving, window, detector, method)
+        (change,) = torch.autograd.grad((views * y).sum(), moving)
+    volume = reference.backproject(y, lines, window, shape, method)
+    yield "project", _error(cuda.project(x, lines, window, occupancy, detector, method), views)
+    yield "scatter", _error(cuda.scatter(y, lines, window, occupancy, method), volume)
+    if method == "joseph":
+        yield "gather", _error(cuda.gather(y, lines, window, occupancy, method), volume)
+    yield "lines_vjp", _error(cuda.lines_vjp(x, y, lines, window, occupancy, method), change)
+
+
+def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:
+    """Lines [3 4 3 3], window, detector and shape: three cone beams, each with another main axis,
+    all slanted.
+    """
+    maps = []
+    for axis in range(3):
+        source, look, u, v = (torch.zeros(3, dtype=torch.float64) for _ in range(4))
+        source[axis], source[axis - 1], source[axis - 2] = -19.3, 1.71, -2.37
+        look[axis], look[axis - 1], look[axis - 2] = 31.1, -2.13, 3.19
+        u[axis - 1], v[axis - 2], u[axis - 2] = 1.13, 1.07, 0.11
+        none, direction = torch.zeros_like(u), torch.stack([u, v, look], dim=-1)
+        moment = torch.linalg.cross(source[:, None].expand(3, 3), direction, dim=0)
+        maps.append(
+            torch.stack([direction, moment, torch.stack([none, none, source], dim=-1), direction])
+        )
+    return torch.stack(maps).to(device), [0.0, 1.0], [5, 6], [5, 4, 6]
+
+
+def _error(got: Tensor, expected: Tensor) -> float:
+    return float((got - expected.detach()).abs().max() / expected.detach().abs().max())

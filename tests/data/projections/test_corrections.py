@@ -1,0 +1,150 @@
+"""Grey values become the line integrals that they were made of, and geometry follows the pixels."""
+
+import math
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import torch
+import yaml
+from PIL import Image as Pillow
+
+from mvrecon.data.projections.corrections import Fields, filled, transmission
+from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.projections.region import Region
+from mvrecon.data.projections.writing import Exposure, write_projections
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, PROJECTORS
+from tests.data.conftest import RIG
+from tests.data.projections.conftest import VIEWS, grey
+
+
+def views(count=3, rows=20, columns=30):
+    """Smooth line integrals from 0 to 4."""
+    m, v, u = np.meshgrid(np.arange(count), np.arange(rows), np.arange(columns), indexing="ij")
+    return torch.from_numpy(2 + 2 * np.sin(0.2 * u + 0.3 * v + m)).float()
+
+
+def test_what_is_written_without_noise_comes_back_to_a_grey_value(tmp_path):
+    integrals = views()
+    write_projections(tmp_path / "scan", integrals, Exposure(photons=None))
+    measured = Measured(path=str(tmp_path / "scan")).open()
+    assert measured.kind == "intensities" and measured.names[1] == "view_00001"
+    step = 0.5 / (50_000 - 100) * integrals.exp()  # half a grey value
+    back = measured.whole()
+    assert ((back.views - integrals).abs() <= 1.05 * step + 1e-5).all()
+    assert back.mask.all() and back.saturated == back.floored == 0
+
+
+def test_noise_has_the_variance_of_the_photons(tmp_path):
+    photons, integral = 1000.0, 1.0
+    write_projections(tmp_path / "scan", torch.full((4, 100, 100), integral), Exposure(photons))
+    got = Measured(path=str(tmp_path / "scan")).open().whole().views.neg().exp().double()
+    expected = math.exp(-integral)
+    deviation = (expected / photons) ** 0.5
+    assert got.mean().item() == pytest.approx(expected, abs=5 * deviation / 200)
+    assert got.std().item() == pytest.approx(deviation, rel=0.05)
+    assert not torch.equal(got[0], got[1])
+    write_projections(tmp_path / "again", torch.full((4, 100, 100), integral), Exposure(photons))
+    again = open_projections(tmp_path / "again").read(0, 4)
+    assert torch.equal(again, open_projections(tmp_path / "scan").read(0, 4))
+
+
+def test_simple_itk_reads_the_images_that_are_written(tmp_path):
+    write_projections(tmp_path / "scan", views())
+    for number, view in enumerate(open_projections(tmp_path / "scan").read(0, 3)):
+        image = sitk.ReadImage(str(tmp_path / "scan" / f"view_0000{number}.tif"))
+        assert image.GetPixelIDTypeAsString() == "16-bit unsigned integer"
+        assert np.array_equal(sitk.GetArrayFromImage(image), view.numpy())
+
+
+def test_fields_are_numbers_files_or_the_folders_own(scan, tmp_path):
+    own = Measured(path=str(scan)).open().whole().views
+    expected = -torch.log((torch.from_numpy(grey().astype("f4")) - 100) / 60_000)
+    assert torch.allclose(own, expected, atol=1e-5)
+    dark, flat = str(scan / "dark.tif"), str(scan / "flat.tif")
+    for options in ({"dark": 100, "flat": 60_100.0}, {"dark": dark, "flat": flat}, {"flat": flat}):
+        assert torch.equal(Measured(path=str(scan), **options).open().whole().views, own)
+    flats = tmp_path / "flats"
+    flats.mkdir()
+    for k, value in enumerate((60_000, 60_200)):  # their mean is the flat field
+        Pillow.fromarray(np.full((6, 8), value, "u2")).save(flats / f"flat_{k}.tif")
+    averaged = Measured(path=str(scan), flat=str(flats)).open().whole().views
+    assert torch.allclose(averaged, own, atol=1e-6)
+
+
+def test_every_second_view_a_part_of_the_rows_and_joined_pixels(scan):
+    options = {"every": 2, "rows": [2, 6], "columns": [1, 7], "binning": [2, 3]}
+    part = Measured(path=str(scan), **options).open()
+    light = Measured(path=str(scan)).open().whole().views[::2, 2:6, 1:7].neg().exp()
+    expected = -light.reshape(6, 2, 2, 2, 3).mean(dim=(2, 4)).log()  # as larger pixels measure
+    assert (part.n_views, part.shape) == (6, (2, 2))
+    assert torch.allclose(part.whole().views, expected, atol=1e-5)
+    assert torch.equal(part.read(2, 4).views, part.whole().views[2:4])
+
+
+def test_integrals_are_joined_by_their_mean(tmp_path):
+    np.save(tmp_path / "p.npy", views().numpy())
+    part = Measured(path=str(tmp_path / "p.npy"), kind="integrals", binning=2).open()
+    expected = views().reshape(3, 10, 2, 15, 2).mean(dim=(2, 4))
+    assert torch.allclose(part.whole().views, expected, atol=1e-6) and part.whole().mask.all()
+
+
+@pytest.mark.parametrize("name", ["circular", "parallel"])
+def test_a_joined_pixel_is_centred_on_the_pixels_it_is_made_of(name):
+    parallel = {"depth_mm": 200.0, "detector": RIG["detector"], "n_views": 3, "name": "parallel"}
+    cameras = CAMERAS.from_config(RIG if name == "circular" else parallel)
+    region = Region.of(cameras.shape, rows=[1, 9], columns=[3, 12], binning=[2, 3])
+    for got, whole in zip(region.seen_by(cameras).rays(), cameras.rays(), strict=True):
+        expected = whole[:, 1:9, 3:12].reshape(3, 4, 2, 3, 3, 3).mean(dim=(2, 4))
+        assert torch.allclose(got, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_what_a_part_of_the_detector_measures_is_what_its_cameras_measure(binning):
+    grid, cameras = Grid.centred(size=(12, 10, 8), spacing=9.0), CAMERAS.from_config(RIG)
+    x = torch.rand(1, 1, *grid.shape, generator=torch.Generator().manual_seed(0)).double()
+    region = Region.of(cameras.shape, rows=[2, 8], columns=[4, 12], binning=binning)
+    whole = PROJECTORS.build("drr", grid=grid, cameras=cameras)(x)[0, 0]
+    part = PROJECTORS.build(
+        "drr", grid=grid, cameras=region.seen_by(cameras), rays_per_pixel=binning
+    )
+    got = region.binned(region.cropped(whole))
+    assert got.shape == (3, *region.shape) and got.max() > 10
+    assert torch.allclose(got, part(x)[0, 0], atol=1e-9)
+
+
+def test_the_settings_are_the_options(root):
+    settings = yaml.safe_load((root / "conf" / "views" / "measured.yaml").read_text())
+    assert settings.pop("path") == "???"
+    assert settings == {f.name: f.default for f in fields(Measured) if f.name != "path"}
+
+
+def test_cameras_are_those_of_the_views_that_are_taken(scan):
+    cameras = CAMERAS.from_config(
+        {**RIG, "n_views": VIEWS, "detector": {**RIG["detector"], "pixels": [6, 8]}}
+    )
+    part = Measured(path=str(scan), every=3, columns=[0, 4]).open()
+    got = part.cameras(cameras)
+    assert len(got) == part.n_views == 4 and got.shape == part.shape
+    assert torch.equal(got.source, cameras.source[::3])
+    with pytest.raises(ValueError, match="expected one camera for each of 12 views, got 11"):
+        part.cameras(cameras[:11])
+    with pytest.raises(ValueError, match=r"that of the views on disk, \(6, 8\).*got \(10, 12\)"):
+        part.cameras(CAMERAS.from_config({**RIG, "n_views": VIEWS}))
+
+
+def test_a_dead_pixel_in_a_slope_gets_the_slopes_value():
+    alive = torch.ones(9, 11, dtype=torch.bool)
+    alive[4, 5] = alive[2, 2] = False
+    v, u = torch.meshgrid(torch.arange(9.0), torch.arange(11.0), indexing="ij")
+    slope = (2 * v - 3 * u + 7)[None].repeat(2, 1, 1)
+    broken = torch.where(alive, slope, 1e6)
+    assert torch.allclose(filled(broken, alive), slope, atol=1e-4)
+    alive[:, 6] = alive[0:4, 0:4] = False  # a column and a corner
+    constant = torch.where(alive, torch.full((1, 9, 11), 3.0), -50.0)
+    assert torch.allclose(filled(constant, alive), torch.tensor(3.0))
+    known = Fields(torch.zeros(9, 11), torch.ones(9, 11), alive)
+    assert torch.equal(transmission(constant, known), filled(constant, alive))

@@ -1,0 +1,300 @@
+"""Scans that cannot be right are refused in words, or told by a warning with numbers."""
+
+import warnings
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from PIL import Image as Pillow
+
+from mvrecon.data.projections import images as image_module
+from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.projections.writing import Exposure, write_projections
+from mvrecon.files.checks import Refused
+from tests.data.projections.conftest import VIEWS, array, dicom_image, grey, images, many_pages
+
+
+def field(folder, name, values):
+    Pillow.fromarray(np.asarray(values, "u2")).save(folder / f"{name}.tif")
+
+
+def cut(path, size):
+    path.write_bytes(path.read_bytes()[:size])
+    return path
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("dark", [0, 300])
+def test_a_flat_field_of_nothing_is_refused(dark, scan):
+    """A flat field that is not above the dark one is refused, with both medians."""
+    field(scan, "flat", np.full((6, 8), dark))
+    field(scan, "dark", np.full((6, 8), dark))
+    with pytest.raises(Refused, match=rf"flat field above the dark one, got .*{dark} and {dark}"):
+        Measured(path=str(scan)).open()
+
+
+@pytest.mark.door
+def test_intensities_need_a_flat_field(tmp_path):
+    """Grey values without a flat field are refused, with the option that gives one."""
+    folder = images(tmp_path / "scan", grey())
+    with pytest.raises(Refused, match="expected a flat field for intensities; give flat="):
+        Measured(path=str(folder)).open()
+    with pytest.raises(Refused, match=r"flat field of the views' \(6, 8\) pixels, got \(3, 8\)"):
+        np.save(tmp_path / "flat.npy", np.ones((3, 8)))
+        Measured(path=str(folder), flat=str(tmp_path / "flat.npy")).open()
+
+
+@pytest.mark.door
+def test_the_kind_of_floats_is_not_guessed(tmp_path):
+    """Floats that may be grey values or line integrals are refused until the kind is said, and
+    integers as line integrals.
+    """
+    np.save(tmp_path / "a.npy", np.ones((2, 4, 4), "f4"))
+    np.save(tmp_path / "b.npy", np.ones((2, 4, 4), "u2"))
+    with pytest.raises(Refused, match="expected kind=integrals or kind=intensities for .*float32"):
+        Measured(path=str(tmp_path / "a.npy")).open()
+    with pytest.raises(Refused, match="expected floats for line integrals, got pixels of uint16"):
+        Measured(path=str(tmp_path / "b.npy"), kind="integrals").open()
+    with pytest.raises(ValueError, match="integrals or intensities, got 'counts'"):
+        Measured(path="a.npy", kind="counts")  # type: ignore[arg-type]
+
+
+@pytest.mark.door
+def test_dark_pixels_count_as_the_floor_and_are_counted(scan):
+    """The logarithm of nothing is not taken: such pixels count as the floor, with their number."""
+    values = grey()[3]
+    values[2, 1:4] = (100, 90, 103)  # at, below and just above the dark field
+    Pillow.fromarray(values).save(scan / "view_3.tif")
+    with pytest.warns(UserWarning, match="3 pixels of 12 views have a transmission of at most"):
+        back = Measured(path=str(scan)).open().whole()
+    assert back.floored == 3 and back.views.isfinite().all()
+    assert torch.allclose(back.views[3, 2, 1:4], torch.tensor(1e4).log())
+
+
+@pytest.mark.door
+def test_a_view_without_light_is_refused(scan):
+    """A view that is dark everywhere is refused with its name."""
+    field(scan, "view_7", np.full((6, 8), 90))
+    with pytest.raises(Refused, match=r"expected light in every view, got none .* in view_7"):
+        Measured(path=str(scan)).open().read(6, 9)
+
+
+@pytest.mark.door
+def test_saturated_and_dead_pixels_are_told_and_masked(scan):
+    """Saturated and dead pixels are told with their number and are out of the mask."""
+    flat = np.full((6, 8), 60_100)
+    flat[1, 1] = flat[4, 6] = 110
+    field(scan, "flat", flat)
+    values = grey()[5]
+    values[0, 0:3] = 65_535
+    Pillow.fromarray(values).save(scan / "view_5.tif")
+    with pytest.warns(UserWarning, match="2 of 48 pixels are dead"):
+        measured = Measured(path=str(scan)).open()
+    with pytest.warns(UserWarning, match="3 pixels of 12 views are saturated .*65535 or more"):
+        back = measured.whole()
+    expected = torch.ones(VIEWS, 6, 8, dtype=torch.bool)
+    expected[:, 1, 1] = expected[:, 4, 6] = expected[5, 0, 0:3] = False
+    assert torch.equal(back.mask, expected) and back.views.isfinite().all()
+    with pytest.warns(UserWarning):
+        joined = Measured(path=str(scan), binning=2).open().whole()
+    assert torch.equal(joined.mask, expected.reshape(VIEWS, 3, 2, 4, 2).all(dim=4).all(dim=2))
+    field(scan, "flat", np.full((6, 8), 65_535))
+    with pytest.raises(
+        Refused, match="expected at least half of the pixels between dark and satur"
+    ):
+        Measured(path=str(scan)).open()
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_pixels_that_are_not_finite_are_refused(value, tmp_path):
+    """A pixel that is NaN or infinite is refused with the number and the name of its view."""
+    values = grey().astype("f4")
+    values[4, 2, 2] = value
+    for form in ("a.npy", "a.h5", "a.mha"):
+        stack = open_projections(array(tmp_path / form, values))
+        assert stack.read(0, 4).isfinite().all()
+        with pytest.raises(Refused, match=r"1 that are NaN or infinite in view 4 \("):
+            stack.read(3, 6)
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("size", [60, 150, 200])
+def test_a_cut_image_is_refused(size, scan):
+    """A TIFF that is cut short is refused with its name, wherever it is cut."""
+    cut(scan / "view_10.tif", size)
+    with pytest.raises(Refused, match=r"view_10\.tif: "):
+        open_projections(scan).read(0, VIEWS)
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("form", ["a.npy", "a.mha", "a.mhd", "a.nrrd", "a.h5", "a.tiff", "a.dcm"])
+def test_a_cut_stack_is_refused(form, tmp_path):
+    """A stack of views that is cut short is refused with its name, in every format."""
+    values, path = grey(), tmp_path / form
+    if form == "a.tiff":
+        many_pages(path, values)
+    elif form == "a.dcm":
+        dicom_image(path, values)
+    else:
+        array(path, values)
+    large = path.with_suffix(".raw") if form == "a.mhd" else path
+    for part in (0.98, 0.7, 0.4):
+        cut(large, int(part * large.stat().st_size))
+        with pytest.raises(Refused, match=rf"{form}: "):
+            open_projections(path).read(0, VIEWS)
+
+
+@pytest.mark.door
+def test_images_of_several_sizes_are_refused(scan, tmp_path):
+    """Images of several sizes, types or formats in one scan are refused, with the file."""
+    values = grey()[0]
+    Pillow.fromarray(values[:, :7]).save(scan / "view_4.tif")
+    with pytest.raises(Refused, match=r"view_4\.tif: expected 6 x 8 pixels .* got 6 x 7 pixels"):
+        open_projections(scan)
+    Pillow.fromarray(values.astype("f4")).save(scan / "view_4.tif")
+    with pytest.raises(Refused, match=r"view_4\.tif: expected .* of uint16 .*got .* of float32"):
+        open_projections(scan)
+    Pillow.fromarray(values).save(scan / "view_4.png")
+    with pytest.raises(Refused, match="those of PNG and TIFF; choose by pattern="):
+        open_projections(scan)
+    Pillow.fromarray(values).save(scan / "view_4.tif")
+    chosen = Measured(path=str(scan), pattern="*.tif").open()  # dark and flat are no views
+    assert chosen.n_views == VIEWS and chosen.whole().views.isfinite().all()
+    pages = [Pillow.fromarray(values), Pillow.fromarray(values[:3])]
+    pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:])
+    with pytest.raises(Refused, match="on every page, got 3 x 8 pixels of uint16 on page 1"):
+        open_projections(tmp_path / "a.tif")
+
+
+@pytest.mark.door
+def test_pixels_that_are_no_grey_values_are_refused(tmp_path):
+    """Colours, complex numbers, truth values and Python objects are refused as views."""
+    Pillow.fromarray(np.zeros((4, 4, 3), "u1")).save(tmp_path / "a.png")
+    with pytest.raises(Refused, match=r"expected grey values .*RGB"):
+        open_projections(tmp_path / "a.png")
+    for kind in ("c8", "?"):
+        np.save(tmp_path / "a.npy", np.ones((2, 4, 4), kind))
+        with pytest.raises(Refused, match="expected pixels that are integers or floats, got"):
+            open_projections(tmp_path / "a.npy")
+    np.save(tmp_path / "a.npy", np.array([[[None]]]), allow_pickle=True)
+    with pytest.raises(Refused, match=r"a\.npy: cannot be read as a NumPy array"):
+        open_projections(tmp_path / "a.npy")
+
+
+@pytest.mark.door
+def test_a_missing_view_is_told(scan):
+    """A view whose number is missing between others is told, unless gaps are allowed."""
+    (scan / "view_6.tif").unlink()
+    with pytest.raises(Refused, match="numbered in equal steps, got 5 and then 7; is a file missi"):
+        open_projections(scan)
+    assert open_projections(scan, gaps=True).n_views == VIEWS - 1
+    field(scan, "view_06", np.ones((6, 8)))
+    field(scan, "view_6", np.ones((6, 8)))
+    with pytest.raises(Refused, match="one file of every number, got 'view_06.tif' and 'view_6.ti"):
+        open_projections(scan)
+
+
+@pytest.mark.door
+def test_an_order_without_numbers_is_told(scan):
+    """Names of views that differ in more than their numbers are told, with the order that came."""
+    (scan / "view_3.tif").rename(scan / "front.tif")
+    with pytest.warns(UserWarning, match=r"more than their numbers; .*text: front\.tif, view_0"):
+        assert open_projections(scan).names[0] == "front"
+
+
+@pytest.mark.door
+def test_nothing_to_read_is_told(tmp_path, monkeypatch):
+    """An empty folder, a missing path, another ending or too many files are told as such."""
+    (tmp_path / "notes.txt").write_text("no view")
+    with pytest.raises(Refused, match=r"expected images \(TIFF, PNG or DICOM\), got none"):
+        open_projections(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no such file or folder; expected a folder of TI"):
+        open_projections(tmp_path / "nowhere")
+    with pytest.raises(Refused, match=r"notes\.txt: expected a folder of TIFF"):
+        open_projections(tmp_path / "notes.txt")
+    images(tmp_path / "scan", grey())
+    with pytest.raises(Refused, match="has no names like '/etc/.*expected such as scan_"):
+        open_projections(tmp_path / "scan", pattern="/etc/*")
+    with pytest.raises(Refused, match=r"expected images named b_\* .*got none"):
+        open_projections(tmp_path / "scan", pattern="b_*")
+    monkeypatch.setattr(image_module, "VIEWS", 5)
+    with pytest.raises(Refused, match="expected at most 5 images, got more"):
+        open_projections(tmp_path / "scan")
+
+
+@pytest.mark.door
+def test_an_h5_of_another_layout_is_refused(tmp_path):
+    """An HDF5 file without our views is refused, with what it holds and what is expected."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["exchange"] = np.ones((2, 3, 4), "f4")
+    with pytest.raises(Refused, match=r"no dataset 'views', only \['exchange'\]; expected the vie"):
+        open_projections(path)
+    with h5py.File(path, "w") as file:
+        file["views"] = np.ones((3, 4), "f4")
+    with pytest.raises(Refused, match=r"has float32 \(3, 4\); expected the views\.h5"):
+        open_projections(path)
+    path.write_bytes(b"no HDF5")
+    with pytest.raises(Refused, match=r"a\.h5: cannot be opened .*is it cut short"):
+        open_projections(path)
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", ["../a.raw", "/etc/passwd", "gone.raw"])
+def test_a_headers_values_lie_beside_it(name, tmp_path):
+    """An MHD header that leads to another folder, or to no file, is refused."""
+    array(tmp_path / "a.mhd", grey())
+    text = (tmp_path / "a.mhd").read_text().replace("a.raw", name)
+    (tmp_path / "a.mhd").write_text(text)
+    with pytest.raises((Refused, FileNotFoundError), match=r"a\.mhd: (has the name|its values)"):
+        open_projections(tmp_path / "a.mhd")
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rows": [2, 7]}, r"rows as \[first, behind the last\] within 0 to 6, got \[2, 7\]"),
+        ({"columns": [5, 5]}, "columns as .* within 0 to 8"),
+        ({"binning": 4}, r"divides the 6 rows and 8 columns, got \(4, 4\); rows="),
+        ({"binning": [0, 1]}, "one or two positive integers"),
+        ({"floor": 0}, "floor between 0 and 1"),
+        ({"saturation": -1}, "positive saturation"),
+        ({"every": 0}, "every from 1 on"),
+    ],
+)
+def test_options_of_views_are_within_range(options, message, scan):
+    """Rows, columns, binning and thresholds of views out of range are refused with their range."""
+    with pytest.raises(ValueError, match=message):
+        Measured(path=str(scan), **options).open()
+
+
+@pytest.mark.door
+def test_a_scan_is_written_whole_or_not_at_all(tmp_path):
+    """A scan that breaks off while it is written leaves nothing, and none is written over."""
+
+    def breaking():
+        yield torch.ones(4, 5)
+        yield torch.full((4, 5), torch.nan)
+
+    with pytest.raises(Refused, match="expected finite line integrals, got 20 .* in view 1"):
+        write_projections(tmp_path / "scan", breaking())
+    for wrong in ([], [torch.ones(4, 5), torch.ones(5, 4)], [torch.ones(2, 4, 5)]):
+        with pytest.raises(Refused):
+            write_projections(tmp_path / "scan", wrong)
+    assert not list(tmp_path.iterdir())
+    write_projections(tmp_path / "scan", torch.ones(2, 4, 5))
+    with pytest.raises(FileExistsError, match="expected a new or an empty folder"):
+        write_projections(tmp_path / "scan", torch.ones(2, 4, 5))
+    for wrong in ({"dark": 9, "flat": 9}, {"flat": 2**16}, {"photons": 0}):
+        with pytest.raises(ValueError, match="Expected"):
+            Exposure(**wrong)
+
+
+def test_a_sound_scan_warns_of_nothing(scan):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Measured(path=str(scan)).open().whole()

@@ -1,0 +1,64 @@
+"""Whatever form a scan has on disk, its views are the same numbers in the same order."""
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.projections.order import ordered
+from mvrecon.files import memory
+from tests.data.projections.conftest import FORMS, VIEWS, grey
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_of_a_scan_has_the_same_views(form, tmp_path):
+    values = grey()
+    stack = open_projections(FORMS[form](tmp_path, values))
+    assert (stack.n_views, stack.shape) == (VIEWS, values.shape[1:])
+    expected = torch.from_numpy(values.astype("f4"))
+    assert torch.equal(stack.read(0, VIEWS), expected)
+    assert torch.equal(stack.read(9, 11), expected[9:11])  # view_10 follows view_9
+    assert torch.equal(torch.cat(list(stack.chunks(pixels=100))), expected)
+    assert torch.allclose(stack.mean(), expected.double().mean(dim=0).float())
+    assert len(set(stack.names)) == VIEWS
+    with pytest.raises(IndexError, match=f"within 0 to {VIEWS}, got 11 to 13"):
+        stack.read(11, 13)
+
+
+@pytest.mark.parametrize("kind", ["i2", "u1", "f4"])
+def test_pixels_of_other_types_keep_their_values(kind, tmp_path):
+    values = (grey() % 101).astype(kind)
+    if kind != "u1":
+        values[0] = -values[0]
+    for form in ("tif", "npy", "mha"):
+        (tmp_path / form).mkdir()
+        stack = open_projections(FORMS[form](tmp_path / form, values))
+        assert np.array_equal(stack.read(0, VIEWS).numpy(), values.astype("f4"))
+
+
+@pytest.mark.parametrize("ending", ["mha", "npy"])
+def test_memory_is_that_of_the_views_asked_for(ending, tmp_path):
+    """512 MiB of views on disk, of which one is read."""
+    path, shape = tmp_path / f"large.{ending}", (512, 512, 1024)
+    if ending == "npy":
+        np.lib.format.open_memmap(path, mode="w+", dtype="u2", shape=shape)
+    else:
+        head = "ObjectType = Image\nNDims = 3\nElementType = MET_USHORT\n"
+        head += "DimSize = 1024 512 512\nElementDataFile = LOCAL\n"
+        with path.open("wb") as file:
+            file.write(head.encode())
+            file.truncate(len(head) + 2 * 2**28)
+    stack = open_projections(path)
+    stack.read(0, 1)
+    before = memory.peak() or 0
+    assert stack.read(300, 302).shape == (2, 512, 1024)
+    assert (memory.peak() or 0) - before < 2**26
+
+
+def test_numbers_in_names_decide_the_order(tmp_path):
+    for names in (["p9", "p10", "p11"], ["a1_b2", "a1_b10", "a2_b1"], ["0007", "8", "09"]):
+        paths = [tmp_path / f"{name}.tif" for name in names]
+        assert ordered(paths[::-1]) == paths
+    steps = [tmp_path / f"{k}.tif" for k in (0, 4, 8, 12)]
+    assert ordered(steps[::-1]) == steps
+    assert ordered([*steps, tmp_path / "14.tif"], gaps=True)[-1].name == "14.tif"

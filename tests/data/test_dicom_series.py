@@ -1,0 +1,174 @@
+"""A CT series is read in the order of its slices in space, or refused with the reason."""
+
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK as sitk
+import torch
+
+from mvrecon.data.dicom_series import open_series
+from mvrecon.data.volume_files import read_volume
+from mvrecon.files.checks import Refused
+from mvrecon.geometry.rigid import euler_rotation
+from tests.data.projections.conftest import dicom_image
+
+COUNT, ROWS, COLUMNS = 7, 5, 6
+SPACING = (2.0, 1.5, 3.0)  # columns, rows, slices
+SERIES = pydicom.uid.generate_uid()
+
+
+def hu():
+    """Hounsfield units, no two voxels alike, [slice row column]."""
+    values = np.arange(COUNT * ROWS * COLUMNS).reshape(COUNT, ROWS, COLUMNS)
+    return (values * 7 % 2001 - 1000).astype("i2")
+
+
+def written(folder, turn=(0.0, 0.0, 0.0), change=None):
+    """Files of a series, named in an order that is not that of the slices; `change` alters the tags
+    of slice k.
+    """
+    folder.mkdir(exist_ok=True)
+    axes = euler_rotation(list(turn), "xyz").numpy().T  # rows: directions of x, y, z
+    for k, values in enumerate(hu()):
+        corner = np.array([-10.0, 20.0, 30.0]) + axes[2] * SPACING[2] * k
+        tags = {
+            "SeriesInstanceUID": SERIES,
+            "Modality": "CT",
+            "ImagePositionPatient": [float(f"{x:.10g}") for x in corner],
+            "ImageOrientationPatient": [float(f"{x:.10g}") for x in axes[:2].ravel()],
+            "PixelSpacing": [SPACING[1], SPACING[0]],
+            "RescaleSlope": 2 if k % 2 else 1,
+            "RescaleIntercept": -1024,
+        }
+        tags |= change(k, tags) if change else {}
+        slope, intercept = tags.get("RescaleSlope") or 1, tags.get("RescaleIntercept") or 0
+        stored = np.rint((values - intercept) / slope).astype("i2")
+        dicom_image(folder / f"{(k * 3) % COUNT}.dcm", stored, **tags)
+    return folder
+
+
+def world(grid, z, y, x):
+    return grid.to_world(torch.tensor([x, y, z], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (20.0, -10.0, 5.0), (90.0, 0.0, 0.0)])
+def test_every_voxel_is_where_simple_itk_has_it(turn, tmp_path):
+    folder = written(tmp_path / "ct", turn)
+    values, grid = read_volume(folder)
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(folder)))
+    image = reader.Execute()
+    assert values.numel() == COUNT * ROWS * COLUMNS and (grid.affine[:3, :3].diag() > 0).all()
+    for k, j, i in np.random.default_rng(0).integers(0, (COUNT, ROWS, COLUMNS), (40, 3)).tolist():
+        xyz = torch.tensor(image.TransformIndexToPhysicalPoint((i, j, k)))
+        place = grid.to_index(xyz.double() * torch.tensor([-1.0, -1.0, 1.0]).double())
+        x, y, z = place.round().int().tolist()
+        assert torch.allclose(place, place.round(), atol=1e-3)
+        assert values[z, y, x].item() == pytest.approx(image.GetPixel((i, j, k)))
+
+
+def test_slope_and_intercept_are_each_slices_own(tmp_path):
+    values, _ = read_volume(written(tmp_path / "ct"))
+    expected = torch.from_numpy(hu()[:, ::-1, ::-1].astype("f4"))  # LPS to RAS: x and y reversed
+    odd = expected[1::2]
+    assert torch.equal(values[::2], expected[::2])
+    assert (values[1::2] - odd).abs().max() <= 1  # a slope of 2 keeps every second number
+
+
+@pytest.mark.parametrize("code", ["RLE", "JPEG"])
+def test_a_packed_series_is_read_as_a_plain_one(code, tmp_path):
+    plain, packed = written(tmp_path / "plain"), tmp_path / "packed"
+    packed.mkdir()
+    for file in plain.iterdir():
+        dataset = pydicom.dcmread(file)
+        dataset.PixelRepresentation = 0
+        if code == "RLE":
+            dataset.compress(pydicom.uid.RLELossless)
+        else:
+            stored = sitk.GetImageFromArray(dataset.pixel_array.astype("u2")[None])
+            writer = sitk.ImageFileWriter()
+            writer.SetFileName(str(tmp_path / "one.dcm"))
+            writer.UseCompressionOn()
+            writer.SetCompressor("JPEG")
+            writer.Execute(stored)
+            jpeg = pydicom.dcmread(tmp_path / "one.dcm")
+            dataset.PixelData = jpeg.PixelData
+            dataset.file_meta.TransferSyntaxUID = jpeg.file_meta.TransferSyntaxUID
+        dataset.save_as(packed / file.name)
+    assert torch.equal(read_volume(packed)[0], read_volume(plain)[0])
+
+
+def lifted(k, tags, mm):
+    x, y, z = tags["ImagePositionPatient"]
+    return {"ImagePositionPatient": [x, y, z + mm]}
+
+
+BROKEN = {
+    "a gap": (
+        lambda k, tags: lifted(k, tags, 3.0 if k > 3 else 0.0),
+        "slices 3 mm apart, got 6 mm between .* is a slice missing",
+    ),
+    "one place twice": (
+        lambda k, tags: lifted(k, tags, -3.0 if k == 4 else 0.0),
+        "every slice at its own place, got .* at one",
+    ),
+    "a tilted gantry": (
+        lambda k, tags: {"ImagePositionPatient": [-10.0, 20.0 + 0.6 * k, 30.0 + 3 * k]},
+        r"a gantry tilt of 11\.3 degrees; resample",
+    ),
+    "two series": (
+        lambda k, tags: {"SeriesInstanceUID": SERIES if k < 4 else f"{SERIES[:-3]}.42"},
+        rf"expected one series, got 2: .*{SERIES[:20]}.*, .*; put each",
+    ),
+    "another modality": (lambda k, tags: {"Modality": "MR"}, "modality CT, got 'MR'"),
+    "two sizes of pixels": (
+        lambda k, tags: {"PixelSpacing": [1.5, 2.0 + 0.1 * (k == 5)]},
+        r"expected \(5, 6\) pixels of \(1\.5, 2\.\d\) mm",
+    ),
+    "no intercept": (
+        lambda k, tags: {"RescaleIntercept": None},
+        "a finite RescaleIntercept of .*got None",
+    ),
+    "no series": (lambda k, tags: {"SeriesInstanceUID": ""}, "with SeriesInstanceUID, got none"),
+    "no place": (
+        lambda k, tags: {"ImagePositionPatient": None},
+        "expected ImagePositionPatient as 3 finite numbers, got None",
+    ),
+}
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_series_that_is_no_volume_is_refused(name, tmp_path):
+    """A DICOM series with gaps, doubled or tilted slices, of several series, sizes or another
+    modality is refused with the reason.
+    """
+    change, message = BROKEN[name]
+    with pytest.raises(Refused, match=message):
+        open_series(written(tmp_path / "ct", change=change))
+
+
+@pytest.mark.door
+def test_a_missing_or_cut_slice_is_told(tmp_path):
+    """A folder without DICOM, a single slice, a missing one and one cut short are told as such."""
+    with pytest.raises(FileNotFoundError, match="no such folder; expected one with a DICOM CT"):
+        open_series(tmp_path / "nowhere")
+    with pytest.raises(
+        FileNotFoundError, match="expected the files of a DICOM CT series, got none"
+    ):
+        open_series(tmp_path)
+    folder = written(tmp_path / "ct")
+    raw = (folder / "5.dcm").read_bytes()
+    (folder / "5.dcm").write_bytes(raw[:-20])
+    with pytest.raises(Refused, match=r"5\.dcm: has pixels that cannot be read"):
+        read_volume(folder)
+    (folder / "5.dcm").write_bytes(raw[:90])
+    with pytest.raises(Refused, match=r"5\.dcm: cannot be read as DICOM"):
+        read_volume(folder)
+    (folder / "5.dcm").unlink()
+    with pytest.raises(Refused, match="got 6 mm between .* is a slice missing"):
+        read_volume(folder)
+    for k in range(1, COUNT):
+        (folder / f"{k}.dcm").unlink(missing_ok=True)
+    with pytest.raises(Refused, match="at least two slices of a series, got one"):
+        read_volume(folder)

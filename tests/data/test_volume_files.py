@@ -1,0 +1,137 @@
+"""Volumes of every format: values stay at their places, in our world (RAS) and ITK's (LPS)."""
+
+import nibabel
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import torch
+
+from mvrecon.data.attenuation import WATER, attenuation, hounsfield
+from mvrecon.data.volume_files import read_volume, save_volume
+from mvrecon.data.volume_scene import Volumes
+from mvrecon.files.checks import Refused
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.rigid import euler_rotation
+from tests.data.test_nifti import AFFINES, SIZE, blobs, centred
+
+LPS = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
+FORMATS = ["nii", "nii.gz", "mha", "nrrd"]
+
+
+def tilted(shape=(4, 6, 5)):
+    """A grid of unlike spacings whose axes are turned about all three of the world's."""
+    affine = torch.eye(4, dtype=torch.float64)
+    turn = euler_rotation([20.0, -15.0, 10.0], "xyz")
+    affine[:3, :3] = turn @ torch.diag(torch.tensor([1.5, 2.0, 3.0], dtype=torch.float64))
+    affine[:3, 3] = torch.tensor([-12.0, 34.0, 56.0])
+    return Grid(shape, affine)
+
+
+def itk_points(path):
+    """World mm in RAS and values of every voxel, as SimpleITK reads the file."""
+    image = sitk.ReadImage(str(path))
+    places = [
+        (x, y, z)
+        for z in range(image.GetDepth())
+        for y in range(image.GetHeight())
+        for x in range(image.GetWidth())
+    ]
+    xyz = torch.tensor([image.TransformIndexToPhysicalPoint(place) for place in places])
+    values = torch.from_numpy(sitk.GetArrayFromImage(image).reshape(-1).astype("f4"))
+    return xyz.double() * LPS, values
+
+
+@pytest.mark.parametrize("ending", FORMATS)
+def test_simple_itk_sees_our_volume_at_our_points(ending, tmp_path):
+    grid, path = tilted(), tmp_path / f"a.{ending}"
+    volume = torch.rand(grid.shape)
+    save_volume(path, volume, grid)
+    points, values = itk_points(path)
+    assert torch.equal(values, volume.flatten())
+    assert torch.allclose(points, voxel_centres(grid).reshape(-1, 3), atol=2e-4)
+    again, there = read_volume(path)
+    assert torch.equal(again, volume)
+    assert torch.allclose(there.affine, grid.affine, atol=1e-5)
+
+
+@pytest.mark.parametrize("ending", ["mha", "nrrd", "mhd"])
+@pytest.mark.parametrize("name", AFFINES)
+def test_an_object_in_an_itk_image_lands_at_its_world_place(name, ending, tmp_path):
+    affine = centred(AFFINES[name])
+    i, j, k = np.meshgrid(*[np.arange(SIZE)] * 3, indexing="ij")
+    xyz = np.stack([i, j, k, np.ones_like(i)], axis=-1) @ affine.T
+    image = sitk.GetImageFromArray(blobs(torch.from_numpy(xyz[..., :3])).numpy().T)
+    lps = np.diag([-1.0, -1, 1, 1]) @ affine
+    spacing = np.linalg.norm(lps[:3, :3], axis=0)
+    image.SetSpacing(spacing.tolist())
+    image.SetDirection((lps[:3, :3] / spacing).flatten().tolist())
+    image.SetOrigin(lps[:3, 3].tolist())
+    sitk.WriteImage(image, str(tmp_path / f"a.{ending}"), True)
+    values, grid = read_volume(tmp_path / f"a.{ending}")
+    assert torch.allclose(values.double(), blobs(voxel_centres(grid)), atol=1e-5)
+    axes = grid.affine[:3, :3].diagonal()
+    assert (axes > 0).all()  # towards right, front and head
+
+
+def test_a_nifti_header_says_mm_and_has_both_forms(tmp_path):
+    grid = tilted()
+    save_volume(tmp_path / "a.nii", torch.zeros(grid.shape), grid)
+    header = nibabel.load(tmp_path / "a.nii").header
+    assert header.get_xyzt_units()[0] == "mm"
+    assert (int(header["sform_code"]), int(header["qform_code"])) == (1, 1)
+    for form in (header.get_sform(), header.get_qform()):
+        assert np.allclose(form, grid.affine.numpy(), atol=1e-4)
+
+
+def test_a_sheared_grid_is_kept_by_nifti_and_refused_by_itk(tmp_path):
+    affine = torch.eye(4, dtype=torch.float64)
+    affine[0, 1] = 0.3
+    grid = Grid((2, 3, 4), affine)
+    save_volume(tmp_path / "a.nii", torch.zeros(grid.shape), grid)
+    assert torch.allclose(read_volume(tmp_path / "a.nii")[1].affine, affine, atol=1e-6)
+    assert int(nibabel.load(tmp_path / "a.nii").header["qform_code"]) == 0
+    with pytest.raises(ValueError, match="voxel axes at right angles.*NIfTI keeps it"):
+        save_volume(tmp_path / "a.mha", torch.zeros(grid.shape), grid)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.nii"]
+
+
+def test_hounsfield_units_come_back_from_attenuation():
+    hu = torch.linspace(-1000, 3000, 401, dtype=torch.float64)
+    assert torch.allclose(hounsfield(attenuation(hu)), hu, atol=1e-9)
+    assert hounsfield(torch.tensor([0.0, WATER])).tolist() == [-1000, 0]
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("ending", ["mha", "nrrd"])
+def test_a_cut_itk_image_is_refused(ending, tmp_path):
+    """An MHA or NRRD volume that is cut short is refused with its name, wherever it is cut."""
+    path = tmp_path / f"a.{ending}"
+    save_volume(path, torch.rand(4, 6, 5), tilted())
+    whole = path.read_bytes()
+    for part in (0.99, 0.8, 0.5, 0.1, 0.0):
+        path.write_bytes(whole[: int(part * len(whole))])
+        with pytest.raises(Refused, match=rf"a\.{ending}: "):
+            read_volume(path)
+
+
+@pytest.mark.door
+def test_itk_images_that_are_no_volume_are_refused(tmp_path):
+    """An ITK image of two axes, of colours, or that declares more than it holds is refused."""
+    path = tmp_path / "a.mha"
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((3, 4), "f4")), str(path))
+    with pytest.raises(Refused, match="expected three axes"):
+        read_volume(path)
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((2, 3, 4, 3), "f4"), isVector=True), str(path))
+    with pytest.raises(Refused, match="one number a voxel"):
+        read_volume(path)
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((2, 3, 4), "f4")), str(path))
+    path.write_bytes(path.read_bytes().replace(b"DimSize = 4 3 2", b"DimSize = 4000 3 2"))
+    with pytest.raises(Refused, match="declares 96000 bytes, where a.mha has"):
+        read_volume(path)
+
+
+def test_a_scene_of_one_file_has_one_case(tmp_path):
+    grid = Grid.centred(size=(10, 9, 8), spacing=3.0)
+    save_volume(tmp_path / "liver.mha", torch.full(grid.shape, 40.0), grid)
+    scene = Volumes(path=str(tmp_path / "liver.mha"))
+    assert scene.length == 1 and scene.case(0)[0] == "liver"
