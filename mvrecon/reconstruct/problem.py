@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.views import check_finite
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.registry import hint
 

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.backends import wide
+from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check_floating, check_views
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.reconstruct.filtered.filters import Filter, filter_rows, ramp_response
