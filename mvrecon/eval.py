@@ -17,7 +17,7 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     Args:
         options: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the
-            run: `test_scene`, `data`, further `compare`; `device` and `save`.
+            run: `test_scene`, `acquisition`, `data`, further `compare`; `device` and `save`.
         folder: where the results go, with `eval.yaml`, which is `options`, and `versions.txt`.
 
     Raises:
@@ -29,7 +29,7 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
         FileExistsError: the folder is a run's own.
     """
     import_plugins(options["plugins"])
-    from mvrecon.engine import agreement, checkpoints, evaluation, export, fit, run_folder
+    from mvrecon.engine import checkpoints, evaluation, export, fit, run_folder
 
     device = evaluation.device_of(options["device"])
     run = checkpoints.run_folder(options["checkpoint"])
@@ -38,7 +38,8 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
         raise ValueError(
             f"compare describes {trained}, which the run has trained already; expected other labels"
         )
-    settings = merged(run_folder.read_settings(run), options)
+    trained = run_folder.read_settings(run)
+    settings = merged(trained, options)
     import_plugins(settings["plugins"])
     data = fit.build_data(settings)
 
@@ -48,25 +49,27 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     see = save if options["save"] else None
     run_folder.compare_measurement(run, data.digests("test"))
     with run_folder.taken(folder, options, run_folder.EVALUATION):
-        agreement.warn_of_other_views(settings, data)
         table = evaluation.results(settings, run, data, device, see)
         table["checkpoint"] = str(run)
+        table["acquisition_of_run"] = trained["acquisition"]
         run_folder.write_results(folder, table)
     return table
 
 
 def merged(run: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """A run's settings with the test scene, the data options and the compared methods that an
-    evaluation gives.
+    """A run's settings with the test scene, the acquisition, the data options and the compared
+    methods that an evaluation gives.
     """
     data = {**run["data"], **(options["data"] or {})}
     data["sizes"] = {**run["data"]["sizes"], **(data["sizes"] or {})}
     scene = options["test_scene"] or run["test_scene"]
+    acquisition = {**run["acquisition"], **(options["acquisition"] or {})}
     compare = {**run["compare"], **options["compare"]}
     return {
         **run,
         "name": f"{run['name']} ({options['name']})",
         "test_scene": scene,
+        "acquisition": acquisition,
         "data": data,
         "compare": compare,
     }

@@ -22,6 +22,11 @@ CAMERAS = Registry(
     parallel="mvrecon.cameras.rigs:parallel",
     from_file="mvrecon.cameras.files:from_file",
     dcspect80="mvrecon.cameras.dcspect80:dcspect80",
+    rtk_xml="mvrecon.cameras.formats.rtk_xml:read",
+    tigre="mvrecon.cameras.formats.tigre:read",
+    astra="mvrecon.cameras.formats.astra:read",
+    angles="mvrecon.cameras.formats.angles:read",
+    matrices="mvrecon.cameras.formats.matrices:read",
 )
 PROJECTORS = Registry(
     "projector",
@@ -44,6 +49,7 @@ RECONSTRUCTORS = Registry(
     "reconstructor",
     fbp="mvrecon.reconstruct.filtered.fdk:fbp",
     fdk="mvrecon.reconstruct.filtered.fdk:fdk",
+    trained="mvrecon.engine.trained:trained",
     sirt="mvrecon.reconstruct.iterative:sirt",
     os_sart="mvrecon.reconstruct.os_sart:os_sart",
     cgls="mvrecon.reconstruct.cgls:cgls",
@@ -52,6 +58,11 @@ RECONSTRUCTORS = Registry(
     pdhg_tv="mvrecon.reconstruct.pdhg_tv:pdhg_tv",
     mlem="mvrecon.reconstruct.mlem:mlem",
     osem="mvrecon.reconstruct.mlem:osem",
+)
+#: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
+STREAMED = Registry(
+    "streamed reconstructor",
+    fdk="mvrecon.reconstruct.filtered.streaming:fdk_streamed",
 )
 MODELS = Registry(
     "model",

@@ -1,7 +1,9 @@
 """`mvrecon-simulate`: the views of a scene's cases as a rig measures them, as images and as
-numbers.
+numbers, and the truth.
 """
 
+import warnings
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +17,24 @@ from mvrecon.config.plugins import import_plugins
 def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
 
+    A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
+    where the scene is in 1/mm), and what moved it as `placement.json` if it came from a file.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`, for
-    `camera=from_file`. A view is a line integral: its unit is the scene's times mm.
+    `camera=from_file`.
 
     Raises:
         RuntimeError: another process is at work in the folder.
         ValueError: the folder's run has other settings.
+
+    Warns:
+        UserWarning: nibabel, which writes the truth, is not installed.
     """
     import_plugins(settings["plugins"])
     from rich.console import Console
     from rich.progress import track
 
+    from mvrecon.acquisition.acquired import Acquired
+    from mvrecon.acquisition.settings import Acquisition
     from mvrecon.cameras import files
     from mvrecon.data.dataset import SceneDataset
     from mvrecon.engine import export, run_folder
@@ -33,21 +42,38 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     from mvrecon.parts import CAMERAS, SCENES
 
     grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
-    scene = SCENES.from_config(settings["scene"])
+    acquisition = Acquisition.of(settings["acquisition"])
+    scene = Acquired(SCENES.from_config(settings["scene"]), settings["projector"], acquisition)
     cases = SceneDataset(scene, grid, cameras, settings["cases"], settings["seed"], cache=False)
+    unit, where = scene.unit_of_views(grid, cameras), folder / "cases"
     case_folders = []
     with run_folder.taken(folder, settings):
         files.save(cameras, folder / "cameras.json")
-        for item in track(
-            range(len(cases)), "Simulating", transient=True, console=Console(stderr=True)
-        ):
-            case = cases[item]
-            case_folders.append(
-                export.save_views(
-                    folder / "cases", case["name"], case["views"][0], f"{scene.unit} * mm"
-                )
-            )
+        console = Console(stderr=True)
+        for item in track(range(len(cases)), "Simulating", transient=True, console=console):
+            case, index = cases[item], settings["cases"][item]
+            name = case["name"]
+            case_folders.append(export.save_views(where, name, case["views"][0], unit))
+            if has_nibabel():
+                export.save_truth(where, name, case["volume"][0], grid, scene.unit)
+            placement = scene.placement(index, settings["seed"], grid)
+            if placement is not None:
+                export.save_placement(where, name, placement)
     return case_folders
+
+
+def has_nibabel() -> bool:
+    """Whether nibabel, which writes the truth, is there.
+
+    Warns:
+        UserWarning: it is not.
+    """
+    if find_spec("nibabel"):
+        return True
+    warnings.warn(
+        "The truth is not written: NIfTI needs nibabel: pip install 'mvrecon[io]'", stacklevel=2
+    )
+    return False
 
 
 def task(config: DictConfig) -> None:

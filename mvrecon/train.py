@@ -28,14 +28,13 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             other data.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.engine import agreement, evaluation, fit, run_folder
+    from mvrecon.engine import evaluation, fit, run_folder
 
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
     with run_folder.taken(folder, settings):
         run_folder.keep_measurement(folder, data)
-        agreement.warn_of_other_views(settings, data)
         for method in fit.methods(settings):
             fit.fit(method, settings, data, folder)
         table = evaluation.results(settings, folder, data, device)

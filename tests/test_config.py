@@ -5,6 +5,7 @@ config.
 import inspect
 import re
 import sys
+from dataclasses import asdict
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -46,6 +47,17 @@ def test_an_experiment_file_is_short(name: str):
     assert len((conf_dir() / "experiment" / f"{name}.yaml").read_text().splitlines()) <= 25
 
 
+def needed_in(options: dict, above: str = "") -> list[str]:
+    """The settings that a file leaves to the user, with dots between their names."""
+    inner = [
+        name
+        for key, value in options.items()
+        if isinstance(value, dict)
+        for name in needed_in(value, f"{above}{key}.")
+    ]
+    return inner + [f"{above}{key}" for key, value in options.items() if value == "???"]
+
+
 #: Groups whose part is an option of the model.
 NESTED = {"head": "head@model.head", "network": "network@model.network"}
 
@@ -58,14 +70,23 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
     assert files
     for file in files:
         key = NESTED.get(group, group)
-        needed = [
-            name for name, value in yaml.safe_load(file.read_text()).items() if value == "???"
-        ]
+        needed = needed_in(yaml.safe_load(file.read_text()))
         node = compose(
             f"{key}={file.stem}", *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed)
         )
         part = node["model"][group] if group in NESTED else node[group]
         assert part["name"] in REGISTRIES[group].names()
+
+
+def test_every_file_of_acquisitions_sets_every_option():
+    from mvrecon.acquisition.settings import Acquisition
+
+    files = sorted((conf_dir() / "acquisition").glob("*.yaml"))
+    assert files
+    for file in files:
+        node = compose(f"acquisition={file.stem}")["acquisition"]
+        assert asdict(Acquisition.of(node)) == node
+    assert Acquisition.of(compose()["acquisition"]) == Acquisition()
 
 
 def test_head_and_networks_are_chosen_on_the_command_line():

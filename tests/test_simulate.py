@@ -1,5 +1,6 @@
 """`mvrecon-simulate` as a user calls it: what it writes is what the scene measures."""
 
+import json
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from PIL import Image as Pillow
 
 import mvrecon.simulate
 from mvrecon.cameras.camera import VECTORS
+from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 
@@ -69,9 +71,11 @@ def test_the_folder_holds_cases_rig_settings_and_versions(run):
     assert {"cases", "cameras.json", "config.yaml", "versions.txt"} <= {
         p.name for p in folder.iterdir()
     }
-    assert set(settings) == {"name", "seed", "grid", "scene", "camera", "cases", "plugins"}
+    measured = {"grid", "scene", "camera", "projector", "acquisition"}
+    assert set(settings) == {"name", "seed", "cases", "plugins"} | measured
     for case in (folder / "cases").iterdir():
         assert sorted(p.name for p in case.iterdir()) == [
+            "truth.nii.gz",
             *(f"view_00{m}.png" for m in range(3)),
             "views.h5",
         ]
@@ -115,6 +119,39 @@ def test_the_rig_comes_back_and_measures_the_same(run, tmp_path):
     call(again, *GRID, "camera=from_file", f"camera.path={rig}", "seed=7", "cases=[1]")
     (name,) = views(again)
     assert np.array_equal(views(again)[name][0], views(folder)[name][0])
+
+
+def test_the_truth_trains_again_where_it_was(tmp_path):
+    """A patient off the centre of its file, cropped to the middle of the rig: `truth.nii.gz` is the
+    same object at the same place, and `placement.json` leads back to the file.
+    """
+    source = Grid.centred((16, 16, 16), 8.0, (40.0, -24.0, 8.0))
+    hu = torch.full(source.shape, -1000.0)
+    hu[4:12, 4:12, 4:10] = 40.0
+    hu[6:9, 5:7, 4:8] = 700.0
+    save_volume(tmp_path / "patient.nii.gz", hu, source)
+    options = ("scene=nifti", f"scene.path={tmp_path}/patient.nii.gz")
+    call(tmp_path / "first", *GRID, *options)
+    (case,) = (tmp_path / "first" / "cases").iterdir()
+    again = ("scene=nifti", f"scene.path={case}/truth.nii.gz", "scene.crop=none")
+    call(tmp_path / "second", *GRID, *again)
+    (one,), (other,) = (views(tmp_path / run).values() for run in ("first", "second"))
+    assert np.linalg.norm(one[0] - other[0]) < 0.02 * np.linalg.norm(one[0])
+    (case_again,) = (tmp_path / "second" / "cases").iterdir()
+    truths = [read_volume(c / "truth.nii.gz")[0] for c in (case, case_again)]
+    assert (truths[0] - truths[1]).abs().max() < 1e-2
+    placement = json.loads((case / "placement.json").read_text())
+    # the middle of the patient's box (x 4..10, y and z 4..12 voxels), which comes to the origin
+    assert placement["shift_mm"] == pytest.approx([-40.0 + 8.0, 24.0, -8.0])
+
+
+def test_a_projector_and_a_detector_make_the_views_and_are_written_down(tmp_path):
+    options = ("camera.n_views=2", "projector=drr", "acquisition=photons", "scene.value=0.02")
+    settings = call(tmp_path, *GRID, *options)
+    assert settings["acquisition"]["photons"] == 1e4 and settings["projector"]["name"] == "drr"
+    ((numbers, attributes, _),) = views(tmp_path).values()
+    counts = 1e4 * np.exp(-numbers.astype(float))
+    assert np.abs(counts - counts.round()).max() < 0.01 and attributes["unit"] == "1/mm * mm"
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras, Extent
+from mvrecon.cameras.detector import detector_centre
 from mvrecon.geometry.frustum import homography_jacobian
 from mvrecon.geometry.rigid import check_rotation, unit
 
@@ -161,8 +162,7 @@ def to_astra(cameras: Cameras) -> Float[Tensor, "m 12"]:
     Convention: ASTRA's world is our (x, y, z) in mm if its volume's window is given in mm; a ray is
     not normalised.
     """
-    rows, columns = cameras.shape
-    centre = cameras.origin + cameras.u * (columns - 1) / 2 + cameras.v * (rows - 1) / 2
+    centre = detector_centre(cameras)
     first = cameras.origin - cameras.source if cameras.parallel else cameras.source
     return torch.cat([first, centre, cameras.u, cameras.v], dim=-1)
 

@@ -94,3 +94,9 @@ class Detector:
             parallel=parallel,
             extent=extent,
         )
+
+
+def detector_centre(cameras: Cameras) -> Float[Tensor, "m 3"]:
+    """Where the middle of each detector is, in mm."""
+    rows, columns = cameras.shape
+    return cameras.origin + cameras.u * (columns - 1) / 2 + cameras.v * (rows - 1) / 2

@@ -10,13 +10,15 @@ from omegaconf import MISSING
 
 @dataclass
 class Measurement:
-    """The top-level keys that all apps share: what is measured, and by which rig."""
+    """The top-level keys that the apps share: what is measured, by which rig, and how."""
 
     name: str = MISSING
     seed: int = 0
     grid: Any = None
     scene: Any = None
     camera: Any = None
+    projector: Any = None
+    acquisition: Any = None
     plugins: Any = field(default_factory=list)
 
 
@@ -34,7 +36,6 @@ class Settings(Measurement):
     """
 
     test_scene: Any = None
-    projector: Any = None
     model: Any = None
     compare: Any = field(default_factory=dict)
     loss: Any = field(default_factory=dict)
@@ -47,6 +48,24 @@ class Settings(Measurement):
 
 
 @dataclass
+class ScanSettings:
+    """Every top-level key of `mvrecon-reconstruct`."""
+
+    name: str = MISSING
+    views: Any = None
+    camera: Any = None
+    projector: Any = None
+    grid: Any = MISSING
+    reconstructor: Any = None
+    out: str | None = None
+    unit: str = MISSING
+    stop: Any = None
+    choose: Any = None
+    device: str = "auto"
+    plugins: Any = field(default_factory=list)
+
+
+@dataclass
 class Evaluation:
     """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the camera, are
     not keys.
@@ -55,6 +74,7 @@ class Evaluation:
     name: str = MISSING
     checkpoint: str = MISSING
     test_scene: Any = None
+    acquisition: Any = None
     data: Any = None
     compare: Any = field(default_factory=dict)
     device: str = "auto"
@@ -62,4 +82,9 @@ class Evaluation:
     plugins: Any = field(default_factory=list)
 
 
-SCHEMAS = {"schema": Settings, "evaluation_schema": Evaluation, "simulation_schema": Simulation}
+SCHEMAS = {
+    "schema": Settings,
+    "evaluation_schema": Evaluation,
+    "simulation_schema": Simulation,
+    "reconstruction_schema": ScanSettings,
+}

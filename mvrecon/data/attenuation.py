@@ -23,26 +23,6 @@ BONE = 0.0573
 DENSE = 20.0
 
 
-def attenuation(hu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Linear attenuation in 1/mm of Hounsfield units: two lines that meet at water, never below
-    zero.
-
-    mu = WATER (1 + HU/1000) below 0 HU, WATER + (BONE - WATER) HU/1000 above. What scanners write
-    outside of their field of view (-1024, -2048) becomes air, 0.
-    """
-    return WATER * (1 + hu.clamp(-1000, 0) / 1000) + (BONE - WATER) * hu.clamp(min=0) / 1000
-
-
-def hounsfield(mu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Hounsfield units of a linear attenuation in 1/mm: the inverse of `attenuation`.
-
-    HU = 1000 (mu / WATER - 1) up to water, 1000 (mu - WATER) / (BONE - WATER) above; what is below
-    zero, as noise can be, goes on below -1000 HU.
-    """
-    below, above = mu / WATER - 1, (mu - WATER) / (BONE - WATER)
-    return 1000 * below.where(mu < WATER, above)
-
-
 def physical(values: Float[Tensor, "*n"], stored: StoredUnit) -> Float[Tensor, "*n"]:
     """What is projected, attenuation in 1/mm or activity, from the numbers in a file.
 
@@ -57,3 +37,22 @@ def physical(values: Float[Tensor, "*n"], stored: StoredUnit) -> Float[Tensor, "
             f"{DENSE:g}; are they HU?"
         )
     return attenuation(values) if stored == "HU" else values
+
+
+def attenuation(hu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Linear attenuation in 1/mm of Hounsfield units: two lines that meet at water, never below
+    zero.
+
+    mu = WATER (1 + HU/1000) below 0 HU, WATER + (BONE - WATER) HU/1000 above. What scanners write
+    outside of their field of view (-1024, -2048) becomes air, 0.
+    """
+    return WATER * (1 + hu.clamp(-1000, 0) / 1000) + (BONE - WATER) * hu.clamp(min=0) / 1000
+
+
+def hounsfield(mu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Hounsfield units of a linear attenuation in 1/mm: the inverse of `attenuation`.
+
+    HU = 1000 (mu - WATER) / WATER up to water, 1000 (mu - WATER) / (BONE - WATER) above.
+    """
+    above = mu - WATER
+    return 1000 * (above.clamp(max=0) / WATER + above.clamp(min=0) / (BONE - WATER))

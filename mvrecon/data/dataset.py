@@ -10,7 +10,7 @@ from torch.utils.data import Dataset, Sampler
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import generator, mixed
+from mvrecon.scenes.analytic import case_numbers, generator, mixed
 from mvrecon.scenes.sample import Sample, Scene, Thin
 from mvrecon.visual_hull.support import warn_of_gaps
 
@@ -75,13 +75,9 @@ class SceneDataset(Dataset[dict[str, Any]]):
         return self._ready
 
     def _made(self, item: int) -> dict[str, Any]:
-        with torch.random.fork_rng(
-            devices=[]
-        ):  # a scene that draws from the global numbers is a pure function, too
-            torch.default_generator.manual_seed(mixed(self.seed, self.indices[item]))
-            sample: Sample = self.scene.sample(
-                self.indices[item], self.seed, self.grid, self.cameras
-            )
+        index = self.indices[item]
+        with case_numbers(self.seed, index):
+            sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
         made = {key: getattr(sample, key) for key in TENSORS}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):

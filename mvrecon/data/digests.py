@@ -1,10 +1,15 @@
-"""SHA-256 digests of a run's measurement: of the rig, and of the files that its scenes read."""
+"""SHA-256 digests of a run's measurement: of the rig, of the files that its scenes read, and of the
+volumes that it trains on.
+"""
 
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
 
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.files.checks import Refused
@@ -28,26 +33,32 @@ def of_rig(cameras: Cameras) -> str:
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
+def of_volume(volume: Float[Tensor, "*c d h w"]) -> str:
+    """Digest of a volume's float32 values, by which a case is known again under another name."""
+    values = volume.detach().cpu().float().contiguous().numpy()
+    return hashlib.sha256(values.tobytes()).hexdigest()
+
+
 def of_file(path: str | Path) -> str:
-    """Digest of a file's bytes.
+    """Digest of a file's bytes; of a folder, of all files below it with their names.
 
     Raises:
         OSError: it cannot be read.
     """
+    if Path(path).is_dir():
+        files = sorted(f for f in Path(path).rglob("*") if f.is_file())
+        digests = {f.relative_to(path).as_posix(): of_file(f) for f in files}
+        return hashlib.sha256(json.dumps(digests).encode()).hexdigest()
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def files_in(settings: Any) -> Iterator[str]:
-    """The files that a part's settings name: every `path` in them at which a file is, or a folder
-    of files.
-    """
+    """The files and folders that a part's settings name: every `path` in them at which one is."""
     if isinstance(settings, Mapping):
         path = settings.get("path")
-        if isinstance(path, str) and Path(path).is_file():
+        if isinstance(path, str) and Path(path).exists():
             yield path
-        elif isinstance(path, str) and Path(path).is_dir():
-            yield from sorted(str(file) for file in Path(path).rglob("*") if file.is_file())
         settings = list(settings.values())
     if isinstance(settings, list | tuple):
         for item in settings:

@@ -9,6 +9,8 @@ import lightning.pytorch as L
 import torch
 from torch.utils.data import DataLoader
 
+from mvrecon.acquisition.acquired import Acquired
+from mvrecon.acquisition.settings import Acquisition
 from mvrecon.data import digests as sha256
 from mvrecon.data.dataset import EpochOrder, SceneDataset
 from mvrecon.geometry.grid import Grid
@@ -27,19 +29,24 @@ class SceneData(L.LightningDataModule):
 
     Random scenes draw training, validation and test cases from different series. A scene from a
     file validates on its last `val` cases and trains on those before; the test cases are the test
-    scene's, or the first fifth where that is the same file. So no case is in two sets.
+    scene's, or the first fifth where that is the same file. So no case is in two sets, unless
+    `overlap` asks for it.
 
     Args:
         scenes: name and options of the scenes "train" and "test".
-        grid: options of `Grid.centred`, in the order (x, y, z).
-        camera: name and options of the rig.
+        measurement: `grid`, options of `Grid.centred`, in the order (x, y, z); `camera`, name and
+            options of the rig; `projector`, name and options of what makes the views, None: line
+            integrals; `acquisition`, options of `Acquisition`, None: a perfect detector.
         sizes: the number of cases for "train", "val" and "test"; a file may hold fewer.
         batch_size: cases in a batch.
         workers: processes that load batches; cases are made once, so 0 is as fast for all but huge
             sets.
+        overlap: training, validation and test take the first cases of a file, the same ones: for a
+            file with one volume.
         seed: of the training cases and their order.
 
     Raises:
+        TypeError: an unknown option of the acquisition.
         ValueError: sizes that leave nothing to train on, scenes of different data range, a number
             that is too small.
     """
@@ -47,11 +54,11 @@ class SceneData(L.LightningDataModule):
     def __init__(
         self,
         scenes: Mapping[str, Mapping[str, Any]],
-        grid: Mapping[str, Any],
-        camera: Mapping[str, Any],
+        measurement: Mapping[str, Any],
         sizes: Mapping[str, int],
         batch_size: int = 1,
         workers: int = 0,
+        overlap: bool = False,
         seed: int = 0,
     ):
         super().__init__()
@@ -66,14 +73,12 @@ class SceneData(L.LightningDataModule):
                 f"Expected sizes, workers and seed of at least 0 and a batch_size of at least 1, "
                 f"got {got}"
             )
-        self.grid = Grid.centred(**grid)
-        self.cameras = CAMERAS.from_config(camera)
-        self.sizes, self.batch_size, self.workers, self.seed = (
-            dict(sizes),
-            batch_size,
-            workers,
-            seed,
-        )
+        self.grid = Grid.centred(**measurement["grid"])
+        self.cameras = CAMERAS.from_config(measurement["camera"])
+        self.projector = measurement.get("projector")
+        self.acquisition = Acquisition.of(measurement.get("acquisition"))
+        self.sizes, self.batch_size, self.workers = dict(sizes), batch_size, workers
+        self.overlap, self.seed = overlap, seed
         self.scenes: dict[str, Scene] = {
             key: SCENES.from_config(scenes[key]) for key in ("train", "test")
         }
@@ -87,6 +92,7 @@ class SceneData(L.LightningDataModule):
         self._digests: dict[str, str] = {}
         self.sets: dict[str, SceneDataset] = {}
         self._order: EpochOrder | None = None
+        self._volumes: list[str] | None = None
 
     @property
     def data_range(self) -> float:
@@ -107,21 +113,21 @@ class SceneData(L.LightningDataModule):
         scene, size = self.scenes["test" if part == "test" else "train"], self.sizes[part]
         if scene.length is None:
             return list(range(size))
-        if part == "test" and not self.shared:
-            return list(range(min(size, scene.length)))
+        if self.overlap or (part == "test" and not self.shared):
+            return _turns(scene, size, range(scene.length), part == "train")
         # a fifth whatever `test` is, since a checkpoint may be older than this `test`
         n_test = scene.length // 5 if self.sizes["train"] else scene.length
         first, last = n_test * self.shared, scene.length - self.sizes["val"]
         if last < first or (size and not {"train": last - first, "val": size, "test": first}[part]):
             raise ValueError(
-                f"A scene with {scene.length} case(s) cannot be split into the sizes {self.sizes}"
+                f"A scene with {scene.length} case(s) cannot be split into the sizes "
+                f"{self.sizes}; data.overlap=true takes the same cases for all"
             )
         if part == "test":
             return list(range(min(size, first)))
         if part == "val":
             return list(range(last, scene.length))
-        turns = range(size if getattr(scene, "vary", False) else min(size, last - first))
-        return [i // (last - first) * scene.length + first + i % (last - first) for i in turns]
+        return _turns(scene, size, range(first, last), True)
 
     def setup(self, stage: str | None = None) -> None:
         """Compute the cases of a stage unless they exist already."""
@@ -129,8 +135,9 @@ class SceneData(L.LightningDataModule):
         for part in STAGES[stage] if stage else ("train", "val", "test"):
             if part not in self.sets:
                 scene = self.scenes["test" if part == "test" else "train"]
+                measured = Acquired(scene, self.projector, self.acquisition)
                 made = SceneDataset(
-                    scene, self.grid, self.cameras, self.indices(part), series[part]
+                    measured, self.grid, self.cameras, self.indices(part), series[part]
                 )
                 made.prepare(f"{part} cases")
                 self.sets[part] = made
@@ -179,7 +186,7 @@ class SceneData(L.LightningDataModule):
 
     def state_dict(self) -> dict[str, Any]:
         """State for a checkpoint: epoch and position in it, names of the training cases, digests of
-        the rig and the files.
+        their volumes, of the rig and of the files.
         """
         loop = self.trainer.fit_loop if self.trainer else None
         if loop is None or self._order is None:
@@ -188,9 +195,13 @@ class SceneData(L.LightningDataModule):
         n_done = n_batches * self.batch_size
         whole = n_done >= len(self._order)  # the epoch: then the next one goes on
         place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}
+        cases = self.sets["train"].prepare()
+        if self._volumes is None:
+            self._volumes = [sha256.of_volume(volume) for volume in cases.get("volume", ())]
         return {
             **place,
-            "cases": list(self.sets["train"].prepare()["name"]),
+            "cases": list(cases["name"]),
+            "volumes": self._volumes,
             "digests": self.digests("train"),
         }
 
@@ -207,6 +218,15 @@ class SceneData(L.LightningDataModule):
             warnings.filterwarnings(
                 "ignore", ".*ended before the epoch ended and your dataloader is not resumable"
             )
+
+
+def _turns(scene: Scene, size: int, cases: range, vary: bool) -> list[int]:
+    """The first `size` cases of a range; with `vary`, a scene that varies them counts on with
+    copies of the range.
+    """
+    n = len(cases)
+    count = size if vary and getattr(scene, "vary", False) else min(size, n)
+    return [i // n * (scene.length or 0) + cases[i % n] for i in range(count)]
 
 
 def same_cases(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:

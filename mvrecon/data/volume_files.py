@@ -63,10 +63,19 @@ def save_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) ->
             f"Expected one volume [d h w] of the grid's {grid.shape} voxels, got "
             f"{tuple(volume.shape)}; volumes[0, 0] is the first of a batch"
         )
+    save = nifti.save_nifti if check_ending(path).startswith(".nii") else itk.save_itk
+    save(path, volume, grid)
+
+
+def check_ending(path: Path) -> str:
+    """The ending of a volume's file that is to be written.
+
+    Raises:
+        Refused: one that `save_volume` does not write.
+    """
     if (ending := _ending(path)) not in WRITTEN:
         raise Refused(f"{path}: expected a volume whose name ends in {' or '.join(WRITTEN)}")
-    save = nifti.save_nifti if ending.startswith(".nii") else itk.save_itk
-    save(path, volume, grid)
+    return ending
 
 
 def volumes_in(path: str | Path) -> list[Path]:

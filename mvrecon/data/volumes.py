@@ -7,7 +7,7 @@ alike.
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,10 +21,10 @@ from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.nifti import ENDING, open_nifti
+from mvrecon.data.placement import Placed, moved
 from mvrecon.data.resample import resample
 from mvrecon.data.slabs import Slabs
 from mvrecon.geometry.grid import Grid
-from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.scenes.analytic import generator, uniform
 from mvrecon.scenes.sample import Sample
@@ -32,9 +32,6 @@ from mvrecon.scenes.sample import Sample
 #: Tissue begins at -400 HU where the patient is looked for, and at a quarter of water where voxels
 #: are judged.
 SKIN, TISSUE = 0.6 * WATER, 0.25 * WATER
-#: How far a varied copy departs from its case: degrees about each axis, part of the size, mm along
-#: each axis.
-TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
 #: Voxels of a finer grid where the scene chooses it, half a GiB: the same on every machine, as the
 #: cases are.
 FINE = 2**27
@@ -122,12 +119,35 @@ class FileScene(ABC):
         inside = enclosed(body(truth[0], self._above(TISSUE)))
         return Sample(self._views(fine, grid, cameras), truth, inside[None], name)
 
-    def finely(self, index: int, seed: int, grid: Grid) -> tuple[str, Float[Tensor, "e i j"]]:
-        """Name of a case, and its attenuation in 1/mm on `grid.refined(self.factor(grid))`.
-
-        Memory: that grid, and a slab of the file. The file is read once, twice where the patient is
-        looked for.
+    def finer(
+        self, index: int, seed: int, grid: Grid, cameras: Cameras, factor: int
+    ) -> Float[Tensor, "1 d h w"]:
+        """The case's attenuation in 1/mm on `grid.refined(factor)`, from a grid as fine as the
+        truth's where that is a multiple.
         """
+        between = max(1, self.factor(grid) // factor)
+        _, fine = self.finely(index, seed, grid, factor * between)
+        return F.avg_pool3d(fine[None], between)
+
+    def finely(
+        self, index: int, seed: int, grid: Grid, factor: int | None = None
+    ) -> tuple[str, Float[Tensor, "e i j"]]:
+        """Name of a case, and its attenuation in 1/mm on `grid.refined(factor)`.
+
+        None stands for `self.factor(grid)`. Memory: that grid, and a slab of the file. The file is
+        read once, twice where the patient is looked for.
+        """
+        case = self._placed(index, seed, grid)
+        return case.name, resample(case.mu, case.grid, grid.refined(factor or self.factor(grid)))
+
+    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"]:
+        """The affine map in mm that carries points of the file's world to the case's: the shift of
+        a crop, and what a varied copy is turned and scaled by after its mirroring.
+        """
+        case = self._placed(index, seed, grid)
+        return case.grid.affine @ torch.linalg.inv(case.source.affine)
+
+    def _placed(self, index: int, seed: int, grid: Grid) -> Placed:
         turn, case = divmod(index, self.length)
         if index < 0 or (turn and not self.vary):
             raise IndexError(
@@ -135,7 +155,6 @@ class FileScene(ABC):
                 f"varied ones"
             )
         name, hu, source = self.case(case)
-        fine = grid.refined(self.factor(grid))
         mu = hu.mapped(lambda slab: self._physical(name, slab))
         rng = generator(seed, index) if turn else None
         if rng is not None and uniform(rng, 0, 1) < 0.5:
@@ -145,7 +164,7 @@ class FileScene(ABC):
         )
         target = grid.centre if self.crop == "body" else pivot
         placed = moved(source, pivot, target, rng)
-        return f"{name}-{seed}-{turn}" if turn else name, resample(mu, placed, fine)
+        return Placed(f"{name}-{seed}-{turn}" if turn else name, mu, source, placed)
 
     def _pivot(self, name: str, mu: Slabs, source: Grid) -> Float[Tensor, "3"]:
         """World mm of the centre of the patient's box."""
@@ -177,39 +196,9 @@ class FileScene(ABC):
             or self._operator[1] is not cameras
         ):
             fine_grid = grid.refined(self.factor(grid))
-            A = RayTransform(fine_grid, split_pixels(cameras, self.rays), method="siddon")
+            A = RayTransform(fine_grid, cameras.refined(self.rays), method="siddon")
             self._operator = (grid, cameras, A)
         return F.avg_pool2d(self._operator[2](fine[None, None])[0], self.rays)
-
-
-def split_pixels(cameras: Cameras, factor: int) -> Cameras:
-    """The same detectors with each pixel cut into `factor` x `factor`; the inverse of
-    `Cameras.binned`.
-    """
-    u, v = cameras.u / factor, cameras.v / factor
-    shift = (u + v) * (1 - factor) / 2
-    shape = (cameras.shape[0] * factor, cameras.shape[1] * factor)
-    source = cameras.source + shift if cameras.parallel else cameras.source
-    return replace(cameras, source=source, origin=cameras.origin + shift, u=u, v=v, shape=shape)
-
-
-def moved(
-    grid: Grid, pivot: Float[Tensor, "3"], target: Float[Tensor, "3"], rng: torch.Generator | None
-) -> Grid:
-    """A grid carried from one point to another, with `rng` also turned, scaled and shifted about it
-    at random.
-    """
-    linear = torch.eye(3, dtype=torch.float64)
-    if rng is not None:
-        angles = [uniform(rng, -TURN, TURN) for _ in range(3)]
-        linear = uniform(rng, 1 - SCALE, 1 + SCALE) * euler_rotation(angles, "xyz")
-        target = target + torch.tensor(
-            [uniform(rng, -SHIFT, SHIFT) for _ in range(3)], dtype=torch.float64
-        )
-    affine = grid.affine.clone()
-    affine[:3, :3] = linear @ affine[:3, :3]
-    affine[:3, 3] = linear @ (affine[:3, 3] - pivot) + target
-    return Grid(grid.shape, affine)
 
 
 @dataclass(kw_only=True)

@@ -24,6 +24,7 @@ class Trained:
         cases: names of the training cases; None: the checkpoint is of a version that did not
             store them.
         digests: SHA-256 of the rig and of the files that it was trained with.
+        volumes: SHA-256 of the training cases' volumes.
     """
 
     module: ReconstructionModule
@@ -31,6 +32,7 @@ class Trained:
     steps: int
     cases: list[str] | None = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
+    volumes: list[str] = field(default_factory=list)
 
 
 def finished(folder: Path, method: str) -> Path:
@@ -85,6 +87,5 @@ def load(path: Path) -> Trained:
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
         data = state.get(SceneData.__qualname__, {})
         cases = list(map(str, data["cases"])) if "cases" in data else None
-        return Trained(
-            module.eval(), seconds, int(state["global_step"]), cases, dict(data.get("digests", {}))
-        )
+        known = dict(data.get("digests", {})), list(map(str, data.get("volumes", ())))
+        return Trained(module.eval(), seconds, int(state["global_step"]), cases, *known)

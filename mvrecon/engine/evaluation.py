@@ -5,7 +5,8 @@ scenes were used in training.
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -105,9 +106,11 @@ def results(
     models: dict[str, nn.Module] = {label: method.module.model for label, method in trained.items()}
     A = next(iter(trained.values())).module.projector
     names: list[str] = []
+    truths: list[str] = []
 
     def watch(scene: dict[str, Any], volumes: dict[str, Tensor]) -> None:
         names.extend(scene["name"])
+        truths.extend(digests.of_volume(truth) for truth in scene["volume"])
         if see is not None:
             see(scene, volumes)
 
@@ -117,7 +120,10 @@ def results(
         "name": settings["name"],
         "seed": settings["seed"],
         "scenes": names,
-        "seen_in_training": seen_in_training(trained.values(), names),
+        "seen_in_training": seen_in_training(trained.values(), names, truths),
+        "overlap": data.overlap and data.scenes["test"].length is not None,
+        "projector": settings["projector"],
+        "acquisition": asdict(data.acquisition),
         "data_range": data.data_range,
         "device": device,
         "threads": torch.get_num_threads(),
@@ -136,15 +142,25 @@ def _row(method: Trained, scores: list[dict[str, float]]) -> dict[str, Any]:
     }
 
 
-def seen_in_training(methods: Iterable[Trained], names: Iterable[str]) -> list[str] | None:
+def seen_in_training(
+    methods: Iterable[Trained], names: Sequence[str], truths: Sequence[str] = ()
+) -> list[str] | None:
     """Names of the scenes that any method was trained on; None if a checkpoint does not store its
     training cases.
+
+    Args:
+        methods: of the run.
+        names: of the scenes.
+        truths: digests of their volumes, by which a training case is known under any name.
     """
-    trained = [method.cases for method in methods if method.steps]
-    if None in trained:
+    trained = [method for method in methods if method.steps]
+    if any(method.cases is None for method in trained):
         return None
-    cases = {case for of_method in trained for case in of_method or ()}
-    return [name for name in names if name in cases]
+    cases = {case for method in trained for case in method.cases or ()}
+    volumes = {volume for method in trained for volume in method.volumes}
+    known = truths or [""] * len(names)
+    pairs = zip(names, known, strict=True)
+    return [name for name, truth in pairs if name in cases or truth in volumes]
 
 
 def device_of(accelerator: str) -> str:

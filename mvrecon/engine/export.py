@@ -1,5 +1,6 @@
 """A case as files: volumes as NIfTI, views and planes as images, measured views as HDF5."""
 
+import json
 import re
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -10,6 +11,7 @@ import h5py
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.nifti import save_nifti
 from mvrecon.files.atomic import written_whole
 from mvrecon.geometry.grid import Grid
@@ -50,8 +52,8 @@ def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str
     Args:
         folder: of all cases.
         name: of the case, and of its own folder in `folder`, which is returned.
-        views: line integrals.
-        unit: of the line integrals.
+        views: line integrals, or what another projector makes.
+        unit: of the views.
     """
     case = folder / _file_name(name)
     for m, image in enumerate(montage.radiographs(views)):
@@ -62,6 +64,33 @@ def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str
         dataset = file.create_dataset("views", data=values, compression="gzip", shuffle=True)
         dataset.attrs.update(axes="camera, v, u", unit=unit)
     return case
+
+
+def save_truth(
+    folder: Path, name: str, volume: Float[Tensor, "d h w"], grid: Grid, unit: str
+) -> Path:
+    """Write the truth of one case as `truth.nii.gz`, in the rig's world in mm; returns the file.
+
+    A scene in 1/mm is written in Hounsfield units, which the scenes of files read; with their
+    option `crop: none` it comes back where it was. Other units are written as they are.
+
+    Raises:
+        ImportError: nibabel is not installed.
+    """
+    path = folder / _file_name(name) / "truth.nii.gz"
+    save_nifti(path, hounsfield(volume) if unit == "1/mm" else volume, grid)
+    return path
+
+
+def save_placement(folder: Path, name: str, placement: Float[Tensor, "4 4"]) -> Path:
+    """Write where a case came from as `placement.json`: the affine map in mm from the file's world
+    to the rig's, and its last column, the shift.
+    """
+    path = folder / _file_name(name) / "placement.json"
+    record = {"file_to_rig": placement.tolist(), "shift_mm": placement[:3, 3].tolist()}
+    with written_whole(path) as part:
+        part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return path
 
 
 def save_png(path: Path, image: Image) -> None:

@@ -54,8 +54,9 @@ def build_data(settings: Settings) -> SceneData:
             f"test_scene holds a scene's settings; choose a file by "
             f"scene@test_scene={scenes['test']}"
         )
-    where = {key: settings[key] for key in ("grid", "camera", "seed")}
-    return SceneData(scenes=scenes, **where, **settings["data"])
+    keys = ("grid", "camera", "projector", "acquisition")
+    measurement = {key: settings[key] for key in keys}
+    return SceneData(scenes, measurement, seed=settings["seed"], **settings["data"])
 
 
 def build_module(settings: Settings, model: Settings, data_range: float) -> ReconstructionModule:

@@ -1,6 +1,9 @@
-"""Settings of earlier versions: options that have a new name now."""
+"""Settings of earlier versions: options that have a new name now, and what was not an option."""
 
+from dataclasses import asdict
 from typing import Any
+
+from mvrecon.acquisition.settings import Acquisition
 
 #: Rigs whose number of views was the option `views` up to version 0.1.0.
 RIGS = ("arc", "circular", "dome", "parallel")
@@ -9,9 +12,17 @@ RIGS = ("arc", "circular", "dome", "parallel")
 def current(settings: Any) -> Any:
     """The settings of a run, or the geometry of a checkpoint, with the option names of this
     version; other values are returned unchanged.
+
+    Runs up to version 0.1.0 had a perfect detector, and no case in two sets.
     """
-    camera = settings.get("camera") if isinstance(settings, dict) else None
-    if not isinstance(camera, dict) or camera.get("name") not in RIGS:
+    if not isinstance(settings, dict):
         return settings
-    renamed = {"n_views" if key == "views" else key: value for key, value in camera.items()}
-    return {**settings, "camera": renamed}
+    camera, data = settings.get("camera"), settings.get("data")
+    if isinstance(camera, dict) and camera.get("name") in RIGS:
+        renamed = {"n_views" if key == "views" else key: value for key, value in camera.items()}
+        settings = {**settings, "camera": renamed}
+    if "scene" in settings and settings.get("acquisition") is None:
+        settings = {**settings, "acquisition": asdict(Acquisition())}
+    if "scene" in settings and isinstance(data, dict):
+        settings = {**settings, "data": {"overlap": False, **data}}
+    return settings

@@ -46,7 +46,29 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
     console = Console(width=max(Console().width, WIDTH))
     console.print(table(results))
+    for line in remarks(results):
+        console.print(line, soft_wrap=True)
     console.print(f"Kept in {folder}", soft_wrap=True)
+
+
+def remarks(results: Mapping[str, Any]) -> list[str]:
+    """What a reader of the table must know of the measurement: a detector that is not perfect, and
+    cases that are in two sets.
+    """
+    lines, got = [], results.get("acquisition")
+    if got and (spoilt := _spoilt(got)):
+        lines.append(f"The views' detector: {spoilt}")
+    if got and (run := results.get("acquisition_of_run", got)) != got:
+        lines.append(f"The run's detector was another: {_spoilt(run) or 'perfect'}")
+    if results.get("overlap"):
+        lines.append("data.overlap: training, validation and test share their cases")
+    return lines
+
+
+def _spoilt(acquisition: Mapping[str, Any]) -> str:
+    """The options of a detector that are not zero, without those that do nothing."""
+    silent = {"fine"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
+    return ", ".join(f"{k} {v:g}" for k, v in acquisition.items() if v and k not in silent)
 
 
 def _scenes(count: int, overlap: list[str] | None) -> str:

@@ -15,11 +15,12 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.symmetry import Mirror
 from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
+from mvrecon.projectors.pixel_integral import PixelIntegral, SaysPixelIntegral
 
 Weight = Tensor | Callable[[], Tensor] | None
 
 
-class LinearOperator:
+class LinearOperator(SaysPixelIntegral):
     """A linear map y = A x from tensors [b c *domain_shape] to [b c *range_shape], and its adjoint.
 
     SIRT, MLEM, likelihoods and models need no more. What an operator can do at less than the cost
@@ -232,15 +233,17 @@ class Scaled(Wrapped):
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
         keep = list(range(self.range_shape[0]) if views is None else views)
-
-        def of_views(factors: Tensor) -> Tensor:
-            return factors.expand(self.range_shape)[keep]
-
+        pixels = self._changed(lambda factors: factors.expand(self.range_shape)[keep])
         voxels = None if self.voxels is None else self.voxels[box.slices]
-        return Scaled(self.A.cropped(box, views), self._changed(of_views), voxels)
+        return Scaled(self.A.cropped(box, views), pixels, voxels)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
         return Scaled(self.A.with_support(support), self.factors or self.fixed_factors, self.voxels)
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """A's own, times the pixels' factors."""
+        own = self.A.pixel_integral()
+        return own.weighted(self.pixels) if own and self.voxels is None else None
 
     def mirror(self) -> Mirror | None:
         """A's own, where it mirrors the weights into themselves, too."""

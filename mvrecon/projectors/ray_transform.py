@@ -17,6 +17,7 @@ from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.integrals import LineIntegrals
 from mvrecon.projectors.operator import LinearOperator, Projector
+from mvrecon.projectors.pixel_integral import PixelIntegral
 from mvrecon.projectors.selection import RaySelection, ViewSelection
 from mvrecon.projectors.skipping import check_support
 from mvrecon.projectors.subset import SomePixels, SomeViews
@@ -91,6 +92,14 @@ class RayTransform(LineIntegrals):
         cameras = rig if views is None else rig[torch.tensor(views, device=rig.source.device)]
         options = (self.method, self.backend, self.rays_per_pixel, self.skip, support)
         return RayTransform(self.grid.cropped(box), cameras, *options).to(self.device)
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """The line integral, or its mean over a pixel's rays; None with a support, which the object
+        need not keep to, and for explicit rays.
+        """
+        if self.support is not None or isinstance(self.rays, ExplicitRays):
+            return None
+        return PixelIntegral.plain(self.rays_per_pixel)
 
     def mirror(self) -> Mirror | None:
         """A plane that mirrors grid, rig and support into themselves."""

@@ -69,7 +69,9 @@ def os_sart(
             f"Expected 0 < relaxation < 2 and 0 < reduction <= 1, got {relaxation} and {reduction}"
         )
     problem = posed(os_sart, A, views, common)
-    parts, column = _subsets(problem, usual_subsets(len(views[0, 0])) if subsets is None else subsets)
+    parts, column = _subsets(
+        problem, usual_subsets(len(views[0, 0])) if subsets is None else subsets
+    )
     x, watch = problem.start, Watch(problem.monitor)
     for number in range(1, iterations + 1):
         for part in parts:

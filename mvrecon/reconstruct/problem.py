@@ -94,9 +94,7 @@ def posed(
     return Problem(within, views, start, options.get("monitor"))
 
 
-def supported(
-    method: Callable[..., Tensor], A: LinearOperator, options: Common
-) -> LinearOperator:
+def supported(method: Callable[..., Tensor], A: LinearOperator, options: Common) -> LinearOperator:
     """A diag(support), after the check of the options' names.
 
     Raises:
@@ -104,7 +102,9 @@ def supported(
         ValueError: a support that is no mask of the volume's shape.
     """
     parameters = inspect.signature(method).parameters.values()
-    known = {p.name for p in parameters if p.kind is not p.VAR_KEYWORD} | set(Common.__annotations__)
+    known = {p.name for p in parameters if p.kind is not p.VAR_KEYWORD} | set(
+        Common.__annotations__
+    )
     for option in options:
         if option not in Common.__annotations__:
             raise TypeError(f"{method.__name__} has no option {option!r}{hint(option, known)}")

@@ -3,10 +3,14 @@ the case alone.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.sample import Rays, Sample
@@ -73,6 +77,15 @@ class AnalyticScene(ABC):
             self.phantom(generator(seed, index), grid), grid, cameras, f"{self.kind}-{seed}-{index}"
         )
 
+    def finer(
+        self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
+    ) -> Float[Tensor, "1 d h w"]:
+        """The case's values on `grid.refined(factor)`, the mean over at least 2^3 points of each
+        voxel.
+        """
+        phantom = self.phantom(generator(seed, index), grid)
+        return voxelise(phantom, grid.refined(factor), max(2, -(-4 // factor)))[None]
+
 
 def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int = 4) -> Sample:
     """Exact views of a phantom, and its truth as the mean over factor^3 points of each voxel."""
@@ -102,6 +115,16 @@ def generator(seed: int, index: int) -> torch.Generator:
             f"A case needs a seed and an index of at least 0, got seed {seed}, index {index}"
         )
     return torch.Generator().manual_seed(mixed(seed, index))
+
+
+@contextmanager
+def case_numbers(seed: int, index: int) -> Iterator[None]:
+    """Context in which torch's global random numbers are those of one case, so that a scene that
+    draws from them is a pure function, too.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(mixed(seed, index))
+        yield
 
 
 def mixed(seed: int, index: int) -> int:

@@ -4,9 +4,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import SCENES
-from mvrecon.scenes.sample import Rays, Sample, Scene, Thin
+from mvrecon.scenes.sample import Rays, Sample, Scene, Thin, finer
 
 
 class Mixture:
@@ -45,7 +48,17 @@ class Mixture:
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
         """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
+        scene, case = self._case(index)
+        return scene.sample(case, seed, grid, cameras)
+
+    def finer(
+        self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
+    ) -> Float[Tensor, "1 d h w"]:
+        """The case's values on `grid.refined(factor)`."""
+        scene, case = self._case(index)
+        return finer(scene, case, seed, grid, cameras, factor)
+
+    def _case(self, index: int) -> tuple[Scene, int]:
         turn, which = divmod(index, len(self.scenes))
         scene = self.scenes[which]
-        case = index if scene.length is None else turn % scene.length
-        return scene.sample(case, seed, grid, cameras)
+        return scene, index if scene.length is None else turn % scene.length

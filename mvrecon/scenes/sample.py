@@ -27,7 +27,8 @@ class Sample:
     """One case.
 
     Args:
-        views: measured line integrals in value * mm, float32.
+        views: line integrals in value * mm, float32; those of an acquisition are in its projector's
+            unit.
         volume: truth on the grid, float32.
         inside: the voxels that the object touches.
         name: of the case, the same for the same (seed, index).
@@ -71,3 +72,36 @@ class Thin(Protocol):
     def thinnest(self, grid: Grid) -> float:
         """The least width in mm of any body in any case on `grid`."""
         ...
+
+
+@runtime_checkable
+class Placing(Protocol):
+    """A scene that moves the objects of its files to where its cases are."""
+
+    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"]:
+        """The affine map in mm that carries points of the file's world to the case's."""
+        ...
+
+
+@runtime_checkable
+class Finer(Protocol):
+    """A scene that gives the object of a case on a finer grid without its views."""
+
+    def finer(
+        self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
+    ) -> Float[Tensor, "1 d h w"]:
+        """The values of the case `index` of the series `seed`, which `sample` puts on `grid`, on
+        `grid.refined(factor)`.
+        """
+        ...
+
+
+def finer(
+    scene: Scene, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
+) -> Float[Tensor, "1 d h w"]:
+    """The object of a case on `grid.refined(factor)`; a scene that has no method for it samples the
+    case on that grid.
+    """
+    if isinstance(scene, Finer):
+        return scene.finer(index, seed, grid, cameras, factor)
+    return scene.sample(index, seed, grid.refined(factor), cameras).volume

@@ -84,6 +84,22 @@ def planes(
     return _captioned(columns, PLANES)
 
 
+def slices(volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES) -> Image:
+    """The three middle planes of a volume in a row, to scale, from 0 or its least value (black) to
+    its greatest.
+
+    Args:
+        volume: the values.
+        spacing: voxel size along (x, y, z), mm.
+    """
+    low, high = min(0.0, volume.min().item()), volume.max().item()
+    window = low, max(high, low + torch.finfo(torch.float32).tiny)
+    images = enlarged([grey(plane, window) for plane in middle_planes(volume, spacing)], 256)
+    tall = max(image.shape[0] for image in images)
+    padded = [np.pad(i, ((0, tall - i.shape[0]), (0, 0), (0, 0))) for i in images]
+    return tiled([[labelled(i, t) for i, t in zip(padded, PLANES, strict=True)]])
+
+
 def projections(
     truth: Float[Tensor, "d h w"],
     volumes: Mapping[str, Float[Tensor, "d h w"]],

@@ -12,8 +12,9 @@ from mvrecon.registry import Registry
 from mvrecon.testing import camera as contract
 from mvrecon.testing.camera import check_camera
 from tests.cameras.rigs import OPTIONS, random_cameras
+from tests.cameras.test_formats import FORMATS, crooked
 
-BUILTIN = sorted(["from_file", *OPTIONS])
+BUILTIN = sorted(["from_file", *OPTIONS, *FORMATS])
 
 
 def test_every_built_in_camera_is_tested_here():
@@ -25,9 +26,14 @@ def test_every_built_in_camera_is_tested_here():
 
 @pytest.mark.parametrize("name", BUILTIN)
 def test_built_in_cameras_keep_the_contract(name, tmp_path):
-    if name == "from_file":
-        save(random_cameras(extent="behind"), tmp_path / "rig.json")
-    check_camera(name, **(OPTIONS | {"from_file": {"path": tmp_path / "rig.json"}})[name])
+    path = tmp_path / "rig"
+    if name in FORMATS:
+        FORMATS[name][0].write(crooked(), path)
+        options = {"path": path, **FORMATS[name][1]}
+    else:
+        save(random_cameras(extent="behind"), path)
+        options = {**OPTIONS, "from_file": {"path": path}}[name]
+    check_camera(name, **options)
 
 
 @pytest.mark.parametrize("extent", ["segment", "behind", "ahead", "line"])

@@ -5,18 +5,19 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from tests.data.conftest import RIG
 
 GRID = {"shape": [6, 6, 6], "spacing": 8.0}
+MEASUREMENT = {"grid": GRID, "camera": RIG}
 RANDOM = {"name": "ellipsoids"}
 
 
-def build(scene=RANDOM, test_scene=None, seed=0, **sizes):
+def build(scene=RANDOM, test_scene=None, seed=0, overlap=False, **sizes):
     scenes = {"train": scene, "test": test_scene or scene}
-    return SceneData(
-        scenes, GRID, RIG, {"train": 5, "val": 2, "test": 3, **sizes}, batch_size=2, seed=seed
-    )
+    sizes = {"train": 5, "val": 2, "test": 3, **sizes}
+    return SceneData(scenes, MEASUREMENT, sizes, 2, overlap=overlap, seed=seed)
 
 
 def names(loader):
@@ -109,6 +110,33 @@ def test_a_file_that_is_too_small_is_refused(volume_file):
     assert build(phantom, train=0, val=0).indices("test") == [0]
 
 
+def test_one_volume_may_be_training_validation_and_test(volume_file):
+    """With `overlap` all sets take the first cases of a file, varied copies in training alone."""
+    heads = {"name": "hdf5", "path": str(volume_file)}
+    data = build(heads, train=9, val=2, test=3, overlap=True)
+    assert [data.indices(part) for part in ("train", "val", "test")] == [
+        [0, 1, 2, 3, 4, 5, 6],
+        [0, 1],
+        [0, 1, 2],
+    ]
+    varied = build(heads | {"vary": True}, train=9, val=1, test=1, overlap=True)
+    assert varied.indices("train") == [*range(9)] and varied.indices("val") == [0]
+    sets = parts(build({"name": "shepp_logan"}, train=1, val=1, test=1, overlap=True))
+    assert [len(names) for names in sets.values()] == [1, 1, 1]
+
+
+def test_the_files_of_a_folder_have_one_digest_that_tells_contents_and_names(tmp_path):
+    folder = tmp_path / "series"
+    (folder / "more").mkdir(parents=True)
+    (folder / "more" / "a.dcm").write_bytes(b"1")
+    assert list(digests.files_in({"name": "some", "path": str(folder)})) == [str(folder)]
+    first = digests.of_file(folder)
+    (folder / "more" / "a.dcm").rename(folder / "more" / "b.dcm")
+    second = digests.of_file(folder)
+    (folder / "more" / "b.dcm").write_bytes(b"2")
+    assert len({first, second, digests.of_file(folder)}) == 3
+
+
 def test_wrong_settings_are_refused():
     with pytest.raises(
         ValueError, match="sizes must give train, val and test; missing or unknown: tset"
@@ -121,8 +149,7 @@ def test_wrong_settings_are_refused():
     with pytest.raises(ValueError, match="spacing must be positive"):
         SceneData(
             {"train": RANDOM, "test": RANDOM},
-            {"shape": [4, 4, 4], "spacing": -1.0},
-            RIG,
+            {"grid": {"shape": [4, 4, 4], "spacing": -1.0}, "camera": RIG},
             dict.fromkeys(("train", "val", "test"), 1),
         )
 

@@ -52,8 +52,16 @@ def test_dicom_series_are_cases_by_their_folders(tmp_path):
 
 
 def test_a_change_in_a_folder_changes_its_digests(folder):
-    files = list(digests.files_in({"name": "volumes", "path": str(folder)}))
-    assert [file.rpartition("/")[2] for file in files] == ["a.mha", "b.nrrd", "c.nii.gz"]
+    def made():
+        settings = {"name": "volumes", "path": str(folder)}
+        return {path: digests.of_file(path) for path in digests.files_in(settings)}
+
+    before = made()
+    assert before and made() == before
+    (folder / "b.nrrd").write_bytes((folder / "b.nrrd").read_bytes()[:-1])
+    changed = made()
+    (folder / "b.nrrd").unlink()
+    assert len({str(digest) for digest in (before, changed, made())}) == 3
 
 
 def test_attenuation_in_a_file_is_taken_as_it_is(tmp_path, grid, cameras):

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from mvrecon.data.attenuation import WATER, attenuation
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.data.volumes import Hdf5Volumes, NiftiVolume, reversed_axes, split_pixels
+from mvrecon.data.volumes import Hdf5Volumes, NiftiVolume, reversed_axes
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.parts import CAMERAS, PROJECTORS, SCENES
 from tests.data.conftest import RIG, SPACING, head
@@ -39,9 +39,7 @@ def test_truth_is_the_block_mean_of_what_is_projected(volume_file, grid, cameras
     name, fine = scene.finely(2, 0, grid)
     assert sample.name == name == "pt_2" and fine.shape == (24, 24, 24)
     assert torch.allclose(sample.volume, F.avg_pool3d(fine[None], 3))
-    A = PROJECTORS.build(
-        "drr", grid=grid.refined(3), cameras=split_pixels(cameras, 2), method="siddon"
-    )
+    A = PROJECTORS.build("drr", grid=grid.refined(3), cameras=cameras.refined(2), method="siddon")
     assert torch.equal(sample.views, F.avg_pool2d(A(fine[None, None])[0], 2))
     assert sample.views.shape == (1, 3, 10, 12) and sample.views.dtype == torch.float32
     assert sample.volume.shape == sample.inside.shape == (1, 8, 8, 8)
@@ -169,7 +167,7 @@ def test_split_pixels_join_again(name, factor):
     detector = {"pixels": [4, 6], "pixel_mm": [2.0, 3.0], "offset_mm": [1.0, -2.0]}
     cone = {"sid": 300.0, "sdd": 450.0} if name == "circular" else {}
     cameras = CAMERAS.build(name, n_views=3, detector=detector, **cone)
-    again = split_pixels(cameras, factor).binned(factor)
+    again = cameras.refined(factor).binned(factor)
     assert again.shape == cameras.shape
     for key in ("source", "origin", "u", "v"):
         assert torch.allclose(getattr(again, key), getattr(cameras, key), atol=1e-12)

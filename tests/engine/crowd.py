@@ -124,7 +124,7 @@ def apps(folder: Path) -> list[tuple[int, str]]:
     """
     import torch
 
-    from mvrecon.engine import agreement, evaluation, fit  # noqa: F401  (all imports once, for every process)
+    from mvrecon.engine import evaluation, fit  # noqa: F401  (all imports once, for every process)
     from tests.engine.lives import OPTIONS
 
     torch.set_num_threads(1)

@@ -2,6 +2,7 @@
 
 import io
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ from PIL import Image as Pillow
 from rich.console import Console
 from torch import nn
 
+from mvrecon.acquisition.settings import Acquisition
 from mvrecon.engine.evaluation import device_of, evaluate, mean_and_spread
 from mvrecon.engine.export import save_case, save_png
-from mvrecon.engine.report import WIDTH, table
+from mvrecon.engine.report import WIDTH, remarks, table
 from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import UNITS
 from mvrecon.models.output import Reconstruction
@@ -120,6 +122,22 @@ def test_a_table_calls_no_scene_unseen_that_a_training_may_have_seen(scenes, see
     """The table of scenes that a training has seen, or may have, does not call them unseen."""
     text = shown({"name": "trial", "scenes": scenes, "seen_in_training": seen, "methods": {}})
     assert title in text and "unseen" not in text
+
+
+@pytest.mark.door
+def test_a_reader_of_the_table_learns_of_shared_cases_and_of_the_detector():
+    """Below the table stand cases that training and test share, and a detector that is not
+    perfect or not the run's.
+    """
+    perfect = asdict(Acquisition())
+    noisy = perfect | {"photons": 1e4, "blur_mm": 2.0}
+    assert remarks({"acquisition": perfect, "overlap": False}) == []
+    assert remarks({"acquisition": noisy, "overlap": True}) == [
+        "The views' detector: blur_mm 2, photons 10000",
+        "data.overlap: training, validation and test share their cases",
+    ]
+    lines = remarks({"acquisition": perfect, "acquisition_of_run": noisy})
+    assert lines == ["The run's detector was another: blur_mm 2, photons 10000"]
 
 
 def shown(found):

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from mvrecon.cameras import rigs
+from mvrecon.config import compose
 from mvrecon.engine import run_folder
 from mvrecon.engine.checkpoint_check import check_settings
 from mvrecon.engine.old_names import RIGS, current
@@ -36,3 +37,15 @@ def test_other_settings_stay_as_they_are(settings):
 
 def test_every_rig_of_the_table_counts_its_views_now():
     assert all("n_views" in getattr(rigs, name).__annotations__ for name in RIGS)
+
+
+def test_a_run_before_acquisitions_had_a_perfect_detector():
+    """Settings without the key `acquisition` are those of today's default, which they are compared
+    with; an evaluation's and a checkpoint's geometry stay as they are.
+    """
+    settings = compose("experiment=smoke")
+    old = {key: value for key, value in settings.items() if key != "acquisition"}
+    old["data"] = {key: value for key, value in settings["data"].items() if key != "overlap"}
+    assert current(old) == settings == current(settings)
+    geometry = {key: settings[key] for key in ("grid", "projector")}
+    assert current(geometry) == geometry and current({"checkpoint": "x"}) == {"checkpoint": "x"}

@@ -77,6 +77,27 @@ def test_patients_of_the_training_are_not_called_unseen(patients, tmp_path, caps
     assert "5 scenes, 3 of them seen in training" in printed and "unseen" not in printed
 
 
+def test_patients_of_the_training_are_known_under_other_names(patients, tmp_path, capsys):
+    """An evaluation names the volumes that trained the model wherever they come from and whatever
+    they are called, and tells a detector that is not the run's.
+    """
+    rng = np.random.default_rng(0)
+    write_volumes(tmp_path / "copies.h5", (volume(f"q{k}", rng) for k in range(7)))
+    scene = ("scene@test_scene=hdf5", f"test_scene.path={tmp_path}/copies.h5")
+    options = (*scene, "test_scene.crop=none", "+data.sizes.test=5", "acquisition=photons")
+    assert (
+        call(mvrecon.eval, f"checkpoint={patients}/run", *options, f"hydra.run.dir={tmp_path}/eval")
+        == 0
+    )
+    table = json.loads((tmp_path / "eval" / "results.json").read_text())
+    assert table["seen_in_training"] == ["q1", "q2", "q3"]
+    assert table["acquisition"]["photons"] == 1e4
+    assert table["acquisition_of_run"]["photons"] is None
+    printed = capsys.readouterr().out
+    assert "The views' detector: photons 10000" in printed
+    assert "The run's detector was another: perfect" in printed
+
+
 def test_data_that_have_changed_are_refused(patients, tmp_path, capsys):
     """A data file that has changed since the training is an error of evaluation and of
     resumption.

@@ -31,6 +31,8 @@ class Measured:
         columns: of the detector that are kept, in the same way.
         binning: pixels that are joined into one, one number or (rows, columns): the mean of their
             transmissions, as a larger pixel measures; of integrals where these are stored.
+        flip_rows: reverse the rows of every view, before anything else: for a geometry file whose
+            rows run the other way (its own option `flip_rows`).
         every: take the first view and every n-th after it.
         pattern: of the names of the images in a folder, such as "scan_*.tif"; None: all.
         gaps: allow names whose numbers are not in equal steps.
@@ -49,6 +51,7 @@ class Measured:
     rows: Sequence[int] | None = None
     columns: Sequence[int] | None = None
     binning: int | Sequence[int] = 1
+    flip_rows: bool = False
     every: int = 1
     pattern: str | None = None
     gaps: bool = False

@@ -66,7 +66,7 @@ class MeasuredViews:
     def fields(self) -> Fields:
         """Dark field and contrast of the kept pixels in grey values."""
         dark, flat = (
-            self.region.cropped(self._field(name, value))
+            self._kept(self._field(name, value))
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
         return fields(dark, flat, self.options.path, self.options.dead, self.saturation)
@@ -110,7 +110,7 @@ class MeasuredViews:
             raw = self.stack.read(first, last)
         else:
             raw = torch.cat([self.stack.read(k * every, k * every + 1) for k in range(first, last)])
-        raw = self.region.cropped(raw)
+        raw = self._kept(raw)
         if self.kind == "integrals":
             views = self.region.binned(raw)
             return Corrected(views, torch.ones_like(views, dtype=torch.bool))
@@ -159,6 +159,10 @@ class MeasuredViews:
             views[first:last], mask[first:last] = part.views, part.mask
             first, saturated, floored = last, saturated + part.saturated, floored + part.floored
         return Corrected(views, mask, saturated, floored)
+
+    def _kept(self, raw: Tensor) -> Tensor:
+        """The kept rows and columns of pixels on disk, the rows in the cameras' order."""
+        return self.region.cropped(raw.flip(-2) if self.options.flip_rows else raw)
 
     def _field(self, name: str, value: Field) -> Float[Tensor, "v u"]:
         """A field in grey values: a number, the mean of images, or the folder's own."""

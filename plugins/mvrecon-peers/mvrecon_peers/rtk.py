@@ -10,6 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.cameras.detector import detector_centre
+from mvrecon.cameras.formats.rtk_xml import gantry_angles
 from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Paired, load
 from mvrecon_peers.frame import require_between
@@ -23,8 +25,6 @@ SHORT = 1e-6
 #: How many times as long as wide a voxel may be: RTK turns rays in mm, which rounds them in the
 #: finest voxels.
 OBLONG = 1e3
-#: Radians that no ray notices; left in, they make ITK's inverse of a matrix fail.
-TINY = 1e-20
 
 
 def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
@@ -38,7 +38,6 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
         ValueError: detectors that are not rectangular, pixels that differ between views, or
             parallel beams that are not square to their detector.
     """
-    rows, columns = rig.shape
     u, v = (torch.nn.functional.normalize(step, dim=-1) for step in (rig.u, rig.v))
     if (skew := (u * v).sum(-1).abs().max().item()) > 1e-6:
         raise ValueError(
@@ -53,7 +52,7 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
                 f"mm"
             )
     axes = torch.stack([u, v, torch.linalg.cross(u, v)], dim=1)
-    centre = rig.origin + rig.u * (columns - 1) / 2 + rig.v * (rows - 1) / 2
+    centre = detector_centre(rig)
     across, down, depth = (axes * centre[:, None]).sum(dim=-1).unbind(dim=-1)
     x, y, z = (axes * rig.source[:, None]).sum(dim=-1).unbind(dim=-1)
     below = z - depth
@@ -68,7 +67,7 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
             f"RTK takes detectors no nearer to the source than {SHORT:g} of the volume's size, "
             f"got {short / size:.2g}"
         )
-    gantry, out, inner = zip(*map(angles, axes.tolist()), strict=True)
+    gantry, out, inner = zip(*map(gantry_angles, axes.tolist()), strict=True)
     z, below, across, down, x, y = (column.tolist() for column in (z, below, across, down, x, y))
     return list(zip(z, below, gantry, across, down, out, inner, x, y, strict=True))
 
@@ -83,23 +82,6 @@ def require_square(box: Grid, rig: Cameras, normal: Float[Tensor, "m 3"]) -> Non
         raise ValueError(
             f"RTK takes parallel beams square to their detector, got one slanted by {slant:.3g}"
         )
-
-
-def angles(axes: list[list[float]]) -> tuple[float, float, float]:
-    """Gantry, out-of-plane and in-plane angle of axes u, v, n = Rz(-inner) Rx(-out) Ry(-gantry),
-    exact in every pose.
-
-    One camera at a time: what torch computes of many, it rounds by where they stand among them.
-    """
-    (ux, uy, uz), _, (nx, ny, nz) = axes
-    gantry, out = math.atan2(nx, nz), math.atan2(-ny, math.hypot(nx, nz))
-    rx, rz = (
-        math.cos(gantry),
-        -math.sin(gantry),
-    )  # where columns run if the in-plane angle is 0; n x that is for rows
-    inner = math.atan2(ux * ny * rz + uy * (nz * rx - nx * rz) - uz * ny * rx, ux * rx + uz * rz)
-    gantry, out, inner = (0.0 if abs(angle) < TINY else angle for angle in (gantry, out, inner))
-    return gantry, out, inner
 
 
 class Rtk(Paired):

@@ -1,0 +1,161 @@
+"""A scene whose views are made by a projector and a detector."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from mvrecon.acquisition.detector import detected
+from mvrecon.acquisition.settings import Acquisition
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.operator import Projector
+from mvrecon.projectors.pixel_integral import PixelIntegral
+from mvrecon.scenes.analytic import case_numbers, generator, mixed
+from mvrecon.scenes.sample import Placing, Sample, Scene, Thin, finer
+
+#: The series of the detector's random numbers, apart from those that draw the objects.
+NOISE = 0x6E6F6973
+
+
+class Lines(NamedTuple):
+    """Pixels that are weighted line integrals, which the scene makes along the rays of `rig`: the
+    run's own, or its pixels cut into several.
+    """
+
+    rig: Cameras
+    pixel: PixelIntegral
+
+
+class Projection(NamedTuple):
+    """A projector on the finer grid that makes the views, with `rays` of its pixels each way in one
+    of the run's.
+    """
+
+    operator: Projector
+    rays: int
+
+
+class Acquired:
+    """A scene whose views are those of an acquisition, in the projector's unit.
+
+    A projector that says how its pixels are made of line integrals (`pixel_integral`) takes the
+    scene's own; any other is built anew on a finer grid, and sees the object there. Case, truth and
+    name are the scene's. The noise is a function of (seed, index).
+
+    Args:
+        scene: the objects.
+        projector: name and options; None: line integrals.
+        acquisition: the detector.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        projector: Mapping[str, Any] | None = None,
+        acquisition: Acquisition | None = None,
+    ):
+        self.scene, self.projector = scene, None if projector is None else dict(projector)
+        self.acquisition = acquisition or Acquisition()
+        self._source: tuple[Grid, Cameras, Lines | Projection] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_source": None}
+
+    @property
+    def data_range(self) -> float:
+        """The fixed range of values that PSNR and SSIM refer to."""
+        return self.scene.data_range
+
+    @property
+    def unit(self) -> str:
+        """Unit of the volumes' values."""
+        return self.scene.unit
+
+    @property
+    def length(self) -> int | None:
+        """How many cases there are; None: endless."""
+        return self.scene.length
+
+    def thinnest(self, grid: Grid) -> float:
+        """The least width in mm of any body in any case on `grid`; infinite where none is known."""
+        return self.scene.thinnest(grid) if isinstance(self.scene, Thin) else math.inf
+
+    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"] | None:
+        """The affine map in mm that carries points of the file's world to the case's; None where
+        the scene reads no file.
+        """
+        return self.scene.placement(index, seed, grid) if isinstance(self.scene, Placing) else None
+
+    def unit_of_views(self, grid: Grid, cameras: Cameras) -> str:
+        """Unit of the views: that of line integrals, or the projector's own."""
+        source = self._source_of(grid, cameras)
+        if isinstance(source, Lines) and bool((source.pixel.weight == 1).all()):
+            return f"{self.unit} * mm"
+        return f"{(self.projector or {}).get('name')} of {self.unit}"
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Any) -> Sample:
+        """The case `index` of the series `seed`, measured by `cameras`, with its truth on `grid`.
+
+        Raises:
+            ValueError: a projector that takes neither the finer grid nor finer pixels with it.
+        """
+        source = self._source_of(grid, cameras)
+        if isinstance(source, Lines):
+            sample = self.scene.sample(index, seed, grid, source.rig)
+            views = _pooled(sample.views, source.pixel.rays)
+            views = views * source.pixel.weight.to(views)
+        else:
+            sample = self.scene.sample(index, seed, grid, cameras)
+            with case_numbers(seed, index):  # the numbers that drew the sample
+                volume = finer(self.scene, index, seed, grid, cameras, self.acquisition.fine)
+            with torch.no_grad():
+                views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
+        rng = generator(NOISE, mixed(seed, index))
+        return replace(sample, views=detected(views, self.acquisition, cameras, rng))
+
+    def _source_of(self, grid: Grid, cameras: Cameras) -> Lines | Projection:
+        if self._source is None or self._source[0] is not grid or self._source[1] is not cameras:
+            made = source_of(self.projector, grid, cameras, self.acquisition.fine)
+            self._source = (grid, cameras, made)
+        return self._source[2]
+
+
+def source_of(
+    projector: Mapping[str, Any] | None, grid: Grid, cameras: Cameras, fine: int
+) -> Lines | Projection:
+    """What makes the views: line integrals, or the projector on a grid `fine` times finer.
+
+    A projector that refuses the finer grid under the detector's own pixels gets finer pixels, too,
+    which are then averaged.
+
+    Raises:
+        ValueError: the projector refuses this as well.
+    """
+    if projector is None:
+        return Lines(cameras, PixelIntegral.plain())
+    A = PROJECTORS.from_config(projector, grid=grid, cameras=cameras)
+    if (pixel := A.pixel_integral()) is not None:
+        return Lines(cameras if pixel.rays == 1 else cameras.refined(pixel.rays), pixel)
+    refusals = []
+    for rays in (1, fine):
+        rig = cameras if rays == 1 else cameras.refined(rays)
+        try:
+            operator = PROJECTORS.from_config(projector, grid=grid.refined(fine), cameras=rig)
+            return Projection(operator, rays)
+        except ValueError as error:
+            refusals.append(str(error))
+    raise ValueError(
+        f"The projector {projector['name']!r} cannot make views on a grid {fine} times finer "
+        f"(acquisition.fine): {refusals[0]}; nor with pixels {fine} times finer: {refusals[1]}"
+    )
+
+
+def _pooled(views: Float[Tensor, "1 m v u"], rays: int) -> Float[Tensor, "1 m v u"]:
+    return views if rays == 1 else avg_pool2d(views, rays)

@@ -1,0 +1,104 @@
+"""A measured scan: its views on disk, its rig, and the grid that is reconstructed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.field import auto_grid, check_rig_sees
+from mvrecon.cameras.formats.text import flips_rows
+from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.volume_files import read_volume
+from mvrecon.files.checks import check_memory
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, PROJECTORS
+from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
+
+#: Volumes of the grid's size that a reconstruction holds at least, in float32.
+HELD_VOLUMES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Measured views with the geometry that they were measured in.
+
+    Args:
+        measured: views, read from disk when they are asked for.
+        cameras: one for each view.
+        grid: voxels that are reconstructed.
+        projector: name and options of the operator.
+    """
+
+    measured: MeasuredViews
+    cameras: Cameras
+    grid: Grid
+    projector: Mapping[str, Any]
+
+    def operator(self, views: slice = slice(None)) -> Projector:
+        """The operator of all views, or of some that follow one another."""
+        cameras = self.cameras[views]
+        return PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
+
+    def posed(self, device: str) -> tuple[LinearOperator, Float[Tensor, "1 1 m v u"]]:
+        """Operator and views without the pixels that were not measured: their rows are zero."""
+        whole = self.measured.whole()
+        A = self.operator().to(device)
+        views, mask = whole.views[None, None].to(device), whole.mask.to(device)
+        if mask.all():
+            return A, views
+        return Scaled(A, pixels=mask.to(views)), views * mask
+
+
+def open_scan(settings: Mapping[str, Any]) -> Scan:
+    """The scan that the settings `views`, `camera`, `grid` and `projector` describe.
+
+    Args:
+        settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
+            counts them from the other end (`flip_rows`); a camera's detector without pixels has
+            those of the views on disk; `grid` has size, spacing and centre, or like; without any of them it
+            is `auto_grid`'s.
+
+    Raises:
+        ValueError: another number of cameras than of views, a rig that does not see the grid, a
+            grid that does not fit into memory; what the parts raise.
+    """
+    flipped = settings["views"]["flip_rows"] or flips_rows(settings["camera"])
+    views = {**settings["views"], "flip_rows": flipped}
+    measured = Measured(**views).open()
+    rig = CAMERAS.from_config(_with_pixels(settings["camera"], measured.stack.shape))
+    cameras = measured.cameras(rig)
+    grid = _grid(settings["grid"], cameras)
+    check_rig_sees(cameras, grid)
+    size = 4 * HELD_VOLUMES * torch.tensor(grid.shape).prod().item()
+    check_memory(size, f"A reconstruction of {grid.shape} voxels")
+    return Scan(measured, cameras, grid, settings["projector"])
+
+
+def _with_pixels(camera: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Any]:
+    """A camera's settings with the number of pixels of the views, where `pixels` is null."""
+    filled = {**camera}
+    if isinstance(detector := camera.get("detector"), Mapping):
+        filled["detector"] = _with_pixels(detector, shape)
+    if camera.get("pixels", shape) is None:
+        filled["pixels"] = list(shape)
+    return filled
+
+
+def _grid(options: Mapping[str, Any], cameras: Cameras) -> Grid:
+    if (like := options["like"]) is not None:
+        if options["size"] is not None or options["spacing"] is not None:
+            raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")
+        return read_volume(like)[1]
+    if options["size"] is None and options["spacing"] is None:
+        return auto_grid(cameras)
+    if options["size"] is None or options["spacing"] is None:
+        raise ValueError(
+            f"Expected grid.size (voxels) and grid.spacing (mm) together, got size "
+            f"{options['size']} and spacing {options['spacing']}"
+        )
+    return Grid.centred(size=options["size"], spacing=options["spacing"], centre=options["centre"])

@@ -1,0 +1,106 @@
+"""A scene behind a detector: the shipped scenes' views to the last bit, and noise that depends on
+the case alone.
+"""
+
+import pickle
+
+import pytest
+import torch
+
+from mvrecon.acquisition.acquired import Acquired
+from mvrecon.acquisition.settings import Acquisition
+from mvrecon.config import compose
+from mvrecon.data.dataset import SceneDataset
+from mvrecon.data.hdf5 import write_volumes
+from mvrecon.data.volumes import Hdf5Volumes
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, PROJECTORS, SCENES
+from mvrecon.projectors.drr import Drr
+from mvrecon.scenes.analytic import generator, render
+from mvrecon.scenes.sample import finer
+from tests.data.conftest import stored
+
+GRID = Grid.centred((12, 12, 12), 10.0)
+NAMES = ["ellipsoids", "derenzo", "ventricle", "shepp_logan", "quickstart"]
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    detector = {"pixels": [12, 16], "pixel_mm": 20.0}
+    return CAMERAS.build("circular", n_views=3, sid=400.0, sdd=800.0, detector=detector)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_drr_and_a_perfect_detector_have_the_scene_s_views_to_the_last_bit(name, cameras):
+    settings = compose(f"scene={name}")
+    scene = SCENES.from_config(settings["scene"])
+    acquisition = Acquisition.of(settings["acquisition"])
+    ours = Acquired(scene, settings["projector"], acquisition).sample(0, 3, GRID, cameras)
+    plain = scene.sample(0, 3, GRID, cameras)
+    for key in ("views", "volume", "inside"):
+        assert torch.equal(getattr(ours, key), getattr(plain, key))
+    if name in ("ellipsoids", "derenzo"):
+        stored = render(scene.phantom(generator(3, 0), GRID), GRID, cameras, "stored")
+        assert torch.equal(ours.views, stored.views) and torch.equal(ours.volume, stored.volume)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_finer_object_is_the_truth_s(name, cameras):
+    """Its mean over the voxels of the grid is the truth, which twice as fine a grid has to the
+    rounding: the same points.
+    """
+    scene = SCENES.from_config(compose(f"scene={name}")["scene"])
+    truth = scene.sample(0, 3, GRID, cameras).volume
+    fine = finer(scene, 0, 3, GRID, cameras, 2)
+    assert torch.allclose(torch.nn.functional.avg_pool3d(fine, 2), truth, atol=1e-5)
+
+
+def test_noise_is_a_function_of_seed_and_index(cameras):
+    scene = SCENES.build("ellipsoids", value=0.02)
+    noisy = Acquired(scene, {"name": "drr"}, Acquisition(photons=1e4))
+    first = noisy.sample(1, 0, GRID, cameras).views
+    torch.manual_seed(7)
+    noisy.sample(2, 0, GRID, cameras)
+    again = pickle.loads(pickle.dumps(noisy)).sample(1, 0, GRID, cameras).views
+    assert torch.equal(first, again)
+    exact = scene.sample(1, 0, GRID, cameras).views
+    other = Acquired(scene, {"name": "drr"}, Acquisition(photons=1e4, blur_mm=1e-6))
+    assert torch.allclose(first, other.sample(1, 0, GRID, cameras).views, atol=0.05)
+    noises = [first - exact, noisy.sample(1, 9, GRID, cameras).views - exact]
+    assert 1e-3 < float(noises[0].std()) < 0.1 and not torch.equal(*noises)
+
+
+class Forgetful:
+    """A scene of a plugin: no method for finer grids, and a value from the global numbers."""
+
+    data_range, unit, length = 1.0, "1/mm", None
+
+    def sample(self, index, seed, grid, rig):
+        value = float(torch.rand(()))
+        return SCENES.build("ellipsoids", value=value).sample(index, seed, grid, rig)
+
+
+class Silent(Drr):
+    """A projector that does not say that it integrates along lines."""
+
+    def forward(self, volume):
+        return super().forward(volume)
+
+
+def test_a_scene_that_draws_from_the_global_numbers_shows_one_object_on_both_grids(
+    cameras, monkeypatch
+):
+    monkeypatch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts, "silent": Silent})
+    scene = Acquired(Forgetful(), {"name": "silent"})
+    case = SceneDataset(scene, GRID, cameras, [1], seed=4, cache=False)[0]
+    again = Drr(GRID, cameras)(case["volume"][None])[0]
+    assert float(again.sum()) == pytest.approx(float(case["views"].sum()), rel=0.02)
+
+
+def test_a_case_of_a_file_is_finer_where_its_truth_is(tmp_path, cameras):
+    write_volumes(tmp_path / "heads.h5", stored(2))
+    scene, grid = Hdf5Volumes(path=str(tmp_path / "heads.h5")), Grid.centred((8, 8, 8), 6.0)
+    truth = scene.sample(1, 0, grid, cameras).volume
+    for factor in (2, 3):
+        fine = torch.nn.functional.avg_pool3d(finer(scene, 1, 0, grid, cameras, factor), factor)
+        assert torch.allclose(fine, truth, atol=1e-6)

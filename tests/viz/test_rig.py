@@ -1,0 +1,43 @@
+"""The picture of a rig shows its parts where they are."""
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.grid import Grid
+from mvrecon.viz.rig import BOX, EDGE, FIRST, STRIP, U, V, picture, save_picture
+
+PLATE = {"pixels": [40, 60], "pixel_mm": 4.0}
+
+
+def middle(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """The mean column and row of a colour, from the panel's middle, rows upwards."""
+    rows, columns = np.nonzero((image == colour).all(axis=-1))
+    return np.array([columns.mean() - EDGE / 2, EDGE / 2 + STRIP - rows.mean()])
+
+
+def test_the_first_view_is_where_it_is():
+    """Of a camera at (sid, 0, 0): its columns run along +y and its rows downwards."""
+    image = picture(circular(4, 400.0, 800.0, PLATE), Grid.centred(32, spacing=4.0))
+    above, side, front = (image[:, EDGE * k : EDGE * (k + 1)] for k in range(3))
+    assert middle(above, U)[0] < -100 and abs(middle(front, V)[1]) < 40
+    assert middle(front, V)[0] < middle(front, U)[0]  # v starts at the first column, u leads on
+    assert middle(front, U)[1] > middle(front, V)[1]  # the first row is the upper one
+    for panel in (above, side, front):
+        assert np.abs(middle(panel, BOX)).max() < 3
+
+
+def test_a_flipped_sign_changes_the_picture():
+    rig = circular(4, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, 30.0]})
+    other = circular(4, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, -30.0]})
+    assert (picture(rig) != picture(other)).any(axis=-1).mean() > 0.001
+
+
+@pytest.mark.parametrize("rig", [parallel(50, PLATE), circular(1, 400.0, 800.0, PLATE)])
+def test_any_rig_has_a_picture_in_a_file(rig, tmp_path):
+    from PIL import Image
+
+    save_picture(tmp_path / "rig.png", rig.moved(torch.eye(3), torch.tensor([1e4, 0.0, 0.0])))
+    image = np.asarray(Image.open(tmp_path / "rig.png"))
+    assert (image == FIRST).all(axis=-1).sum() > 50
