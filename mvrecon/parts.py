@@ -77,6 +77,7 @@ MODELS = Registry(
     primal_dual="mvrecon.models.sparse_view.primal_dual:PrimalDual",
     backprojection="mvrecon.models.baselines:Backprojection",
     sirt="mvrecon.models.baselines:Sirt",
+    classical="mvrecon.models.classical:Classical",
 )
 
 REGISTRIES = {

@@ -151,6 +151,10 @@ class Registry:
         Raises:
             TypeError: an option that the part does not have; the message names the nearest.
         """
+        return self._accepting(name, options)(*args, **options)
+
+    def _accepting(self, name: str, options: Iterable[str]) -> Callable[..., Any]:
+        """One part, if it has these options."""
         part = self.get(name)
         parameters = inspect.signature(part).parameters
         if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
@@ -160,17 +164,30 @@ class Registry:
                         f"The {self.kind} {name!r} has no option "
                         f"{option!r}{hint(option, parameters)}"
                     )
-        return part(*args, **options)
+        return part
+
+    def check(self, config: Mapping[str, Any]) -> None:
+        """Check the mapping of `from_config` without building the part.
+
+        Raises:
+            LookupError: the name is unknown.
+            TypeError: no name, or an option that the part does not have.
+        """
+        self._accepting(*self._split(config))
 
     def from_config(self, config: Mapping[str, Any], *args: Any, **keywords: Any) -> Any:
         """Construct the part that a mapping `{"name": ..., **options}` describes."""
+        name, options = self._split(config)
+        return self.build(name, *args, **keywords, **options)
+
+    def _split(self, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+        """The name and the options of a part's mapping."""
         if "name" not in config:
             raise TypeError(
                 f"A {self.kind} needs a 'name', got only {sorted(config)}. Known: "
                 f"{', '.join(self.names())}"
             )
-        options = {key: value for key, value in config.items() if key != "name"}
-        return self.build(config["name"], *args, **keywords, **options)
+        return config["name"], {key: value for key, value in config.items() if key != "name"}
 
 
 def _where(part: Any) -> str:

@@ -108,6 +108,15 @@ def test_a_network_s_file_says_every_option(name: str):
     }
 
 
+def test_a_reconstructor_is_chosen_on_the_command_line_with_its_own_options_alone():
+    files = sorted((conf_dir() / "reconstructor").glob("*.yaml"))
+    assert files
+    for file in files:
+        choice = f"+reconstructor@model.reconstructor={file.stem}"
+        node = compose("model=classical", choice)["model"]["reconstructor"]
+        assert node == yaml.safe_load(file.read_text())
+
+
 @pytest.fixture
 def user_conf(tmp_path: Path):
     """A user's own experiment beside ours, as `--config-dir` finds it."""

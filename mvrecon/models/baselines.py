@@ -11,7 +11,9 @@ from torch import Tensor, nn
 
 from mvrecon.models.consistency import (
     Consistency,
+    Start,
     anything,
+    checked_start,
     content_scale,
     normalised,
     typical_chord,
@@ -25,7 +27,7 @@ from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.iterative import correction, sirt, sirt_weights
+from mvrecon.reconstruct.iterative import SirtWeights, correction, sirt, sirt_weights
 
 
 class MeanFusion(CrossView):
@@ -43,7 +45,7 @@ class MeanFusion(CrossView):
         projector: Projector,
         head: Mapping[str, Any],
         opinion: Mapping[str, Any] | None = None,
-        start: int = 12,
+        start: Start = 12,
         consistency: int = 3,
         **options: Any,
     ):
@@ -67,7 +69,8 @@ class BackprojectionUNet(nn.Module):
     Args:
         projector: holds the grid and the rig.
         width: channels of the finest level, where the options name no network.
-        start: SIRT iterations of the classical start.
+        start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
+            ..., **options}`.
         consistency: learned gradient steps towards the data at the end.
         options: of `Options`: what is left out (support, masked, ...), nothing by default, and the
             network.
@@ -80,7 +83,7 @@ class BackprojectionUNet(nn.Module):
         self,
         projector: Projector,
         width: int = 18,
-        start: int = 12,
+        start: Start = 12,
         consistency: int = 3,
         **options: Any,
     ):
@@ -88,7 +91,7 @@ class BackprojectionUNet(nn.Module):
         self.options = Options.of(type(self), options)
         _refuse_where(self.options)
         self.cropping = Cropping(projector, self.options)
-        self.iterations = start
+        self.start = checked_start(start)
         self.net = network_by_name(self.options.network, 3, 1, width, zero=1)
         self.consistency = Consistency(consistency)
 
@@ -98,7 +101,7 @@ class BackprojectionUNet(nn.Module):
 
     def reconstruct(self, views: Float[Tensor, "b 1 m v u"], geometry: Geometry) -> Reconstruction:
         """The volume on a geometry: the whole grid's, or a crop's."""
-        y, x0, scale = normalised(geometry, views, self.iterations)
+        y, x0, scale = normalised(geometry, views, self.start)
         evidence = torch.cat([x0, geometry.back(y), geometry.residual(x0, y)], dim=1)
         volume = x0 + geometry.within(self.net(evidence, geometry.network_mask))
         sigma = None if self.options.sigma is None else self.options.sigma / scale
@@ -184,4 +187,5 @@ class Backprojection(nn.Module):
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         check_views(views, self.projector.cameras)
-        return Reconstruction(correction(self.projector, views, (self.row, self.column)))
+        weights = SirtWeights(self.row, self.column)
+        return Reconstruction(correction(self.projector, views, weights))

@@ -2,12 +2,16 @@
 data-consistency steps.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.geometry import Geometry
+from mvrecon.parts import RECONSTRUCTORS
 from mvrecon.reconstruct.iterative import sirt
 
 
@@ -51,21 +55,58 @@ class Consistency(nn.Module):
         return volume
 
 
+#: Iterations of SIRT with momentum, or a reconstructor as a mapping: its name and options.
+Start = int | Mapping[str, Any]
+
+
+def checked_start(start: Start) -> Start:
+    """The start of a model, of a reconstructor that there is.
+
+    Raises:
+        LookupError: an unknown name.
+        TypeError: an option that the reconstructor does not have, or a mapping without a name.
+    """
+    if isinstance(start, Mapping):
+        RECONSTRUCTORS.check(start)
+    return start
+
+
 def normalised(
-    geometry: Geometry, views: Float[Tensor, "b 1 m v u"], iterations: int
+    geometry: Geometry, views: Float[Tensor, "b 1 m v u"], start: Start
 ) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
     """Views and their classical start, both divided by the content's scale, and that
     scale.
 
-    The start is SIRT with momentum from zero, non-negative, not differentiated. The scale of views
-    of nothing is zero.
+    The start is SIRT with momentum from zero, non-negative, or another reconstructor; it is not
+    differentiated. The scale of views of nothing is zero.
     """
     with torch.no_grad():
-        start = sirt(
-            geometry.A, views, iterations, weights=(geometry.row, geometry.column), momentum=True
-        )
-    scale = content_scale(start)
-    return views / scale, start / scale, scale * anything(views)
+        if isinstance(start, Mapping):
+            x = _reconstructed(geometry, views, start)
+        else:
+            x = sirt(geometry.A, views, start, weights=geometry.weights, momentum=True)
+    scale = content_scale(x)
+    return views / scale, x / scale, scale * anything(views)
+
+
+def _reconstructed(
+    geometry: Geometry, views: Float[Tensor, "b 1 m v u"], start: Mapping[str, Any]
+) -> Float[Tensor, "b 1 d h w"]:
+    """The volume of a reconstructor within each sample's mask.
+
+    Its views are scaled to a mean density of the rays of about one before, so that a weight of its
+    options is relative to the content.
+    """
+    level = content_scale(views) / typical_chord(geometry.A.grid)
+    y, mask = views / level, geometry.mask
+    if mask is None:
+        return RECONSTRUCTORS.from_config(start, geometry.A, y) * level
+    samples = zip(y.split(1), mask[:, 0], strict=True)
+    volumes = [
+        RECONSTRUCTORS.from_config(start, geometry.A, own, support=support)
+        for own, support in samples
+    ]
+    return torch.cat(volumes) * level
 
 
 def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:

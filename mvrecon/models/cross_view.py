@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, normalised
+from mvrecon.models.consistency import Consistency, Start, checked_start, normalised
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
@@ -34,9 +34,10 @@ class CrossView(nn.Module):
         head: the head's name and options.
         opinion: fields of `DepthNetwork` (width, features, binning, shared, prior, network).
         fusion: "weighted" by a U-Net, or the plain "mean" over the cameras that see a voxel.
-        refine: channels of the U-Net that corrects the fused volume, 0 for no correction: a
-            weighted mean cannot create what no camera holds.
-        start: SIRT iterations of the classical start.
+        refine: channels of the U-Net that corrects the fused volume, 0 for none: a weighted mean
+            cannot create what no camera holds.
+        start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
+            ..., **options}`.
         consistency: learned gradient steps towards the data at the end.
         options: of `Options`: what is left out (support, masked, ...), nothing by default, and the
             network that corrects the fused volume.
@@ -54,7 +55,7 @@ class CrossView(nn.Module):
         opinion: Mapping[str, Any] | None = None,
         fusion: Literal["weighted", "mean"] = "weighted",
         refine: int = 16,
-        start: int = 12,
+        start: Start = 12,
         consistency: int = 3,
         **options: Any,
     ):
@@ -62,7 +63,7 @@ class CrossView(nn.Module):
         if fusion not in ("weighted", "mean"):
             raise ValueError(f"fusion must be 'weighted' or 'mean', got {fusion!r}")
         self.options = Options.of(type(self), options)
-        self.iterations = start
+        self.start = checked_start(start)
         self.opinions = Opinions(projector, head, DepthNetwork(**(opinion or {})))
         self.cropping = Cropping(projector, self.options, self.opinions.binning)
         self.weighting = Weighting(5) if fusion == "weighted" else None
@@ -85,7 +86,7 @@ class CrossView(nn.Module):
 
     def reconstruct(self, views: Float[Tensor, "b 1 m v u"], geometry: Geometry) -> Reconstruction:
         """The volume and the opinions on a geometry: the whole grid's, or a crop's."""
-        y, x0, scale = normalised(geometry, views, self.iterations)
+        y, x0, scale = normalised(geometry, views, self.start)
         expected = geometry.A(x0)
         opinions, features = self.opinions(geometry, y, x0, y - expected)
         cross_views = geometry.A(opinions[:, :, 0])  # each opinion as every camera would see it

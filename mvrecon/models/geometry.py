@@ -16,7 +16,12 @@ from torch.nn.functional import adaptive_max_pool3d
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.networks import MULTIPLE
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.iterative import correction, inverse_sums, sirt_weights
+from mvrecon.reconstruct.iterative import (
+    SirtWeights,
+    correction,
+    inverse_sums,
+    sirt_weights,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +79,14 @@ class Geometry:
         visible = self.fine.visible
         return visible if self.mask is None else visible & self.mask[:, None]
 
+    @property
+    def weights(self) -> SirtWeights:
+        """R and C of SIRT."""
+        return SirtWeights(self.row, self.column)
+
     def back(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """Residual views as a correction of the volume, C A^T R r."""
-        return correction(self.A, residual, (self.row, self.column))
+        return correction(self.A, residual, self.weights)
 
     def residual(
         self, volume: Float[Tensor, "b c d h w"], views: Float[Tensor, "b c m v u"]

@@ -97,13 +97,13 @@ def ordered_subsets(count: int, subsets: int) -> list[range]:
 def distant_order(count: int) -> list[int]:
     """An order of `count` ordered subsets in which one is far from those just before it.
 
-    Steps of the golden section of their number (Kohler, IEEE Nucl. Sci. Symp. 2004), made coprime
-    to it, so that every subset comes once.
+    The ranks of the multiples of the golden section of a turn (Kohler, IEEE Nucl. Sci. Symp. 2004).
     """
-    golden = count * (math.sqrt(5) - 1) / 2
-    coprime = [step for step in range(1, count + 1) if math.gcd(step, count) == 1]
-    step = min(coprime, key=lambda n: abs(n - golden))
-    return [number * step % count for number in range(count)]
+    golden = (math.sqrt(5) - 1) / 2
+    order = [0] * count
+    for rank, number in enumerate(sorted(range(count), key=lambda n: n * golden % 1)):
+        order[number] = rank
+    return order
 
 
 def usual_subsets(count: int) -> int:

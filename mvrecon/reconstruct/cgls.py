@@ -85,8 +85,10 @@ def conjugate_gradients(
         q = A(p)
         curvature = norms(q if root is None else root * q).square()
         if penalty is not None:
-            curvature = curvature + (p * penalty(p)).flatten(2).sum(dim=2)[..., None, None, None]
-        step = torch.where(active, size.square() / torch.where(active, curvature, 1), 0)
+            curvature = curvature + _products(p, penalty(p))
+        # <s, p> is |s|^2 up to rounding, and with it no step goes up, however many are taken
+        moves = active & (curvature > 0)
+        step = torch.where(moves, _products(s, p) / torch.where(moves, curvature, 1), 0)
         x, r = torch.addcmul(x, step, p), torch.addcmul(r, step, q, value=-1)
         if watch.ends(number, x, lambda: r):  # noqa: B023
             break
@@ -95,6 +97,10 @@ def conjugate_gradients(
         ratio = torch.where(active, (size / torch.where(active, last, 1)).square(), 0)
         p = torch.addcmul(s, ratio, p)
     return x
+
+
+def _products(one: Float[Tensor, "b c *n"], other: Float[Tensor, "b c *n"]) -> Tensor:
+    return (one * other).flatten(2).sum(dim=2)[..., None, None, None]
 
 
 def norms(tensor: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c 1 1 1"]:

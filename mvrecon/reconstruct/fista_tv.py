@@ -38,20 +38,19 @@ def fista_tv(
     """Total variation regularisation, min |y - A x|^2_R / (2 c) + weight sum |D x|, in the unit of
     the volume, by FISTA.
 
-    The data term is that of `WeightedFit`, about half the squared error summed over voxels, and D
-    is the gradient per mm. So the weight depends neither on the number of views nor on pixels, and
-    little on voxels; a multiple of the views with the same multiple of the weight gives that
-    multiple of the volume. Under complete views a ball of radius r loses up to 3 weight / r of its
-    value, a disk 2 weight / r (Strong and Chan, Inverse Probl. 19, 2003). The proximal map starts
-    where the last one ended (Beck and Teboulle, SIAM J. Imaging Sci. 2, 2009, and IEEE Trans. Image
-    Process. 18, 2009).
+    The data term is that of `WeightedFit`, and D is the gradient per mm. So a weight does not
+    depend on the number of views, pixels or voxels; a multiple of the views with the same multiple
+    of the weight gives that multiple of the volume. The proximal map starts where the last one
+    ended, and the momentum is restarted where a step turns back (Beck and Teboulle, SIAM J. Imaging
+    Sci. 2, 2009, and IEEE Trans. Image Process. 18, 2009).
 
     Args:
         A: the operator.
         views: measured integrals.
         iterations: how many.
         weight: of the total variation, in (unit of the volume) mm.
-        inner: gradient steps of each proximal map.
+        inner: gradient steps of each proximal map; a weight that smooths strongly needs 10 to 20
+            for the exact minimum.
         preconditioned: steps of SIRT's lengths, the inverse column sums; else one length for all
             voxels, the inverse of the squared norm by the power method. The minimum is the same.
         nonnegative: only volumes without negative values.
@@ -81,7 +80,7 @@ def fista_tv(
         volume, dual = tv_proximal(volume, shrinkage, dual, inner)
         return volume
 
-    return descend(problem, step, proximal, iterations)
+    return descend(problem, step, proximal, iterations, "restarted")
 
 
 @torch.no_grad()

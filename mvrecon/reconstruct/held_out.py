@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.views import check_finite
+from mvrecon.geometry.box import Box
 from mvrecon.projectors.operator import LinearOperator
-from mvrecon.projectors.selection import ViewSelection
 from mvrecon.reconstruct.problem import Iterate
 
 #: A reconstructor: operator, views and options to a volume.
@@ -71,7 +71,8 @@ def held_out(
         options: of the method; its `iterations` are the most that are tried.
 
     Raises:
-        ValueError: fewer than two views, `every` below 2, no weight; views that are not finite.
+        ValueError: fewer than two views, `every` below 2, no weight; views that are not finite; no
+            iteration, as for views of zero.
     """
     count, fixed = A.range_shape[0], dict(options or {})
     if count < 2 or every < 2 or (weights is not None and not len(weights)):
@@ -82,10 +83,11 @@ def held_out(
     check_finite(views)
     judges = list(range(min(every // 2, count - 1), count, every))
     rest = [view for view in range(count) if view not in set(judges)]
-    left_out, taken = (ViewSelection(A.range_shape, chosen) for chosen in (judges, rest))
-    jury, trials = _Jury(A.subset(left_out), left_out(views), patience), []
+    grid = Box.whole(A.domain_shape)  # a crop, unlike a subset, knows its voxels' size
+    jury, trials = _Jury(A.cropped(grid, judges), views[:, :, judges], patience), []
+    taken, explained = A.cropped(grid, rest), views[:, :, rest]
     for weight in [None] if weights is None else weights:
-        run = partial(method, A.subset(taken), taken(views), **_with(fixed, weight))
+        run = partial(method, taken, explained, **_with(fixed, weight))
         trials.append(Trial(weight, jury.errors(run)))
     best = min(trials, key=lambda trial: min(trial.errors))
     iterations = 1 + best.errors.index(min(best.errors))
@@ -109,6 +111,8 @@ class _Jury(NamedTuple):
             return len(errors) - 1 - errors.index(min(errors)) >= self.patience
 
         run(monitor=judge)
+        if not errors:
+            raise ValueError("Expected a method that iterates, got one that ended before it began")
         return errors
 
 

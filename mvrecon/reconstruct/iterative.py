@@ -96,4 +96,4 @@ def sirt(
     def proximal(volume: Tensor) -> Tensor:
         return volume.clamp_min(0) if nonnegative else volume
 
-    return descend(problem, step, proximal, iterations, momentum)
+    return descend(problem, step, proximal, iterations, "nesterov" if momentum else "none")

@@ -12,7 +12,7 @@ from torch import Tensor
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
 from mvrecon.reconstruct.poisson import PoissonLikelihood
-from mvrecon.reconstruct.problem import Common, Watch, supported
+from mvrecon.reconstruct.problem import Common, Watch, check_start, supported
 
 
 def mlem(
@@ -53,7 +53,9 @@ def mlem(
             negative somewhere or not finite, a number of subsets that is below one or above that of
             the cameras.
     """
-    A = supported(mlem, A, common)
+    A, start = supported(mlem, A, common), common.get("start")
+    if start is not None:
+        check_start(A, start, counts)
     dealt = ordered_subsets(A.range_shape[0], subsets)
     with torch.no_grad():
         parts = [
@@ -61,7 +63,7 @@ def mlem(
             for subset in distant_order(subsets)
         ]
         sums = [part.sensitivity(parts[0].counts.dtype) for part in parts]
-        x, watch = _admitted(parts, sums, common.get("start")), Watch(common.get("monitor"))
+        x, watch = _admitted(parts, sums, start), Watch(common.get("monitor"))
         for number in range(1, iterations + 1):
             for part, s in zip(parts, sums, strict=True):
                 # a voxel that these views do not see, though others do, is left to the others
@@ -100,10 +102,8 @@ def _admitted(
     """The start, which must allow every count."""
     every = torch.stack(sums).sum(dim=0)
     x = _uniform(parts, every) if start is None else start
-    if bool((~(x >= 0) | ~x.isfinite()).any()):
-        raise ValueError(
-            "MLEM starts from a volume that is finite and nowhere negative, got another"
-        )
+    if (x < 0).any():
+        raise ValueError("MLEM starts from a volume that is nowhere negative, got another")
     # 0 / 0 is 0: no counts can come from a voxel that no ray passes
     x = x * (every > 0)
     for part in parts:

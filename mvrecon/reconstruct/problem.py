@@ -81,13 +81,7 @@ def posed(
     if start is None:
         start = views.new_zeros(*views.shape[:2], *A.domain_shape)
     else:
-        _check(start, "start", A.domain_shape, A.device)
-        if start.shape[:2] != views.shape[:2] or not start.isfinite().all():
-            raise ValueError(
-                f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
-                f"{tuple(start.shape)} with {int((~start.isfinite()).sum())} values that are not "
-                f"finite"
-            )
+        check_start(A, start, views)
         start = start.to(views.dtype)
     if support is not None:
         start = start * support.to(start.device)
@@ -102,12 +96,10 @@ def supported(method: Callable[..., Tensor], A: LinearOperator, options: Common)
         ValueError: a support that is no mask of the volume's shape.
     """
     parameters = inspect.signature(method).parameters.values()
-    known = {p.name for p in parameters if p.kind is not p.VAR_KEYWORD} | set(
-        Common.__annotations__
-    )
-    for option in options:
-        if option not in Common.__annotations__:
-            raise TypeError(f"{method.__name__} has no option {option!r}{hint(option, known)}")
+    own, common = {p.name for p in parameters}, Common.__annotations__
+    for option in set(options) - set(common):
+        known = (own - {"common"}) | set(common)
+        raise TypeError(f"{method.__name__} has no option {option!r}{hint(option, known)}")
     support = options.get("support")
     if support is None:
         return A
@@ -115,6 +107,20 @@ def supported(method: Callable[..., Tensor], A: LinearOperator, options: Common)
         got = f"{support.dtype} {tuple(support.shape)}"
         raise ValueError(f"Expected a support, a mask of {tuple(A.domain_shape)}, got {got}")
     return A.with_support(support)
+
+
+def check_start(A: LinearOperator, start: Tensor, views: Tensor) -> None:
+    """Refuse a first volume that does not belong to the operator and the views.
+
+    Raises:
+        ValueError: another shape, batch or device, or values that are not finite.
+    """
+    _check(start, "start", A.domain_shape, A.device)
+    if start.shape[:2] != views.shape[:2] or not start.isfinite().all():
+        raise ValueError(
+            f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
+            f"{tuple(start.shape)} with {int((~start.isfinite()).sum())} values that are not finite"
+        )
 
 
 class Watch:
@@ -129,7 +135,7 @@ class Watch:
         self.residual: Tensor | None = None
 
     def ends(
-        self, number: int, volume: Tensor, residual: Callable[[], Tensor], beta: float = 0.0
+        self, number: int, volume: Tensor, residual: Callable[[], Tensor], beta: float | Tensor = 0
     ) -> bool:
         """Whether the method ends with iterate `number`.
 
@@ -142,7 +148,7 @@ class Watch:
         if self.monitor is None:
             return False
         own = residual()
-        if beta and self.residual is not None:
+        if self.residual is not None:
             own = (own + beta * self.residual) / (1 + beta)
         self.residual = own
         return number > 0 and bool(self.monitor(Iterate(number, volume, own)))

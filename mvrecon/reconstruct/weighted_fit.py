@@ -1,4 +1,4 @@
-"""The data term that the penalised methods share, so that a weight means the same in all of them."""
+"""The data term of the penalised methods, one for all, so that a weight means the same in them."""
 
 from typing import NamedTuple
 
@@ -15,8 +15,9 @@ class WeightedFit(NamedTuple):
     voxels.
 
     R are the inverse row sums of A, as in SIRT, and c is the mean column sum of the voxels that a
-    ray meets. So it is about half the squared error of the volume, summed over its voxels, whatever
-    the number of views, pixels and voxels: a penalty's weight means the same on every rig.
+    ray meets. For a change of all voxels alike it is half the square of that change, summed over
+    voxels, and the less the finer a change is; whatever the number of views, pixels and voxels, so
+    that a penalty's weight means the same on every rig.
 
     Args:
         weights: R and C of `sirt_weights`.

@@ -1,0 +1,85 @@
+"""What the tests of the reconstructors share: operators, and what each method promises."""
+
+from typing import Any, NamedTuple
+
+import torch
+
+from mvrecon.cameras.rigs import circular
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import PROJECTORS, RECONSTRUCTORS
+from mvrecon.projectors.operator import LinearOperator
+
+GRID = Grid.centred(size=(8, 7, 6), spacing=2.0)
+RIG = circular(9, 60.0, 100.0, {"pixels": [9, 11], "pixel_mm": 2.5}, start_degrees=5.0)
+
+
+class Dense(LinearOperator):
+    """A matrix without negative entries, which knows neither grid nor cameras."""
+
+    domain_shape, range_shape = (4, 5, 6), (6, 5, 7)
+
+    def __init__(self) -> None:
+        random = torch.Generator().manual_seed(3)
+        self.matrix = torch.rand(210, 120, dtype=torch.float64, generator=random)
+        self.matrix[torch.rand(210, 120, generator=random) < 0.8] = 0
+
+    def forward(self, x):
+        return (x.flatten(2) @ self.matrix.T.to(x)).unflatten(2, self.range_shape)
+
+    def adjoint(self, y):
+        return (y.flatten(2) @ self.matrix.to(y)).unflatten(2, self.domain_shape)
+
+
+def projector():
+    return PROJECTORS.build("drr", grid=GRID, cameras=RIG)
+
+
+class Promise(NamedTuple):
+    """What a method promises.
+
+    Args:
+        options: for a quick run on the small operators.
+        linear: the volume is linear in the views, with these further options.
+        rate: the residual of consistent views after the run, relative to the views.
+        penalised: has a weight, in the unit of the volume.
+    """
+
+    options: dict[str, Any]
+    linear: dict[str, Any] | None = None
+    rate: float = 1e-2
+    penalised: bool = False
+
+
+PROMISES = {
+    "sirt": Promise({"iterations": 100, "momentum": True}, {"nonnegative": False}),
+    "os_sart": Promise({"iterations": 100}, {"nonnegative": False}),
+    "cgls": Promise({"iterations": 40}, {}, 1e-3),
+    "tikhonov": Promise({"iterations": 40, "weight": 1e-4}, {"weight": 0.1}),
+    "fista_tv": Promise({"iterations": 100, "weight": 1e-6}, penalised=True),
+    "pdhg_tv": Promise({"iterations": 200, "weight": 1e-6}, penalised=True),
+    "mlem": Promise({"iterations": 100}, rate=2e-2),
+    "osem": Promise({"iterations": 30}, rate=2e-2),
+}
+#: Methods that need a rig of a certain kind, and have tests of their own.
+GEOMETRIC = {"fbp", "fdk"}
+NAMES = [
+    name
+    for name in RECONSTRUCTORS.names()
+    if RECONSTRUCTORS.origin(name).startswith("mvrecon.") and name not in GEOMETRIC
+]
+
+
+def run(name: str, A, views, **options):
+    """A registered method with the options of its promise."""
+    return RECONSTRUCTORS.build(name, A, views, **{**PROMISES[name].options, **options})
+
+
+def truth(A, batch: int = 1, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    """Random volumes."""
+    random = torch.Generator().manual_seed(1)
+    return torch.rand(batch, 1, *A.domain_shape, dtype=dtype, generator=random)
+
+
+def gap(one, other) -> float:
+    """The relative difference."""
+    return ((one - other).norm() / other.norm()).item()

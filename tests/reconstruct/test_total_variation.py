@@ -1,0 +1,145 @@
+"""Total variation: its gradient, its proximal map, and the two methods that minimise it."""
+
+import pytest
+import torch
+
+from mvrecon.cameras.rigs import circular
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import PROJECTORS
+from mvrecon.reconstruct.fista_tv import fista_tv, tv_objective
+from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstruct.pdhg_tv import pdhg_tv
+from mvrecon.reconstruct.power import power_norm
+from mvrecon.reconstruct.total_variation import (
+    Shrinkage,
+    gradient,
+    gradient_adjoint,
+    total_variation,
+    tv_proximal,
+)
+from mvrecon.reconstruct.weighted_fit import WeightedFit
+from tests.reconstruct.methods import Dense, gap
+
+STEPS = (1.5, 2.0, 0.5)
+
+
+def slice_operator(views: int = 8, size: int = 24):
+    """A square slice and a fan of few views."""
+    grid = Grid.centred(size=(size, size, 1), spacing=2.0)
+    rig = circular(views, 200.0, 400.0, {"pixels": [1, 40], "pixel_mm": 3.0})
+    return PROJECTORS.build("drr", grid=grid, cameras=rig)
+
+
+@pytest.fixture
+def blocks():
+    """A volume of constant pieces."""
+    x = torch.zeros(1, 1, 1, 24, 24, dtype=torch.float64)
+    x[..., 6:17, 8:15] = 1
+    x[..., 9:12, 10:13] = 0.5
+    return x
+
+
+def test_the_gradient_of_a_slope_is_its_slope_and_its_transpose_is_exact():
+    torch.manual_seed(0)
+    axes = [torch.arange(n, dtype=torch.float64) for n in (4, 5, 6)]
+    z, y, x = torch.meshgrid(*axes, indexing="ij")
+    slope = 3 * STEPS[0] * z - 2 * STEPS[1] * y + 7 * STEPS[2] * x
+    g = gradient(slope[None, None], STEPS)
+    inner = g[..., :-1, :-1, :-1].flatten(1)
+    assert torch.allclose(inner, torch.tensor([[3.0], [-2.0], [7.0]], dtype=torch.float64))
+    assert not g[0, ..., -1, :, :].any() and not g[2, ..., -1].any()
+    v, p = torch.randn(2, 1, 4, 5, 6, dtype=torch.float64), torch.randn(3, 2, 1, 4, 5, 6).double()
+    one, other = (gradient(v, STEPS) * p).sum(), (v * gradient_adjoint(p, STEPS)).sum()
+    assert (one - other).abs() < 1e-12 * v.norm() * p.norm()
+
+
+def test_the_total_variation_of_a_block_is_its_surface_times_its_height():
+    """But for the corner's voxels, where the root of three squares is taken; per voxel's volume."""
+    x = torch.zeros(1, 1, 12, 12, 12, dtype=torch.float64)
+    x[..., 2:10, 3:9, 4:8] = 2.5
+    z, y, u = 8 * STEPS[0], 6 * STEPS[1], 4 * STEPS[2]
+    surface = 2 * (z * y + y * u + z * u)
+    voxel = STEPS[0] * STEPS[1] * STEPS[2]
+    value = total_variation(x, STEPS).item() * voxel
+    assert 0.9 * 2.5 * surface < value <= 2.5 * surface
+
+
+@pytest.mark.parametrize("nonnegative", [True, False])
+def test_the_proximal_map_closes_its_duality_gap(nonnegative):
+    """Primal value less dual value of |x - z|^2 / (2 s) + |D x| falls to zero, for a strength s of
+    its own in every voxel, and at a strength of zero a voxel stays.
+    """
+    torch.manual_seed(0)
+    z = torch.randn(2, 1, 5, 6, 7, dtype=torch.float64)
+    strength = 0.1 + torch.rand(1, 1, 5, 6, 7, dtype=torch.float64)
+    shrinkage = Shrinkage(strength, STEPS, nonnegative)
+    gaps = []
+    for iterations in (10, 100, 1000):
+        dual = torch.zeros(3, *z.shape, dtype=torch.float64)
+        x, p = tv_proximal(z, shrinkage, dual, iterations)
+        assert torch.linalg.vector_norm(p, dim=0).max() <= 1 + 1e-12
+        primal = ((x - z).square() / (2 * strength)).sum() + total_variation(x, STEPS).sum()
+        # the minimum over x of |x - z|^2 / (2 s) + <p, D x>, a lower bound for every p in the balls
+        bound = ((x - z).square() / (2 * strength)).sum() + (p * gradient(x, STEPS)).sum()
+        gaps.append(((primal - bound) / primal).item())
+    assert gaps[0] > gaps[1] > gaps[2] >= -1e-12 and gaps[2] < 1e-4
+    strength[..., 2, 3, 4] = 0
+    x, _ = tv_proximal(z, shrinkage, torch.zeros(3, *z.shape, dtype=torch.float64), 50)
+    expected = z[..., 2, 3, 4].clamp_min(0) if nonnegative else z[..., 2, 3, 4]
+    assert torch.equal(x[..., 2, 3, 4], expected)
+
+
+def test_two_voxels_are_drawn_together_by_the_strength():
+    """The closed form: a step of height h becomes h - 2 s / step, or vanishes."""
+    for height, after in ((4.0, 2.0), (1.0, 0.0)):
+        z = torch.tensor([0.0, height], dtype=torch.float64).reshape(1, 1, 1, 1, 2)
+        strength = torch.full((1, 1, 1, 1, 1), 2.0, dtype=torch.float64)
+        dual = torch.zeros(3, *z.shape, dtype=torch.float64)
+        x, _ = tv_proximal(z, Shrinkage(strength, (1.0, 1.0, 2.0), False), dual, 200)
+        assert torch.allclose(x.diff().squeeze(), torch.tensor(after).double(), atol=1e-5)
+        assert torch.allclose(x.mean(), z.mean())
+
+
+def test_constant_pieces_from_few_views_come_back_by_total_variation_and_not_by_sirt(blocks):
+    A = slice_operator(7)
+    y = A(blocks)
+    plain = gap(sirt(A, y, 300, momentum=True), blocks)
+    assert gap(fista_tv(A, y, 200, 1e-4), blocks) < 0.3 * plain
+
+
+def test_all_ways_to_the_minimum_agree(blocks):
+    torch.manual_seed(0)
+    A, blocks, weight = slice_operator(size=14), blocks[..., 4:18, 4:18], 3e-3
+    y = A(blocks)
+    y = y + 0.01 * y.max() * torch.randn_like(y)
+    ways = [
+        fista_tv(A, y, 100, weight, inner=10),
+        fista_tv(A, y, 100, weight, inner=10, preconditioned=False),
+        pdhg_tv(A, y, 500, weight, balance=0.2),
+    ]
+    values = torch.stack([tv_objective(A, y, x, weight).squeeze() for x in ways])
+    assert (values.max() - values.min()) / values.min() < 1e-3
+    for x in ways[1:]:
+        assert gap(x, ways[0]) < 1e-3
+    # no small change of the volume is better
+    least = values.min()
+    for change in (blocks, torch.ones_like(blocks), torch.randn_like(blocks)):
+        for size in (1e-2, -1e-2):
+            other = (ways[0] + size * change).clamp_min(0)
+            assert tv_objective(A, y, other, weight) > least
+
+
+def test_the_weight_means_the_same_on_every_rig(blocks):
+    """The data term of the same error hardly depends on the number of views and pixels."""
+    error, values = blocks.roll(3, 3) - 0.3 * blocks, []
+    for views in (8, 16, 32):
+        A = slice_operator(views)
+        values.append(WeightedFit.of(A, torch.float64)(A(error)).item())
+    assert max(values) < 1.1 * min(values)
+
+
+def test_the_power_method_comes_to_the_norm_from_below():
+    A = Dense()
+    exact = torch.linalg.svdvals(A.matrix)[0].item()
+    few, many = (power_norm(A, n, torch.float64) for n in (3, 30))
+    assert few <= many <= exact * (1 + 1e-12) and many > 0.999 * exact
