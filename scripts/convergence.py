@@ -24,7 +24,7 @@ from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.problem import Iterate
 
 #: Iterations at which the error is looked at.
-AT = (1, 3, 10, 30, 100, 300, 1000, 2000, 3000)
+AT = (1, 3, 10, 30, 100, 300, 1000, 2000, 3000, 6000, 10000)
 
 
 class Run(NamedTuple):
@@ -47,6 +47,7 @@ RUNS = (
     Run("fista_tv", {"weight": 1e-5}, 300),
     Run("fista_tv", {"weight": 1e-6}, 1000),
     Run("fista_tv", {"weight": 1e-7}, 3000),
+    Run("fista_tv", {"weight": 1e-8}, 10000),
 )
 
 
