@@ -9,6 +9,8 @@ from omegaconf import DictConfig
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
 
+UNITS = ("1/mm", "HU")
+
 
 def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Reconstruct a measured scan; returns what `results.json` then holds.
@@ -28,6 +30,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.engine.evaluation import device_of
     from mvrecon.viz import montage, rig
 
+    if settings["unit"] not in UNITS:
+        raise ValueError(f"Expected the unit 1/mm or HU, got {settings['unit']!r}")
     out = Path(settings["out"] or folder / "volume.nii.gz").expanduser()
     check_ending(out)
     with run_folder.taken(folder, settings):

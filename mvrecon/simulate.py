@@ -20,11 +20,13 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
     where the scene is in 1/mm), and what moved it as `placement.json` if it came from a file.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`, for
-    `camera=from_file`.
+    `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, and every case
+    has `projections`, see `export.save_greys`.
 
     Raises:
         RuntimeError: another process is at work in the folder.
-        ValueError: the folder's run has other settings.
+        ValueError: the folder's run has other settings; `rtk` with a rig that RTK does not have, or
+            with views that are no attenuation.
 
     Warns:
         UserWarning: nibabel, which writes the truth, is not installed.
@@ -36,6 +38,7 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     from mvrecon.acquisition.acquired import Acquired
     from mvrecon.acquisition.settings import Acquisition
     from mvrecon.cameras import files
+    from mvrecon.cameras.formats import rtk_xml
     from mvrecon.data.dataset import SceneDataset
     from mvrecon.engine import export, run_folder
     from mvrecon.geometry.grid import Grid
@@ -49,11 +52,15 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     case_folders = []
     with run_folder.taken(folder, settings):
         files.save(cameras, folder / "cameras.json")
+        if settings["rtk"]:
+            rtk_xml.write(cameras, folder / "geometry.xml")
         console = Console(stderr=True)
         for item in track(range(len(cases)), "Simulating", transient=True, console=console):
             case, index = cases[item], settings["cases"][item]
             name = case["name"]
             case_folders.append(export.save_views(where, name, case["views"][0], unit))
+            if settings["rtk"]:
+                export.save_greys(where, name, case["views"][0])
             if has_nibabel():
                 export.save_truth(where, name, case["volume"][0], grid, scene.unit)
             placement = scene.placement(index, settings["seed"], grid)

@@ -26,6 +26,7 @@ class Measurement:
 class Simulation(Measurement):
     """Every top-level key of `mvrecon-simulate`."""
 
+    rtk: bool = False
     cases: list[int] = MISSING
 
 

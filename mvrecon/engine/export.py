@@ -13,10 +13,14 @@ from torch import Tensor
 
 from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.nifti import save_nifti
+from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.files.atomic import written_whole
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz import montage
 from mvrecon.viz.planes import Image
+
+#: Line integral of which one grey value of 16 bits is left.
+OPAQUE = 10.0
 
 
 def save_case(
@@ -91,6 +95,29 @@ def save_placement(folder: Path, name: str, placement: Float[Tensor, "4 4"]) -> 
     with written_whole(path) as part:
         part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return path
+
+
+def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
+    """Write the views of one case as a detector's grey values in `projections`: 16-bit TIFF with
+    dark and flat field.
+
+    Convention: RTK's; the first row is the lowest one, against the rows of `views`.
+
+    Args:
+        folder: of all cases.
+        name: of the case.
+        views: line integrals of attenuation.
+
+    Raises:
+        ValueError: integrals that 16 bits cannot hold, as of another unit than 1/mm.
+    """
+    if not (top := views.max().item()) < OPAQUE:
+        raise ValueError(
+            f"Expected line integrals of attenuation below {OPAQUE:g} for 16-bit images, got "
+            f"{top:.3g}; scene.value=0.02 is near water, in 1/mm"
+        )
+    case = folder / _file_name(name)
+    return write_projections(case / "projections", views.flip(-2), Exposure(photons=None))
 
 
 def save_png(path: Path, image: Image) -> None:

@@ -1,10 +1,10 @@
 """A measured scan: its views on disk, its rig, and the grid that is reconstructed."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,7 +20,7 @@ from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
-HELD_VOLUMES = 3
+VOLUMES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +60,8 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     Args:
         settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
             counts them from the other end (`flip_rows`); a camera's detector without pixels has
-            those of the views on disk; `grid` has size, spacing and centre, or like; without any of them it
-            is `auto_grid`'s.
+            those of the views on disk; `grid` has size, spacing and centre, or like; without
+            any of them it is `auto_grid`'s.
 
     Raises:
         ValueError: another number of cameras than of views, a rig that does not see the grid, a
@@ -74,8 +74,8 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     cameras = measured.cameras(rig)
     grid = _grid(settings["grid"], cameras)
     check_rig_sees(cameras, grid)
-    size = 4 * HELD_VOLUMES * torch.tensor(grid.shape).prod().item()
-    check_memory(size, f"A reconstruction of {grid.shape} voxels")
+    bytes_needed = 4 * VOLUMES * math.prod(grid.shape)
+    check_memory(bytes_needed, f"A reconstruction of {grid.shape} voxels")
     return Scan(measured, cameras, grid, settings["projector"])
 
 

@@ -68,7 +68,7 @@ def trained(
     """
     network = load(checkpoint, method)
     module = network.module
-    for difference in _differences(A, module):
+    for difference in _differences(A, module.projector):
         warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=2)
     model = MODELS.from_config(module.hparams["model"], projector=A)
     try:
@@ -84,10 +84,9 @@ def trained(
     return volume.clone()
 
 
-def _differences(A: Projector, module: torch.nn.Module) -> list[str]:
-    own = module.projector
-    grid, trained_grid = A.grid, own.grid
-    lines = []
+def _differences(A: Projector, own: Projector) -> list[str]:
+    """What differs from the operator of the training, in words."""
+    grid, trained_grid, lines = A.grid, own.grid, []
     if digests.of_rig(A.cameras) != digests.of_rig(own.cameras):
         counts = f"{len(own.cameras)} cameras of {own.cameras.shape} pixels"
         lines.append(f"rig ({counts}); got {len(A.cameras)} of {A.cameras.shape}")

@@ -60,8 +60,8 @@ PROMISES = {
     "mlem": Promise({"iterations": 100}, rate=2e-2),
     "osem": Promise({"iterations": 30}, rate=2e-2),
 }
-#: Methods that need a rig of a certain kind, and have tests of their own.
-GEOMETRIC = {"fbp", "fdk"}
+#: Methods that need a rig of a certain kind or a checkpoint, and have tests of their own.
+GEOMETRIC = {"fbp", "fdk", "trained"}
 NAMES = [
     name
     for name in RECONSTRUCTORS.names()

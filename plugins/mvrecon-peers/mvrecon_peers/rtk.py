@@ -3,7 +3,9 @@
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -135,6 +137,28 @@ class Rtk(Paired):
             self.rtk.JosephBackProjectionImageFilter, empty, self._image(views, self.detector)
         )
         return volume[RIM:-RIM, RIM:-RIM, RIM:-RIM]
+
+    def reconstruct(
+        self, name: str, views: Float[Tensor, "m v u"], configure: Callable[[Any], None]
+    ) -> Float[Tensor, "d h w"]:
+        """The volume by the filter of a name after `configure(filter)`, in 1/mm."""
+        box = Grid.centred(size=self.grid.size, spacing=self.voxels[0])
+        empty = self._image(
+            views.new_zeros(self.grid.shape), (self.voxels[0], box.affine[:3, 3].tolist())
+        )
+        kind = getattr(self.rtk, name)
+        method = kind[next(key for key in kind.keys() if key[0] is type(empty))].New()
+        method.SetGeometry(self.geometry)
+        stack = self._image(views, self.detector)
+        if hasattr(method, "SetInputProjectionStack"):
+            method.SetInputVolume(empty)
+            method.SetInputProjectionStack(stack)
+        else:
+            method.SetInput(0, empty)
+            method.SetInput(1, stack)
+        configure(method)
+        method.Update()
+        return torch.from_numpy(self.itk.array_from_image(method.GetOutput())) / self.unit
 
     def _image(self, values: Tensor, frame: tuple[list[float], list[float]]):
         image = self.itk.image_view_from_array(values.numpy())

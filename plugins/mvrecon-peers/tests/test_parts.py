@@ -55,6 +55,21 @@ def test_every_part_is_configured_by_its_own_defaults():
         assert yaml.safe_load((folder / f"{name}.yaml").read_text()) == {"name": name} | options
 
 
+def test_every_reconstructor_is_configured_by_its_own_defaults():
+    folder = Path(__file__).parents[1] / "mvrecon_peers" / "conf" / "reconstructor"
+    methods = {
+        k.partition(".")[2]: v
+        for k, v in PLUGIN["entry-points"]["mvrecon.plugins"].items()
+        if k.startswith("reconstructor")
+    }
+    assert {file.stem for file in folder.glob("*.yaml")} == set(methods)
+    for name, where in methods.items():
+        module, _, attribute = where.partition(":")
+        _, _, *options = signature(getattr(import_module(module), attribute)).parameters.values()
+        expected = {"name": name} | {option.name: option.default for option in options}
+        assert yaml.safe_load((folder / f"{name}.yaml").read_text()) == expected
+
+
 def test_importing_the_parts_imports_no_library():
     import subprocess
 

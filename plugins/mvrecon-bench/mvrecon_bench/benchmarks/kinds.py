@@ -5,6 +5,7 @@ from mvrecon.registry import Registry
 BENCHES = Registry(
     "bench",
     operators="mvrecon_bench.benchmarks.operators:Operators",
+    methods="mvrecon_bench.benchmarks.methods:Methods",
     small="mvrecon_bench.benchmarks.small:Small",
     scaling="mvrecon_bench.benchmarks.scaling:Scaling",
     precision="mvrecon_bench.benchmarks.precision:Precision",

@@ -1,0 +1,174 @@
+"""`bench=methods`: run time and memory against error of the reconstruction methods."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.parts import RECONSTRUCTORS
+from mvrecon.projectors.drr import Drr
+from mvrecon.scenes.voxelise import voxelise
+from mvrecon_bench.benchmarks import report
+from mvrecon_bench.benchmarks.cases import Case, expand
+from mvrecon_bench.benchmarks.columns import METHODS, METHODS_KEYS
+from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads, with_memory
+from mvrecon_bench.benchmarks.part import Part
+from mvrecon_bench.benchmarks.rows import Row, number
+from mvrecon_bench.benchmarks.trial import reason
+from mvrecon_bench.benchmarks.truth import pixel_mean
+
+
+@dataclass(frozen=True)
+class Job:
+    """A method on a case."""
+
+    part: Part
+    case: Case
+    peer: str
+
+    @property
+    def row(self) -> Row:
+        """The columns that tell this row from all others."""
+        names = ("scene", "camera", "n", "ratio", "views", "device", "dtype", "threads")
+        columns = {name: getattr(self.case, name) for name in names}
+        part = {name: self.part.row[name] for name in ("part", "options")}
+        return {**part, "peer": self.peer, **columns}
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What the methods are given, and the truth."""
+
+    A: Drr
+    views: Float[Tensor, "1 1 m v u"]
+    volume: Float[Tensor, "d h w"]
+    inside: Bool[Tensor, "d h w"]
+
+    def error(self, volume: Float[Tensor, "1 1 d h w"]) -> float:
+        """|x - truth| / |truth| over the voxels of the object."""
+        truth = self.volume[self.inside]
+        return ((volume[0, 0][self.inside] - truth).norm() / truth.norm()).item()
+
+
+@lru_cache(maxsize=2)
+def measurement_of(case: Case, rays: int) -> Measurement:
+    """Pixel means of the exact integrals over rays x rays lines, and the truth of a case."""
+    grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
+    views = pixel_mean(phantom, rig, rays)[None, None].float()
+    volume = voxelise(phantom, grid).float()
+    inside = volume > 0
+    return Measurement(Drr(grid, rig), views, volume, inside)
+
+
+class Methods:
+    """Every reconstructor on every case of a plan, those of one case timed in turns.
+
+    Args:
+        parts: the reconstructors `{name: ..., peer: ..., **options}`, see `Part.of`; `peer` is the
+            name of the part that a row's time is divided by.
+        base: the case that the plan begins with, options of `Case`.
+        plan: blocks `{about: {...}, vary: {axis: [values]}}`, see `cases.expand`.
+        rays: a pixel of the views is the mean over rays x rays exact integrals.
+        repeats: least number of calls of which a time is the median.
+        once_s: a call that takes longer, in seconds, is timed once.
+    """
+
+    columns: Mapping[str, str] = METHODS
+    keys: Sequence[str] = METHODS_KEYS
+    charts: Sequence[str] = ("error", "ms", "peak_mb")
+
+    def __init__(
+        self,
+        parts: Sequence[Mapping[str, Any]],
+        base: Mapping[str, Any],
+        plan: Mapping[str, Mapping[str, Any]],
+        rays: int = 2,
+        repeats: int = 3,
+        once_s: float = 20.0,
+    ):
+        peers = [str(config.get("peer", "")) for config in parts]
+        plain = [{key: v for key, v in config.items() if key != "peer"} for config in parts]
+        self.parts = list(zip(map(Part.of, plain), peers, strict=True))
+        self.plan, self.rays = expand(base, plan), rays
+        self.repeats, self.once_s = repeats, once_s
+
+    def groups(self) -> list[list[Job]]:
+        """What is measured together: one case by all methods that take it."""
+        groups = []
+        for case, settings in self.plan:
+            fits = [p for p in self.parts if p[0].takes(case.n, False, settings["block"])]
+            groups.append([Job(part, case, peer) for part, peer in fits])
+        return groups
+
+    def label(self, row: Row) -> str:
+        """A row's method, short."""
+        return report.part_label(row)
+
+    def measure(
+        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
+        """The rows of jobs on one case."""
+        case = jobs[0].case
+        with threads(case.threads):
+            say(f"{report.case_label(jobs[0].row)}: exact views")
+            data = measurement_of(case, self.rays)
+            calls: dict[int, Callable[[], Tensor]] = {}
+            done: dict[int, Row] = {}
+            for key, job in enumerate(jobs):
+                say(job.part.label)
+                call = self._call(job, data)
+                try:
+                    done[key] = {**job.row, "load": load_average(), **self._first(call, data, case)}
+                except Exception as error:  # whatever a part raises is its row's status
+                    yield {**job.row, "load": load_average(), "status": f"skipped: {reason(error)}"}
+                else:
+                    calls[key] = call
+            say("times")
+            yield from self._timed(calls, done, case)
+
+    def _call(self, job: Job, data: Measurement) -> Callable[[], Tensor]:
+        A = data.A.to(job.case.device)
+        views = data.views.to(job.case.device)
+
+        def call() -> Tensor:
+            with torch.no_grad():
+                return RECONSTRUCTORS.build(job.part.name, A, views, **job.part.options)
+
+        return call
+
+    def _first(self, call: Callable[[], Tensor], data: Measurement, case: Case) -> Row:
+        """Error, memory and time of a second call; the first may compile."""
+        call()
+        volume, peak = with_memory(call, case.device)
+        seconds = once(call, case.device)[1]
+        return {"error": data.error(volume.cpu()), "peak_mb": peak, "ms": 1e3 * seconds}
+
+    def _timed(
+        self, calls: Mapping[int, Callable[[], Tensor]], done: Mapping[int, Row], case: Case
+    ) -> Iterator[Row]:
+        seconds = {key: row["ms"] / 1e3 for key, row in done.items()}
+        short = {key: call for key, call in calls.items() if seconds[key] < self.once_s}
+        times = interleaved(short, seconds, self.repeats, case.device)
+        ms = {key: times[key].ms if key in times else row["ms"] for key, row in done.items()}
+        names = {row["part"]: ms[key] for key, row in done.items()}
+        for key, row in done.items():
+            n_calls = times[key].calls if key in times else 1
+            over = ms[key] / names.get(row["peer"], math.nan)
+            yield {**row, "ms": ms[key], "calls": n_calls, "over_peer": over, "status": "ok"}
+
+    def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
+        """The table by name."""
+        names = ("n", "views", "error", "ms", "peak_mb", "peer", "over_peer")
+        done = [row for row in rows if row["status"] == "ok"]
+        done.sort(key=lambda row: (number(row, "n"), number(row, "views")))
+        lines = [
+            (report.part_label(row), *(report.figure(row, name) for name in names)) for row in done
+        ]
+        text = f"# Reconstruction methods\n\n{report.markdown(('part', *names), lines, 1)}"
+        return {"table": text + report.left_out(rows) + report.legend(self.columns)}

@@ -1,0 +1,148 @@
+"""`mvrecon-reconstruct` as a user calls it: a scan on disk comes back as the volume it was made
+from.
+"""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image as Pillow
+
+import mvrecon.reconstruction
+import mvrecon.simulate
+from mvrecon.data.attenuation import WATER
+from mvrecon.data.volume_files import read_volume
+from tests.engine.runs import call
+
+VALUE = WATER
+SIMULATED = (
+    "scene=ellipsoids",
+    f"scene.value={VALUE}",
+    "grid.size=[24,22,20]",
+    "grid.spacing=8",
+    "camera.n_views=40",
+    "camera.arc_degrees=360",
+    "camera.sid=600",
+    "camera.sdd=900",
+    "camera.detector={pixels: [36, 40], pixel_mm: 9.0, offset_mm: [0.0, 0.0]}",
+    "rtk=true",
+)
+RIG = ("camera=rtk_xml", "camera.detector.pixel_mm=9.0")
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """A simulated scan: folder of projections, rig as RTK's XML, and the truth."""
+    folder = tmp_path_factory.mktemp("scan")
+    assert call(mvrecon.simulate, *SIMULATED, f"hydra.run.dir={folder}/simulated") == 0
+    case = next((folder / "simulated" / "cases").iterdir())
+    shutil.copytree(case / "projections", folder / "projections")
+    shutil.copy(folder / "simulated" / "geometry.xml", folder / "geometry.xml")
+    for name in ("truth.nii.gz", "views.h5"):
+        shutil.copy(case / name, folder / name)
+    return folder
+
+
+def run(scan, folder, *options, views="projections"):
+    """Exit of the app on the scan, with the truth's grid."""
+    return call(
+        mvrecon.reconstruction,
+        f"views.path={scan / views}",
+        *RIG,
+        f"camera.path={scan}/geometry.xml",
+        f"grid.like={scan}/truth.nii.gz",
+        f"hydra.run.dir={folder}",
+        *options,
+    )
+
+
+def error_of(scan, path):
+    """Relative error of a volume in HU against the truth, which mvrecon-simulate wrote in HU."""
+    (truth, grid), (volume, own) = read_volume(scan / "truth.nii.gz"), read_volume(path)
+    assert torch.allclose(own.affine, grid.affine)
+    return ((volume - truth).norm() / (truth + 1000).norm()).item()
+
+
+@pytest.mark.parametrize(
+    ("method", "limit"),
+    [
+        (("reconstructor=fdk", "reconstructor.filter=hann"), 0.3),
+        (("reconstructor=sirt", "reconstructor.momentum=true"), 0.25),
+        (("reconstructor=cgls", "choose={every: 8}"), 0.25),
+        (("reconstructor=os_sart", "stop.sigma=0.001"), 0.25),
+    ],
+)
+def test_a_scan_as_a_detector_stores_it_comes_back_in_place_and_in_hu(
+    scan, tmp_path, method, limit
+):
+    folder = tmp_path / "run"
+    assert run(scan, folder, *method, f"out={tmp_path}/volume.nii.gz", "unit=HU") == 0
+    assert error_of(scan, tmp_path / "volume.nii.gz") < limit
+    table = json.loads((folder / "results.json").read_text())
+    assert table["view_nrmse"] < 0.15 and table["seconds"] > 0
+    for picture in ("rig.png", "planes.png"):
+        assert np.asarray(Pillow.open(folder / picture)).std() > 0
+
+
+def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
+    """views.h5 has mvrecon's order of rows, the images RTK's; either file knows its own."""
+    stored = (
+        f"views.path={scan}/views.h5",
+        "camera=from_file",
+        f"camera.path={scan}/simulated/cameras.json",
+        f"grid.like={scan}/truth.nii.gz",
+        f"out={tmp_path}/stored.nii.gz",
+        f"hydra.run.dir={tmp_path}/stored",
+    )
+    assert call(mvrecon.reconstruction, *stored) == 0
+    assert run(scan, tmp_path / "grey", f"out={tmp_path}/grey.nii.gz") == 0
+    grey, exact = (read_volume(tmp_path / f"{name}.nii.gz")[0] for name in ("grey", "stored"))
+    assert (grey - exact).norm() < 2e-3 * exact.norm()
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("views.every=3", "views.rows=[0, 99]"), "rows"),
+        (("out=volume.raw",), "ends in"),
+        (("choose={every: 8}",), "does not iterate"),
+        (("stop.sigma=0.1",), "does not iterate"),
+        (("grid.size=[8, 8, 8]",), "grid.like"),
+        (("camera.detector.pixels=[36, 41]",), "detector"),
+        (("views.flat=50", "views.dark=100"), "flat field"),
+        (("unit=kg",), "unit"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_and_leave_no_volume(
+    scan, tmp_path, options, message, capsys
+):
+    assert run(scan, tmp_path / "run", *options) == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.nii.gz"))
+
+
+@pytest.mark.door
+def test_fewer_views_than_cameras_are_refused(scan, tmp_path, capsys):
+    short = tmp_path / "projections"
+    shutil.copytree(scan / "projections", short)
+    (short / "view_00039.tif").unlink()
+    assert (
+        run(
+            tmp_path,
+            tmp_path / "run",
+            f"camera.path={scan}/geometry.xml",
+            f"grid.like={scan}/truth.nii.gz",
+        )
+        == 1
+    )
+    assert "expected one camera for each of 39 views, got 40" in capsys.readouterr().err
+
+
+@pytest.mark.door
+def test_a_grid_larger_than_memory_is_refused_with_its_size(scan, tmp_path, capsys):
+    options = ("grid.like=null", "grid.size=[40000, 40000, 40000]", "grid.spacing=0.01")
+    assert run(scan, tmp_path / "run", *options) == 1
+    assert "GiB" in capsys.readouterr().err
