@@ -1,7 +1,5 @@
 """The compiled steps of the total variation on the CPU. Every result is the same to the last bit
 for any number of threads: a thread owns slices, and a voxel's terms are added in one order.
-
-A volume of one slice is shared by its rows, which are then what slices are elsewhere.
 """
 
 from collections.abc import Sequence
@@ -32,10 +30,14 @@ def _flat(volume: Tensor) -> np.ndarray:
     return volume.detach().contiguous().flatten(0, 1).numpy()
 
 
-def _field(dual: Tensor) -> np.ndarray:
-    """Fields [3 n d h w], which are written into."""
-    if not dual.is_contiguous():
-        raise ValueError("Expected a contiguous dual field, got strides {dual.stride()}")
+def _field(dual: Tensor, volume: Tensor) -> np.ndarray:
+    """The fields [3 n d h w] of volumes, to be written into; the loops test no bounds."""
+    shape = (3, *volume.shape)
+    if dual.shape != shape or dual.dtype != volume.dtype or not dual.is_contiguous():
+        raise ValueError(
+            f"Expected a contiguous dual field {shape} in {volume.dtype}, got "
+            f"{tuple(dual.shape)} in {dual.dtype} with strides {dual.stride()}"
+        )
     return dual.flatten(1, 2).numpy()
 
 
@@ -67,7 +69,7 @@ def primal(
 ) -> Float[Tensor, "b c d h w"]:
     """z - strength D^T p, clipped; see `reference.primal`."""
     out = torch.empty(volume.shape, dtype=volume.dtype)
-    flat, field = _flat(out), _field(dual)
+    flat, field = _flat(out), _field(dual, volume)
     of, to = _dual(field, field, Stride(0.0), shrinkage.steps), _primal(volume, shrinkage)
 
     def work(first: int, last: int) -> None:
@@ -84,7 +86,7 @@ def dual_step(
     steps: Sequence[float],
 ) -> Float[Tensor, "3 b c d h w"]:
     """p + rate D x, shortened, in place; see `reference.dual_step`."""
-    flat, field = _flat(volume), _field(dual)
+    flat, field = _flat(volume), _field(dual, volume)
     of = _dual(field, field, Stride(rate), steps)
 
     def work(first: int, last: int) -> None:
@@ -102,16 +104,17 @@ def proximal_step(
     shrinkage: Shrinkage,
 ) -> Float[Tensor, "3 b c d h w"]:
     """One step of fast gradient projection, written over `last`; see `reference.proximal_step`."""
-    of, to = _dual(_field(dual), _field(last), stride, shrinkage.steps), _primal(volume, shrinkage)
+    fields = _field(dual, volume), _field(last, volume)
+    of, to = _dual(*fields, stride, shrinkage.steps), _primal(volume, shrinkage)
     batch, depth, *slice_shape = to.volume.shape
     slabs = -(-depth // THICKNESS)
     heads = np.empty((batch, slabs, *slice_shape), to.volume.dtype)
 
-    def begin(first: int, last: int) -> None:
-        first_slices(of, to, THICKNESS, heads, first, last)
+    def begin(first: int, end: int) -> None:
+        first_slices(of, to, THICKNESS, heads, first, end)
 
-    def work(first: int, last: int) -> None:
-        dual_slabs(of, to, THICKNESS, heads, _room(to.volume), first, last)
+    def work(first: int, end: int) -> None:
+        dual_slabs(of, to, THICKNESS, heads, _room(to.volume), first, end)
 
     share(begin, batch * slabs, heads.size)
     share(work, batch * slabs, to.volume.size)
