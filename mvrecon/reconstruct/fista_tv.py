@@ -29,7 +29,7 @@ def fista_tv(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     iterations: int = 100,
-    weight: float = 1e-3,
+    weight: float = 1e-5,
     inner: int = 20,
     preconditioned: bool = True,
     nonnegative: bool = True,
@@ -48,7 +48,8 @@ def fista_tv(
         A: the operator.
         views: measured integrals.
         iterations: how many.
-        weight: of the total variation, in (unit of the volume) mm.
+        weight: of the total variation, in (unit of the volume) mm; the default is for attenuation
+            in 1/mm, densities of about one want 1e-4 to 1e-2.
         inner: gradient steps of each proximal map; with few, such as 5, the objective stays about
             1 % above the minimum, however many iterations there are.
         preconditioned: steps of SIRT's lengths, the inverse column sums; else one length for all

@@ -20,7 +20,7 @@ def pdhg_tv(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     iterations: int = 200,
-    weight: float = 1e-3,
+    weight: float = 1e-5,
     balance: float = 0.1,
     nonnegative: bool = True,
     **common: Unpack[Common],
@@ -36,7 +36,8 @@ def pdhg_tv(
         A: the operator.
         views: measured integrals.
         iterations: how many.
-        weight: of the total variation, in (unit of the volume) mm.
+        weight: of the total variation, in (unit of the volume) mm; the default is for attenuation
+            in 1/mm, densities of about one want 1e-4 to 1e-2.
         balance: of the dual steps to the primal ones; it changes the speed alone.
         nonnegative: only volumes without negative values.
         common: start, support, monitor: see `Common`.
