@@ -42,8 +42,8 @@ def volume_metrics(
     """PSNR in dB (infinite for equal volumes), SSIM and NRMSE of one volume, over all of it and
     inside the object.
 
-    SSIM inside is the mean of the SSIM map over the object's voxels. Without any voxel inside,
-    those figures are nan.
+    A volume of one slice has the SSIM of an image. SSIM inside is the mean of the SSIM map over the
+    object's voxels. Without any voxel inside, those figures are nan.
 
     Raises:
         ValueError: shapes that differ, fewer than 6 voxels along an axis, or a data range that is
@@ -54,17 +54,17 @@ def volume_metrics(
         raise ValueError(
             f"Metrics need volume, truth and inside of one shape [1 d h w], got {shapes}"
         )
-    if min(volume.shape[1:]) < 6:
-        raise ValueError(
-            f"SSIM's window needs at least 6 voxels along each axis, got {tuple(volume.shape[1:])}"
-        )
+    shape = tuple(volume.shape[1:])
+    if min(shape[1:] if shape[0] == 1 else shape) < 6:
+        raise ValueError(f"SSIM's window needs at least 6 voxels along each axis, got {shape}")
     if not data_range > 0:
         raise ValueError(f"data_range must be positive, got {data_range}")
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     volume, truth = volume.detach().double(), truth.double()
+    one, other = (v[None, :, 0] if shape[0] == 1 else v[None] for v in (volume, truth))
     similarity, local = structural_similarity_index_measure(
-        volume[None], truth[None], data_range=data_range, return_full_image=True
+        one, other, data_range=data_range, return_full_image=True
     )
     whole = {
         "psnr": _psnr(volume, truth, data_range),
@@ -75,7 +75,7 @@ def volume_metrics(
         return whole | {"psnr_inside": math.nan, "ssim_inside": math.nan, "nrmse_inside": math.nan}
     return whole | {
         "psnr_inside": _psnr(volume[inside], truth[inside], data_range),
-        "ssim_inside": float(local[0][inside].mean()),
+        "ssim_inside": float(local[0].view_as(inside)[inside].mean()),
         "nrmse_inside": nrmse(volume[inside], truth[inside]),
     }
 

@@ -9,6 +9,7 @@ SCENES = Registry(
     ventricle="mvrecon.scenes.ventricle:RandomVentricle",
     shepp_logan="mvrecon.scenes.shepp_logan:SheppLogan",
     mixture="mvrecon.scenes.mixture:Mixture",
+    breast="mvrecon.data.breast:BreastSlices",
     hdf5="mvrecon.data.volumes:Hdf5Volumes",
     nifti="mvrecon.data.volumes:NiftiVolume",
     volumes="mvrecon.data.volume_scene:Volumes",
@@ -40,6 +41,7 @@ HEADS = Registry(
 NETWORKS = Registry(
     "network",
     unet="mvrecon.models.networks:UNet3d",
+    unet2d="mvrecon.models.unet2d:UNet2d",
     unet3d="mvrecon.models.published:CicekUNet3d",
     residual_unet3d="mvrecon.models.published:ResidualUNet3d",
 )
@@ -68,6 +70,11 @@ MODELS = Registry(
     mean_fusion="mvrecon.models.baselines:MeanFusion",
     backprojection_unet="mvrecon.models.baselines:BackprojectionUNet",
     geometry_free="mvrecon.models.baselines:GeometryFree",
+    fbp_unet="mvrecon.models.sparse_view.schools:FbpUNet",
+    sinogram_unet="mvrecon.models.sparse_view.schools:SinogramUNet",
+    dual_domain="mvrecon.models.sparse_view.schools:DualDomain",
+    itnet="mvrecon.models.sparse_view.itnet:ItNet",
+    primal_dual="mvrecon.models.sparse_view.primal_dual:PrimalDual",
     backprojection="mvrecon.models.baselines:Backprojection",
     sirt="mvrecon.models.baselines:Sirt",
     classical="mvrecon.models.classical:Classical",

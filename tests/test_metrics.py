@@ -73,6 +73,15 @@ def test_ssim_inside_is_the_mean_of_the_map_over_the_object():
     assert 0.25 * halves[0] + 0.75 * halves[1] == pytest.approx(figures["ssim"], abs=1e-9)
 
 
+def test_a_slice_has_the_ssim_of_an_image():
+    truth, inside = case((1, 1, 12, 14))
+    figures = volume_metrics(truth + 0.2, truth, inside, 1.0)
+    assert figures["psnr"] == pytest.approx(20 * math.log10(5), abs=1e-4)
+    a, b, c1 = torch.full_like(truth, 0.3), torch.full_like(truth, 0.7), 0.01**2
+    ssim = volume_metrics(a, b, inside, 1.0)["ssim"]
+    assert ssim == pytest.approx((2 * 0.3 * 0.7 + c1) / (0.3**2 + 0.7**2 + c1), abs=1e-6)
+
+
 def test_equal_volumes_are_perfect():
     truth, inside = case()
     figures = volume_metrics(truth, truth, inside, 1.0)

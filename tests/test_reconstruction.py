@@ -119,6 +119,7 @@ def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
 def test_settings_that_do_not_fit_are_refused_and_leave_no_volume(
     scan, tmp_path, options, message, capsys
 ):
+    """Settings that do not fit views, geometry or method are an error, and no volume is written."""
     assert run(scan, tmp_path / "run", *options) == 1
     assert message in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.nii.gz"))
@@ -126,6 +127,7 @@ def test_settings_that_do_not_fit_are_refused_and_leave_no_volume(
 
 @pytest.mark.door
 def test_fewer_views_than_cameras_are_refused(scan, tmp_path, capsys):
+    """A scan with another number of views than of cameras is an error that gives both."""
     short = tmp_path / "projections"
     shutil.copytree(scan / "projections", short)
     (short / "view_00039.tif").unlink()
@@ -143,6 +145,7 @@ def test_fewer_views_than_cameras_are_refused(scan, tmp_path, capsys):
 
 @pytest.mark.door
 def test_a_grid_larger_than_memory_is_refused_with_its_size(scan, tmp_path, capsys):
+    """A grid that does not fit into memory is an error that says how large it is."""
     options = ("grid.like=null", "grid.size=[40000, 40000, 40000]", "grid.spacing=0.01")
     assert run(scan, tmp_path / "run", *options) == 1
     assert "GiB" in capsys.readouterr().err

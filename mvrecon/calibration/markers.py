@@ -43,7 +43,7 @@ def dlt(points: Float[Tensor, "n 3"], uv: Float[Tensor, "m n 2"]) -> Float[Tenso
 
     Args:
         points: places of the markers in world mm.
-        uv: their images (u, v), NaN where one is not seen.
+        uv: their images (u, v), NaN where one is not visible.
 
     Raises:
         ValueError: shapes that do not agree, or a view with fewer than six markers or with markers
@@ -59,11 +59,11 @@ def dlt(points: Float[Tensor, "n 3"], uv: Float[Tensor, "m n 2"]) -> Float[Tenso
 
 
 def _dlt(points: Tensor, uv: Tensor, m: int) -> Float[Tensor, "3 4"]:
-    seen = uv.isfinite().all(dim=-1)
-    if (count := int(seen.sum())) < LEAST:
+    visible = uv.isfinite().all(dim=-1)
+    if (count := int(visible.sum())) < LEAST:
         raise ValueError(f"expected at least {LEAST} markers in view {m}, got {count}")
-    X, space = _normalised(points[seen])
-    x, plane = _normalised(uv[seen])
+    X, space = _normalised(points[visible])
+    x, plane = _normalised(uv[visible])
     zero = torch.zeros_like(X)
     rows = torch.cat(
         [
@@ -108,7 +108,7 @@ def from_markers(
 
     Args:
         points: places of the markers in world mm.
-        uv: their images (u, v) in pixels, NaN where one is not seen; see `centroids`.
+        uv: their images (u, v) in pixels, NaN where one is not visible; see `centroids`.
         shape: detector pixels (rows, columns).
         pixel_mm: pixel size (v, u).
 
@@ -161,7 +161,7 @@ def _rig(start: Cameras, values: Float[Tensor, "m 9"]) -> Cameras:
 def _residual(
     start: Cameras, points: Tensor, uv: Tensor, values: Float[Tensor, "m 9"]
 ) -> Float[Tensor, "m k"]:
-    """Distances (u, v) of projected from measured markers in pixels, zero where one is not seen."""
+    """Distances (u, v) of projected from measured markers in pixels, zero for those not visible."""
     difference = _rig(start, values).project(points.double())[..., :2] - uv
     return torch.where(uv.isfinite(), difference, 0.0).flatten(1)
 

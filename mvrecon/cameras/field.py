@@ -118,9 +118,9 @@ def check_rig_sees(cameras: Cameras, grid: Grid) -> Bool[Tensor, " m"]:
         ValueError: no view meets the box; the message tells where the box and the isocentre are, in
             mm.
     """
-    seen = views_that_see(cameras, grid)
-    if seen.any():
-        return seen
+    meeting = views_that_see(cameras, grid)
+    if meeting.any():
+        return meeting
     low, high = grid.corners().aminmax(dim=0)
     box = ", ".join(
         f"{axis} {a:.4g} to {b:.4g}"

@@ -47,15 +47,15 @@ def gathered(
     sizes = torch.tensor(volume.shape[:1:-1], device=points.device)
     places = ((points + 1) * sizes - 1) / 2
     low, flat = places.detach().floor(), volume.flatten(2)
-    found = volume.new_zeros(*volume.shape[:2], *points.shape[1:4])
+    values = volume.new_zeros(*volume.shape[:2], *points.shape[1:4])
     for corner in product((0, 1), repeat=3):
         at = (low + low.new_tensor(corner)).long()
-        held = ((at >= 0) & (at < sizes)).all(dim=-1)
-        x, y, z = at.where(held[..., None], 0).unbind(dim=-1)
+        inside = ((at >= 0) & (at < sizes)).all(dim=-1)
+        x, y, z = at.where(inside[..., None], 0).unbind(dim=-1)
         index = (
             ((z * sizes[1] + y) * sizes[0] + x).flatten(1)[:, None].expand(-1, flat.shape[1], -1)
         )
         along_x, along_y, along_z = (1 - (places - at).abs()).unbind(dim=-1)
-        share = along_x * along_y * along_z * held
-        found = found + flat.gather(2, index).unflatten(2, held.shape[1:]) * share[:, None]
-    return found
+        share = along_x * along_y * along_z * inside
+        values = values + flat.gather(2, index).unflatten(2, inside.shape[1:]) * share[:, None]
+    return values

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from mvrecon.models.networks import UNet3d
+from mvrecon.models.unet2d import UNet2d
 from mvrecon.parts import NETWORKS
 
 
@@ -38,7 +39,7 @@ def network_by_name(
         network: Any = UNet3d(inputs, outputs, width)
     else:
         network = NETWORKS.from_config(config, inputs, outputs)
-    if isinstance(network, UNet3d):
+    if isinstance(network, UNet3d | UNet2d):
         nn.init.zeros_(network.last.weight[:zero])
         return network
     if not isinstance(network, nn.Module):

@@ -6,15 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.kernels.differences.choice import differences_for
+from mvrecon.kernels.differences.shrinkage import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.reconstruct.cgls import check_not_negative
 from mvrecon.reconstruct.problem import Common, Watch, posed
-from mvrecon.reconstruct.total_variation import (
-    gradient,
-    gradient_adjoint,
-    into_unit_balls,
-    voxel_steps,
-)
+from mvrecon.reconstruct.total_variation import voxel_steps
 from mvrecon.reconstruct.weighted_fit import WeightedFit
 
 
@@ -59,7 +56,8 @@ def pdhg_tv(
         primal = primal * support.to(primal.device)
     spread = 4 * weight * sum(1 / step for step in steps)
     rate = balance * min(steps) / spread if weight else 0.0
-    dual_views, dual = None, x.new_zeros(3, *x.shape)
+    shrinkage = Shrinkage(weight * fit.level * primal, steps, nonnegative)
+    kernels, dual_views, dual = differences_for(x), None, x.new_zeros(3, *x.shape)
     ahead, watch = x, Watch(monitor)
     for number in range(iterations):
         residual = views - A(ahead)
@@ -67,12 +65,11 @@ def pdhg_tv(
             return x
         pull = fit.weights.row * residual
         dual_views = pull if dual_views is None else dual_views.lerp_(pull, balance / (1 + balance))
-        back = A.T(dual_views)
+        last, x = x, torch.addcmul(x, primal, A.T(dual_views))
         if weight:
-            into_unit_balls(dual.add_(gradient(ahead, steps), alpha=rate))
-            back = back.sub(gradient_adjoint(dual, steps), alpha=weight * fit.level)
-        last, x = x, torch.addcmul(x, primal, back)
-        x = x.clamp_min_(0) if nonnegative else x
+            x = kernels.primal(x, kernels.dual_step(ahead, dual, rate, steps), shrinkage)
+        elif nonnegative:
+            x = x.clamp_min_(0)
         ahead = torch.lerp(last, x, 2)
     watch.ends(iterations, x, lambda: views - A(x))
     return x

@@ -14,6 +14,7 @@ APPS = {
     "eval": "mvrecon.eval",
     "train": "mvrecon.train",
     "simulate": "mvrecon.simulate",
+    "reconstruct": "mvrecon.reconstruction",
     "bench": "mvrecon_bench.bench",
     "stress": "mvrecon_bench.stress",
 }
@@ -29,7 +30,9 @@ UNUSED = [
     ("train", "+device=cpu"),
     ("train", "+save=true"),
     ("train", "+camra.n_views=12"),
-    ("simulate", "+projector.name=drr"),
+    ("simulate", "+loss.volume=1"),
+    ("reconstruct", "+model.name=sirt"),
+    ("reconstruct", "+loss.volume=1"),
     ("simulate", "+model.name=sirt"),
     ("bench", "+device=cpu"),
     ("stress", "+bench.name=operators"),

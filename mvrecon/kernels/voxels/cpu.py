@@ -41,8 +41,8 @@ def look(
     for some, by_columns in ((~chosen, False), (chosen, True)):
         if some.any():
             part = sight._replace(maps=np.ascontiguousarray(sight.maps[some]))
-            seen = views.numpy() if some.all() else views.numpy()[:, some]
-            (_add_by_columns if by_columns else _add_by_rows)(seen, part, volumes)
+            chosen = views.numpy() if some.all() else views.numpy()[:, some]
+            (_add_by_columns if by_columns else _add_by_rows)(chosen, part, volumes)
     return torch.from_numpy(volumes)
 
 

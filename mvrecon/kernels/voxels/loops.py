@@ -77,20 +77,20 @@ def _cells(row, part, sight, at, weight):
 
 @scalar
 def _look(flat, across, count, at, weight, line):
-    seen = face(flat, across)
+    image = face(flat, across)
     for n in range(np.uint32(count)):
-        line[n] += weight[2, n] * bilinear(seen, np.uint64(at[n]), weight[0, n], weight[1, n])
+        line[n] += weight[2, n] * bilinear(image, np.uint64(at[n]), weight[0, n], weight[1, n])
 
 
 @scalar
 def _show(flat, across, count, at, weight, line):
-    seen, end = face(flat, across), np.uint64(len(flat) - across)
+    image, end = face(flat, across), np.uint64(len(flat) - across)
     for n in range(np.uint32(count)):
         k = np.uint64(at[n])
         if (
             k < end
         ):  # voxels reach beyond these detector rows, and no unsigned index lies before them
-            lay(seen, k, weight[0, n], weight[1, n], weight[2, n] * line[n])
+            lay(image, k, weight[0, n], weight[1, n], weight[2, n] * line[n])
 
 
 @compiled

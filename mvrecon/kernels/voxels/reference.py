@@ -38,6 +38,6 @@ def look(
         flat = torch.cat([index, torch.zeros_like(index[..., :1])], dim=-1)
         points = normalised(flat, (1, view.shape[1], view.shape[2]))
         points = torch.where(counts[..., None], points, 4.0).to(view.dtype)
-        seen = sample(view[None, :, None], points[None])[0]
-        total = total + (seen * (inverse**2).to(view.dtype) if weighted else seen)
+        values = sample(view[None, :, None], points[None])[0]
+        total = total + (values * (inverse**2).to(view.dtype) if weighted else values)
     return total

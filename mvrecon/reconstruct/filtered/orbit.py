@@ -96,6 +96,8 @@ def _turn(cameras: Cameras, grid: Grid) -> Orbit:
 def _circle(cameras: Cameras) -> Orbit:
     count, mean = len(cameras), cameras.source.mean(dim=0)
     places = cameras.source - mean
+    extent = places.norm(dim=1).max()
+    places = places / extent if extent > 0 else places  # the same digits in every unit of length
     _, sizes, axes = torch.linalg.svd(places)
     if count < 3 or sizes[1] < 1e-6 * sizes[0] or not sizes[0] > 0:
         raise ValueError(
@@ -103,17 +105,19 @@ def _circle(cameras: Cameras) -> Orbit:
         )
     flat = places @ axes[:2].T
     system = torch.cat([2 * flat, torch.ones_like(flat[:, :1])], dim=1)
-    fit = torch.linalg.lstsq(system, flat.square().sum(dim=1, keepdim=True)).solution[:, 0]
+    # the normal equations: the last bits of LAPACK's lstsq change with where a tensor lies
+    fit = torch.linalg.solve(system.T @ system, system.T @ flat.square().sum(dim=1))
     radius = (fit[2] + fit[:2].square().sum()).sqrt().item()
     out = flat - fit[:2]
     off = torch.hypot(places @ axes[2], out.norm(dim=1) - radius).max().item()
     if not off <= TOLERANCE * radius:
         raise ValueError(
             f"FDK needs sources on a circle, within {TOLERANCE:.0%} of its radius, got {count} "
-            f"sources that leave the best circle, of radius {radius:.4g} mm, by up to {off:.4g} "
-            f"mm; use sirt"
+            f"sources that leave the best circle, of radius {extent * radius:.4g} mm, by up to "
+            f"{extent * off:.4g} mm; use sirt"
         )
-    return Orbit(axes[2], mean + fit[:2] @ axes[:2], radius, unit(out) @ axes[:2])
+    centre, radius = mean + extent * (fit[:2] @ axes[:2]), extent.item() * radius
+    return Orbit(axes[2], centre, radius, unit(out) @ axes[:2])
 
 
 def _check_rows(cameras: Cameras, orbit: Orbit) -> None:

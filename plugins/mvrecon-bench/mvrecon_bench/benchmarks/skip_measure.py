@@ -82,7 +82,7 @@ def _timed(tried: dict[str, Tried], repeats: int, device: str) -> dict[str, Row]
     for n, mode in enumerate(modes):
         trial, row = tried[mode].trial, tried[mode].row
         charge = row.get("build_ms", 0.0) if trial.charged else 0.0
-        chosen, why = trial.told()
+        chosen, why = trial.choice()
         rows[mode] = {
             **row,
             "ms": times[n].ms + charge,

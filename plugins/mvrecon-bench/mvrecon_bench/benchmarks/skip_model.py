@@ -113,7 +113,7 @@ class Learned:
         return Trial(
             call=call,
             whole=lambda part: placed(part, box, self.A.grid.shape),
-            told=lambda: ("none", "") if mode in DENSE else _told(self.support(mode)),
+            choice=lambda: ("none", "") if mode in DENSE else _choice(self.support(mode)),
             build=None if mode in DENSE else lambda: self.support(mode),
             score=None if self.weights is None else score,
         )
@@ -144,5 +144,5 @@ class Learned:
         return volume_metrics(volume, case.volume, case.inside, self.data_range)["psnr"]
 
 
-def _told(support: Support) -> tuple[str, str]:
+def _choice(support: Support) -> tuple[str, str]:
     return support.kind, f"{support.fraction:.1%} of the grid"

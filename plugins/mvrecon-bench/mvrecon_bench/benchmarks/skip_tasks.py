@@ -34,7 +34,7 @@ class Trial:
     Args:
         call: what is timed.
         whole: its result on the grid or the detectors of "off", so that they can be compared.
-        told: mode that the last call chose, and why.
+        choice: mode that the last call chose, and why.
         build: makes the mask, once for a support; None: there is none, or every call makes its own.
         charged: whether that time counts with the call's.
         score: PSNR in dB, where there is something that was trained for it.
@@ -42,7 +42,7 @@ class Trial:
 
     call: Callable[[], Tensor]
     whole: Callable[[Tensor], Tensor]
-    told: Callable[[], tuple[str, str]]
+    choice: Callable[[], tuple[str, str]]
     build: Callable[[], Any] | None = None
     charged: bool = False
     score: Callable[[], float] | None = None
@@ -128,13 +128,13 @@ def forward(bed: Bed, mode: str) -> Trial:
         x[..., :1, :1, :1].mul_(1)  # another, as far as its version tells
         return A(x)
 
-    return Trial(call, _same, _told(A, mode))
+    return Trial(call, _same, _choice(A, mode))
 
 
 def forward_static(bed: Bed, mode: str) -> Trial:
     """A x with the support given once."""
     A, x = bed.operator(mode, masked=mode not in DENSE), bed.cut(bed.volume, mode)
-    return Trial(lambda: A(x), _same, _told(A, mode), _rebuilding(A, bed, mode))
+    return Trial(lambda: A(x), _same, _choice(A, mode), _rebuilding(A, bed, mode))
 
 
 def adjoint(bed: Bed, mode: str) -> Trial:
@@ -148,7 +148,7 @@ def adjoint(bed: Bed, mode: str) -> Trial:
     def whole(part: Tensor) -> Tensor:
         return torch.where(bed.mask, bed.pasted(part, mode), 0)
 
-    return Trial(lambda: A.T(y), whole, _told(A, mode), _rebuilding(A, bed, mode))
+    return Trial(lambda: A.T(y), whole, _choice(A, mode), _rebuilding(A, bed, mode))
 
 
 def reconstruction(bed: Bed, mode: str) -> Trial:
@@ -162,14 +162,14 @@ def reconstruction(bed: Bed, mode: str) -> Trial:
         (lambda: sirt(A, within.views, ITERATIONS)),
         (lambda part: within.pasted(part, mode)),
     )
-    return Trial(call, whole, _told(A, mode), build, charged=True)
+    return Trial(call, whole, _choice(A, mode), build, charged=True)
 
 
 def _same(views: Tensor) -> Tensor:
     return views
 
 
-def _told(A: RayTransform, mode: str) -> Callable[[], tuple[str, str]]:
+def _choice(A: RayTransform, mode: str) -> Callable[[], tuple[str, str]]:
     return lambda: (OFF, "") if mode in DENSE else (A.skipped.mode, A.skipped.why)
 
 

@@ -1,0 +1,1 @@
+"""Finite differences of volumes: the steps of total variation."""
