@@ -20,8 +20,9 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
     where the scene is in 1/mm), and what moved it as `placement.json` if it came from a file.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`, for
-    `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, and every case
-    has `projections`, see `export.save_greys`.
+    `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,
+    where RTK's gantry turns about the z axis here, and every case has `projections`, see
+    `export.save_greys`.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -53,7 +54,8 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     with run_folder.taken(folder, settings):
         files.save(cameras, folder / "cameras.json")
         if settings["rtk"]:
-            rtk_xml.write(cameras, folder / "geometry.xml")
+            # RTK's FDK weights views by their gantry angles, about the file's y: z in IEC's axes
+            rtk_xml.write(cameras, folder / "geometry.xml", "IEC")
         console = Console(stderr=True)
         for item in track(range(len(cases)), "Simulating", transient=True, console=console):
             case, index = cases[item], settings["cases"][item]

@@ -29,7 +29,7 @@ SIMULATED = (
     "camera.detector={pixels: [36, 40], pixel_mm: 9.0, offset_mm: [0.0, 0.0]}",
     "rtk=true",
 )
-RIG = ("camera=rtk_xml", "camera.detector.pixel_mm=9.0")
+RIG = ("camera=rtk_xml", "camera.detector.pixel_mm=9.0", "camera.world=IEC")
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from xml.etree import ElementTree
 
 import h5py
 import numpy as np
@@ -152,6 +153,23 @@ def test_a_projector_and_a_detector_make_the_views_and_are_written_down(tmp_path
     ((numbers, attributes, _),) = views(tmp_path).values()
     counts = 1e4 * np.exp(-numbers.astype(float))
     assert np.abs(counts - counts.round()).max() < 0.01 and attributes["unit"] == "1/mm * mm"
+
+
+def test_the_rig_for_rtk_turns_about_the_axis_that_rtk_s_fdk_takes_its_angles_about(tmp_path):
+    """A circle about z: RTK's gantry goes round in equal steps, its detector is not tilted."""
+    call(
+        tmp_path,
+        *GRID,
+        "camera.n_views=6",
+        "camera.arc_degrees=360",
+        "scene.value=0.02",
+        "rtk=true",
+    )
+    views = ElementTree.parse(tmp_path / "geometry.xml").getroot().findall("Projection")
+    gantry = torch.tensor([float(view.findtext("GantryAngle")) for view in views])
+    assert torch.allclose(gantry.diff() % 360, torch.tensor(60.0), atol=1e-4)
+    for tilt in ("OutOfPlaneAngle", "InPlaneAngle"):
+        assert all(abs(float(view.findtext(tilt))) < 1e-9 for view in views)
 
 
 @pytest.mark.parametrize(

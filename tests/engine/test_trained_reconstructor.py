@@ -1,0 +1,108 @@
+"""A trained network as a reconstructor: the same volume as its module's, and words where the scan
+is another than in training.
+"""
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import mvrecon as mv
+import mvrecon.reconstruction
+from mvrecon.cameras import files
+from mvrecon.config import compose
+from mvrecon.data.volume_files import read_volume
+from mvrecon.engine import fit, run_folder
+from mvrecon.engine.export import save_views
+from mvrecon.engine.trained import trained
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import PROJECTORS
+from tests.engine.runs import call
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """One step of two methods: one that takes any rig, and one that is made for its own."""
+    settings = compose(
+        "experiment=smoke",
+        "+model@compare.geometry_free=geometry_free",
+        "trainer.max_steps=1",
+        "trainer.val_check_interval=1",
+    )
+    folder = tmp_path_factory.mktemp("run")
+    run_folder.start(folder, settings)
+    for label in ("cross_view", "geometry_free"):
+        fit.fit(label, settings, fit.build_data(settings), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def A(run: Path):
+    """The operator of the training."""
+    return mv.load(run).module.projector
+
+
+@pytest.fixture(scope="module")
+def views(A) -> torch.Tensor:
+    """Views of a cube of half the training's greatest value."""
+    cube = torch.zeros(1, 1, *A.grid.shape)
+    cube[..., 4:12, 4:12, 4:12] = 0.5
+    return A(cube)
+
+
+def test_a_checkpoint_reconstructs_a_scan_of_its_own_rig_as_its_module_does(
+    run, A, views, tmp_path
+):
+    case = save_views(tmp_path, "scan", views[0, 0], "1")
+    files.save(A.cameras, tmp_path / "rig.json")
+    options = (
+        f"views.path={case}/views.h5",
+        f"camera.path={tmp_path}/rig.json",
+        f"grid.size={list(A.grid.size)}",
+        f"grid.spacing={list(A.grid.spacing)}",
+        "reconstructor=trained",
+        f"reconstructor.checkpoint={run}",
+        f"out={tmp_path}/volume.nii.gz",
+        f"hydra.run.dir={tmp_path}/run",
+        "device=cpu",
+    )
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        assert call(mvrecon.reconstruction, *options) == 0
+    assert not [w for w in told if "trained" in str(w.message)]
+    volume, grid = read_volume(tmp_path / "volume.nii.gz")
+    with torch.inference_mode():
+        expected = mv.load(run).module.eval()(views).volume[0, 0]
+    assert torch.allclose(volume, expected, rtol=1e-4, atol=1e-5) and expected.max() > 0.1
+    assert torch.allclose(grid.affine, A.grid.affine)
+    assert json.loads((tmp_path / "run" / "results.json").read_text())["method"] == "trained"
+
+
+def test_another_rig_or_grid_is_reconstructed_and_told_in_words(run, A, views):
+    shifted = replace(A.cameras, source=A.cameras.source + torch.tensor([5.0, 0.0, 0.0]))
+    other = PROJECTORS.build("drr", grid=A.grid, cameras=shifted)
+    with pytest.warns(UserWarning, match="trained with another rig"):
+        assert trained(other, views, str(run)).shape[2:] == A.grid.shape
+    fine = Grid.centred(size=(20, 20, 20), spacing=6.4)
+    other = PROJECTORS.build("drr", grid=fine, cameras=A.cameras)
+    with pytest.warns(UserWarning, match=r"another grid .*\(16, 16, 16\).*got \(20, 20, 20\)"):
+        assert trained(other, views, str(run)).shape[2:] == fine.shape
+
+
+def test_views_in_another_unit_are_told_by_the_range_of_values(run, A, views):
+    with pytest.warns(UserWarning, match="another unit"):
+        trained(A, 1000 * views, str(run))
+
+
+@pytest.mark.door
+def test_a_network_made_for_its_own_cameras_refuses_another_number_of_views(run, A, views):
+    """A network whose weights belong to one rig is not applied to another number of views."""
+    other = PROJECTORS.build("drr", grid=A.grid, cameras=A.cameras[:3])
+    with (
+        pytest.warns(UserWarning, match="trained with another rig"),
+        pytest.raises(ValueError, match="expected the rig and the grid of its training, got 3"),
+    ):
+        trained(other, views[:, :, :3], str(run), "geometry_free")
