@@ -34,8 +34,9 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         raise ValueError(f"Expected the unit 1/mm or HU, got {settings['unit']!r}")
     out = Path(settings["out"] or folder / "volume.nii.gz").expanduser()
     check_ending(out)
+    case = scan.open_scan(settings)
+    solve.check(settings)  # what does not fit is told before the folder is anybody's
     with run_folder.taken(folder, settings):
-        case = scan.open_scan(settings)
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = solve.solve(case, settings, device_of(settings["device"]))

@@ -43,23 +43,34 @@ class Outcome:
     chosen: dict[str, Any] = field(default_factory=dict)
 
 
+def check(settings: Mapping[str, Any]) -> None:
+    """Check the settings `reconstructor`, `stop` and `choose` before any view is read.
+
+    Raises:
+        LookupError, TypeError: no such method, or no such option of it.
+        ValueError: a rule to stop or to choose for a method that does not iterate.
+    """
+    name = settings["reconstructor"]["name"]
+    RECONSTRUCTORS.check(settings["reconstructor"])
+    ruled = settings["choose"] or settings["stop"]["sigma"] is not None
+    if ruled and not _iterates(name):
+        raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")
+
+
 def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outcome:
     """The volume of a scan by the method that the settings `reconstructor`, `stop` and `choose`
     describe.
 
     Raises:
-        ValueError: what the method raises; a rule to stop or to choose for one that does not
-            iterate.
+        ValueError: what the method raises.
     """
     name, options = settings["reconstructor"]["name"], dict(settings["reconstructor"])
     del options["name"]
     start = time.perf_counter()
     curve, chosen = Curve(), {}
     if name in STREAMED.names():
-        _refuse_rules(name, settings)
         volume = _streamed(scan, name, options)
     elif not _iterates(name):
-        _refuse_rules(name, settings)
         views = scan.measured.whole().views[None, None].to(device)
         volume = RECONSTRUCTORS.build(name, scan.operator().to(device), views, **options)
     else:
@@ -116,11 +127,6 @@ def _iterates(name: str) -> bool:
     """Whether a method shows its iterates to a monitor."""
     parameters = signature(RECONSTRUCTORS.get(name)).parameters.values()
     return any(p.name == "monitor" or p.kind is p.VAR_KEYWORD for p in parameters)
-
-
-def _refuse_rules(name: str, settings: Mapping[str, Any]) -> None:
-    if settings["choose"] or settings["stop"]["sigma"] is not None:
-        raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")
 
 
 @contextmanager

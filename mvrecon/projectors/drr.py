@@ -24,5 +24,5 @@ class Drr(RayTransform):
     def check_rig(cameras: Cameras | ExplicitRays) -> None:
         if cameras.parallel:
             raise ValueError(
-                "The projector 'drr' needs central cameras, got a parallel rig; use 'radon'"
+                "The projector 'drr' needs central cameras, got a parallel rig; use projector=radon"
             )
