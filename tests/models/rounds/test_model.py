@@ -134,7 +134,6 @@ def test_corrections_learn_from_the_truth_s_own_views_alone():
 
 
 def test_the_correction_term_is_a_mean_density_and_earlier_rounds_count_less():
-    projector = small_projector()
     truth, row = torch.zeros(1, 1, 12, 12, 12), torch.full((1, 1, 4, 12, 12), 0.5)
     views = torch.zeros(1, 1, 4, 12, 12)
     earlier = tuple(torch.full_like(truth, value) for value in (3.0, 2.0))
