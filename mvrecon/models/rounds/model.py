@@ -19,6 +19,9 @@ from mvrecon.models.rounds.step import Measured, Round, State
 from mvrecon.models.rounds.unet import Precision
 from mvrecon.projectors.operator import Projector
 
+#: Of the longest chord of a support: as long counts each ray that meets it, at least.
+SHORTEST = 0.1
+
 
 class Rounds(nn.Module):
     """Reconstruction in rounds: cameras correct their views, a network in the world changes the
@@ -108,13 +111,14 @@ class Rounds(nn.Module):
         )
 
     def _geometry(self, views: Float[Tensor, "b 1 m v u"]) -> Geometry:
-        """The whole grid's, with C zero outside the support.
+        """The whole grid's, within the support: R from the rays' chords of it, C zero outside.
 
-        R stays that of whole rays: where views err, rays that graze a support measure more than
-        its short chords explain.
+        Chords count as at least `SHORTEST` of the longest: where views err, rays that graze the
+        support measure more than their chords explain.
         """
         whole = self.cropping.whole
         if self.cropping.options.support == "none":
             return whole
-        mask = self.cropping.mask(views)
-        return replace(whole, column=whole.column * mask, mask=mask)
+        within = whole.with_mask(self.cropping.mask(views), masked=False)
+        of_longest = torch.where(within.row > 0, within.row, torch.inf).amin((1, 2, 3, 4), True)
+        return replace(within, row=within.row.minimum(of_longest / SHORTEST))

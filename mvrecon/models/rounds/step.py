@@ -38,12 +38,12 @@ class Measured(NamedTuple):
     Args:
         geometry: the operator and SIRT's weights; C is zero outside the support.
         views: y, relative to the content's scale.
-        chord: the row sums of A in mm, zero where R is.
+        chord: 1 / R in mm, zero where R is.
     """
 
     geometry: Geometry
     views: Float[Tensor, "b 1 m v u"]
-    chord: Float[Tensor, "1 1 m v u"]
+    chord: Float[Tensor, "#b 1 m v u"]
 
 
 class Round(nn.Module):

@@ -97,6 +97,19 @@ def test_outside_the_hull_all_rounds_are_zero_and_inside_not():
         assert not (volume * ~out.support).any() and volume.any()
 
 
+@pytest.mark.filterwarnings("ignore:Rays are up to")
+@torch.no_grad()
+def test_no_ray_is_weighted_by_less_than_a_tenth_of_the_longest_chord_of_the_hull():
+    projector = small_projector()
+    model = Rounds(projector, SMALL["M3"], support="hull")
+    geometry = model._geometry(projector(blob(projector, 2)))
+    chords = projector(geometry.mask.float())
+    longest = chords.amax(dim=(1, 2, 3, 4), keepdim=True)
+    expected = torch.where(chords > 0, 1 / chords.maximum(0.1 * longest), 0.0)
+    assert ((chords > 0) & (chords < 0.1 * longest)).any()
+    assert torch.allclose(geometry.row, expected, rtol=1e-5)
+
+
 @torch.no_grad()
 def test_rays_that_miss_the_grid_are_not_corrected():
     grid, cameras = small_rig()
