@@ -110,6 +110,19 @@ def test_no_ray_is_weighted_by_less_than_a_tenth_of_the_longest_chord_of_the_hul
     assert torch.allclose(geometry.row, expected, rtol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:Rays are up to")
+@pytest.mark.parametrize("support", ["hull", "box", "auto"])
+def test_a_sample_of_nothing_has_an_empty_hull_and_spoils_no_gradient(support):
+    projector = small_projector()
+    truth = blob(projector, 2)
+    truth[1] = 0
+    model = stirred(projector, support=support)
+    volume = model(projector(truth)).volume
+    assert volume[0].any() and not volume[1].any()
+    volume.square().sum().backward()
+    assert all(p.grad.isfinite().all() for p in model.parameters() if p.grad is not None)
+
+
 @torch.no_grad()
 def test_rays_that_miss_the_grid_are_not_corrected():
     grid, cameras = small_rig()
