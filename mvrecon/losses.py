@@ -9,6 +9,9 @@ from torch import Tensor, nn
 
 from mvrecon.models.output import Reconstruction
 
+#: Weight of a round's volume relative to that of the round behind it.
+EARLIER = 0.4
+
 
 def edge_difference(
     a: Float[Tensor, "b 1 d h w"],
@@ -54,6 +57,11 @@ class ReconstructionLoss(nn.Module):
         opinions: weight of the mean squared error of the opinions, where the cameras see.
         cross_view: weight of the squared error of opinions projected to the other cameras,
             relative to the views.
+        rounds: weight of the mean squared errors of the volumes after earlier rounds, each less
+            than the one behind it by the factor `EARLIER`.
+        corrected_views: weight of the mean squared error of the views as the cameras' networks
+            have corrected them, against the truth's own views A x_true, as mean densities along
+            rays.
     """
 
     def __init__(
@@ -63,6 +71,8 @@ class ReconstructionLoss(nn.Module):
         edges: float = 0.0,
         opinions: float = 0.0,
         cross_view: float = 0.0,
+        rounds: float = 0.0,
+        corrected_views: float = 0.0,
     ):
         super().__init__()
         if not data_range > 0:
@@ -73,12 +83,20 @@ class ReconstructionLoss(nn.Module):
             "edges": edges,
             "opinions": opinions,
             "cross_view": cross_view,
+            "rounds": rounds,
+            "corrected_views": corrected_views,
         }
 
     def forward(
         self, out: Reconstruction, batch: dict[str, Tensor]
     ) -> dict[str, Float[Tensor, ""]]:
-        """Each term unweighted, and their weighted sum as "total"."""
+        """Each term unweighted, and their weighted sum as "total".
+
+        Args:
+            out: of the model.
+            batch: "volume" and "views", and where `compares_views` is true of the reconstruction
+                "true_views", the truth's own views.
+        """
         truth, views = batch["volume"] / self.data_range, batch["views"]
         volume = out.volume / self.data_range
         terms = {"volume": mean_where((volume - truth).square(), out.support)}
@@ -90,8 +108,31 @@ class ReconstructionLoss(nn.Module):
         if out.cross_views is not None and self.weights["cross_view"]:
             power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
             terms["cross_view"] = (out.cross_views - views).square().mean() / power
+        if out.earlier and self.weights["rounds"]:
+            terms["rounds"] = self._rounds(out, truth)
+        if self.compares_views(out):
+            terms["corrected_views"] = self._corrected(out, batch["true_views"])
         total = sum(self.weights[name] * value for name, value in terms.items())
         return {**terms, "total": torch.as_tensor(total)}
+
+    def compares_views(self, out: Reconstruction) -> bool:
+        """Whether corrected views of this reconstruction are compared with the truth's own."""
+        return bool(out.corrected_views and self.weights["corrected_views"])
+
+    def _rounds(self, out: Reconstruction, truth: Tensor) -> Float[Tensor, ""]:
+        errors = [
+            EARLIER**behind * mean_where((volume / self.data_range - truth).square(), out.support)
+            for behind, volume in enumerate(reversed(out.earlier), start=1)
+        ]
+        return torch.stack(errors).sum()
+
+    def _corrected(
+        self, out: Reconstruction, true_views: Float[Tensor, "b 1 m v u"]
+    ) -> Float[Tensor, ""]:
+        assert out.row is not None
+        weight = out.row / self.data_range
+        errors = [(weight * (views - true_views)).square().mean() for views in out.corrected_views]
+        return torch.stack(errors).mean()
 
     @staticmethod
     def _opinions(error: Tensor, visible: Tensor, support: Tensor | None) -> Float[Tensor, ""]:

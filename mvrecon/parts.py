@@ -45,6 +45,10 @@ NETWORKS = Registry(
     unet3d="mvrecon.models.published:CicekUNet3d",
     residual_unet3d="mvrecon.models.published:ResidualUNet3d",
 )
+CAMERA_NETWORKS = Registry(
+    "camera_network",
+    rays2d="mvrecon.models.rounds.rays2d:Rays2d",
+)
 RECONSTRUCTORS = Registry(
     "reconstructor",
     fbp="mvrecon.reconstruct.filtered.fdk:fbp",
@@ -67,6 +71,7 @@ STREAMED = Registry(
 MODELS = Registry(
     "model",
     cross_view="mvrecon.models.cross_view:CrossView",
+    rounds="mvrecon.models.rounds.model:Rounds",
     mean_fusion="mvrecon.models.baselines:MeanFusion",
     backprojection_unet="mvrecon.models.baselines:BackprojectionUNet",
     geometry_free="mvrecon.models.baselines:GeometryFree",
@@ -81,5 +86,15 @@ MODELS = Registry(
 )
 
 REGISTRIES = {
-    r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, NETWORKS, RECONSTRUCTORS, MODELS)
+    r.kind: r
+    for r in (
+        SCENES,
+        CAMERAS,
+        PROJECTORS,
+        HEADS,
+        NETWORKS,
+        CAMERA_NETWORKS,
+        RECONSTRUCTORS,
+        MODELS,
+    )
 }

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from mvrecon.acquisition.detector import detected
+from mvrecon.acquisition.disturbances import rig_errors
 from mvrecon.acquisition.settings import Acquisition
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -20,8 +21,9 @@ from mvrecon.projectors.pixel_integral import PixelIntegral
 from mvrecon.scenes.analytic import case_numbers, generator, mixed
 from mvrecon.scenes.sample import Placing, Sample, Scene, Thin, finer
 
-#: The series of the detector's random numbers, apart from those that draw the objects.
-NOISE = 0x6E6F6973
+#: The series of the random numbers of the detector and of rig errors, apart from those that draw
+#: the objects.
+NOISE, ERRORS = 0x6E6F6973, 0x72696773
 
 
 class Lines(NamedTuple):
@@ -106,18 +108,25 @@ class Acquired:
         Raises:
             ValueError: a projector that takes neither the finer grid nor finer pixels with it.
         """
-        source = self._source_of(grid, cameras)
+        rng, errors = generator(NOISE, mixed(seed, index)), None
+        source, rig = self._source_of(grid, cameras), cameras
+        if self.acquisition.disturbed is not None:
+            drawn = generator(ERRORS, mixed(seed, index))
+            errors = rig_errors(self.acquisition.disturbed, cameras, drawn)
+            rig = errors.rig(cameras)
+            source = source_of(self.projector, grid, rig, self.acquisition.fine)
         if isinstance(source, Lines):
             sample = self.scene.sample(index, seed, grid, source.rig)
             views = _pooled(sample.views, source.pixel.rays)
             views = views * source.pixel.weight.to(views)
         else:
-            sample = self.scene.sample(index, seed, grid, cameras)
+            sample = self.scene.sample(index, seed, grid, rig)
             with case_numbers(seed, index):  # the numbers that drew the sample
-                volume = finer(self.scene, index, seed, grid, cameras, self.acquisition.fine)
+                volume = finer(self.scene, index, seed, grid, rig, self.acquisition.fine)
             with torch.no_grad():
                 views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
-        rng = generator(NOISE, mixed(seed, index))
+        if errors is not None:
+            views = views * errors.gain.to(views)
         return replace(sample, views=detected(views, self.acquisition, cameras, rng))
 
     def _source_of(self, grid: Grid, cameras: Cameras) -> Lines | Projection:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from mvrecon.acquisition.disturbances import Disturbance
 from mvrecon.registry import hint
 
 
@@ -30,6 +31,7 @@ class Acquisition:
             projector's unit. None: no counts.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
+        disturbed: rig errors of each case that nobody knows, before all that the detector does.
 
     Raises:
         TypeError: an option that is no number.
@@ -43,10 +45,12 @@ class Acquisition:
     photons: float | None = None
     counts: float | None = None
     noise: float = 0.0
+    disturbed: Disturbance | None = None
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            self._check(name, value)
+            if name != "disturbed":
+                self._check(name, value)
         if self.photons is not None and self.counts is not None:
             raise ValueError(
                 f"An acquisition has photons (transmission) or counts (emission), got photons "
@@ -76,7 +80,10 @@ class Acquisition:
                 raise TypeError(
                     f"An acquisition has no option {option!r}{hint(str(option), known)}"
                 )
-        return cls(**(options or {}))
+        values = {**(options or {})}
+        if values.get("disturbed") is not None:
+            values["disturbed"] = Disturbance.of(values["disturbed"])
+        return cls(**values)
 
     @property
     def perfect(self) -> bool:

@@ -237,10 +237,16 @@ class Cameras:
                     f"Expected rows and columns inside the detector {self.shape}, got {rows} and "
                     f"{columns}"
                 )
-        shift = self.u * columns[0] + self.v * rows[0]
+        first = self.source.new_tensor([[columns[0], rows[0]]])
         shape = (rows[1] - rows[0], columns[1] - columns[0])
+        return replace(self.shifted(first), shape=shape)
+
+    def shifted(self, pixels: Float[Tensor, "#m 2"]) -> "Cameras":
+        """The same detectors moved in their planes by so many columns and rows, (u, v)."""
+        column, row = pixels.split(1, dim=1)
+        shift = column * self.u + row * self.v
         source = self.source + shift if self.parallel else self.source
-        return replace(self, source=source, origin=self.origin + shift, shape=shape)
+        return replace(self, source=source, origin=self.origin + shift)
 
     def refined(self, factor: int) -> "Cameras":
         """The same detectors with every pixel cut into `factor` x `factor`; undone by `binned`."""

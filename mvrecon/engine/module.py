@@ -65,7 +65,7 @@ class ReconstructionModule(L.LightningModule):
         Raises:
             FloatingPointError: a loss that is not finite.
         """
-        terms = self.loss(self.model(batch["views"]), batch)
+        terms = self._terms(self.model(batch["views"]), batch)
         if not terms["total"].isfinite():
             shown = ", ".join(f"{name} {value.item():.4g}" for name, value in terms.items())
             raise FloatingPointError(
@@ -83,10 +83,16 @@ class ReconstructionModule(L.LightningModule):
             )
         return terms["total"]
 
+    def _terms(self, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """The loss, with the truth's own views where views are corrected towards them."""
+        if self.loss.compares_views(out):
+            batch = {**batch, "true_views": self.projector(batch["volume"])}
+        return self.loss(out, batch)
+
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
         """Log the loss and the figures of merit; hand the reconstruction on to the board."""
         out = self.model(batch["views"])
-        terms = {f"loss_{name}": value for name, value in self.loss(out, batch).items()}
+        terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
         predicted = self.projector(out.volume)
         figures = [
             volume_metrics(volume, truth, inside, self.hparams["data_range"])

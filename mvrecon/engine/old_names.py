@@ -8,6 +8,9 @@ from mvrecon.acquisition.settings import Acquisition
 #: Rigs whose number of views was the option `views` up to version 0.1.0.
 RIGS = ("arc", "circular", "dome", "parallel")
 
+#: Terms of the loss that version 0.1.0 did not have.
+NEW_TERMS = {"rounds": 0.0, "corrected_views": 0.0}
+
 
 def current(settings: Any) -> Any:
     """The settings of a run, or the geometry of a checkpoint, with the option names of this
@@ -21,8 +24,11 @@ def current(settings: Any) -> Any:
     if isinstance(camera, dict) and camera.get("name") in RIGS:
         renamed = {"n_views" if key == "views" else key: value for key, value in camera.items()}
         settings = {**settings, "camera": renamed}
-    if "scene" in settings and settings.get("acquisition") is None:
-        settings = {**settings, "acquisition": asdict(Acquisition())}
+    if "scene" in settings:
+        acquisition = {**asdict(Acquisition()), **(settings.get("acquisition") or {})}
+        settings = {**settings, "acquisition": acquisition}
+    if "scene" in settings and isinstance(settings.get("loss"), dict):
+        settings = {**settings, "loss": {**NEW_TERMS, **settings["loss"]}}
     if "scene" in settings and isinstance(data, dict):
         settings = {**settings, "data": {"overlap": False, **data}}
     return settings

@@ -68,7 +68,10 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
 def _spoilt(acquisition: Mapping[str, Any]) -> str:
     """The options of a detector that are not zero, without those that do nothing."""
     silent = {"fine"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
-    return ", ".join(f"{k} {v:g}" for k, v in acquisition.items() if v and k not in silent)
+    errors = acquisition.get("disturbed") or {}
+    disturbed = {f"disturbed.{name}": value for name, value in errors.items()}
+    shown = {**acquisition, "disturbed": 0, **disturbed}
+    return ", ".join(f"{k} {v:g}" for k, v in shown.items() if v and k not in silent)
 
 
 def _scenes(count: int, overlap: list[str] | None) -> str:

@@ -18,7 +18,7 @@ from mvrecon.models.networks import MULTIPLE
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
-from mvrecon.visual_hull.support import WORTH, support_from_views
+from mvrecon.visual_hull.support import WORTH, Support, support_from_views
 
 #: Crops whose geometry is kept; a fixed rig's scenes share few.
 KEPT = 8
@@ -69,17 +69,27 @@ class Cropping(nn.Module):
     def region(self, views: Float[Tensor, "b 1 m v u"]) -> tuple[Geometry, Box]:
         """The crop around the support of views, with the support as its mask, and where it lies."""
         options, shape = self.options, self.projector.grid.shape
-        support = support_from_views(
-            views, self.cameras, self.projector.grid, "hull", options.noise
-        )
-        assert support.mask is not None  # a hull has a mask
-        mask = torch.cat([support_of(one, options.support) for one in support.mask.split(1)])
+        support = self._hull(views)
+        mask = self._mask(support)
         box = Box.around(mask)
         box = box if box.size else support.box
         box = box.grown(options.margin, shape).aligned(MULTIPLE, shape)
         mask = mask[..., *box.slices]
         crop = self.crop(box, occupied_bricks(mask) if options.masked else None)
         return crop.with_mask(mask, options.masked), box
+
+    def mask(self, views: Float[Tensor, "b 1 m v u"]) -> Bool[Tensor, "b 1 d h w"]:
+        """The support of views on the whole grid."""
+        return self._mask(self._hull(views))
+
+    def _hull(self, views: Float[Tensor, "b 1 m v u"]) -> Support:
+        grid, noise = self.projector.grid, self.options.noise
+        return support_from_views(views, self.cameras, grid, "hull", noise)
+
+    def _mask(self, support: Support) -> Bool[Tensor, "b 1 d h w"]:
+        assert support.mask is not None  # a hull has a mask
+        kind = self.options.support
+        return torch.cat([support_of(one, kind) for one in support.mask.split(1)])
 
     def crop(self, box: Box, bricks: Bool[Tensor, "z y x"] | None = None) -> Geometry:
         """The geometry of a crop, or of some bricks of it, made at most once while it is kept."""

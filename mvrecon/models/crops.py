@@ -56,10 +56,8 @@ class Window:
 
     def cameras(self, cameras: Cameras) -> Cameras:
         """The rig with its detectors cut."""
-        row, column = self.first[:, 1:].to(cameras.source).split(1, dim=1)
-        shift = column * cameras.u + row * cameras.v
-        source = cameras.source + shift if cameras.parallel else cameras.source
-        return replace(cameras, source=source, origin=cameras.origin + shift, shape=self.shape[1:])
+        first = self.first[:, [2, 1]].to(cameras.source)
+        return replace(cameras.shifted(first), shape=self.shape[1:])
 
     def edges(self, edges: Float[Tensor, "m e"]) -> Float[Tensor, "m f"]:
         """The planes between the window's depth bins, of those between all."""

@@ -137,18 +137,18 @@ def _step(steps: nn.Sequential, x: Tensor, on: Voxels | None) -> Tensor:
 
 
 def convolution(
-    x: Float[Tensor, "n i d h w"], weight: Float[Tensor, "o i 3 3 3"]
+    x: Float[Tensor, "n i d h w"], weight: Float[Tensor, "o i 3 3 3"], bias: Tensor | None = None
 ) -> Float[Tensor, "n o d h w"]:
-    """A 3x3x3 convolution without bias, zero beyond the volume; a small volume that is alone goes
-    as two halves.
+    """A 3x3x3 convolution, zero beyond the volume; a small volume that is alone goes as two
+    halves.
     """
     n, channels, d, h = x.shape[:4]
     if n > 1 or d < 2 or x.is_cuda or channels * d * h > ALONE:
-        return F.conv3d(x, weight, padding=1)
+        return F.conv3d(x, weight, bias, padding=1)
     half = (d + 1) // 2
     padded = F.pad(x, (0, 0, 0, 0, 1, 1 + 2 * half - d))
     halves = torch.cat([padded[:, :, : half + 2], padded[:, :, half:]])
-    front, back = F.conv3d(halves, weight, padding=(0, 1, 1)).split(1)
+    front, back = F.conv3d(halves, weight, bias, padding=(0, 1, 1)).split(1)
     return torch.cat([front, back], dim=2)[:, :, :d]
 
 

@@ -20,6 +20,10 @@ class Reconstruction:
         support: where the volume may differ from zero; none for everywhere.
         start: the classical reconstruction that the network began with.
         start_views: the start projected into every camera, in the unit of the views.
+        earlier: the volumes after each round but the last, of a model in rounds.
+        corrected_views: the views as the cameras' networks of each round have corrected them, in
+            the unit of the views.
+        row: R, the inverse row sums of A in 1/mm, where views are corrected.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -30,3 +34,6 @@ class Reconstruction:
     support: Bool[Tensor, "b 1 d h w"] | None = None
     start: Float[Tensor, "b 1 d h w"] | None = None
     start_views: Float[Tensor, "b 1 m v u"] | None = None
+    earlier: tuple[Float[Tensor, "b 1 d h w"], ...] = ()
+    corrected_views: tuple[Float[Tensor, "b 1 m v u"], ...] = ()
+    row: Float[Tensor, "#b 1 m v u"] | None = None

@@ -47,5 +47,8 @@ def test_a_run_before_acquisitions_had_a_perfect_detector():
     old = {key: value for key, value in settings.items() if key != "acquisition"}
     old["data"] = {key: value for key, value in settings["data"].items() if key != "overlap"}
     assert current(old) == settings == current(settings)
+    late = {"acquisition": "disturbed", "loss": "corrected_views"}
+    parts = {key: {k: v for k, v in settings[key].items() if k != new} for key, new in late.items()}
+    assert current({**settings, **parts}) == settings
     geometry = {key: settings[key] for key in ("grid", "projector")}
     assert current(geometry) == geometry and current({"checkpoint": "x"}) == {"checkpoint": "x"}

@@ -1,0 +1,124 @@
+"""The model in rounds, each at its own resolution; `docs/model.md` tells the design."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvrecon.models.consistency import Consistency, Start, checked_start, normalised
+from mvrecon.models.cropping import Cropping
+from mvrecon.models.door import admitted
+from mvrecon.models.geometry import Geometry
+from mvrecon.models.options import Options
+from mvrecon.models.output import Reconstruction
+from mvrecon.models.rounds.settings import ROUNDS, RoundOptions
+from mvrecon.models.rounds.step import Measured, Round, State
+from mvrecon.models.rounds.unet import Precision
+from mvrecon.projectors.operator import Projector
+
+#: Of the longest chord of a support: as long counts each ray that meets it, at least.
+SHORTEST = 0.1
+
+
+class Rounds(nn.Module):
+    """Reconstruction in rounds: cameras correct their views, a network in the world changes the
+    volume, in the unit of (views / mm).
+
+    From SIRT with momentum in the support each round adds to x what its networks make of the
+    residual views y + e - A x, where e is what the cameras have corrected; then come data
+    consistency with the corrected views, and non-negativity. Everything is divided by the
+    content's scale, f(a y) = a f(y).
+
+    Args:
+        projector: its grid and its rig.
+        rounds: options of each round: `{resolution, widths, cameras}`.
+        start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
+            ..., **options}`.
+        consistency: learned gradient steps towards the corrected views at the end.
+        support: where the density may differ from zero, from the views: the visual "hull", its
+            "box", "auto", or "none" for the whole grid.
+        noise: of the views, as `support_from_views` wants it; none for exact views.
+        precision: of the convolutions, "float32", or "auto": bfloat16 where the processor has
+            instructions for it.
+
+    Raises:
+        TypeError: an option that a round does not have.
+        ValueError: no round, an unknown support or precision, or cameras' networks whose memories
+            do not fit one another.
+    """
+
+    def __init__(
+        self,
+        projector: Projector,
+        rounds: Sequence[Mapping[str, Any]] = ROUNDS,
+        start: Start = 12,
+        consistency: int = 2,
+        support: str = "none",
+        noise: Mapping[str, Any] | None = None,
+        precision: Precision = "float32",
+    ):
+        super().__init__()
+        if not rounds or precision not in ("float32", "auto"):
+            raise ValueError(
+                f"Expected at least one round, and the precision float32 or auto, got "
+                f"{len(rounds)} and {precision!r}"
+            )
+        options = [RoundOptions.of(one) for one in rounds]
+        first = next((i for i, one in enumerate(options) if one.cameras), len(options))
+        self.cropping = Cropping(projector, Options(support=support, noise=noise))
+        self.start = checked_start(start)
+        self.rounds = nn.ModuleList(
+            Round(projector, one, first < i, precision) for i, one in enumerate(options)
+        )
+        self.trust = nn.Parameter(torch.ones(())) if first < len(options) else None
+        self.consistency = Consistency(consistency)
+        self._check_memories()
+
+    def _check_memories(self) -> None:
+        networks: list[Any] = [one.cameras for one in self.rounds if one.cameras is not None]
+        shapes = {tuple(network.memory_shape) for network in networks}
+        if len(shapes) > 1:
+            raise ValueError(
+                f"Expected cameras' networks of equal binning and memory, got memories "
+                f"{sorted(shapes)}"
+            )
+
+    def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
+        views = admitted(views, self.cropping.cameras, self.consistency.lengths)
+        geometry = self._geometry(views)
+        y, x0, scale = normalised(geometry, views, self.start)
+        chord = torch.where(geometry.row > 0, 1 / geometry.row, 0)
+        measured, state = Measured(geometry, y, chord), State(x0, torch.zeros_like(x0))
+        volumes, corrected = [], []
+        for one in self.rounds:
+            state = one(measured, state)
+            volumes.append(state.volume * scale)
+            if one.cameras is not None:
+                corrected.append((y + chord * state.correction) * scale)
+        if state.correction is not None and self.trust is not None:
+            y = y + self.trust * chord * state.correction
+        volume = self.consistency(geometry, state.volume, y).clamp_min(0)
+        return Reconstruction(
+            volume * scale,
+            support=geometry.mask,
+            start=x0 * scale,
+            earlier=tuple(volumes[:-1]),
+            corrected_views=tuple(corrected),
+            row=geometry.row if corrected else None,
+        )
+
+    def _geometry(self, views: Float[Tensor, "b 1 m v u"]) -> Geometry:
+        """The whole grid's, within the support: R from the rays' chords of it, C zero outside.
+
+        Chords count as at least `SHORTEST` of the longest: where views err, rays that graze the
+        support measure more than their chords explain.
+        """
+        whole = self.cropping.whole
+        if self.cropping.options.support == "none":
+            return whole
+        within = whole.with_mask(self.cropping.mask(views), masked=False)
+        of_longest = torch.where(within.row > 0, within.row, torch.inf).amin((1, 2, 3, 4), True)
+        return replace(within, row=within.row.minimum(of_longest / SHORTEST))

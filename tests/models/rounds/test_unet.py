@@ -1,0 +1,60 @@
+"""The U-Net without normalisation: sizes, its start, and the numbers that it convolves in."""
+
+import pytest
+import torch
+
+from mvrecon.models.networks import convolution
+from mvrecon.models.rounds import unet
+from mvrecon.models.rounds.unet import Block, PlainUNet, arithmetic
+
+
+@pytest.mark.parametrize("sizes", [(1, 1), (5, 7), (1, 1, 1), (3, 1, 6)])
+def test_images_and_volumes_of_any_size_keep_it(sizes):
+    network = PlainUNet(2 if len(sizes) == 2 else 3, 3, 2, (4, 6, 8))
+    answer = network(torch.rand(2, 3, *sizes))
+    assert answer.shape == (2, 2, *sizes) and answer.isfinite().all()
+
+
+def test_outputs_that_correct_start_at_zero_and_the_others_do_not():
+    answer = PlainUNet(3, 2, 3, (4, 8), zero=2)(torch.rand(1, 2, 4, 4, 4))
+    assert not answer[:, :2].any() and answer[:, 2:].any()
+
+
+def test_a_block_of_no_weights_leaves_its_input():
+    block = Block(torch.nn.Conv2d, 3)
+    torch.nn.init.zeros_(block.second.weight)
+    x = torch.rand(2, 3, 5, 5)
+    assert torch.equal(block(x), x)
+
+
+def test_without_normalisation_an_offset_of_the_input_is_not_lost():
+    """The answer to a brighter volume is another one; group normalisation would hide most of it."""
+    torch.manual_seed(0)
+    network = PlainUNet(3, 1, 1, (4, 8))
+    x = torch.rand(1, 1, 8, 8, 8)
+    assert (network(x + 10) - network(x)).abs().min() > 1e-3
+
+
+def test_a_volume_that_is_alone_is_convolved_with_the_same_offset():
+    torch.manual_seed(0)
+    conv = torch.nn.Conv3d(3, 4, 3, padding=1).double()
+    x = torch.rand(1, 3, 7, 6, 5, dtype=torch.float64)
+    assert torch.allclose(convolution(x, conv.weight, conv.bias), conv(x), rtol=1e-12)
+
+
+def test_bfloat16_is_taken_only_where_the_processor_has_it_and_it_is_asked_for(monkeypatch):
+    torch.manual_seed(0)
+    network = PlainUNet(2, 2, 1, (4, 8), precision="auto").eval()
+    x = torch.rand(1, 2, 8, 8)
+    with torch.no_grad():
+        monkeypatch.setattr(unet, "has_amx", lambda: False)
+        exact = network(x)
+        monkeypatch.setattr(unet, "has_amx", lambda: True)
+        narrow = network(x)
+        assert narrow.dtype == torch.float32
+        difference = (narrow - exact).abs().max() / exact.abs().max()
+        assert 0 < difference < 0.05
+        network.precision = "float32"
+        assert torch.equal(network(x), exact)
+    with arithmetic("auto", x.double()):
+        assert not torch.is_autocast_enabled("cpu")
