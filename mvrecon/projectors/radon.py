@@ -25,4 +25,6 @@ class Radon(RayTransform):
     def check_rig(cameras: Cameras | ExplicitRays) -> None:
         if not cameras.parallel:
             kind = "explicit rays" if isinstance(cameras, ExplicitRays) else "central cameras"
-            raise ValueError(f"The projector 'radon' needs a parallel rig, got {kind}; use projector=drr")
+            raise ValueError(
+                f"The projector 'radon' needs a parallel rig, got {kind}; use projector=drr"
+            )

@@ -1,5 +1,6 @@
 """Iterations and weight from the data alone: some views are left out, and judge."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -70,6 +71,9 @@ def held_out(
         patience: a trial ends where so many iterations have brought nothing better.
         options: of the method; its `iterations` are the most that are tried.
 
+    Warns:
+        UserWarning: the best number of iterations is the most that was allowed.
+
     Raises:
         ValueError: fewer than two views, `every` below 2, no weight; views that are not finite; no
             iteration, as for views of zero.
@@ -91,6 +95,12 @@ def held_out(
         trials.append(Trial(weight, jury.errors(run)))
     best = min(trials, key=lambda trial: min(trial.errors))
     iterations = 1 + best.errors.index(min(best.errors))
+    if iterations == fixed.get("iterations"):
+        warnings.warn(
+            f"All {iterations} iterations that were allowed are the best of {method.__name__}; "
+            f"more may be better",
+            stacklevel=2,
+        )
     chosen = {**_with(fixed, best.weight), "iterations": iterations}
     return Choice(method(A, views, **chosen), iterations, best.weight, trials)
 

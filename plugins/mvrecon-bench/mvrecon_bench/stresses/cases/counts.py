@@ -125,14 +125,19 @@ def zero_start(subject: ProjectorSubject) -> float:
     """
     A = operator(subject)
     counts = A(subject.random(1, 1, *GRID.shape))
-    starts = {"zeros": 0.0, "below zero": -1.0, "NaN": torch.nan, "infinite": torch.inf}
+    starts = {
+        "zeros": (0.0, "allow none"),
+        "below zero": (-1.0, "nowhere negative"),
+        "NaN": (torch.nan, "finite"),
+        "infinite": (torch.inf, "finite"),
+    }
     failures = {}
-    for name, value in starts.items():
+    for name, (value, words) in starts.items():
         start = torch.full((1, 1, *GRID.shape), value, dtype=counts.dtype, device=subject.device)
         for skip in (True, False):
             failures[f"{name}, skip_zero_bins={skip}"] = refusal(
                 lambda start=start, skip=skip: mlem(A, counts, 1, start=start, skip_zero_bins=skip),
-                "allow none" if name == "zeros" else "finite and nowhere negative",
+                words,
             )
     return none_of(failures)
 
