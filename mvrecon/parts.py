@@ -53,7 +53,7 @@ RECONSTRUCTORS = Registry(
     "reconstructor",
     fbp="mvrecon.reconstruct.filtered.fdk:fbp",
     fdk="mvrecon.reconstruct.filtered.fdk:fdk",
-    trained="mvrecon.engine.trained:trained",
+    trained="mvrecon.engine.trained_reconstructor:trained",
     sirt="mvrecon.reconstruct.iterative:sirt",
     os_sart="mvrecon.reconstruct.os_sart:os_sart",
     cgls="mvrecon.reconstruct.cgls:cgls",

@@ -73,6 +73,7 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
         "mvrecon-train": "mvrecon.train:main",
         "mvrecon-eval": "mvrecon.eval:main",
         "mvrecon-simulate": "mvrecon.simulate:main",
+        "mvrecon-reconstruct": "mvrecon.reconstruction:main",
         "mvrecon-list": "mvrecon.listing:main",
     }
 

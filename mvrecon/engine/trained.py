@@ -1,23 +1,12 @@
-"""A trained method, from the path of its checkpoint or of its run; also as a reconstructor."""
+"""A trained method, from the path of its checkpoint or of its run."""
 
-import warnings
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from mvrecon.config.plugins import import_plugins
-from mvrecon.data import digests
 from mvrecon.engine import checkpoints
 from mvrecon.engine.checkpoints import Trained
 from mvrecon.engine.fit import methods
 from mvrecon.engine.run_folder import read_settings
-from mvrecon.parts import MODELS
-from mvrecon.projectors.operator import Projector
-
-#: Of the training's value range: a volume whose greatest value is not between these is told.
-USUAL = (0.05, 2.0)
 
 
 def load(path: str | Path, method: str | None = None) -> Trained:
@@ -46,63 +35,3 @@ def load(path: str | Path, method: str | None = None) -> Trained:
         raise LookupError(f"The run {folder} has no method {method!r}. It has {', '.join(labels)}")
     import_plugins(settings["plugins"])
     return checkpoints.load(checkpoints.finished(folder, method or labels[0]))
-
-
-def trained(
-    A: Projector, views: Float[Tensor, "b 1 m v u"], checkpoint: str, method: str | None = None
-) -> Float[Tensor, "b 1 d h w"]:
-    """Reconstruct by a trained network, in the unit of its training.
-
-    Args:
-        A: the operator that made the views, on the grid that is reconstructed.
-        views: in the operator's unit.
-        checkpoint: path of a checkpoint or of a run folder.
-        method: its label in the run's table; see `load`.
-
-    Warns:
-        UserWarning: another rig, grid, projector or range of values than in training.
-
-    Raises:
-        ValueError: a network that was trained for another number of cameras or voxels.
-        FileNotFoundError, LookupError, Refused: as `load`.
-    """
-    network = load(checkpoint, method)
-    module = network.module
-    for difference in _differences(A, module.projector):
-        warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=2)
-    model = MODELS.from_config(module.hparams["model"], projector=A)
-    try:
-        model.load_state_dict(module.model.state_dict())
-    except RuntimeError as error:
-        raise ValueError(
-            f"{checkpoint}: expected the rig and the grid of its training, got "
-            f"{len(A.cameras)} cameras and {A.grid.shape} voxels: {error}"
-        ) from error
-    with torch.inference_mode():
-        volume = model.to(A.device).eval()(views).volume
-    _warn_of_values(volume, module.hparams["data_range"], checkpoint)
-    return volume.clone()
-
-
-def _differences(A: Projector, own: Projector) -> list[str]:
-    """What differs from the operator of the training, in words."""
-    grid, trained_grid, lines = A.grid, own.grid, []
-    if digests.of_rig(A.cameras) != digests.of_rig(own.cameras):
-        counts = f"{len(own.cameras)} cameras of {own.cameras.shape} pixels"
-        lines.append(f"rig ({counts}); got {len(A.cameras)} of {A.cameras.shape}")
-    if grid.shape != trained_grid.shape or not torch.allclose(grid.affine, trained_grid.affine):
-        got = f"{grid.shape} voxels of {grid.spacing} mm"
-        lines.append(f"grid ({trained_grid.shape} of {trained_grid.spacing} mm); got {got}")
-    if type(A) is not type(own):
-        lines.append(f"projector ({type(own).__name__}); got {type(A).__name__}")
-    return lines
-
-
-def _warn_of_values(volume: Tensor, data_range: float, checkpoint: str) -> None:
-    top = volume.amax().item() / data_range
-    if not USUAL[0] <= top <= USUAL[1]:
-        warnings.warn(
-            f"{checkpoint} was trained on values up to {data_range:g}; the reconstruction reaches "
-            f"{top * data_range:.3g}: do the views have another unit?",
-            stacklevel=3,
-        )

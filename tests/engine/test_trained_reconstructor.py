@@ -17,7 +17,7 @@ from mvrecon.config import compose
 from mvrecon.data.volume_files import read_volume
 from mvrecon.engine import fit, run_folder
 from mvrecon.engine.export import save_views
-from mvrecon.engine.trained import trained
+from mvrecon.engine.trained_reconstructor import trained
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 from tests.engine.runs import call

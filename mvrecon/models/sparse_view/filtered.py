@@ -54,10 +54,14 @@ def scaled(A: Projector, views: Float[Tensor, "b 1 m v u"], filter: Filter) -> S
     """Views and their filtered back-projection, divided by a scale that is not differentiated:
     f(a y) = a f(y) of whatever follows.
     """
-    with torch.no_grad():
-        volume = filtered(A, views, filter)
-        scale = content_scale(volume)
+    volume = filtered(A, views, filter)
+    scale = content_scale(volume.detach())
     return Scaled(views / scale, volume / scale, scale * anything(views))
+
+
+def in_full_precision(views: Tensor) -> torch.autocast:
+    """Context without autocast: the ramp amplifies what half precision rounds in a sinogram."""
+    return torch.autocast(views.device.type, enabled=False)
 
 
 def corrector(

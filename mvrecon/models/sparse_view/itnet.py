@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mvrecon.models.door import admitted
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.sparse_view.filtered import corrector, filtered, scaled
+from mvrecon.models.sparse_view.filtered import corrector, filtered, in_full_precision, scaled
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.filtered.filters import Filter
 from mvrecon.reconstruct.filtered.scan_weights import scan_of
@@ -36,6 +36,9 @@ class ItNet(nn.Module):
     Raises:
         ValueError: no iteration, or a rig that filtered back-projection does not take.
     """
+
+    #: Only rigs whose sources lie on a circle are taken.
+    needs_circle = True
 
     def __init__(
         self,
@@ -64,13 +67,14 @@ class ItNet(nn.Module):
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         views = admitted(views, self.projector.cameras, self.lengths)
-        y, start, scale = scaled(self.projector, views, self.filter)
-        x = start
-        state = x.new_zeros(len(x), self.memory, *x.shape[2:])
-        for number, length in enumerate(self.lengths):
-            answer = self.nets[number % len(self.nets)](torch.cat([x, state], dim=1))
-            x, state = x + answer[:, :1], answer[:, 1:]
-            x = self.consistent(x, y, length)
+        with in_full_precision(views):
+            y, start, scale = scaled(self.projector, views, self.filter)
+            x = start
+            state = x.new_zeros(len(x), self.memory, *x.shape[2:])
+            for number, length in enumerate(self.lengths):
+                answer = self.nets[number % len(self.nets)](torch.cat([x, state], dim=1))
+                x, state = x + answer[:, :1], answer[:, 1:]
+                x = self.consistent(x, y, length)
         return Reconstruction(x * scale, start=start * scale)
 
     def consistent(

@@ -31,6 +31,9 @@ class PrimalDual(nn.Module):
         ValueError: no iteration, or too few channels.
     """
 
+    #: Its lengths are for the number of cameras it was built with.
+    counts_cameras = True
+
     row: Tensor
     column: Tensor
 

@@ -16,7 +16,14 @@ from mvrecon.models.consistency import typical_chord
 from mvrecon.models.door import admitted
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.sparse_view.angles import AngularUpsampling
-from mvrecon.models.sparse_view.filtered import Geometry, corrector, filtered, scaled, sinograms
+from mvrecon.models.sparse_view.filtered import (
+    Geometry,
+    corrector,
+    filtered,
+    in_full_precision,
+    scaled,
+    sinograms,
+)
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.filtered.filters import Filter
 from mvrecon.reconstruct.filtered.scan_weights import scan_of
@@ -68,6 +75,9 @@ class SinogramCompletion(nn.Module):
 class _School(nn.Module):
     """Filtered back-projection with a network before it, behind it, or both."""
 
+    #: Only rigs whose sources lie on a circle are taken.
+    needs_circle = True
+
     def __init__(self, projector: Projector, filter: Filter):
         super().__init__()
         scan_of(projector.cameras, projector.grid)  # refuses other rigs
@@ -82,12 +92,13 @@ class _School(nn.Module):
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         views = admitted(views, self.projector.cameras, next(self.parameters()))
-        y, start, scale = scaled(self.projector, views, self.filter)
-        x = start
-        if self.completion is not None:
-            x = filtered(self.completion.geometry, self.completion(y), self.filter)
-        if self.net is not None:
-            x = x + self.net(x)
+        with in_full_precision(views):
+            y, start, scale = scaled(self.projector, views, self.filter)
+            x = start
+            if self.completion is not None:
+                x = filtered(self.completion.geometry, self.completion(y), self.filter)
+            if self.net is not None:
+                x = x + self.net(x)
         return Reconstruction(x * scale, start=start * scale)
 
 

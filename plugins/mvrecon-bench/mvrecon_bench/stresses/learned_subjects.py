@@ -70,10 +70,15 @@ class ModelSubject(Subject):
         """A new model with its first weights, the same each time, in evaluation.
 
         Raises:
-            DoesNotApply: it needs an option that it was not given.
+            DoesNotApply: it needs an option that it was not given, or (`needs_circle`) sources on a
+                circle.
         """
+        kind = MODELS.get(self.name)
+        if cameras is not None and getattr(kind, "needs_circle", False):
+            if len(cameras.source.unique(dim=0)) < 3:
+                raise DoesNotApply("it takes rigs whose sources lie on a circle alone")
         settings = {**self.options, **options}
-        for name, parameter in inspect.signature(MODELS.get(self.name)).parameters.items():
+        for name, parameter in inspect.signature(kind).parameters.items():
             if name in ("projector", *settings) or parameter.kind in (
                 parameter.VAR_KEYWORD,
                 parameter.VAR_POSITIONAL,

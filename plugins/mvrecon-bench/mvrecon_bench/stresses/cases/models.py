@@ -43,7 +43,7 @@ def copies(subject: ModelSubject) -> float:
         {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
         for model in (single, triple)
     ]
-    if shapes[0] != shapes[1]:
+    if shapes[0] != shapes[1] or getattr(type(single), "counts_cameras", False):
         raise DoesNotApply("its weights are made for a number of cameras")
     with torch.no_grad():
         triple.load_state_dict(single.state_dict())
