@@ -126,6 +126,23 @@ def test_settings_that_do_not_fit_are_refused_and_leave_no_volume(
 
 
 @pytest.mark.door
+@pytest.mark.parametrize("method", ["fdk", "sirt"])
+def test_saturated_pixels_are_told_by_every_way_of_reading(scan, tmp_path, method):
+    """A scan with saturated pixels is told with their number, streamed or read as a whole."""
+    with pytest.warns(UserWarning, match="pixels of 40 views are saturated"):
+        assert (
+            run(
+                scan,
+                tmp_path / "run",
+                f"reconstructor={method}",
+                "views.saturation=49500",
+                "views.flat=49000",
+            )
+            == 0
+        )
+
+
+@pytest.mark.door
 def test_fewer_views_than_cameras_are_refused(scan, tmp_path, capsys):
     """A scan with another number of views than of cameras is an error that gives both."""
     short = tmp_path / "projections"

@@ -4,7 +4,6 @@ import time
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -100,7 +99,6 @@ def _iterated(
 ) -> tuple[Tensor, dict[str, Any]]:
     name = settings["reconstructor"]["name"]
     A, views = scan.posed(device)
-    method = partial(RECONSTRUCTORS.build, name)
     if rule := settings["choose"]:
         choice = held_out(RECONSTRUCTORS.get(name), A, views, options=options, **rule)
         trials = [{"weight": t.weight, "errors": t.errors} for t in choice.trials]
@@ -110,17 +108,24 @@ def _iterated(
         monitors = [curve, lambda iterate: advance(iterate.number)]
         if settings["stop"]["sigma"] is not None:
             monitors.append(discrepancy(settings["stop"]["sigma"]))
-        return method(A, views, monitor=combined(*monitors), **options), {}
+        monitor = combined(*monitors)
+        return RECONSTRUCTORS.build(name, A, views, monitor=monitor, **options), {}
 
 
 def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> Tensor:
+    saturated = floored = 0
     with _bar(name, len(scan.cameras)) as advance:
 
         def read(first: int, last: int) -> Tensor:
-            advance(first)
-            return scan.measured.read(first, last).views
+            nonlocal saturated, floored
+            part = scan.measured.read(first, last)
+            saturated, floored = saturated + part.saturated, floored + part.floored
+            advance(last)
+            return part.views
 
-        return STREAMED.build(name, read, scan.cameras, scan.grid, **options)
+        volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
+    scan.measured.warn_of_values(saturated, floored)
+    return volume
 
 
 def _iterates(name: str) -> bool:

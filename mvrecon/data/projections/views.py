@@ -138,7 +138,7 @@ class MeasuredViews:
             part = self.read(first, min(first + step, self.n_views))
             saturated, floored = saturated + part.saturated, floored + part.floored
             yield part
-        self._warn_of_values(saturated, floored)
+        self.warn_of_values(saturated, floored)
 
     def whole(self) -> Corrected:
         """All views in memory.
@@ -193,7 +193,8 @@ class MeasuredViews:
                 stacklevel=4,
             )
 
-    def _warn_of_values(self, saturated: int, floored: int) -> None:
+    def warn_of_values(self, saturated: int, floored: int) -> None:
+        """Warn how many pixels were saturated or at the floor, where any was."""
         if saturated:
             warnings.warn(
                 f"{self.options.path}: {saturated} pixels of {self.n_views} views are "
