@@ -52,17 +52,17 @@ def trained(
     return volume.clone()
 
 
-def _differences(A: Projector, own: Projector) -> list[str]:
+def _differences(A: Projector, other: Projector) -> list[str]:
     """What differs from the operator of the training, in words."""
-    grid, trained_grid, lines = A.grid, own.grid, []
-    if digests.of_rig(A.cameras) != digests.of_rig(own.cameras):
-        counts = f"{len(own.cameras)} cameras of {own.cameras.shape} pixels"
+    grid, trained_grid, lines = A.grid, other.grid, []
+    if digests.of_rig(A.cameras) != digests.of_rig(other.cameras):
+        counts = f"{len(other.cameras)} cameras of {other.cameras.shape} pixels"
         lines.append(f"rig ({counts}); got {len(A.cameras)} of {A.cameras.shape}")
     if grid.shape != trained_grid.shape or not torch.allclose(grid.affine, trained_grid.affine):
         got = f"{grid.shape} voxels of {grid.spacing} mm"
         lines.append(f"grid ({trained_grid.shape} of {trained_grid.spacing} mm); got {got}")
-    if type(A) is not type(own):
-        lines.append(f"projector ({type(own).__name__}); got {type(A).__name__}")
+    if type(A) is not type(other):
+        lines.append(f"projector ({type(other).__name__}); got {type(A).__name__}")
     return lines
 
 

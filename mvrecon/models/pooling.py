@@ -46,9 +46,9 @@ def leave_one_out(
     others = count.clamp_min(1)
     first = (about.sum(dim=1, keepdim=True) - about) / others
     second = (about.square().sum(dim=1, keepdim=True) - about.square()) / others
-    some = count > 0
+    counted = count > 0
     variance = (second - first.square()).clamp_min(0)
-    return torch.where(some, first + centre, 0.0), torch.where(some, variance, 0.0), count
+    return torch.where(counted, first + centre, 0.0), torch.where(counted, variance, 0.0), count
 
 
 def deviation(variance: Tensor) -> Tensor:

@@ -1,5 +1,5 @@
-"""Geometry files come back as the rig that was written, other programs read them as the same rays,
-and files that are wrong are refused with the reason.
+"""Geometry files come back as the rig that was written, and other programs read them as the same
+rays.
 """
 
 import json
@@ -17,28 +17,27 @@ from mvrecon.cameras.rigs import circular
 from mvrecon.files.checks import Refused
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.projectors.drr import Drr
-from tests.cameras.rigs import same
+from tests.cameras.rigs import DETECTOR, same
 
-PLATE = {"pixels": [6, 9], "pixel_mm": [2.0, 3.0]}
 FORMATS = {
-    "rtk_xml": (rtk_xml, {"detector": PLATE}),
+    "rtk_xml": (rtk_xml, {"detector": DETECTOR}),
     "tigre": (tigre, {}),
     "astra": (astra, {"pixels": [6, 9]}),
-    "angles": (angles, {"detector": PLATE}),
-    "matrices": (matrices, {"detector": PLATE}),
+    "angles": (angles, {"detector": DETECTOR}),
+    "matrices": (matrices, {"detector": DETECTOR}),
 }
 
 
 def crooked(n_views=5):
     """A rig with an offset, turned detectors and a source off its circle: nothing is symmetric."""
-    ideal = circular(n_views, 400.0, 800.0, {**PLATE, "offset_mm": [5.0, -7.0]})
+    ideal = circular(n_views, 400.0, 800.0, {**DETECTOR, "offset_mm": [5.0, -7.0]})
     rng = torch.Generator().manual_seed(0)
     turn = euler_rotation(4 * torch.randn(n_views, 3, generator=rng, dtype=torch.float64))
     R = torch.stack([torch.nn.functional.normalize(x, dim=-1) for x in (ideal.u, ideal.v)], dim=1)
     R = torch.cat([R, torch.linalg.cross(R[:, 0], R[:, 1])[:, None]], dim=1) @ turn
     shift = 8 * torch.randn(2, n_views, 3, generator=rng, dtype=torch.float64)
     centre = ideal.origin + 4 * ideal.u + 2.5 * ideal.v
-    return Detector.of(PLATE).carried(ideal.source + shift[0], centre + shift[1], R)
+    return Detector.of(DETECTOR).carried(ideal.source + shift[0], centre + shift[1], R)
 
 
 @pytest.mark.parametrize("name", sorted(FORMATS))
@@ -67,7 +66,7 @@ def test_axes_are_named_by_where_a_patient_points():
 
 def test_ours_is_the_rig_that_each_convention_names(tmp_path):
     """TIGRE: S = (DSO, 0, 0), turned about z by radians; the table: as `circular`."""
-    plate = {**PLATE, "offset_mm": [4.0, -6.0]}
+    plate = {**DETECTOR, "offset_mm": [4.0, -6.0]}
     expected = circular(3, 400.0, 800.0, plate, angles=[10.0, 40.0, 90.0])
     turned = [math.radians(a) for a in (10.0, 40.0, 90.0)]
     record = {"DSD": 800, "DSO": 400, "nDetector": [6, 9], "dDetector": [2, 3], "angles": turned}
@@ -75,7 +74,7 @@ def test_ours_is_the_rig_that_each_convention_names(tmp_path):
     path.write_text(json.dumps({**record, "offDetector": [-4, -6]}))
     assert same(tigre.read(path), expected, 1e-9)
     path.write_text("angle_degrees, offset_v_mm\n10, 4\n40, 4\n90, 4\n")
-    shifted = {**PLATE, "offset_mm": [0.0, -6.0]}
+    shifted = {**DETECTOR, "offset_mm": [0.0, -6.0]}
     assert same(angles.read(path, shifted, 400.0, 800.0), expected, 1e-9)
 
 
@@ -99,10 +98,10 @@ def test_matrices_of_any_scale_sign_and_first_pixel_are_one_rig(tmp_path):
     P = rig.matrix * torch.tensor([2.0, -3.0, 1e-3, -1e3, 1.0])[:, None, None]
     P = torch.stack([P[:, 0] + P[:, 2], 6 * P[:, 2] - P[:, 1], P[:, 2]], dim=1)  # MATLAB, upwards
     path.write_text("\n".join(" ".join(map(repr, row)) for row in P.flatten(0, 1).tolist()))
-    read = matrices.read(path, PLATE, first_pixel=1.0, flip_rows=True)
+    read = matrices.read(path, DETECTOR, first_pixel=1.0, flip_rows=True)
     assert same(read, rig, 1e-8)
     with pytest.raises(Refused, match="flip_rows=true"):
-        matrices.read(path, PLATE, first_pixel=1.0)
+        matrices.read(path, DETECTOR, first_pixel=1.0)
 
 
 def test_astra_vectors_of_a_npy_file_are_those_of_the_text(tmp_path):
@@ -183,7 +182,7 @@ def test_what_rtk_says_once_holds_for_all_views(tmp_path):
     writer.SetFilename(str(tmp_path / "rig.xml"))
     writer.SetObject(geometry)
     writer.WriteFile()
-    rig = rtk_xml.read(tmp_path / "rig.xml", PLATE, world="RAS")
+    rig = rtk_xml.read(tmp_path / "rig.xml", DETECTOR, world="RAS")
     points = 20 * torch.randn(30, 3, generator=torch.Generator().manual_seed(0)).double()
     for m in range(10):
         P = torch.from_numpy(itk_matrix(geometry.GetMatrix(m)))
@@ -205,112 +204,7 @@ def test_astra_names_its_own_circular_geometry_so(tmp_path):
     turned = np.radians([0.0, 30.0, 100.0])
     cone = library.create_proj_geom("cone", 3.0, 2.0, 6, 9, turned, 400.0, 400.0)
     np.save(tmp_path / "rig.npy", library.geom_2vec(cone)["Vectors"])
-    expected = circular(3, 400.0, 800.0, PLATE, angles=[-90.0, -60.0, 10.0])
+    expected = circular(3, 400.0, 800.0, DETECTOR, angles=[-90.0, -60.0, 10.0])
     assert same(astra.read(tmp_path / "rig.npy", [6, 9]), expected, 1e-9)
     with pytest.raises(Refused, match="left-handed.*flip_rows=false"):
         astra.read(tmp_path / "rig.npy", [6, 9], flip_rows=False)
-
-
-XML = """<?xml version="1.0"?>
-<!DOCTYPE RTKGEOMETRY>
-<RTKThreeDCircularGeometry version="3">
-<SourceToIsocenterDistance>400</SourceToIsocenterDistance>
-<SourceToDetectorDistance>800</SourceToDetectorDistance>
-{}</RTKThreeDCircularGeometry>
-"""
-VIEW = "<Projection><GantryAngle>{}</GantryAngle></Projection>\n"
-RADIANS = [k * math.pi / 8 for k in range(16)]
-
-
-@pytest.mark.door
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (XML.format(VIEW.format(10))[:-40], "no element found|not an RTK geometry"),
-        (XML.format("".join(map(VIEW.format, RADIANS))), "look like radians"),
-        (XML.replace("400", "900").format(VIEW.format(10)), "SID < SDD"),
-        (XML.format(VIEW.format("nan")), "a finite number for GantryAngle, got 'nan'"),
-        (XML.format(""), "1 to 65536 projections, got 0"),
-        (XML.replace("3", "2").format(VIEW.format(1)), "version 3"),
-        (
-            XML.format(VIEW.format("&a;")).replace("GEOMETRY>", 'GEOMETRY [<!ENTITY a "1">]>', 1),
-            "no entities",
-        ),
-        (
-            XML.format(VIEW.format(1)).replace(
-                "<Proj", "<RadiusCylindricalDetector>9</RadiusCylindricalDetector><Proj", 1
-            ),
-            "flat detector",
-        ),
-        (XML.format("<Zoom>1</Zoom>"), "got 'Zoom'"),
-        ("<html/>", "RTKThreeDCircularGeometry of version 3"),
-    ],
-)
-def test_xml_that_is_no_rig_is_refused(text, message, tmp_path):
-    """RTK's XML that is cut short, in radians, with SID > SDD, or with entities is refused with the
-    reason.
-    """
-    path = tmp_path / "rig.xml"
-    path.write_text(text)
-    with pytest.raises(Refused, match=message):
-        rtk_xml.read(path, PLATE)
-
-
-@pytest.mark.door
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("angle_degrees,sid_mm\n" + ",400\n".join(map(str, RADIANS)) + ",400", "like radians"),
-        ("angle_degrees,sid_mm\n1,900\n", "SID < SDD"),
-        ("angle_degree,sid_mm\n1,400\n", "did you mean 'angle_degrees'"),
-        ("angle_degrees,sid_mm\n1\n", "1 to 65536 lines of 2 numbers"),
-        ("angle_degrees,sid_mm\n1,inf\n", "finite number for sid_mm of view 0"),
-        ("angle_degrees\n1\n", "expected sid_mm, a column"),
-        ("", "lines of 0 numbers"),
-    ],
-)
-def test_tables_that_are_no_rig_are_refused(text, message, tmp_path):
-    """A table of angles in radians, with SID > SDD, or with an unknown or missing column is refused
-    with the reason.
-    """
-    path = tmp_path / "rig.csv"
-    path.write_text(text)
-    with pytest.raises(Refused, match=message):
-        angles.read(path, PLATE, sdd_mm=800.0)
-
-
-def test_a_small_arc_in_degrees_can_be_insisted_on(tmp_path):
-    path = tmp_path / "rig.csv"
-    path.write_text("angle_degrees\n" + "\n".join(map(str, RADIANS)))
-    assert len(angles.read(path, PLATE, 400.0, 800.0, small_arc=True)) == len(RADIANS)
-
-
-@pytest.mark.door
-def test_vectors_and_json_that_are_no_rig_are_refused(tmp_path):
-    """ASTRA's vectors and TIGRE's JSON that are cut short, not finite, in degrees, or pickled are
-    refused with the reason.
-    """
-    path = tmp_path / "rig"
-    for text, message in (("1 2 3", "lines of 12"), ("1 " * 11 + "nan", "line 1"), ("", "0 lines")):
-        path.write_text(text)
-        with pytest.raises(Refused, match=message):
-            astra.read(path, [6, 9])
-    record = {"DSD": 800, "DSO": 400, "nDetector": [6, 9], "dDetector": [2, 3], "angles": [1.0]}
-    for change, message in (
-        ({"angles": [0.0, 180.0]}, "are they degrees"),
-        ({"DSO": 900}, "SID < SDD"),
-        ({"angles": "1e9"}, "numbers for angles"),
-        ({"offDetector": [[1, 2]] * 2}, "one for each of 1 views"),
-        ({"DSDs": 1}, "did you mean 'DSD'"),
-        ({"DSD": float("nan")}, "finite numbers for DSD"),
-    ):
-        path.write_text(json.dumps({**record, **change}))
-        with pytest.raises(Refused, match=message):
-            tigre.read(path)
-    np.save(tmp_path / "rig.npy", np.array([{}] * 12, dtype=object), allow_pickle=True)
-    with pytest.raises(Refused, match="floating"):
-        astra.read(tmp_path / "rig.npy", [6, 9])
-    np.save(tmp_path / "cut.npy", np.zeros((3, 12)))
-    (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:-8])
-    with pytest.raises(Refused, match="another length"):
-        astra.read(tmp_path / "cut.npy", [6, 9])

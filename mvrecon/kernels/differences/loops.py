@@ -85,22 +85,22 @@ def _primal_row(dual, primal, n, z, y, out):
 
 
 @scalar
-def _ahead(p, q, momentum, rate, after, here, out):
-    """Write a row of p + momentum (p - q) + rate (after - here)."""
+def _ahead(p, q, momentum, rate, after, before, out):
+    """Write a row of p + momentum (p - q) + rate (after - before)."""
     for x in range(len(out)):
-        out[x] = p[x] + momentum * (p[x] - q[x]) + rate * (after[x] - here[x])
+        out[x] = p[x] + momentum * (p[x] - q[x]) + rate * (after[x] - before[x])
 
 
 @scalar
-def _dual_rows(dual, here, below, room, n, z):
-    """Write slice z of a field's step: along the gradient of the volume between the slices `here`
+def _dual_rows(dual, above, below, room, n, z):
+    """Write slice z of a field's step: along the gradient of the volume between the slices `above`
     and `below` [h w], vectors longer than 1 shortened to 1.
     """
     p, q, momentum, rates, one = dual
     field, size = room.field, room.size
-    height, width = here.shape
+    height, width = above.shape
     for y in range(height):
-        row, after = here[y], here[min(y + 1, height - 1)]
+        row, after = above[y], above[min(y + 1, height - 1)]
         _ahead(p[0, n, z, y], q[0, n, z, y], momentum, rates[0], below[y], row, field[0])
         _ahead(p[1, n, z, y], q[1, n, z, y], momentum, rates[1], after, row, field[1])
         inner, px, qx = width - 1, p[2, n, z, y], q[2, n, z, y]
@@ -160,13 +160,13 @@ def dual_slabs(dual, primal, thickness, heads, room, first, last):
     for number in range(first, last):
         n, slab = number // slabs, number % slabs
         begin, end = slab * thickness, min(depth, (slab + 1) * thickness)
-        here = heads[n, slab]
+        above = heads[n, slab]
         for z in range(begin, end):
             if z + 1 < end:
                 below = room.slices[z % 2]
                 for y in range(below.shape[0]):
                     _primal_row(dual, primal, n, z + 1, y, below[y])
             else:
-                below = heads[n, slab + 1] if end < depth else here
-            _dual_rows(dual, here, below, room, n, z)
-            here = below
+                below = heads[n, slab + 1] if end < depth else above
+            _dual_rows(dual, above, below, room, n, z)
+            above = below

@@ -37,12 +37,12 @@ def look(
     sight = _sight(maps, views.shape[2:], window, weighted)
     depth, height, width = map(int, shape)
     volumes = np.zeros([len(views), depth, height, width], dtype=views.numpy().dtype)
-    chosen = upright(sight.maps, (depth, height, width))
-    for some, by_columns in ((~chosen, False), (chosen, True)):
-        if some.any():
-            part = sight._replace(maps=np.ascontiguousarray(sight.maps[some]))
-            chosen = views.numpy() if some.all() else views.numpy()[:, some]
-            (_add_by_columns if by_columns else _add_by_rows)(chosen, part, volumes)
+    level = upright(sight.maps, (depth, height, width))
+    for mask, by_columns in ((~level, False), (level, True)):
+        if mask.any():
+            part = sight._replace(maps=np.ascontiguousarray(sight.maps[mask]))
+            stack = views.numpy() if mask.all() else views.numpy()[:, mask]
+            (_add_by_columns if by_columns else _add_by_rows)(stack, part, volumes)
     return torch.from_numpy(volumes)
 
 

@@ -67,8 +67,8 @@ class PrimalDual(nn.Module):
         f = y.new_zeros(len(y), self.channels, *self.projector.grid.shape)
         h = y.new_zeros(len(y), self.channels, *y.shape[2:])
         for dual, primal in zip(self.dual, self.primal, strict=True):
-            seen = self.projector(f[:, 1:2]) / self.norm
-            h = h + sinograms(dual(sinograms(torch.cat([h, seen, y], dim=1))))
+            projected = self.projector(f[:, 1:2]) / self.norm
+            h = h + sinograms(dual(sinograms(torch.cat([h, projected, y], dim=1))))
             f = f + primal(torch.cat([f, self.projector.T(h[:, :1]) / self.norm], dim=1))
         return Reconstruction(f[:, :1] * scale * anything(views), start=start)
 

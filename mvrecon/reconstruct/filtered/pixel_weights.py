@@ -19,6 +19,8 @@ factor (R / D) belongs to its virtual detector at the axis. Rows of a cone beam 
 in their tilted planes, as theirs are. For parallel rays W = 1 / T.U.
 """
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -67,9 +69,8 @@ def _fan(
     """Fan coordinates; of one pixel a view where the shares do not depend on them."""
     if scan.kind == "full":
         return u.new_zeros(len(rig), 1, 1)
-    orbit = scan.orbit
-    some = type(orbit)(orbit.axis, orbit.centre, orbit.radius, orbit.outwards[views])
-    return fan_coordinate(rig, some, u, v)
+    part = replace(scan.orbit, outwards=scan.orbit.outwards[views])
+    return fan_coordinate(rig, part, u, v)
 
 
 def _squares(

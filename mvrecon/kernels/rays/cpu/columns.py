@@ -151,7 +151,7 @@ def project_columns(store, rig, room, reads, views, first, last):
         room.values[:] = 0
         for i in range(count):
             span = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
-            some = within_occupied(rig, room, i, span)
+            inside = within_occupied(rig, room, i, span)
             rows = rows_of(room, i, real, steps)
             if not level or i == 0:
                 places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
@@ -159,7 +159,7 @@ def project_columns(store, rig, room, reads, views, first, last):
                 if rig.heights.size and (not level or i == 0):
                     _clear(room, group, lanes, span)
                 add = level and (i > 0 or rig.heights.size > 0)
-                _blend(room, store, group, rows, some, add)
+                _blend(room, store, group, rows, inside, add)
                 if not level or i == count - 1:
                     _read(room, lanes, group, rays)
         for v in range(rays[0], rays[1] if count else rays[0]):
@@ -268,10 +268,10 @@ def backproject_columns(store, rig, room, reads, views, slabs):
         for group in range(len(room.values)):
             for i in range(count):
                 span_z = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
-                some = within_occupied(rig, room, i, span_z)
+                inside = within_occupied(rig, room, i, span_z)
                 rows = rows_of(room, i, real, steps)
                 if not level or i == 0:
                     places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
                     _write(room, lanes, group, rays)
                     _gather(room, lanes, span_z)
-                _unblend(room, store, group, rows, some)
+                _unblend(room, store, group, rows, inside)

@@ -69,8 +69,8 @@ def _copies(volume: Tensor, occupancy: Occupancy, plan: Plan) -> Iterator[Copy]:
     for near, axes in plan.layouts:
         for rows, piece in plan.pieces:
             into = empty(len(volume), _piece_sizes(piece), near, plan.lanes, real, into)
-            some, where = _overlap(occupancy, rows, piece)
-            to, values = part_of(into, near, where), volume[:, :, some]
+            overlap, where = _overlap(occupancy, rows, piece)
+            to, values = part_of(into, near, where), volume[:, :, overlap]
 
             def copy(first: int, last: int, to=to, near=near, values=values) -> None:
                 for row in range(first, last, TOGETHER):
@@ -126,8 +126,8 @@ def backproject(
     for near, axes in plan.layouts:
         for rows, piece in plan.pieces:
             into = empty(len(views), _piece_sizes(piece), near, plan.lanes, values.dtype, into)
-            some, where = _overlap(occupancy, rows, piece)
-            source, part = part_of(into, near, where), volume[:, :, some]
+            overlap, where = _overlap(occupancy, rows, piece)
+            source, part = part_of(into, near, where), volume[:, :, overlap]
             for axis in range(3):
                 if axes[axis]:
                     _spread_rows(store(into, near), piece, axis, plan.reads[near], values)

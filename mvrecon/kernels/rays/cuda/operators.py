@@ -108,9 +108,9 @@ def gather(
     volume = y.new_zeros(len(y), *around.shape)
     pixels, blocks = math.prod(scene.detector), (-(-around.size // BLOCK), _groups(len(y)))
     record, collect = loops.record_kernel(), loops.gather_kernel(_group(len(y)))
-    some = max(1, RAYS // pixels)
-    for first in range(0, len(lines), some):
-        count = min(some, len(lines) - first)
+    at_once = max(1, RAYS // pixels)
+    for first in range(0, len(lines), at_once):
+        count = min(at_once, len(lines) - first)
         rays, frames = y.new_empty(8, count * pixels), y.new_empty(count, 3, 4)
         axes = torch.zeros(count, 3, dtype=torch.int32, device=y.device)
         launch(record, (-(-count * pixels // BLOCK),), numbers, scene, first, rays, frames, axes)
