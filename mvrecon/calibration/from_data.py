@@ -1,11 +1,12 @@
 """Calibration from the measured views alone: the misalignment that makes them consistent with one
 volume.
 
-A rig that is wrong leaves a residual that no volume explains. What all views share (a detector's
-offset, the tilt of the axis) is fitted by Gauss-Newton steps on the residual of the whole
-reconstruction, the volume being computed anew for every try (variable projection: Golub & Pereyra,
-SIAM J. Numer. Anal. 10, 1973); shifts of single views by matching each with the re-projection of
-the current volume (alignment by re-projection: Dengler, Ultramicroscopy 30, 1989).
+A rig that is wrong leaves a residual that no volume explains. Rig and volume are fitted together by
+Gauss-Newton steps on |S y - A(rig) G x|, with the views blurred by S and the volume made of
+Gaussian blobs, G: with voxels alone a volume has so many freedoms that it explains a tilted axis,
+too (of a sharp object wrongly by 0.4 degrees). In each step the rig's unknowns are eliminated
+exactly and the volume's change comes from conjugate gradients (separable least squares: Golub &
+Pereyra, SIAM J. Numer. Anal. 10, 1973; blobs: Lewitt, J. Opt. Soc. Am. A 7, 1990).
 """
 
 from collections.abc import Callable, Sequence
@@ -15,26 +16,33 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.calibration.blur import Blur, blurred
+from mvrecon.calibration.linearised import Complement, derivatives
+from mvrecon.calibration.unknowns import Unknowns, unknowns
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.field import isocentre
+from mvrecon.cameras.field import resolution
 from mvrecon.cameras.misalignment import Misalignment, misaligned
-from mvrecon.cameras.views import check_finite
-from mvrecon.projectors.operator import LinearOperator
-from mvrecon.reconstruct.iterative import sirt, sirt_weights
-from mvrecon.registry import hint
+from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
+from mvrecon.reconstruct.cgls import cgls
 
-OperatorOf = Callable[[Cameras], LinearOperator]
+OperatorOf = Callable[[Cameras], Projector]
 
-#: What all views may share: a field of `Misalignment` and its column.
-SHARED = {
-    "offset_u": ("offset_px", 0),
-    "offset_v": ("offset_px", 1),
-    "slant": ("tilt_degrees", 0),
-    "swivel": ("tilt_degrees", 1),
-    "tilt": ("tilt_degrees", 2),
-}
-#: Pixels (degrees) by which a difference quotient steps, and the longest step of a round.
-STEP, LONGEST = 0.1, 3.0
+#: Standard deviation of a blob in voxels, and of the views' blur in voxels' images.
+BLOB, VIEW_BLUR = 1.0, 2.0
+#: The fit ends where no number changes by so much of its longest change.
+CLOSE = 1e-3
+
+
+class Round(NamedTuple):
+    """A round of the fit, as a monitor sees it.
+
+    Args:
+        number: from 1.
+        residual: |S y - A x| / |S y| of the blurred views at its start.
+    """
+
+    number: int
+    residual: float
 
 
 class Estimate(NamedTuple):
@@ -42,125 +50,101 @@ class Estimate(NamedTuple):
 
     Args:
         cameras: the rig.
-        misalignment: what was wrong with the rig that was given, in pixels, degrees and mm.
-        residual: ||y - A x|| / ||y|| of every round's reconstruction, the first being that of the
-            rig that was given.
+        misalignment: what was wrong with each view of the rig that was given, in pixels and
+            degrees.
+        gains: factor of each view's integrals, their geometric mean 1; to be divided by.
+        residual: |S y - A x| / |S y| of the blurred views, at the start of each round and at the
+            end; the first is that of the rig that was given.
     """
 
     cameras: Cameras
     misalignment: Misalignment
+    gains: Float[Tensor, " m"]
     residual: list[float]
 
 
+class _Model(NamedTuple):
+    operator_of: OperatorOf
+    cameras: Cameras
+    unknowns: Unknowns
+
+    def rig(self, values: Float[Tensor, "m k"]) -> Cameras:
+        return misaligned(self.cameras, self.unknowns.misalignment(values))
+
+    def operator(self, values: Float[Tensor, "m k"]) -> Projector:
+        A = self.operator_of(self.rig(values))
+        if "gain" not in self.unknowns.kinds:
+            return A
+        return Scaled(A, pixels=self.unknowns.gains(values)[:, None, None].to(A.device))
+
+
 @torch.no_grad()
-def shared_misalignment(
+def calibrated(
     operator_of: OperatorOf,
     cameras: Cameras,
     views: Float[Tensor, "1 1 m v u"],
     free: Sequence[str] = ("offset_u", "tilt"),
-    iterations: int = 30,
-    rounds: int = 5,
+    iterations: int = 15,
+    rounds: int = 12,
+    monitor: Callable[[Round], object] | None = None,
 ) -> Estimate:
-    """Detector offset (pixels) and axis tilt (degrees) that all views share, from the measured
-    views alone.
+    """Rig fitted in pixels and degrees to the measured views alone.
 
-    A tilt needs a grid fine enough for the object: errors of sharp edges on a coarse one outweigh
-    it (experiments/08_calibration).
+    Blobs and blur go with the grid's voxel: coarse voxels are fast and robust as long as the views
+    are many for them (about three times as many as voxels across), and need not hold the object's
+    edges. The object must be inside the grid and the views.
 
     Args:
-        operator_of: the operator of a rig, such as `partial(Drr, grid)`; the grid must hold the
-            whole object.
+        operator_of: the operator of a rig, such as `partial(Drr, grid)`.
         cameras: the rig as it should be.
         views: measured integrals.
-        free: what is fitted: "offset_u", "offset_v" (pixels), "tilt" (about the beam), "slant"
-            (about u), "swivel" (about v; degrees). Along the axis of a circle an offset_v is nearly
-            a shift of the object.
-        iterations: of SIRT with momentum for every volume.
-        rounds: of Gauss-Newton; each computes 1 + len(free) volumes.
+        free: what is fitted. One number for all views: "offset_u", "offset_v" (pixels), "tilt"
+            (about the beam, which is the tilt of the axis), "slant" (about u), "swivel" (about v;
+            degrees). A number for each view: "shifts" (u and v, pixels), "gains" (factors). Along
+            the axis of a circle an offset_v is nearly a shift of the object.
+        iterations: of conjugate gradients in each round.
+        rounds: of Gauss-Newton at most; it ends before where nothing changes any more.
+        monitor: called after each round.
 
     Raises:
-        ValueError: an unknown name, or views that are not finite.
+        ValueError: names that `unknowns` refuses; views that are not finite or of another shape
+            than the operator's; parallel beams, which `misaligned` refuses.
     """
-    check_finite(views)
-    for name in free:
-        if name not in SHARED:
-            raise ValueError(f"Unknown misalignment {name!r}{hint(name, SHARED)}")
-    theta, history = torch.zeros(len(free), dtype=torch.float64), []
-    steps = STEP * torch.eye(len(free), dtype=torch.float64)
-
-    def residual(values: Tensor) -> Tensor:
-        A = operator_of(misaligned(cameras, _shared(free, values)))
-        return (A(_volume(A, views, iterations)) - views).flatten().double()
-
-    for _ in range(rounds):
-        r = residual(theta)
-        history.append((r.norm() / views.double().norm()).item())
-        J = torch.stack([(residual(theta + step) - r) / STEP for step in steps], dim=1)
-        change = torch.linalg.lstsq(J, -r[:, None]).solution[:, 0]
-        theta = theta + change.clamp(-LONGEST, LONGEST)
-    by = _shared(free, theta)
-    return Estimate(misaligned(cameras, by), by, history)
-
-
-@torch.no_grad()
-def view_shifts(
-    operator_of: OperatorOf,
-    cameras: Cameras,
-    views: Float[Tensor, "1 1 m v u"],
-    iterations: int = 10,
-    rounds: int = 20,
-) -> Estimate:
-    """Shift of each view's detector (u, v) in pixels, from the measured views alone.
-
-    Shifts that a moved object would cause as well are left out: the object stays where it is.
-    Arguments and errors as `shared_misalignment`.
-    """
-    check_finite(views)
-    shifts = torch.zeros(len(cameras), 2, dtype=torch.float64)
+    model = _Model(operator_of, cameras, unknowns(cameras, free))
+    values = model.unknowns.basis.new_zeros(model.unknowns.basis.shape[:2])
+    A = model.operator(values)
+    blobs = Blur(A.domain_shape, [BLOB] * 3, A.device)
+    views = blurred(views, _view_blur(A))
+    x = cgls(A @ blobs, views, iterations)
     history = []
-    for _ in range(rounds):
-        A = operator_of(misaligned(cameras, _shifted(shifts)))
-        x = _volume(A, views, iterations)
-        r = (views - A(x))[0, 0].flatten(1).double()
-        history.append((r.norm() / views.double().norm()).item())
-        columns = []
-        for direction in STEP * torch.eye(2, dtype=torch.float64):
-            ahead, behind = (
-                operator_of(misaligned(cameras, _shifted(shifts + side * direction)))(x)
-                for side in (1, -1)
-            )
-            columns.append((ahead - behind)[0, 0].flatten(1).double() / (2 * STEP))
-        J = torch.stack(columns, dim=-1)
-        change = torch.linalg.lstsq(J, r[..., None]).solution[..., 0]
-        shifts = without_motion(cameras, shifts + change.clamp(-LONGEST, LONGEST))
-    by = _shifted(shifts)
-    return Estimate(misaligned(cameras, by), by, history)
+    for number in range(1, rounds + 1):
+        r = _residual(model, values, views, blobs(x))
+        history.append((r.norm() / views.norm()).item())
+        rig = Complement(
+            derivatives(lambda v: model.operator(v)(blobs(x)), values),  # noqa: B023
+            model.unknowns,
+        )
+        A = model.operator(values) @ blobs
+        change = cgls(rig @ A, rig(r), iterations)
+        x, step = x + change, rig.change(r - A(change))
+        longest = model.unknowns.longest
+        values = values + step.clamp(-longest, longest)
+        if monitor is not None:
+            monitor(Round(number, history[-1]))
+        if (step.abs() < CLOSE * longest).all():
+            break
+    r = _residual(model, values, views, blobs(x))
+    history.append((r.norm() / views.norm()).item())
+    by, gains = model.unknowns.misalignment(values), model.unknowns.gains(values)
+    return Estimate(model.rig(values), by, gains, history)
 
 
-def without_motion(cameras: Cameras, shifts: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
-    """Shifts of views in pixels, less those that a moved object would cause as well (three degrees
-    of freedom, at the isocentre).
-    """
-    centre = isocentre(cameras)
-    points = torch.cat([centre[None], centre + torch.eye(3).to(centre)])
-    uv = cameras.project(points)[..., :2]
-    moves = (uv[:, 1:] - uv[:, :1]).permute(0, 2, 1).reshape(-1, 3)
-    amount = torch.linalg.lstsq(moves, shifts.reshape(-1, 1)).solution
-    return shifts - (moves @ amount).reshape(-1, 2)
+def _residual(model: _Model, values: Tensor, views: Tensor, volume: Tensor) -> Tensor:
+    return views - model.operator(values)(volume)
 
 
-def _volume(A: LinearOperator, views: Tensor, iterations: int) -> Tensor:
-    dtype = views.dtype if views.dtype == torch.float64 else torch.float32
-    return sirt(A, views, iterations, weights=sirt_weights(A, dtype), momentum=True)
-
-
-def _shared(free: Sequence[str], values: Float[Tensor, " k"]) -> Misalignment:
-    by = Misalignment.none(1)
-    for name, value in zip(free, values, strict=True):
-        field, column = SHARED[name]
-        getattr(by, field)[0, column] = value
-    return by
-
-
-def _shifted(shifts: Float[Tensor, "m 2"]) -> Misalignment:
-    return Misalignment.none(len(shifts))._replace(offset_px=shifts)
+def _view_blur(A: Projector) -> float:
+    """Blur of the views in pixels."""
+    centre = A.grid.corners().mean(dim=0)
+    pixel = resolution(A.cameras.to("cpu"), centre.to("cpu").double())
+    return VIEW_BLUR * max(A.grid.spacing) / pixel

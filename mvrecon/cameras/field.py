@@ -98,12 +98,12 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
     if size is not None:
         step = (extent / extent.new_tensor(list(size))).max().item()
         return Grid.centred(size=size, spacing=step, centre=centre.tolist())
-    step = _resolution(rig, centre)
+    step = resolution(rig, centre)
     counts = [max(1, math.ceil(mm / step - 1e-6)) for mm in extent.tolist()]
     return Grid.centred(size=counts, spacing=step, centre=centre.tolist())
 
 
-def _resolution(cameras: Cameras, point: Float[Tensor, "3"]) -> float:
+def resolution(cameras: Cameras, point: Float[Tensor, "3"]) -> float:
     """The median over views of the finer pixel pitch, demagnified to a point, in mm."""
     pitch = torch.minimum(cameras.u.norm(dim=-1), cameras.v.norm(dim=-1))
     if not cameras.parallel:

@@ -1,0 +1,145 @@
+"""What a calibration from the views fits: names, the numbers of each view that they stand for, and
+the rig that the numbers make.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.field import isocentre
+from mvrecon.cameras.misalignment import Misalignment
+from mvrecon.registry import hint
+
+
+class Kind(NamedTuple):
+    """A number that a view has.
+
+    Args:
+        field, column: of `Misalignment`; None: the logarithm of the view's gain.
+        longest: change in a round at most, in pixels, degrees or as a logarithm.
+    """
+
+    field: str | None
+    column: int
+    longest: float
+
+
+KINDS = {
+    "offset_u": Kind("offset_px", 0, 3.0),
+    "offset_v": Kind("offset_px", 1, 3.0),
+    "slant": Kind("tilt_degrees", 0, 3.0),
+    "swivel": Kind("tilt_degrees", 1, 3.0),
+    "tilt": Kind("tilt_degrees", 2, 3.0),
+    "gain": Kind(None, 0, 0.3),
+}
+#: What has a number of its own in every view, and the kinds of the numbers.
+SINGLE = {"shifts": ("offset_u", "offset_v"), "gains": ("gain",)}
+#: What may be fitted; what all views share has one number.
+NAMES = (*(name for name in KINDS if name != "gain"), *SINGLE)
+
+
+class Unknowns(NamedTuple):
+    """The numbers of all views, as far as they are free: values = basis z for any z.
+
+    Args:
+        kinds: names of the numbers that a view has.
+        basis: of the values that are allowed; its columns have unit length.
+    """
+
+    kinds: tuple[str, ...]
+    basis: Float[Tensor, "m k n"]
+
+    @property
+    def longest(self) -> Float[Tensor, " k"]:
+        """The longest change in a round, of each kind."""
+        return self.basis.new_tensor([KINDS[kind].longest for kind in self.kinds])
+
+    def misalignment(self, values: Float[Tensor, "m k"]) -> Misalignment:
+        """What is wrong with each view, in pixels and degrees."""
+        by = Misalignment.none(len(values))
+        for name, column in zip(self.kinds, values.T, strict=True):
+            if field := KINDS[name].field:
+                getattr(by, field)[:, KINDS[name].column] = column
+        return by
+
+    def gains(self, values: Float[Tensor, "m k"]) -> Float[Tensor, " m"]:
+        """The factor of each view, 1 where it is not free."""
+        if "gain" not in self.kinds:
+            return values.new_ones(len(values))
+        return values[:, self.kinds.index("gain")].exp()
+
+
+def unknowns(cameras: Cameras, free: Sequence[str]) -> Unknowns:
+    """The numbers that names stand for, without those that the views cannot tell.
+
+    Shifts leave out what a moved object would cause as well; of gains the mean logarithm is zero,
+    as a factor of all views is one of the object.
+
+    Args:
+        cameras: the rig as it should be.
+        free: names out of `NAMES`.
+
+    Raises:
+        ValueError: no name, an unknown one, one that is there twice or is part of another; fewer
+            than two views.
+    """
+    _check(cameras, free)
+    views = len(cameras)
+    kinds = tuple(k for k in KINDS if any(k in SINGLE.get(name, (name,)) for name in free))
+    blocks = []
+    for name in free:
+        own = SINGLE.get(name, (name,))
+        rows = torch.arange(views)[:, None] * len(kinds) + torch.tensor(
+            [kinds.index(kind) for kind in own]
+        )
+        columns = _columns(cameras, name)
+        block = columns.new_zeros(views * len(kinds), columns.shape[1])
+        block[rows.flatten()] = columns
+        blocks.append(block)
+    return Unknowns(kinds, torch.cat(blocks, dim=1).reshape(views, len(kinds), -1))
+
+
+def without_motion(cameras: Cameras, shifts: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
+    """Shifts of views in pixels, less those that a moved object would cause as well (three degrees
+    of freedom, at the isocentre).
+    """
+    rest = _complement(_motions(cameras))
+    return (rest @ (rest.T @ shifts.reshape(-1, 1))).reshape(-1, 2)
+
+
+def _check(cameras: Cameras, free: Sequence[str]) -> None:
+    for name in free:
+        if name not in NAMES:
+            raise ValueError(f"Unknown misalignment {name!r}{hint(name, NAMES)}")
+    single = {kind for name in free for kind in SINGLE.get(name, ())}
+    if not free or len(set(free)) < len(free) or single & set(free):
+        raise ValueError(
+            f"expected names out of {', '.join(NAMES)}, none twice, and no offset beside the "
+            f"shifts that hold it; got {', '.join(free) or 'none'}"
+        )
+    if len(cameras) < 2:
+        raise ValueError(f"expected at least two views to calibrate from, got {len(cameras)}")
+
+
+def _columns(cameras: Cameras, name: str) -> Float[Tensor, "rows n"]:
+    if name == "shifts":
+        return _complement(_motions(cameras))
+    same = torch.full((len(cameras), 1), len(cameras) ** -0.5, dtype=torch.float64)
+    return _complement(same) if name in SINGLE else same
+
+
+def _complement(columns: Float[Tensor, "rows n"]) -> Float[Tensor, "rows k"]:
+    """An orthonormal basis of what is orthogonal to all columns."""
+    return torch.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
+
+
+def _motions(cameras: Cameras) -> Float[Tensor, "rows 3"]:
+    """Shifts of all views, pixels a mm, that a move of the object causes along x, y and z."""
+    centre = isocentre(cameras)
+    points = torch.cat([centre[None], centre + torch.eye(3).to(centre)])
+    uv = cameras.project(points)[..., :2]
+    return (uv[:, 1:] - uv[:, :1]).permute(0, 2, 1).reshape(-1, 3)
