@@ -13,6 +13,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mvrecon.calibration.from_data import calibrated as calibrated
+    from mvrecon.calibration.markers import from_markers as from_markers
     from mvrecon.cameras.camera import Cameras as Cameras
     from mvrecon.cameras.dcspect80 import dcspect80 as dcspect80
     from mvrecon.cameras.explicit import ExplicitRays as ExplicitRays
@@ -51,6 +53,7 @@ _DOOR = {
     "LinearOperator": "mvrecon.projectors.operator:LinearOperator",
     "Radon": "mvrecon.projectors.radon:Radon",
     "arc": "mvrecon.cameras.rigs:arc",
+    "calibrated": "mvrecon.calibration.from_data:calibrated",
     "cgls": "mvrecon.reconstruct.cgls:cgls",
     "circular": "mvrecon.cameras.rigs:circular",
     "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
@@ -60,6 +63,7 @@ _DOOR = {
     "fdk": "mvrecon.reconstruct.filtered.fdk:fdk",
     "fdk_streamed": "mvrecon.reconstruct.filtered.streaming:fdk_streamed",
     "from_file": "mvrecon.cameras.files:from_file",
+    "from_markers": "mvrecon.calibration.markers:from_markers",
     "held_out": "mvrecon.reconstruct.held_out:held_out",
     "load": "mvrecon.engine.trained:load",
     "mlem": "mvrecon.reconstruct.mlem:mlem",

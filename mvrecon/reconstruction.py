@@ -16,7 +16,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Reconstruct a measured scan; returns what `results.json` then holds.
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
-    `results.json` and, unless `out` names another file, the volume.
+    `results.json` and, unless `out` names another file, the volume. A rig that was calibrated
+    (`calibrate`) lies beside the volume, too: `<volume>.cameras.json`.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -26,7 +27,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.cameras import files
     from mvrecon.data.attenuation import hounsfield
     from mvrecon.data.volume_files import check_ending, save_volume
-    from mvrecon.engine import export, run_folder, scan, solve
+    from mvrecon.engine import calibrate, export, run_folder, scan, solve
     from mvrecon.engine.evaluation import device_of
     from mvrecon.viz import montage, rig
 
@@ -35,11 +36,17 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     out = Path(settings["out"] or folder / "volume.nii.gz").expanduser()
     check_ending(out)
     case = scan.open_scan(settings)
+    if free := settings["calibrate"]:
+        calibrate.check(free, case)
     solve.check(settings)  # what does not fit is told before the folder is anybody's
+    estimate, device = None, device_of(settings["device"])
     with run_folder.taken(folder, settings):
+        if free:
+            case, estimate = calibrate.calibrate(case, free, device)
+            files.save(case.cameras, beside(out))
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
-        outcome = solve.solve(case, settings, device_of(settings["device"]))
+        outcome = solve.solve(case, settings, device)
         volume = outcome.volume
         spacing = case.grid.spacing
         export.save_png(folder / "planes.png", montage.slices(volume, spacing))
@@ -57,8 +64,19 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             "residuals": outcome.residuals,
             "chosen": outcome.chosen,
         }
+        if estimate is not None:
+            table["calibration"] = {
+                **calibrate.table(estimate, free),
+                "cameras": str(beside(out)),
+                "words": calibrate.in_words(estimate, free),
+            }
         run_folder.write_results(folder, table)
     return table
+
+
+def beside(volume: Path) -> Path:
+    """The file of a calibrated rig beside its volume; a rig that is there by another name stays."""
+    return volume.with_name(volume.name.partition(".")[0] + ".cameras.json")
 
 
 def task(config: DictConfig) -> None:
@@ -71,7 +89,10 @@ def task(config: DictConfig) -> None:
     table = reconstruct(anchored(to_plain(config)), folder)
     peak = table["peak_bytes"]
     memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
-    Console(markup=False, highlight=False).print(
+    console = Console(markup=False, highlight=False)
+    if fit := table.get("calibration"):
+        console.print(f"calibrate: {fit['words']}; {fit['cameras']}", soft_wrap=True)
+    console.print(
         f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
         f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
         soft_wrap=True,

@@ -3,6 +3,7 @@ from.
 """
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image as Pillow
 
 import mvrecon.reconstruction
 import mvrecon.simulate
+from mvrecon.cameras import files
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.volume_files import read_volume
 from tests.engine.runs import call
@@ -102,6 +104,29 @@ def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
     assert (grey - exact).norm() < 2e-3 * exact.norm()
 
 
+def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
+    """The detector is said to be two pixels of 9 mm aside, and turned by nothing."""
+    options = (
+        f"views.path={scan}/views.h5",
+        "camera=from_file",
+        f"camera.path={tmp_path}/wrong.json",
+        f"grid.like={scan}/truth.nii.gz",
+        "calibrate=[offset_u,tilt]",
+        f"out={tmp_path}/volume.nii.gz",
+        f"hydra.run.dir={tmp_path}/run",
+    )
+    rig = files.from_file(scan / "simulated" / "cameras.json")
+    files.save(rig.shifted(torch.tensor([[-2.0, 0.0]])), tmp_path / "wrong.json")
+    assert call(mvrecon.reconstruction, *options) == 0
+    assert re.search(
+        r"offset_u \+(1\.9|2\.0)\d+ pixels, tilt [+-]0\.[0-2]", capsys.readouterr().out
+    )
+    mended = files.from_file(tmp_path / "volume.cameras.json")
+    assert (mended.origin - rig.origin).abs().max() < 9.0 / 4
+    fit = json.loads((tmp_path / "run" / "results.json").read_text())["calibration"]
+    assert fit["residual"][-1] < 0.2 * fit["residual"][0] and fit["free"] == ["offset_u", "tilt"]
+
+
 @pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "message"),
@@ -114,6 +139,9 @@ def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
         (("camera.detector.pixels=[36, 41]",), "detector"),
         (("views.flat=50", "views.dark=100"), "flat field"),
         (("unit=kg",), "unit"),
+        (("calibrate=tilt",), "such as calibrate=[offset_u,tilt]"),
+        (("calibrate=[tild]",), "did you mean 'tilt'"),
+        (("calibrate=[gains]", "views.every=40"), "at least two views"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused_and_leave_no_volume(

@@ -22,6 +22,7 @@ from mvrecon.calibration.unknowns import Unknowns, unknowns
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.field import resolution
 from mvrecon.cameras.misalignment import Misalignment, misaligned
+from mvrecon.cameras.views import check_finite
 from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
 from mvrecon.reconstruct.cgls import cgls
 
@@ -30,7 +31,7 @@ OperatorOf = Callable[[Cameras], Projector]
 #: Standard deviation of a blob in voxels, and of the views' blur in voxels' images.
 BLOB, VIEW_BLUR = 1.0, 2.0
 #: The fit ends where no number changes by so much of its longest change.
-CLOSE = 1e-3
+CLOSE = 2e-3
 
 
 class Round(NamedTuple):
@@ -38,7 +39,7 @@ class Round(NamedTuple):
 
     Args:
         number: from 1.
-        residual: |S y - A x| / |S y| of the blurred views at its start.
+        residual: |S y - A x| / |S y| of the blurred views at its end.
     """
 
     number: int
@@ -53,8 +54,8 @@ class Estimate(NamedTuple):
         misalignment: what was wrong with each view of the rig that was given, in pixels and
             degrees.
         gains: factor of each view's integrals, their geometric mean 1; to be divided by.
-        residual: |S y - A x| / |S y| of the blurred views, at the start of each round and at the
-            end; the first is that of the rig that was given.
+        residual: |S y - A x| / |S y| of the blurred views, of the rig that was given and after
+            each round.
     """
 
     cameras: Cameras
@@ -63,19 +64,30 @@ class Estimate(NamedTuple):
     residual: list[float]
 
 
-class _Model(NamedTuple):
+class _Problem(NamedTuple):
+    """Blurred views, and what explains them: a volume of blobs, and the rig's unknowns."""
+
     operator_of: OperatorOf
     cameras: Cameras
     unknowns: Unknowns
+    blobs: Blur
+    views: Float[Tensor, "1 1 m v u"]
 
     def rig(self, values: Float[Tensor, "m k"]) -> Cameras:
         return misaligned(self.cameras, self.unknowns.misalignment(values))
 
-    def operator(self, values: Float[Tensor, "m k"]) -> Projector:
+    def operator(self, values: Float[Tensor, "m k"]) -> LinearOperator:
+        """From a volume's coefficients to its views."""
         A = self.operator_of(self.rig(values))
-        if "gain" not in self.unknowns.kinds:
-            return A
-        return Scaled(A, pixels=self.unknowns.gains(values)[:, None, None].to(A.device))
+        if "gain" in self.unknowns.kinds:
+            A = Scaled(A, pixels=self.unknowns.gains(values)[:, None, None].to(A.device))
+        return A @ self.blobs
+
+    def residual(self, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"]) -> Tensor:
+        return self.views - self.operator(values)(x)
+
+    def relative(self, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"]) -> float:
+        return (self.residual(values, x).norm() / self.views.norm()).item()
 
 
 @torch.no_grad()
@@ -88,11 +100,11 @@ def calibrated(
     rounds: int = 12,
     monitor: Callable[[Round], object] | None = None,
 ) -> Estimate:
-    """Rig fitted in pixels and degrees to the measured views alone.
+    """Rig fitted to the measured views alone, in pixels and degrees.
 
-    Blobs and blur go with the grid's voxel: coarse voxels are fast and robust as long as the views
-    are many for them (about three times as many as voxels across), and need not hold the object's
-    edges. The object must be inside the grid and the views.
+    Blobs and blur go with the grid's voxel. Voxels may be coarse, which is fast and robust: edges
+    need not be resolved, but there should be about as many views as voxels across. The object must
+    be inside the grid and inside all views.
 
     Args:
         operator_of: the operator of a rig, such as `partial(Drr, grid)`.
@@ -107,44 +119,54 @@ def calibrated(
         monitor: called after each round.
 
     Raises:
-        ValueError: names that `unknowns` refuses; views that are not finite or of another shape
-            than the operator's; parallel beams, which `misaligned` refuses.
+        ValueError: names that `unknowns` refuses; views that are zero, not finite, or of another
+            shape than the operator's; parallel beams, which `misaligned` refuses.
     """
-    model = _Model(operator_of, cameras, unknowns(cameras, free))
-    values = model.unknowns.basis.new_zeros(model.unknowns.basis.shape[:2])
-    A = model.operator(values)
+    numbers = unknowns(cameras, free)
+    values = numbers.basis.new_zeros(numbers.basis.shape[:2])
+    A = operator_of(misaligned(cameras, numbers.misalignment(values)))
+    _check(views, A)
     blobs = Blur(A.domain_shape, [BLOB] * 3, A.device)
-    views = blurred(views, _view_blur(A))
-    x = cgls(A @ blobs, views, iterations)
-    history = []
+    problem = _Problem(operator_of, cameras, numbers, blobs, blurred(views, _view_blur(A)))
+    x = cgls(problem.operator(values), problem.views, iterations)
+    history = [problem.relative(values, x)]
     for number in range(1, rounds + 1):
-        r = _residual(model, values, views, blobs(x))
-        history.append((r.norm() / views.norm()).item())
-        rig = Complement(
-            derivatives(lambda v: model.operator(v)(blobs(x)), values),  # noqa: B023
-            model.unknowns,
-        )
-        A = model.operator(values) @ blobs
-        change = cgls(rig @ A, rig(r), iterations)
-        x, step = x + change, rig.change(r - A(change))
-        longest = model.unknowns.longest
-        values = values + step.clamp(-longest, longest)
+        last = values
+        values, x = _improved(problem, values, x, iterations)
+        history.append(problem.relative(values, x))
         if monitor is not None:
             monitor(Round(number, history[-1]))
-        if (step.abs() < CLOSE * longest).all():
+        if ((values - last).abs() < CLOSE * numbers.longest).all():
             break
-    r = _residual(model, values, views, blobs(x))
-    history.append((r.norm() / views.norm()).item())
-    by, gains = model.unknowns.misalignment(values), model.unknowns.gains(values)
-    return Estimate(model.rig(values), by, gains, history)
+    by = numbers.misalignment(values)
+    return Estimate(problem.rig(values), by, numbers.gains(values), history)
 
 
-def _residual(model: _Model, values: Tensor, views: Tensor, volume: Tensor) -> Tensor:
-    return views - model.operator(values)(volume)
+def _improved(
+    problem: _Problem, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"], iterations: int
+) -> tuple[Float[Tensor, "m k"], Float[Tensor, "1 1 d h w"]]:
+    """The rig's numbers and the volume after a Gauss-Newton step for both."""
+    A, r = problem.operator(values), problem.residual(values, x)
+    columns = derivatives(lambda moved: problem.operator(moved)(x), values)
+    rest = Complement(columns, problem.unknowns)
+    change = cgls(rest @ A, rest(r), iterations)
+    longest = problem.unknowns.longest
+    step = rest.change(r - A(change)).clamp(-longest, longest)
+    return values + step, x + change
+
+
+def _check(views: Float[Tensor, "1 1 m v u"], A: Projector) -> None:
+    if tuple(views.shape) != (1, 1, *A.range_shape):
+        raise ValueError(
+            f"expected views [1 1 m v u] {(1, 1, *A.range_shape)} of the operator, got "
+            f"{tuple(views.shape)}"
+        )
+    check_finite(views)
+    if not views.any():
+        raise ValueError("expected views of an object to calibrate from, got zeros alone")
 
 
 def _view_blur(A: Projector) -> float:
     """Blur of the views in pixels."""
-    centre = A.grid.corners().mean(dim=0)
-    pixel = resolution(A.cameras.to("cpu"), centre.to("cpu").double())
+    pixel = resolution(A.cameras.to("cpu"), A.grid.centre)
     return VIEW_BLUR * max(A.grid.spacing) / pixel

@@ -59,12 +59,13 @@ class Unknowns(NamedTuple):
         return self.basis.new_tensor([KINDS[kind].longest for kind in self.kinds])
 
     def misalignment(self, values: Float[Tensor, "m k"]) -> Misalignment:
-        """What is wrong with each view, in pixels and degrees."""
-        by = Misalignment.none(len(values))
-        for name, column in zip(self.kinds, values.T, strict=True):
+        """What is wrong with each view, in pixels and degrees; differentiable."""
+        still = Misalignment.none(len(values))
+        fields = {name: list(getattr(still, name).unbind(dim=1)) for name in still._fields}
+        for name, column in zip(self.kinds, values.unbind(dim=1), strict=True):
             if field := KINDS[name].field:
-                getattr(by, field)[:, KINDS[name].column] = column
-        return by
+                fields[field][KINDS[name].column] = column
+        return Misalignment(**{name: torch.stack(own, dim=1) for name, own in fields.items()})
 
     def gains(self, values: Float[Tensor, "m k"]) -> Float[Tensor, " m"]:
         """The factor of each view, 1 where it is not free."""

@@ -62,6 +62,7 @@ class ScanSettings:
     unit: str = MISSING
     stop: Any = None
     choose: Any = None
+    calibrate: Any = None
     device: str = "auto"
     plugins: Any = field(default_factory=list)
 

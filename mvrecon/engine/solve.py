@@ -104,7 +104,7 @@ def _iterated(
         trials = [{"weight": t.weight, "errors": t.errors} for t in choice.trials]
         chosen = {"iterations": choice.iterations, "weight": choice.weight, "trials": trials}
         return choice.volume, chosen
-    with _bar(name, options.get("iterations")) as advance:
+    with bar(name, options.get("iterations")) as advance:
         monitors = [curve, lambda iterate: advance(iterate.number)]
         if settings["stop"]["sigma"] is not None:
             monitors.append(discrepancy(settings["stop"]["sigma"]))
@@ -114,7 +114,7 @@ def _iterated(
 
 def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> Tensor:
     saturated = floored = 0
-    with _bar(name, len(scan.cameras)) as advance:
+    with bar(name, len(scan.cameras)) as advance:
 
         def read(first: int, last: int) -> Tensor:
             nonlocal saturated, floored
@@ -135,7 +135,7 @@ def _iterates(name: str) -> bool:
 
 
 @contextmanager
-def _bar(name: str, total: int | None):
+def bar(name: str, total: int | None):
     """Context with a progress bar on stderr; gives the function that moves it."""
     columns = (TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn())
     bars = Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)

@@ -5,7 +5,8 @@ is used.
 import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -59,6 +60,7 @@ class MeasuredViews:
         self.region = Region.of(stack.shape, options.rows, options.columns, options.binning)
         self.kind: Kind = _kind(options, stack)
         self.saturation = options.saturation or stack.top or math.inf
+        self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
             self._warn_of_dead(self.fields)
 
@@ -99,12 +101,24 @@ class MeasuredViews:
             )
         return self.region.seen_by(cameras[:: self.options.every])
 
+    def divided_by(self, gains: Float[Tensor, " m"]) -> "MeasuredViews":
+        """The same views with each one's integrals divided by its gain, as a calibration has it."""
+        other = copy(self)
+        other.gains = gains if self.gains is None else gains * self.gains
+        return other
+
     def read(self, first: int, last: int) -> Corrected:
         """Views `first` to `last - 1`, of those that are taken, as line integrals.
 
         Raises:
             IndexError, Refused: see `ProjectionStack.read`; a view without any light.
         """
+        part = self._read(first, last)
+        if self.gains is None:
+            return part
+        return replace(part, views=part.views / self.gains[first:last, None, None])
+
+    def _read(self, first: int, last: int) -> Corrected:
         every = self.options.every
         if every == 1:
             raw = self.stack.read(first, last)
