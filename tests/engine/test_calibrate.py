@@ -1,0 +1,60 @@
+"""A scan's rig is fitted on fewer voxels and pixels than the scan has, and comes back in its own
+pixels.
+"""
+
+import torch
+
+from mvrecon.cameras.misalignment import Misalignment, misaligned
+from mvrecon.cameras.rigs import circular
+from mvrecon.data.projections.views import Corrected
+from mvrecon.engine import calibrate
+from mvrecon.engine.scan import Scan
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.projectors.drr import Drr
+
+GRID = Grid.centred(size=(32, 28, 24), spacing=(3.0, 3.0, 4.0))
+RIG = circular(20, 400.0, 600.0, {"pixels": [48, 64], "pixel_mm": 3.2})
+
+
+class Measured:
+    """Views in memory, with the two methods that a calibration asks for."""
+
+    def __init__(self, views, mask):
+        self.views, self.mask, self.gains = views, mask, torch.ones(len(views))
+
+    def whole(self):
+        return Corrected(self.views / self.gains[:, None, None], self.mask)
+
+    def divided_by(self, gains):
+        other = Measured(self.views, self.mask)
+        other.gains = gains
+        return other
+
+
+def test_offset_gains_and_dead_pixels_of_a_scan(monkeypatch):
+    """Half the voxels and pixels each way; one pixel in fifty is dead, with a wild value."""
+    monkeypatch.setattr(calibrate, "COARSE", 16)
+    rng = torch.Generator().manual_seed(0)
+    truth = Misalignment.none(20)
+    truth.offset_px[:, 0] = 2.6
+    gains = (0.05 * torch.linspace(-1, 1, 20)).exp()
+    places = torch.tensor([[12.0, 5.0, -10.0], [-15.0, 10.0, 12.0], [5.0, -18.0, 0.0]])
+    x = sum(torch.exp(-((voxel_centres(GRID) - p) ** 2).sum(-1) / 128) for p in places)
+    exact = Drr(GRID, misaligned(RIG, truth))(x.float()[None, None])[0, 0] * gains[:, None, None]
+    mask = torch.rand(exact.shape, generator=rng) > 0.02
+    scan = Scan(Measured(torch.where(mask, exact, 99.0), mask), RIG, GRID, {"name": "drr"})
+    mended, fit = calibrate.calibrate(scan, ["offset_u", "gains"])
+    assert (fit.misalignment.offset_px[:, 0] - 2.6).abs().max() < 0.1
+    assert (mended.cameras.origin - misaligned(RIG, truth).origin).norm(dim=1).max() < 0.1 * 3.2
+    views = mended.measured.whole().views
+    assert ((views - exact / gains[:, None, None])[mask].norm() / exact[mask].norm()) < 0.01
+    assert "offset_u +2." in calibrate.in_words(fit, ["offset_u", "gains"])
+
+
+def test_the_coarse_grid_fills_the_same_box():
+    turned = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    fine = Grid.centred(size=(100, 80, 10), spacing=(1.0, 1.0, 2.0), centre=(5.0, 0.0, -3.0))
+    fine = fine.moved(turned.double(), torch.tensor([1.0, 2.0, 3.0]).double())
+    coarse = calibrate._coarse(fine)
+    assert coarse.size == (64, 52, 10)
+    assert torch.allclose(coarse.corners(), fine.corners())
