@@ -20,7 +20,7 @@ def derivatives(
 
     All views move at once, as none depends on another's numbers. Along blurred volumes the
     quotient is the derivative to the second order of its step; the kernels have a derivative by the
-    pose backwards alone, and the reference's forwards takes a hundred times as long.
+    pose backwards alone, and the reference's forwards takes some sixty times as long.
 
     Args:
         views_at: the views [1 1 m v u] of a volume, of the numbers.
