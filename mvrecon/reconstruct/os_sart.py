@@ -17,7 +17,7 @@ from mvrecon.projectors.selection import (
 from mvrecon.reconstruct.iterative import inverse_sums
 from mvrecon.reconstruct.problem import Common, Problem, Watch, posed
 
-#: Of the greatest column sum's inverse: the longest step, below 2, beyond which one could go astray.
+#: The longest step, in inverse greatest column sums: below 2, beyond which none is stable.
 STABLE = 1.9
 
 
