@@ -150,7 +150,9 @@ class Methods:
 
         def call() -> Tensor:
             with torch.no_grad():
-                return RECONSTRUCTORS.build(job.part.name, A, views, **job.part.options | fewer)
+                return RECONSTRUCTORS.build(
+                    job.part.name, A, views, **{**job.part.options, **fewer}
+                )
 
         return call
 
