@@ -46,11 +46,11 @@ def os_sart(
     One iteration goes through all views, and does the work of as many SIRT iterations as there are
     subsets. C is the inverse of the *mean* column sum of the subsets, cut off where l C would pass
     1.9 over the *greatest* one, so that every step is stable: for views that agree no step brings x
-    farther from any solution that is not negative, in the norm of C^-1, and the iterates converge
-    to one (Censor and Elfving, SIAM J. Matrix Anal. Appl. 24, 2002, whose C is one matrix for all
-    subsets; SART: Andersen and Kak, Ultrason. Imaging 6, 1984). For views that do not agree they
-    stay bounded and end in a cycle around the weighted least-squares solution, which shrinks with a
-    relaxation that is reduced.
+    farther from any solution that is not negative, in the norm of C^-1, and at a constant
+    relaxation x converges to one (Censor and Elfving, SIAM J. Matrix Anal. Appl. 24, 2002, whose C
+    is one matrix for all subsets; SART: Andersen and Kak, Ultrason. Imaging 6, 1984). For views
+    that do not agree the iterates end in a cycle around the weighted least-squares solution; it
+    shrinks with a relaxation that is reduced.
 
     Convention: RTK and others divide by the column sum of the subset at work. The iterates are
     nearly the same, but their metric changes with each subset, and the proof does not cover them.
