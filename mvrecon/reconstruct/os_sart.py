@@ -1,4 +1,10 @@
-"""OS-SART: SIRT's step for one ordered subset of the views after the other."""
+"""OS-SART: SIRT's step for one ordered subset of the views after the other.
+
+RTK and others divide by the column sum of the subset at work. The iterates are nearly the same as
+here, but their metric changes with each subset, and the proof for one matrix does not cover them.
+There is no momentum, since with subsets it may diverge (Kim, Ramani and Fessler, IEEE Trans. Med.
+Imaging 34, 2015).
+"""
 
 from functools import partial
 from typing import NamedTuple, Unpack
@@ -52,10 +58,7 @@ def os_sart(
     that do not agree the iterates end in a cycle around the weighted least-squares solution; it
     shrinks with a relaxation that is reduced.
 
-    Convention: RTK and others divide by the column sum of the subset at work. The iterates are
-    nearly the same, but their metric changes with each subset, and the proof does not cover them.
-    There is no momentum, since with subsets it may diverge (Kim, Ramani and Fessler, IEEE Trans.
-    Med. Imaging 34, 2015).
+    Convention: RTK and others divide by the column sum of the subset at work: see the module.
 
     Args:
         A: the operator.
