@@ -1,4 +1,10 @@
-"""OS-SART: SIRT's step for one ordered subset of the views after the other."""
+"""OS-SART: SIRT's step for one ordered subset of the views after the other.
+
+RTK and others divide by the column sum of the subset at work. The iterates are nearly the same as
+here, but their metric changes with each subset, and the proof for one matrix does not cover them.
+There is no momentum, since with subsets it may diverge (Kim, Ramani and Fessler, IEEE Trans. Med.
+Imaging 34, 2015).
+"""
 
 from functools import partial
 from typing import NamedTuple, Unpack
@@ -16,6 +22,9 @@ from mvrecon.projectors.selection import (
 )
 from mvrecon.reconstruct.iterative import inverse_sums
 from mvrecon.reconstruct.problem import Common, Problem, Watch, posed
+
+#: The longest step, in inverse greatest column sums: below 2, beyond which none is stable.
+STABLE = 1.9
 
 
 class Subset(NamedTuple):
@@ -41,12 +50,15 @@ def os_sart(
     turn, in the unit of the volume.
 
     One iteration goes through all views, and does the work of as many SIRT iterations as there are
-    subsets. C is the inverse of the greatest column sum that any subset has, so that every step is
-    stable: for views that agree no step brings x farther from any solution, in the norm of C^-1
-    (Censor and Elfving, SIAM J. Matrix Anal. Appl. 24, 2002; SART: Andersen and Kak, Ultrason.
-    Imaging 6, 1984). For noisy views the iterates end in a cycle around the weighted least-squares
-    solution; it shrinks with a relaxation that is reduced. There is no momentum, since with subsets
-    it may diverge (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34, 2015).
+    subsets. C is the inverse of the *mean* column sum of the subsets, cut off where l C would pass
+    1.9 over the *greatest* one, so that every step is stable: for views that agree no step brings x
+    farther from any solution that is not negative, in the norm of C^-1, and at a constant
+    relaxation x converges to one (Censor and Elfving, SIAM J. Matrix Anal. Appl. 24, 2002, whose C
+    is one matrix for all subsets; SART: Andersen and Kak, Ultrason. Imaging 6, 1984). For views
+    that do not agree the iterates end in a cycle around the weighted least-squares solution; it
+    shrinks with a relaxation that is reduced.
+
+    Convention: RTK and others divide by the column sum of the subset at work: see the module.
 
     Args:
         A: the operator.
@@ -69,14 +81,15 @@ def os_sart(
             f"Expected 0 < relaxation < 2 and 0 < reduction <= 1, got {relaxation} and {reduction}"
         )
     problem = posed(os_sart, A, views, common)
-    parts, column = _subsets(
-        problem, usual_subsets(len(views[0, 0])) if subsets is None else subsets
-    )
+    count = usual_subsets(A.range_shape[0]) if subsets is None else subsets
+    parts, column = _subsets(problem, count, relaxation)
     x, watch = problem.start, Watch(problem.monitor)
     for number in range(1, iterations + 1):
         for part in parts:
             residual = part.views - part.A(x)
-            x = torch.addcmul(x, column, part.A.T(residual.mul_(part.row)), value=relaxation)
+            back = part.A.T(residual.mul_(part.row))
+            # onto the adjoint's memory: a monitor may keep x
+            x = torch.addcmul(x, column, back, value=relaxation, out=back)
             x = x.clamp_min_(0) if nonnegative else x
         relaxation *= reduction
         if watch.ends(number, x, partial(_residual, problem, x)):
@@ -84,18 +97,24 @@ def os_sart(
     return x
 
 
-def _subsets(problem: Problem, count: int) -> tuple[list[Subset], Float[Tensor, "1 1 d h w"]]:
+def _subsets(
+    problem: Problem, count: int, relaxation: float
+) -> tuple[list[Subset], Float[Tensor, "1 1 d h w"]]:
     """The subsets in their order, and C."""
     A, views, *_ = problem
     dealt = ordered_subsets(A.range_shape[0], count)
     ones = views.new_ones(1, 1, *A.domain_shape)
-    rows, greatest, parts = inverse_sums(A(ones)), torch.zeros_like(ones), []
+    rows, total, greatest = inverse_sums(A(ones)), torch.zeros_like(ones), torch.zeros_like(ones)
+    parts = []
     for subset in distant_order(count):
         selection = ViewSelection(A.range_shape, dealt[subset])
         part = Subset(A.subset(selection), selection(rows), selection(views))
-        greatest = torch.maximum(greatest, part.A.T(torch.ones_like(part.row)))
+        sums = part.A.T(torch.ones_like(part.row))
+        total += sums
+        greatest = torch.maximum(greatest, sums, out=greatest)
         parts.append(part)
-    return parts, inverse_sums(greatest)
+    longest = (STABLE / relaxation) * inverse_sums(greatest)
+    return parts, torch.minimum(count * inverse_sums(total), longest)
 
 
 def _residual(problem: Problem, x: Tensor) -> Tensor:

@@ -2,6 +2,9 @@
 only for use).
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -24,6 +27,26 @@ def vectors(rig: Cameras) -> Float[Tensor, "m 6"]:
     first = rig.origin - rig.source if rig.parallel else rig.source
     upside = torch.tensor([1.0, -1.0]).to(first)
     return torch.cat([points[:, :2] * upside for points in (first, centre, rig.u)], dim=-1)
+
+
+def turned(rig: Cameras) -> Float[Tensor, " m"]:
+    """Angles in radians of parallel views as ASTRA's FBP takes them: its geometry `parallel`.
+
+    Raises:
+        ValueError: a fan, rays that are not square to their detector, or a detector whose middle is
+            not opposite the axis.
+    """
+    ray, centre, across = vectors(rig).unflatten(1, (3, 2)).unbind(dim=1)
+    pitch = across.norm(dim=1)
+    slant = (ray * across).sum(dim=1) / (pitch * ray.norm(dim=1))
+    offset = (centre * across).sum(dim=1) / pitch.square()
+    if not rig.parallel or max(slant.abs().max(), offset.abs().max()) > 1e-6:
+        raise ValueError(
+            f"ASTRA's FBP takes parallel beams square to a centred detector, got "
+            f"{'parallel beams' if rig.parallel else 'a fan'} slanted by {slant.abs().max():.3g}, "
+            f"detectors {offset.abs().max():.3g} columns off"
+        )
+    return torch.atan2(across[:, 1], across[:, 0])
 
 
 class Astra(Paired):
@@ -78,7 +101,7 @@ class Astra(Paired):
         x, rows, columns = volume, *self.rig.shape
         views = x.new_zeros(rows, len(self.rig), columns)
         for row, index in self.pairs:
-            self._run("FP", x[index], views[row])
+            self._run("FP", x[index], views[row], self.fan)
         return views.transpose(0, 1)
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
@@ -87,24 +110,51 @@ class Astra(Paired):
         x = y.new_zeros(self.grid.shape)
         for row, index in self.pairs:
             image = torch.zeros_like(x[index])
-            self._run("BP", image, y[row])
+            self._run("BP", image, y[row], self.fan)
             x[index] += image
         return x
 
-    def _run(self, kind: str, image: Tensor, lines: Tensor) -> None:
+    def reconstruct(
+        self,
+        kind: str,
+        views: Float[Tensor, "m v u"],
+        iterations: int = 1,
+        options: Mapping[str, Any] | None = None,
+    ) -> Float[Tensor, "d h w"]:
+        """Slices by ASTRA's algorithm of a name, such as "SIRT", in (unit of the views) / mm."""
+        y = views.transpose(0, 1).contiguous()
+        x = y.new_zeros(self.grid.shape)
+        fan, pitch = self.fan, self.rig.u[0].norm().item()
+        if kind == "FBP":
+            angles = turned(self.rig).numpy()
+            fan = self.astra.create_proj_geom("parallel", pitch, self.rig.shape[1], angles)
+        for row, index in self.pairs:
+            self._run(kind, x[index], y[row], fan, iterations, options)
+        return x
+
+    def _run(
+        self,
+        kind: str,
+        image: Tensor,
+        lines: Tensor,
+        fan: Mapping[str, Any],
+        iterations: int = 1,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         """One algorithm, between a slice and its views, in place."""
         astra = self.astra
         volume = astra.data2d.link("-vol", self.plane, image.numpy())
-        views = astra.data2d.link("-sino", self.fan, lines.numpy())
-        projector = astra.create_projector(self.kind, self.fan, self.plane)
-        result = {"FP": "VolumeDataId", "BP": "ReconstructionDataId"}[kind]
+        views = astra.data2d.link("-sino", fan, lines.numpy())
+        projector = astra.create_projector(self.kind, fan, self.plane)
+        result = "VolumeDataId" if kind == "FP" else "ReconstructionDataId"
         config = astra.astra_dict(kind) | {
             "ProjectorId": projector,
             "ProjectionDataId": views,
             result: volume,
+            "option": dict(options or {}),
         }
         algorithm = astra.algorithm.create(config)
-        astra.algorithm.run(algorithm)
+        astra.algorithm.run(algorithm, iterations)
         astra.algorithm.delete(algorithm)
         astra.projector.delete(projector)
         astra.data2d.delete([volume, views])

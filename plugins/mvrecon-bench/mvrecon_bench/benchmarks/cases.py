@@ -34,6 +34,7 @@ class Case:
         device: "cpu", "cuda", or "auto": a GPU where there is one.
         dtype: in which volume and views are kept.
         threads: 0: as many as torch has.
+        slices: voxels along z, about the centre, one for each row of parallel beams; 0: n.
 
     Raises:
         ValueError: an unknown camera or dtype, or sizes that are not positive.
@@ -47,6 +48,7 @@ class Case:
     device: str = "cpu"
     dtype: str = "float32"
     threads: int = 0
+    slices: int = 0
 
     def __post_init__(self) -> None:
         for what, name, known in (("camera", self.camera, RIGS), ("dtype", self.dtype, DTYPES)):
@@ -54,7 +56,7 @@ class Case:
                 raise ValueError(
                     f"Unknown {what} {name!r} of a benchmark. Known: {', '.join(known)}"
                 )
-        if self.n < 1 or not self.ratio > 0 or self.views < 1 or self.threads < 0:
+        if self.n < 1 or not self.ratio > 0 or self.views < 1 or min(self.threads, self.slices) < 0:
             raise ValueError(f"A benchmark's n, ratio and views must be positive, got {self}")
         device = "cuda" if torch.cuda.is_available() else "cpu"
         settled = {
@@ -82,7 +84,9 @@ class Case:
 
     def grid(self) -> Grid:
         """The volume's voxels, about the origin."""
-        return Grid.centred((self.n,) * 3, self.field / self.n)
+        return Grid.centred(
+            size=(self.n, self.n, self.slices or self.n), spacing=self.field / self.n
+        )
 
     def cameras(self) -> Cameras:
         """The rig."""
@@ -92,7 +96,7 @@ class Case:
         """The object, the same in mm for every n."""
         if self.scene == "box":
             return boxes(self.field)
-        return SCENES.build(self.scene).phantom(generator(0, 0), self.grid())
+        return SCENES.build(self.scene).phantom(generator(0, 0), replace(self, slices=0).grid())
 
 
 def boxes(field: float) -> Phantom:
@@ -142,9 +146,9 @@ def _cone(case: Case, sid: float, sdd: float, odd: int = 0, **angles: Any) -> Ca
 def _parallel(case: Case, views: int) -> Cameras:
     count = max(1, round(case.n / case.ratio))
     start = 0.0 if views == 1 else 3.0
-    return rigs.parallel(
-        views, {"pixels": [count, count], "pixel_mm": case.pixel}, start_degrees=start
-    )
+    rows, height = (case.slices, case.field / case.n) if case.slices else (count, case.pixel)
+    detector = {"pixels": [rows, count], "pixel_mm": [height, case.pixel]}
+    return rigs.parallel(views, detector, start_degrees=start)
 
 
 def _dcspect80(case: Case) -> Cameras:

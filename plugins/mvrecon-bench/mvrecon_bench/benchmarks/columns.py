@@ -96,18 +96,23 @@ SMALL = {
     "load": OPERATORS["load"],
 }
 
-METHODS_KEYS = ("part", "options", "scene", "camera", "n", "ratio", "views", "device", "threads")
+METHODS_KEYS = (
+    *("part", "options", "scene", "camera", "n", "slices", "ratio", "views", "device", "threads"),
+)
 
 #: `bench=methods`.
 METHODS = {
     "part": "reconstructor, by its name in the registry",
     "options": OPERATORS["options"],
-    **{name: OPERATORS[name] for name in ("scene", "camera", "n", "ratio", "views")},
-    **{name: OPERATORS[name] for name in ("device", "dtype", "threads")},
+    **{name: OPERATORS[name] for name in ("scene", "camera", "n")},
+    "slices": "voxels along z; 0: n",
+    **{name: OPERATORS[name] for name in ("ratio", "views", "device", "dtype", "threads")},
     "status": OPERATORS["status"],
     "error": "|x - t| / |t| over the voxels of the object, t the mean of the phantom in each voxel",
     "ms": "one reconstruction in ms, weights and filters included: median of at least `repeats` "
     "taken in turns with the other parts of the case",
+    "iterations_timed": "blank: the whole run; else ms is scaled from so many iterations, of a run "
+    "that would take longer than `limit_s`, and there is no error",
     "peak_mb": "most memory in 2^20 bytes of a call beyond what was in use before it, its result "
     "included",
     "peer": "the part that the time is divided by",

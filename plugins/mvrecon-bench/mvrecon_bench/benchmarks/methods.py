@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.parts import RECONSTRUCTORS
-from mvrecon.projectors.drr import Drr
+from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.benchmarks import report
 from mvrecon_bench.benchmarks.cases import Case, expand
@@ -20,6 +20,7 @@ from mvrecon_bench.benchmarks.columns import METHODS, METHODS_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads, with_memory
 from mvrecon_bench.benchmarks.part import Part
 from mvrecon_bench.benchmarks.rows import Row, number
+from mvrecon_bench.benchmarks.shortened import shortened
 from mvrecon_bench.benchmarks.trial import reason
 from mvrecon_bench.benchmarks.truth import pixel_mean
 
@@ -38,7 +39,7 @@ class Job:
     @property
     def row(self) -> Row:
         """The columns that tell this row from all others."""
-        names = ("scene", "camera", "n", "ratio", "views", "device", "dtype", "threads")
+        names = ("scene", "camera", "n", "slices", "ratio", "views", "device", "dtype", "threads")
         columns = {name: getattr(self.case, name) for name in names}
         part = {name: self.part.row[name] for name in ("part", "options")}
         return {**part, "peer": self.peer, **columns}
@@ -48,7 +49,7 @@ class Job:
 class Measurement:
     """What the methods are given, and the truth."""
 
-    A: Drr
+    A: RayTransform
     views: Float[Tensor, "1 1 m v u"]
     volume: Float[Tensor, "d h w"]
     inside: Bool[Tensor, "d h w"]
@@ -66,7 +67,7 @@ def measurement_of(case: Case, rays: int) -> Measurement:
     views = pixel_mean(phantom, rig, rays)[None, None].float()
     volume = voxelise(phantom, grid).float()
     inside = volume > 0
-    return Measurement(Drr(grid, rig), views, volume, inside)
+    return Measurement(RayTransform(grid, rig), views, volume, inside)
 
 
 class Methods:
@@ -80,6 +81,8 @@ class Methods:
         rays: a pixel of the views is the mean over rays x rays exact integrals.
         repeats: least number of calls of which a time is the median.
         once_s: a call that takes longer, in seconds, is timed once.
+        limit_s: a method that would take longer, in seconds, is not run to its end: its time is
+            scaled from that of one and of two iterations.
     """
 
     columns: Mapping[str, str] = METHODS
@@ -94,12 +97,13 @@ class Methods:
         rays: int = 2,
         repeats: int = 3,
         once_s: float = 20.0,
+        limit_s: float = 300.0,
     ):
         peers = [str(config.get("peer", "")) for config in parts]
         plain = [{key: v for key, v in config.items() if key != "peer"} for config in parts]
         self.parts = list(zip(map(Part.of, plain), peers, strict=True))
         self.plan, self.rays = expand(base, plan), rays
-        self.repeats, self.once_s = repeats, once_s
+        self.repeats, self.once_s, self.limit_s = repeats, once_s, limit_s
 
     def groups(self) -> list[list[Job]]:
         """What is measured together: one case by all methods that take it."""
@@ -128,7 +132,8 @@ class Methods:
                 call = self._call(job, data)
                 try:
                     self._call(job, measurement_of(replace(case, n=TINY, views=TINY), 1))()
-                    done[key] = {**job.row, "load": load_average(), **self._first(call, data, case)}
+                    figures = self._short(job, data) or self._first(call, data, case)
+                    done[key] = {**job.row, "load": load_average(), **figures}
                 except Exception as error:  # whatever a part raises is its row's status
                     yield {**job.row, "load": load_average(), "status": f"skipped: {reason(error)}"}
                 else:
@@ -136,15 +141,34 @@ class Methods:
             say("times")
             yield from self._timed(calls, done, case)
 
-    def _call(self, job: Job, data: Measurement) -> Callable[[], Tensor]:
+    def _call(
+        self, job: Job, data: Measurement, iterations: int | None = None
+    ) -> Callable[[], Tensor]:
         A = data.A.to(job.case.device)
         views = data.views.to(job.case.device)
+        fewer = {} if iterations is None else {"iterations": iterations}
 
         def call() -> Tensor:
             with torch.no_grad():
-                return RECONSTRUCTORS.build(job.part.name, A, views, **job.part.options)
+                return RECONSTRUCTORS.build(
+                    job.part.name, A, views, **{**job.part.options, **fewer}
+                )
 
         return call
+
+    def _short(self, job: Job, data: Measurement) -> Row | None:
+        """Time and memory of a method that is not run to its end; None: it is."""
+        if (iterations := job.part.options.get("iterations")) is None:
+            return None
+        device = job.case.device
+
+        def run(count: int) -> float:
+            return once(self._call(job, data, count), device)[1]
+
+        timed, peak = with_memory(lambda: shortened(run, iterations, self.limit_s), device)
+        if timed is None:
+            return None
+        return {"ms": 1e3 * timed.seconds, "iterations_timed": timed.iterations, "peak_mb": peak}
 
     def _first(self, call: Callable[[], Tensor], data: Measurement, case: Case) -> Row:
         """Error, memory and time of a call; of a short one's second, which has its caches."""
@@ -158,7 +182,8 @@ class Methods:
         self, calls: Mapping[int, Callable[[], Tensor]], done: Mapping[int, Row], case: Case
     ) -> Iterator[Row]:
         seconds = {key: row["ms"] / 1e3 for key, row in done.items()}
-        short = {key: call for key, call in calls.items() if seconds[key] < self.once_s}
+        whole = [key for key, row in done.items() if "iterations_timed" not in row]
+        short = {key: calls[key] for key in whole if seconds[key] < self.once_s}
         times = interleaved(short, seconds, self.repeats, case.device)
         ms = {key: times[key].ms if key in times else row["ms"] for key, row in done.items()}
         names = {row["part"]: ms[key] for key, row in done.items()}
@@ -169,7 +194,7 @@ class Methods:
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """The table by name."""
-        names = ("n", "views", "error", "ms", "peak_mb", "peer", "over_peer")
+        names = ("n", "views", "error", "ms", "iterations_timed", "peak_mb", "peer", "over_peer")
         done = [row for row in rows if row["status"] == "ok"]
         done.sort(key=lambda row: (number(row, "n"), number(row, "views")))
         lines = [

@@ -1,0 +1,92 @@
+"""ASTRA's 2-D algorithms on the CPU as reconstructors: FBP, SIRT and CGLS of stacks of parallel
+slices, one slice after the other on one thread. ASTRA's 3-D algorithms need a GPU.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.projectors.checks import check_views
+from mvrecon.projectors.operator import Projector
+from mvrecon_peers.astra import Astra
+
+
+def astra_fbp(
+    A: Projector,
+    views: Float[Tensor, "b 1 m v u"],
+    filter: str = "ram-lak",
+    method: str = "linear",
+) -> Float[Tensor, "b 1 d h w"]:
+    """Filtered back-projection by ASTRA's FBP, in (unit of the views) / mm.
+
+    Args:
+        A: holds the grid and the rig, parallel beams in the middle planes of slices.
+        views: line integrals.
+        filter: ASTRA's name of the ramp's window, such as "ram-lak" or "hann".
+        method: ASTRA's projector, whose transpose back-projects: see `Astra`.
+
+    Raises:
+        ImportError: ASTRA is not installed.
+        ValueError: a geometry that ASTRA does not take.
+    """
+    return _reconstructed(A, views, method, "FBP", 1, {"FilterType": filter})
+
+
+def astra_sirt(
+    A: Projector,
+    views: Float[Tensor, "b 1 m v u"],
+    iterations: int = 50,
+    method: str = "linear",
+) -> Float[Tensor, "b 1 d h w"]:
+    """SIRT without negative values by ASTRA's SIRT, in (unit of the views) / mm.
+
+    Args:
+        A: holds the grid and the rig.
+        views: line integrals.
+        iterations: how many.
+        method: ASTRA's projector: see `Astra`.
+
+    Raises:
+        ImportError: ASTRA is not installed.
+        ValueError: a geometry that ASTRA does not take.
+    """
+    return _reconstructed(A, views, method, "SIRT", iterations, {"MinConstraint": 0.0})
+
+
+def astra_cgls(
+    A: Projector,
+    views: Float[Tensor, "b 1 m v u"],
+    iterations: int = 20,
+    method: str = "linear",
+) -> Float[Tensor, "b 1 d h w"]:
+    """Conjugate gradients for least squares by ASTRA's CGLS, in (unit of the views) / mm.
+
+    Args:
+        A: holds the grid and the rig.
+        views: line integrals.
+        iterations: how many.
+        method: ASTRA's projector: see `Astra`.
+
+    Raises:
+        ImportError: ASTRA is not installed.
+        ValueError: a geometry that ASTRA does not take.
+    """
+    return _reconstructed(A, views, method, "CGLS", iterations, {})
+
+
+def _reconstructed(
+    A: Projector,
+    views: Tensor,
+    method: str,
+    algorithm: str,
+    iterations: int,
+    options: Mapping[str, Any],
+) -> Tensor:
+    check_views(views, A.cameras)
+    peer = Astra(A.grid, A.cameras, method)
+    cases = [case[0].detach().float() for case in views]
+    volumes = [peer.reconstruct(algorithm, case, iterations, options) for case in cases]
+    return torch.stack(volumes)[:, None]
