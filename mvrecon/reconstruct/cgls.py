@@ -96,7 +96,7 @@ def conjugate_gradients(
         size = norms(s)
         ratio = torch.where(active, (size / torch.where(active, last, 1)).square(), 0)
         p = torch.addcmul(s, ratio, p)
-    return x
+    return watch.result(x)
 
 
 def _products(one: Float[Tensor, "b c *n"], other: Float[Tensor, "b c *n"]) -> Tensor:

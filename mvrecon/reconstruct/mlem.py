@@ -70,7 +70,7 @@ def mlem(
                 x = torch.where(s > 0, x * (part.explained(x) / torch.where(s > 0, s, 1)), x)
             if watch.ends(number, x, partial(_unexplained, A, counts, background, x)):
                 break
-        return x
+        return watch.result(x)
 
 
 def osem(

@@ -81,7 +81,7 @@ def os_sart(
         relaxation *= reduction
         if watch.ends(number, x, partial(_residual, problem, x)):
             break
-    return x
+    return watch.result(x)
 
 
 def _subsets(problem: Problem, count: int) -> tuple[list[Subset], Float[Tensor, "1 1 d h w"]]:

@@ -63,7 +63,7 @@ def pdhg_tv(
     for number in range(iterations):
         residual = views - A(ahead)
         if watch.ends(number, x, lambda: residual, beta=min(number, 1)):  # noqa: B023
-            return x
+            return watch.result(x)
         pull = fit.weights.row * residual
         dual_views = pull if dual_views is None else dual_views.lerp_(pull, balance / (1 + balance))
         last, x = x, torch.addcmul(x, primal, A.T(dual_views))
@@ -73,4 +73,4 @@ def pdhg_tv(
             x = x.clamp_min_(0)
         ahead = torch.lerp(last, x, 2)
     watch.ends(iterations, x, lambda: views - A(x))
-    return x
+    return watch.result(x)

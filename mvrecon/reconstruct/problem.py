@@ -30,8 +30,9 @@ class Iterate(NamedTuple):
     residual: Float[Tensor, "b c m v u"]
 
 
-#: Looks at every iterate; the method ends with the one for which it returns true.
-Monitor = Callable[[Iterate], bool | None]
+#: Looks at every iterate; the method ends with the one for which it returns true. A mask [b] ends
+#: single samples: each keeps its iterate, and the method goes on until all have ended.
+Monitor = Callable[[Iterate], bool | Bool[Tensor, " b"] | None]
 
 
 class Common(TypedDict, total=False):
@@ -127,12 +128,15 @@ class Watch:
     """Shows a monitor the iterates of a method whose steps begin at x + beta (x - last).
 
     The residual at that point gives the one at x by linearity, so that no iterate is projected for
-    the monitor but the last. Without a monitor nothing is kept.
+    the monitor but the last. Without a monitor nothing is kept. A sample that has ended before the
+    others keeps its iterate, so that a batch gives what its samples alone would.
     """
 
     def __init__(self, monitor: Monitor | None):
         self.monitor = monitor
         self.residual: Tensor | None = None
+        self._done: Tensor | None = None
+        self._kept: Tensor | None = None
 
     def ends(
         self, number: int, volume: Tensor, residual: Callable[[], Tensor], beta: float | Tensor = 0
@@ -151,7 +155,29 @@ class Watch:
         if self.residual is not None:
             own = (own + beta * self.residual) / (1 + beta)
         self.residual = own
-        return number > 0 and bool(self.monitor(Iterate(number, volume, own)))
+        if number == 0:
+            return False
+        verdict = self.monitor(Iterate(number, volume, own))
+        return self._ended(verdict, volume) if isinstance(verdict, Tensor) else bool(verdict)
+
+    def result(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
+        """The volume that a method returns: of every sample the iterate with which it has ended."""
+        if self._done is None or self._kept is None:
+            return volume
+        return torch.where(_of_samples(self._done), self._kept, volume)
+
+    def _ended(self, verdict: Bool[Tensor, " b"], volume: Tensor) -> bool:
+        """Keep the samples that end here; whether all have ended."""
+        verdict = verdict.to(volume.device)
+        kept = self.result(volume)
+        self._done = verdict if self._done is None else self._done | verdict
+        if self._done.any():
+            self._kept = kept
+        return bool(self._done.all())
+
+
+def _of_samples(mask: Bool[Tensor, " b"]) -> Bool[Tensor, "b 1 1 1 1"]:
+    return mask[:, None, None, None, None]
 
 
 def _check(tensor: Any, what: str, sizes: tuple[int, ...], device: torch.device) -> None:
