@@ -10,13 +10,16 @@ from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
 
 UNITS = ("1/mm", "HU")
+#: What a run writes into its folder beside the volume.
+WRITTEN = ("config.yaml", "versions.txt", "rig.json", "rig.png", "planes.png", "results.json")
 
 
 def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Reconstruct a measured scan; returns what `results.json` then holds.
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
-    `results.json` and, unless `out` names another file, the volume.
+    `results.json` and, unless `out` names another file, the volume. A run that fails leaves none of
+    them, so that the folder is free for a second try.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -36,7 +39,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     check_ending(out)
     case = scan.open_scan(settings)
     solve.check(settings)  # what does not fit is told before the folder is anybody's
-    with run_folder.taken(folder, settings):
+    with run_folder.taken(folder, settings, own=WRITTEN):
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = solve.solve(case, settings, device_of(settings["device"]))
@@ -53,7 +56,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
             "seconds": outcome.seconds,
             "peak_bytes": outcome.peak_bytes,
-            "view_nrmse": solve.residual(case, volume),
+            "view_nrmse": outcome.view_nrmse,
             "residuals": outcome.residuals,
             "chosen": outcome.chosen,
         }
