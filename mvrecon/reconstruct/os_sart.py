@@ -15,7 +15,7 @@ from mvrecon.projectors.selection import (
     usual_subsets,
 )
 from mvrecon.reconstruct.iterative import inverse_sums
-from mvrecon.reconstruct.problem import Common, Problem, Watch, posed
+from mvrecon.reconstruct.problem import Common, Problem, Watch, posed, without_gradient
 
 
 class Subset(NamedTuple):
@@ -26,7 +26,7 @@ class Subset(NamedTuple):
     views: Float[Tensor, "b c k v u"]
 
 
-@torch.no_grad()
+@without_gradient
 def os_sart(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
@@ -47,6 +47,8 @@ def os_sart(
     Imaging 6, 1984). For noisy views the iterates end in a cycle around the weighted least-squares
     solution; it shrinks with a relaxation that is reduced. There is no momentum, since with subsets
     it may diverge (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34, 2015).
+
+    No gradient: views that require one are refused.
 
     Args:
         A: the operator.

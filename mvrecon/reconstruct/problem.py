@@ -4,7 +4,8 @@ that looks at each iterate.
 
 import inspect
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypedDict
+from functools import wraps
+from typing import Any, NamedTuple, ParamSpec, TypedDict
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,6 +16,8 @@ from mvrecon.kernels.precision import wide
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.registry import hint
 
+P = ParamSpec("P")
+
 
 class Iterate(NamedTuple):
     """An iterate x_n of a method, as a monitor sees it; its tensors must not be written into.
@@ -23,11 +26,14 @@ class Iterate(NamedTuple):
         number: n, from 1.
         volume: x_n, in the unit of the volume.
         residual: y - A x_n, in the unit of the views.
+        gap: how far the objective is above its minimum at most, relative to the objective; None for
+            methods, and for iterates, without this number.
     """
 
     number: int
     volume: Float[Tensor, "b c d h w"]
     residual: Float[Tensor, "b c m v u"]
+    gap: Float[Tensor, "b c"] | None = None
 
 
 #: Looks at every iterate; the method ends with the one for which it returns true. A mask [b] ends
@@ -47,6 +53,31 @@ class Common(TypedDict, total=False):
     start: Float[Tensor, "b c d h w"] | None
     support: Bool[Tensor, "d h w"] | None
     monitor: Monitor | None
+
+
+def without_gradient(method: Callable[P, Tensor]) -> Callable[P, Tensor]:
+    """A reconstructor that computes without gradients, and refuses views or a start that want one,
+    instead of a volume that silently is a constant.
+
+    Raises:
+        ValueError: of the method that is returned, where gradients are recorded and a tensor among
+            its arguments requires one.
+    """
+
+    @wraps(method)
+    def checked(*args: P.args, **options: P.kwargs) -> Tensor:
+        tensors = [value for value in (*args, *options.values()) if isinstance(value, Tensor)]
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+            name = getattr(method, "__name__", "the method")
+            raise ValueError(
+                f"Expected tensors without gradient for {name}, which has none, got one that "
+                f"requires it; take tikhonov, sirt, fbp or fdk, which are differentiable, or "
+                f"views.detach()"
+            )
+        with torch.no_grad():
+            return method(*args, **options)
+
+    return checked
 
 
 class Problem(NamedTuple):
@@ -139,7 +170,12 @@ class Watch:
         self._kept: Tensor | None = None
 
     def ends(
-        self, number: int, volume: Tensor, residual: Callable[[], Tensor], beta: float | Tensor = 0
+        self,
+        number: int,
+        volume: Tensor,
+        residual: Callable[[], Tensor],
+        beta: float | Tensor = 0,
+        gap: Tensor | None = None,
     ) -> bool:
         """Whether the method ends with iterate `number`.
 
@@ -148,6 +184,7 @@ class Watch:
             volume: x.
             residual: y - A (x + beta (x - last)), asked for only where a monitor looks.
             beta: how far the step begins beyond x.
+            gap: of the iterate, where it is known.
         """
         if self.monitor is None:
             return False
@@ -157,7 +194,7 @@ class Watch:
         self.residual = own
         if number == 0:
             return False
-        verdict = self.monitor(Iterate(number, volume, own))
+        verdict = self.monitor(Iterate(number, volume, own, gap))
         return self._ended(verdict, volume) if isinstance(verdict, Tensor) else bool(verdict)
 
     def result(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
