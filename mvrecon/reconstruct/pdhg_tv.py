@@ -28,7 +28,7 @@ def pdhg_tv(
     views: Float[Tensor, "b c m v u"],
     iterations: int = 200,
     weight: float = 1e-5,
-    balance: float = 0.3,
+    balance: float = 0.2,
     nonnegative: bool = True,
     gap: float = 0.0,
     **common: Unpack[Common],
