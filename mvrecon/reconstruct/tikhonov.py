@@ -72,12 +72,16 @@ def tikhonov(
     if not (torch.is_grad_enabled() and problem.views.requires_grad):
         with torch.no_grad():
             return solve(problem)
-    if weight == 0 or problem.start.requires_grad:
+    _check_differentiable(weight, problem.start)
+    return _Minimum.apply(problem.views, problem, weights, solve)
+
+
+def _check_differentiable(weight: float, start: Tensor) -> None:
+    if weight == 0 or start.requires_grad:
         raise ValueError(
             "Expected a weight above 0 and a start without gradient where the views require a "
             f"gradient, got a weight of {weight:g}"
         )
-    return _Minimum.apply(problem.views, problem, weights, solve)
 
 
 class _Minimum(torch.autograd.Function):
