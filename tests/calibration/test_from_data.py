@@ -66,6 +66,8 @@ def test_nothing_is_misaligned_by_nothing():
     assert torch.allclose(rig.origin, RIG.origin) and torch.allclose(rig.u, RIG.u)
 
 
+@pytest.mark.door
 def test_unknown_freedoms_are_named():
+    """A calibration of a freedom that does not exist is an error that names the nearest."""
     with pytest.raises(ValueError, match="'offset_x'; did you mean 'offset_"):
         shared_misalignment(partial(Drr, GRID), RIG, torch.zeros(1, 1, 16, 24, 32), ["offset_x"])
