@@ -10,6 +10,8 @@ from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
 
 UNITS = ("1/mm", "HU")
+#: What a run writes into its folder beside the volume.
+WRITTEN = ("config.yaml", "versions.txt", "rig.json", "rig.png", "planes.png", "results.json")
 
 
 def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -17,7 +19,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
     `results.json` and, unless `out` names another file, the volume. A rig that was calibrated
-    (`calibrate`) lies beside the volume, too: `<volume>.cameras.json`.
+    (`calibrate`) lies beside the volume, too: `<volume>.cameras.json`. A run that fails leaves none
+    of them, so that the folder is free for a second try.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -40,7 +43,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         calibrate.check(free, case)
     solve.check(settings)  # what does not fit is told before the folder is anybody's
     estimate, device = None, device_of(settings["device"])
-    with run_folder.taken(folder, settings):
+    with run_folder.taken(folder, settings, own=WRITTEN):
         if free:
             case, estimate = calibrate.calibrate(case, free, device)
             files.save(case.cameras, beside(out))
@@ -60,7 +63,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
             "seconds": outcome.seconds,
             "peak_bytes": outcome.peak_bytes,
-            "view_nrmse": solve.residual(case, volume),
+            "view_nrmse": outcome.view_nrmse,
             "residuals": outcome.residuals,
             "chosen": outcome.chosen,
         }

@@ -9,13 +9,16 @@ import shutil
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image as Pillow
 
 import mvrecon.reconstruction
 import mvrecon.simulate
 from mvrecon.cameras import files
 from mvrecon.data.attenuation import WATER
+from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.volume_files import read_volume
+from mvrecon.engine.scan import open_scan
 from tests.engine.runs import call
 
 VALUE = WATER
@@ -125,6 +128,58 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
     assert (mended.origin - rig.origin).abs().max() < 9.0 / 4
     fit = json.loads((tmp_path / "run" / "results.json").read_text())["calibration"]
     assert fit["residual"][-1] < 0.2 * fit["residual"][0] and fit["free"] == ["offset_u", "tilt"]
+
+
+@pytest.mark.parametrize("method", ["fdk", "cgls", "os_sart"])
+def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, monkeypatch):
+    """Told from the method's own last residual, or one projection: never from the files anew."""
+    reads = []
+    read = MeasuredViews.read
+    monkeypatch.setattr(MeasuredViews, "read", lambda *a: reads.append(a) or read(*a))
+    options = (f"reconstructor={method}", "views.every=4", f"out={tmp_path}/volume.nii.gz")
+    assert run(scan, tmp_path / "run", *options) == 0
+    last = {"fdk": 2}.get(method, 1)  # FDK is streamed: its views need not fit into memory
+    assert sum(b - a for _, a, b in reads) == last * 10
+    settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    case = open_scan(settings)
+    A, y = case.posed("cpu")
+    x = read_volume(tmp_path / "volume.nii.gz")[0][None, None]
+    expected = ((y - A(x)).norm() / y.norm()).item()
+    table = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert table["view_nrmse"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
+    scan, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(scan)
+    fields = ("views.dark=projections/dark.tif", "views.flat=projections/flat.tif")
+    (scan / "elsewhere").mkdir(exist_ok=True)
+    options = (*fields, "views.path=projections", "camera.path=geometry.xml", "views.every=4")
+    assert run(scan, tmp_path / "run", *options, "grid.like=truth.nii.gz") == 0
+    first = read_volume(tmp_path / "run" / "volume.nii.gz")[0]
+    settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    monkeypatch.chdir(scan / "elsewhere")
+    again = mvrecon.reconstruction.reconstruct(settings, tmp_path / "again")
+    assert torch.equal(read_volume(again["volume"])[0], first)
+
+
+@pytest.mark.door
+def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypatch, capsys):
+    """A reconstruction that fails in the middle leaves neither settings nor pictures nor a volume,
+    and another with other settings may have its folder.
+    """
+
+    def fails(*_):
+        raise MemoryError("no room left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mvrecon.engine.solve.solve", fails)
+        assert run(scan, tmp_path / "run", "views.every=4") == 1
+    assert "no room left" in capsys.readouterr().err
+    assert {file.name for file in (tmp_path / "run").iterdir()} <= {".lock", "reconstruct.log"}
+    assert run(scan, tmp_path / "run", "views.every=5") == 0
+    assert (tmp_path / "run" / "volume.nii.gz").is_file()
 
 
 @pytest.mark.door

@@ -10,6 +10,14 @@ from mvrecon.files.checks import EDGE, VOLUME, Refused, blaming
 #: Endings of DICOM files; a file of another name is one if it says so from byte 128 on.
 DICOM = (".dcm", ".dicom", ".ima")
 MAGIC = 128
+#: Where the frames of an enhanced image have what a plain slice has itself.
+GROUPS = {
+    "ImagePositionPatient": "PlanePositionSequence",
+    "ImageOrientationPatient": "PlaneOrientationSequence",
+    "PixelSpacing": "PixelMeasuresSequence",
+    "RescaleSlope": "PixelValueTransformationSequence",
+    "RescaleIntercept": "PixelValueTransformationSequence",
+}
 #: The one packed transfer syntax that pydicom reads alone.
 RLE = "1.2.840.10008.1.2.5"
 
@@ -40,6 +48,36 @@ def header_of(path: Path) -> Any:
     return dataset
 
 
+def frames_of(dataset: Any) -> int:
+    """Number of frames of a DICOM image, 1 without such a number."""
+    return int(dataset.get("NumberOfFrames") or 1)
+
+
+def enhanced(dataset: Any) -> bool:
+    """Whether an image has functional groups, which describe its frames (PS3.3, C.7.6.16)."""
+    return bool(dataset.get("PerFrameFunctionalGroupsSequence"))
+
+
+def value_of(dataset: Any, name: str, frame: int = 0) -> Any:
+    """A value of a frame: the image's own, the frame's, or that which all frames share; None where
+    there is none.
+
+    Args:
+        dataset: of the image.
+        name: such as ImagePositionPatient, one of `GROUPS`.
+        frame: from 0.
+    """
+    if dataset.get(name) is not None:
+        return dataset.get(name)
+    own, shared = (
+        dataset.get(f"{kind}FunctionalGroupsSequence") or [] for kind in ("PerFrame", "Shared")
+    )
+    for groups in (*own[frame : frame + 1], *shared[:1]):
+        if macro := groups.get(GROUPS[name]):
+            return macro[0].get(name)
+    return None
+
+
 def pixels_of(path: Path) -> np.ndarray:
     """Pixels of a DICOM image, slope and intercept applied, float32: [v u], or [m v u] of frames.
 
@@ -51,15 +89,27 @@ def pixels_of(path: Path) -> np.ndarray:
     """
     with blaming(path, "has pixels that cannot be read"):
         dataset = _pydicom(path).dcmread(path)
-        frames = int(dataset.get("NumberOfFrames") or 1)
+        frames = frames_of(dataset)
         if 4 * frames * int(dataset.Rows) * int(dataset.Columns) > VOLUME:
             raise Refused(f"{path}: expected at most {VOLUME} bytes of pixels, got more")
         syntax = dataset.file_meta.TransferSyntaxUID
         if syntax.is_encapsulated and syntax != RLE:
+            if enhanced(dataset):
+                raise Refused(f"{path}: expected frames unpacked or as RLE, got {syntax.name}")
             return _decompressed(path, frames)
-        slope = float(dataset.get("RescaleSlope", 1))
         values = dataset.pixel_array.astype(np.float32)
-        return values * np.float32(slope) + np.float32(dataset.get("RescaleIntercept", 0))
+        slope, intercept = (
+            _of_frames(dataset, name, usual, frames)
+            for name, usual in (("RescaleSlope", 1), ("RescaleIntercept", 0))
+        )
+        return values * slope + intercept
+
+
+def _of_frames(dataset: Any, name: str, usual: float, frames: int) -> np.ndarray:
+    """A number for each frame, [m 1 1]; one number without axes where there is one frame."""
+    values = [value_of(dataset, name, frame) for frame in range(frames)]
+    numbers = np.array([usual if value is None else float(value) for value in values], np.float32)
+    return numbers[:, None, None] if frames > 1 else numbers[0]
 
 
 def _decompressed(path: Path, frames: int) -> np.ndarray:

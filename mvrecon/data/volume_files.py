@@ -15,20 +15,21 @@ READ, WRITTEN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"), (".nii", ".nii.gz"
 ENDING = re.compile(r"\.(nii(\.gz)?|mha|mhd|nrrd)$", re.IGNORECASE)
 
 
-def read_volume(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
+def read_volume(path: str | Path, resample: bool = False) -> tuple[Float[Tensor, "d h w"], Grid]:
     """The values of a volume as they are stored (CT: HU), float32, and where its voxels lie in mm;
     see `open_volume`.
     """
-    slabs, grid = open_volume(path)
+    slabs, grid = open_volume(path, resample)
     return slabs.whole(), grid
 
 
-def open_volume(path: str | Path) -> tuple[Slabs, Grid]:
+def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
     """The values of a volume as they are stored, slab by slab, and where its voxels lie in world mm
     (RAS).
 
     Args:
         path: NIfTI, MHA, MHD or NRRD by its ending, or a folder with one DICOM CT series.
+        resample: the slices of a tilted gantry, see `data.dicom_series.open_series`.
 
     Raises:
         ImportError: a library of the extra `io` is not installed.
@@ -38,7 +39,7 @@ def open_volume(path: str | Path) -> tuple[Slabs, Grid]:
     """
     path = Path(path).expanduser()
     if path.is_dir():
-        return dicom_series.open_series(path)
+        return dicom_series.open_series(path, resample)
     ending = _ending(path)
     if ending not in READ:
         raise Refused(

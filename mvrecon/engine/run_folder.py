@@ -6,7 +6,7 @@ import json
 import math
 import platform
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -24,15 +24,25 @@ from mvrecon.files.checks import Refused, blaming, shown, text_of, yaml_of
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
+#: Settings whose text is a file or a folder.
+PLACES = ("path", "dark", "flat", "like", "out", "checkpoint")
 DIGESTS, RIG = "digests.json", "rig.json"
 #: Results of a run; a folder that has one of them but no file of settings is refused.
 WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 
 @contextmanager
-def taken(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> Iterator[None]:
+def taken(
+    folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, own: Sequence[str] = ()
+) -> Iterator[None]:
     """Context that locks a run folder, new or started with the same settings, and writes the
     settings into it.
+
+    Args:
+        folder: of the run.
+        settings: plain.
+        file: of the settings.
+        own: files that a run which fails takes away with it, if they were not there before.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -40,8 +50,9 @@ def taken(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> It
     """
     with claimed(folder):
         check(folder, settings, file)
-        start(folder, dict(settings), file)
-        yield
+        with _cleared_on_failure(folder, own):
+            start(folder, dict(settings), file)
+            yield
 
 
 def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
@@ -152,12 +163,12 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def anchored(value: Any) -> Any:
-    """Settings with every `path` in them made absolute, so that they mean the same from any other
-    folder.
+    """Settings with every file and folder in them (`PLACES`) made absolute, so that they mean the
+    same from any other folder.
     """
     if isinstance(value, dict):
         return {
-            key: _absolute(item) if key == "path" else anchored(item) for key, item in value.items()
+            key: _absolute(item) if key in PLACES else anchored(item) for key, item in value.items()
         }
     return [anchored(item) for item in value] if isinstance(value, list) else value
 
@@ -176,7 +187,20 @@ def write(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+@contextmanager
+def _cleared_on_failure(folder: Path, names: Sequence[str]) -> Iterator[None]:
+    new = [folder / name for name in names if not (folder / name).exists()]
+    try:
+        yield
+    except BaseException:
+        for path in new:
+            path.unlink(missing_ok=True)
+        raise
+
+
 def _absolute(path: Any) -> Any:
+    if isinstance(path, dict | list):
+        return anchored(path)
     return str(Path(path).expanduser().absolute()) if isinstance(path, str) else path
 
 

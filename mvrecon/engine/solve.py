@@ -1,11 +1,11 @@
 """One reconstruction of a measured scan: the method, its progress, its time and memory."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from inspect import signature
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxtyping import Float
 from rich.console import Console
@@ -15,7 +15,8 @@ from torch import Tensor
 from mvrecon.engine.scan import Scan
 from mvrecon.files.memory import peak
 from mvrecon.parts import RECONSTRUCTORS, STREAMED
-from mvrecon.reconstruct.held_out import held_out
+from mvrecon.reconstruct.held_out import Choice, held_out
+from mvrecon.reconstruct.problem import Iterate
 from mvrecon.reconstruct.stopping import Curve, combined, discrepancy
 
 #: Views whose residual is computed at a time.
@@ -33,11 +34,13 @@ class Outcome:
         residuals: |y - A x| after each iteration, in the unit of the views; empty where the
             method does not iterate.
         chosen: iterations and weight that views which were left out have chosen.
+        view_nrmse: |y - A x| / |y| over the measured pixels; NaN for views of zero.
     """
 
     volume: Float[Tensor, "d h w"]
     seconds: float
     peak_bytes: int | None
+    view_nrmse: float
     residuals: list[float] = field(default_factory=list)
     chosen: dict[str, Any] = field(default_factory=dict)
 
@@ -66,53 +69,95 @@ def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outco
     name, options = settings["reconstructor"]["name"], dict(settings["reconstructor"])
     del options["name"]
     start = time.perf_counter()
-    curve, chosen = Curve(), {}
     if name in STREAMED.names():
-        volume = _streamed(scan, name, options)
-    elif not _iterates(name):
-        views = scan.measured.whole().views[None, None].to(device)
-        volume = RECONSTRUCTORS.build(name, scan.operator().to(device), views, **options)
+        run = _streamed(scan, name, options)
+    elif _iterates(name):
+        run = _iterated(scan, settings, options, device)
     else:
-        volume, chosen = _iterated(scan, settings, options, curve, device)
+        run = _direct(scan, name, options, device)
     seconds = time.perf_counter() - start
-    return Outcome(volume[0, 0].cpu(), seconds, peak(), curve.residuals, chosen)
+    volume = run.volume[0, 0].cpu()
+    return Outcome(volume, seconds, peak(), run.misfit(), run.residuals, run.chosen)
 
 
-def residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
-    """|y - A x| / |y| over the measured pixels, views read in blocks."""
-    squares, total = 0.0, 0.0
-    for first in range(0, len(scan.cameras), BLOCK):
-        last = min(first + BLOCK, len(scan.cameras))
-        part = scan.measured.read(first, last)
-        rest = part.views - scan.operator(slice(first, last))(volume[None, None])[0, 0]
-        squares += (rest[part.mask].double()).square().sum().item()
-        total += (part.views[part.mask].double()).square().sum().item()
-    return (squares / total) ** 0.5 if total else float("nan")
+class _Run(NamedTuple):
+    """What a method gave.
+
+    Args:
+        volume: in the unit of the views per mm.
+        misfit: |y - A x| / |y|, computed without the method's time.
+        residuals, chosen: as of `Outcome`.
+    """
+
+    volume: Float[Tensor, "1 1 d h w"]
+    misfit: Callable[[], float]
+    residuals: list[float] = []
+    chosen: dict[str, Any] = {}
+
+
+class _Runs:
+    """A monitor of one run after the other: moves the bar, and has the curve of the last."""
+
+    def __init__(self, advance: Callable[[int], None], iterations: int | None):
+        self.curve, self._advance = Curve(), advance
+        self._length, self._before = iterations or 0, -(iterations or 0)
+
+    def __call__(self, iterate: Iterate) -> bool:
+        if iterate.number == 1:
+            self.curve, self._before = Curve(), self._before + self._length
+        self._advance(self._before + iterate.number)
+        return self.curve(iterate)
 
 
 def _iterated(
-    scan: Scan,
-    settings: Mapping[str, Any],
-    options: dict[str, Any],
-    curve: Curve,
-    device: str,
-) -> tuple[Tensor, dict[str, Any]]:
-    name = settings["reconstructor"]["name"]
+    scan: Scan, settings: Mapping[str, Any], options: dict[str, Any], device: str
+) -> _Run:
+    name, rule = settings["reconstructor"]["name"], settings["choose"]
     A, views = scan.posed(device)
-    if rule := settings["choose"]:
-        choice = held_out(RECONSTRUCTORS.get(name), A, views, options=options, **rule)
-        trials = [{"weight": t.weight, "errors": t.errors} for t in choice.trials]
-        chosen = {"iterations": choice.iterations, "weight": choice.weight, "trials": trials}
-        return choice.volume, chosen
-    with bar(name, options.get("iterations")) as advance:
-        monitors = [curve, lambda iterate: advance(iterate.number)]
-        if settings["stop"]["sigma"] is not None:
-            monitors.append(discrepancy(settings["stop"]["sigma"]))
-        monitor = combined(*monitors)
-        return RECONSTRUCTORS.build(name, A, views, monitor=monitor, **options), {}
+    most, chosen = options.get("iterations"), {}
+    trials = 0 if not rule else len(rule.get("weights") or [None])
+    with bar(name, most and most * (1 + trials)) as advance:
+        runs = _Runs(advance, most)
+        if rule:
+            options["monitor"] = runs
+            choice = held_out(RECONSTRUCTORS.get(name), A, views, options=options, **rule)
+            volume, chosen = choice.volume, _told(choice)
+        else:
+            sigma = settings["stop"]["sigma"]
+            monitor = runs if sigma is None else combined(runs, discrepancy(sigma))
+            volume = RECONSTRUCTORS.build(name, A, views, monitor=monitor, **options)
+    residuals, size = runs.curve.residuals, views.norm().item()
+    last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
+    return _Run(volume, lambda: _share(last, size), residuals, chosen)
 
 
-def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> Tensor:
+def _told(choice: Choice) -> dict[str, Any]:
+    """The choice of the one sample that a scan is."""
+    trials = [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials]
+    weight = choice.weights[0] if choice.weights else None
+    return {"iterations": choice.iterations[0], "weight": weight, "trials": trials}
+
+
+def _direct(scan: Scan, name: str, options: dict[str, Any], device: str) -> _Run:
+    """A method that does not iterate, with all views in memory."""
+    whole = scan.measured.whole()
+    A, views = scan.operator().to(device), whole.views[None, None].to(device)
+    volume = RECONSTRUCTORS.build(name, A, views, **options)
+    mask = whole.mask.to(device)
+
+    def misfit() -> float:
+        rest = (views - A(volume))[0, 0]
+        return _share(rest[mask].norm().item(), views[0, 0][mask].norm().item())
+
+    return _Run(volume, misfit)
+
+
+def _share(rest: float, whole: float) -> float:
+    return rest / whole if whole else float("nan")
+
+
+def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> _Run:
+    """A method that reads the views block by block, once for the volume and once for the misfit."""
     saturated = floored = 0
     with bar(name, len(scan.cameras)) as advance:
 
@@ -125,7 +170,19 @@ def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> Tensor:
 
         volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
     scan.measured.warn_of_values(saturated, floored)
-    return volume
+    return _Run(volume, lambda: _residual(scan, volume[0, 0]))
+
+
+def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
+    """|y - A x| / |y| over the measured pixels, views read in blocks."""
+    squares, total = 0.0, 0.0
+    for first in range(0, len(scan.cameras), BLOCK):
+        last = min(first + BLOCK, len(scan.cameras))
+        part = scan.measured.read(first, last)
+        rest = part.views - scan.operator(slice(first, last))(volume[None, None])[0, 0]
+        squares += (rest[part.mask].double()).square().sum().item()
+        total += (part.views[part.mask].double()).square().sum().item()
+    return _share(squares**0.5, total**0.5)
 
 
 def _iterates(name: str) -> bool:
@@ -135,7 +192,7 @@ def _iterates(name: str) -> bool:
 
 
 @contextmanager
-def bar(name: str, total: int | None):
+def bar(name: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Context with a progress bar on stderr; gives the function that moves it."""
     columns = (TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn())
     bars = Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)

@@ -8,13 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
-from mvrecon.reconstruct.problem import Common, Problem, Watch, posed
+from mvrecon.reconstruct.problem import Common, Problem, Watch, posed, without_gradient
 
 #: N x of a penalty <x, N x>, for a volume x.
 Penalty = Callable[[Tensor], Tensor]
 
 
-@torch.no_grad()
+@without_gradient
 def cgls(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
@@ -30,6 +30,8 @@ def cgls(
     and A^T (Hestenes and Stiefel, 1952; CGLS as in Bjorck, Numerical Methods for Least Squares
     Problems, 1996, 7.4). The iterates are those of LSQR. With noise the first iterations are the
     best: few are a regularisation. Linear in the views, if it starts at zero and tolerance is 0.
+
+    No gradient: views that require one are refused.
 
     Args:
         A: the operator.
@@ -55,8 +57,10 @@ def conjugate_gradients(
     tolerance: float,
     penalty: Penalty | None = None,
     weights: Float[Tensor, "#b #c m v u"] | None = None,
+    pull: Float[Tensor, "b c d h w"] | None = None,
 ) -> Float[Tensor, "b c d h w"]:
-    """The volume that minimises |y - A x|^2_W + <x, N x>, by conjugate gradients, for each sample.
+    """The volume that minimises |y - A x|^2_W + <x, N x> - 2 <g, x>, by conjugate gradients, for
+    each sample.
 
     Args:
         problem: operator, views, start.
@@ -64,19 +68,22 @@ def conjugate_gradients(
         tolerance: of |A^T W y| for the gradient, and of |y| for the residual without a penalty.
         penalty: N x.
         weights: W of the views; None: one.
+        pull: g; None: zero.
     """
     A, views, x, monitor = problem
     root = None if weights is None else weights.sqrt()
 
     def gradient(residual: Tensor, volume: Tensor | None) -> Tensor:
         back = A.T(residual if weights is None else weights * residual)
+        back = back if pull is None else back + pull
         return back if penalty is None or volume is None else back - penalty(volume)
 
     r = views - A(x) if x.any() else views
     s = gradient(r, x)
     floor = max(tolerance, torch.finfo(views.dtype).eps)
     goal = floor * (norms(gradient(views, None)) if x.any() else norms(s))
-    enough = floor * norms(views) if penalty is None else torch.zeros_like(goal)
+    # with a penalty a residual of zero is no sign of the minimum
+    enough = floor * norms(views) if penalty is None else torch.full_like(goal, -1)
     p, size, watch = s, norms(s), Watch(monitor)
     for number in range(1, iterations + 1):
         active = (size > goal) & (norms(r) > enough)
@@ -96,7 +103,7 @@ def conjugate_gradients(
         size = norms(s)
         ratio = torch.where(active, (size / torch.where(active, last, 1)).square(), 0)
         p = torch.addcmul(s, ratio, p)
-    return x
+    return watch.result(x)
 
 
 def _products(one: Float[Tensor, "b c *n"], other: Float[Tensor, "b c *n"]) -> Tensor:

@@ -44,7 +44,7 @@ def descend(
     for number in range(iterations):
         residual = views - A(ahead)
         if watch.ends(number, x, lambda: residual, beta):  # noqa: B023
-            return x
+            return watch.result(x)
         last, x = x, proximal(ahead + step(residual))
         if momentum == "none":
             ahead = x
@@ -57,7 +57,7 @@ def descend(
         beta = (before - 1) / t
         ahead = x + beta * (x - last)
     watch.ends(iterations, x, lambda: views - A(x))
-    return x
+    return watch.result(x)
 
 
 def _turns_back(ahead: Tensor, x: Tensor, last: Tensor) -> Bool[Tensor, "b c 1 1 1"]:

@@ -10,7 +10,7 @@ from mvrecon.projectors.operator import LinearOperator, Scaled
 from mvrecon.reconstruct.cgls import check_not_negative
 from mvrecon.reconstruct.descent import descend
 from mvrecon.reconstruct.power import power_norm
-from mvrecon.reconstruct.problem import Common, posed
+from mvrecon.reconstruct.problem import Common, posed, without_gradient
 from mvrecon.reconstruct.total_variation import (
     Shrinkage,
     total_variation,
@@ -24,7 +24,7 @@ from mvrecon.reconstruct.weighted_fit import WeightedFit
 FLOOR = 0.5
 
 
-@torch.no_grad()
+@without_gradient
 def fista_tv(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
@@ -43,6 +43,8 @@ def fista_tv(
     of the weight gives that multiple of the volume. The proximal map starts where the last one
     ended, and the momentum is restarted where a step turns back (Beck and Teboulle, SIAM J. Imaging
     Sci. 2, 2009, and IEEE Trans. Image Process. 18, 2009).
+
+    No gradient: views that require one are refused.
 
     Args:
         A: the operator.

@@ -12,7 +12,8 @@ from torch import Tensor
 from mvrecon.cameras.views import check_finite
 from mvrecon.geometry.box import Box
 from mvrecon.projectors.operator import LinearOperator
-from mvrecon.reconstruct.problem import Iterate
+from mvrecon.reconstruct.problem import Iterate, Monitor
+from mvrecon.reconstruct.stopping import combined
 
 #: A reconstructor: operator, views and options to a volume.
 Method = Callable[..., Tensor]
@@ -24,10 +25,11 @@ class Trial(NamedTuple):
     Args:
         weight: of the penalty; None for a method without.
         errors: relative error of the views that were left out, |y - A x_n| / |y|, for n = 1, 2, ...
+            of each sample in turn.
     """
 
     weight: float | None
-    errors: list[float]
+    errors: list[list[float]]
 
 
 class Choice(NamedTuple):
@@ -35,14 +37,14 @@ class Choice(NamedTuple):
 
     Args:
         volume: of all views, in the unit of the volume.
-        iterations: how many were best.
-        weight: which was best; None for a method without.
+        iterations: how many were best, for each sample.
+        weights: which was best, for each sample; None for a method without.
         trials: the runs that were compared.
     """
 
     volume: Float[Tensor, "b c d h w"]
-    iterations: int
-    weight: float | None
+    iterations: list[int]
+    weights: list[float] | None
     trials: list[Trial]
 
 
@@ -58,9 +60,10 @@ def held_out(
     """The volume with those iterations and that weight of which a reconstruction of the other views
     predicts one view in `every` best, in the unit of the volume.
 
-    One choice for the whole batch. Then all views are reconstructed with it. The cost is that of
-    one more reconstruction for every weight (cross-validation: Wahba, Spline Models for
-    Observational Data, 1990, chapter 4).
+    Every sample of a batch has its own choice, the one that it would have alone. Then all views are
+    reconstructed with it, samples of the same choice together. The cost is that of one more
+    reconstruction for every weight (cross-validation: Wahba, Spline Models for Observational Data,
+    1990, chapter 4).
 
     Args:
         method: an iterative reconstructor, such as `cgls`.
@@ -68,8 +71,9 @@ def held_out(
         views: measured.
         weights: values of the method's option `weight` to compare; None: the method's own value.
         every: one view in so many judges.
-        patience: a trial ends where so many iterations have brought nothing better.
-        options: of the method; its `iterations` are the most that are tried.
+        patience: a trial ends where so many iterations have brought nothing better to any sample.
+        options: of the method; its `iterations` are the most that are tried, its `monitor` sees the
+            iterates of all runs in turn.
 
     Warns:
         UserWarning: the best number of iterations is the most that was allowed.
@@ -92,17 +96,25 @@ def held_out(
     taken, explained = A.cropped(grid, rest), views[:, :, rest]
     for weight in [None] if weights is None else weights:
         run = partial(method, taken, explained, **_with(fixed, weight))
-        trials.append(Trial(weight, jury.errors(run)))
-    best = min(trials, key=lambda trial: min(trial.errors))
-    iterations = 1 + best.errors.index(min(best.errors))
-    if iterations == fixed.get("iterations"):
+        trials.append(Trial(weight, jury.errors(run, fixed.get("monitor"))))
+    picks = [_best(trials, sample) for sample in range(len(views))]
+    most = max(pick.iterations for pick in picks)
+    if most == fixed.get("iterations"):
         warnings.warn(
-            f"All {iterations} iterations that were allowed are the best of {method.__name__}; "
-            f"more may be better",
+            f"All {most} iterations that were allowed are the best of {method.__name__}; more may "
+            f"be better",
             stacklevel=2,
         )
-    chosen = {**_with(fixed, best.weight), "iterations": iterations}
-    return Choice(method(A, views, **chosen), iterations, best.weight, trials)
+    volume = _chosen(method, A, views, picks, fixed)
+    best = None if weights is None else [pick.weight for pick in picks if pick.weight is not None]
+    return Choice(volume, [pick.iterations for pick in picks], best, trials)
+
+
+class _Pick(NamedTuple):
+    """The choice of one sample."""
+
+    iterations: int
+    weight: float | None
 
 
 class _Jury(NamedTuple):
@@ -112,18 +124,45 @@ class _Jury(NamedTuple):
     views: Tensor
     patience: int
 
-    def errors(self, run: Callable[..., Tensor]) -> list[float]:
-        """Their relative error after every iteration of a run."""
-        errors, size = [], self.views.norm().clamp_min(torch.finfo(torch.float32).tiny)
+    def errors(self, run: Callable[..., Tensor], monitor: Monitor | None) -> list[list[float]]:
+        """Their relative error after every iteration of a run, for each sample."""
+        errors: list[list[float]] = [[] for _ in self.views]
+        size = self.views.flatten(1).norm(dim=1).clamp_min(torch.finfo(torch.float32).tiny)
 
         def judge(iterate: Iterate) -> bool:
-            errors.append(((self.views - self.A(iterate.volume)).norm() / size).item())
-            return len(errors) - 1 - errors.index(min(errors)) >= self.patience
+            misfit = (self.views - self.A(iterate.volume)).flatten(1).norm(dim=1) / size
+            for curve, error in zip(errors, misfit.tolist(), strict=True):
+                if not self._tired(curve):
+                    curve.append(error)
+            return all(map(self._tired, errors))
 
-        run(monitor=judge)
-        if not errors:
+        run(monitor=judge if monitor is None else combined(judge, monitor))
+        if not all(errors):
             raise ValueError("Expected a method that iterates, got one that ended before it began")
         return errors
+
+    def _tired(self, errors: list[float]) -> bool:
+        return len(errors) - 1 - errors.index(min(errors)) >= self.patience if errors else False
+
+
+def _best(trials: Sequence[Trial], sample: int) -> _Pick:
+    """The iterations and the weight with the least error of a sample."""
+    best = min(trials, key=lambda trial: min(trial.errors[sample]))
+    return _Pick(1 + best.errors[sample].index(min(best.errors[sample])), best.weight)
+
+
+def _chosen(
+    method: Method, A: LinearOperator, views: Tensor, picks: list[_Pick], options: dict[str, Any]
+) -> Float[Tensor, "b c d h w"]:
+    """All samples, those of the same choice in one run."""
+    parts: dict[int, Tensor] = {}
+    for pick in dict.fromkeys(picks):
+        samples = [sample for sample, own in enumerate(picks) if own == pick]
+        chosen = {**_with(options, pick.weight), "iterations": pick.iterations}
+        if chosen.get("start") is not None:
+            chosen["start"] = chosen["start"][samples]
+        parts.update(zip(samples, method(A, views[samples], **chosen), strict=True))
+    return torch.stack([parts[sample] for sample in range(len(views))])
 
 
 def _with(options: dict[str, Any], weight: float | None) -> dict[str, Any]:

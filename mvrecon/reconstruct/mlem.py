@@ -12,9 +12,10 @@ from torch import Tensor
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
 from mvrecon.reconstruct.poisson import PoissonLikelihood
-from mvrecon.reconstruct.problem import Common, Watch, check_start, supported
+from mvrecon.reconstruct.problem import Common, Watch, check_start, supported, without_gradient
 
 
+@without_gradient
 def mlem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
@@ -34,6 +35,8 @@ def mlem(
     then zero for ever as soon as one subset that sees it has no counts for it, which at few counts
     leaves bins with counts that no voxel explains (OSEM: Hudson and Larkin, IEEE Trans. Med.
     Imaging 13, 1994).
+
+    No gradient: counts that require one are refused.
 
     Args:
         A: the operator, in counts per unit of the volume.
@@ -70,9 +73,10 @@ def mlem(
                 x = torch.where(s > 0, x * (part.explained(x) / torch.where(s > 0, s, 1)), x)
             if watch.ends(number, x, partial(_unexplained, A, counts, background, x)):
                 break
-        return x
+        return watch.result(x)
 
 
+@without_gradient
 def osem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
@@ -84,6 +88,8 @@ def osem(
 ) -> Float[Tensor, "b c d h w"]:
     """MLEM over ordered subsets of the cameras, x <- x / s_k A_k^T (y_k / (A_k x + r)), in the unit
     of the volume.
+
+    No gradient, as `mlem`.
 
     Args:
         A, counts, iterations, background, skip_zero_bins, common: as for `mlem`.

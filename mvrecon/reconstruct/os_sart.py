@@ -21,7 +21,7 @@ from mvrecon.projectors.selection import (
     usual_subsets,
 )
 from mvrecon.reconstruct.iterative import inverse_sums
-from mvrecon.reconstruct.problem import Common, Problem, Watch, posed
+from mvrecon.reconstruct.problem import Common, Problem, Watch, posed, without_gradient
 
 #: The longest step, in inverse greatest column sums: below 2, beyond which none is stable.
 STABLE = 1.9
@@ -35,7 +35,7 @@ class Subset(NamedTuple):
     views: Float[Tensor, "b c k v u"]
 
 
-@torch.no_grad()
+@without_gradient
 def os_sart(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
@@ -59,6 +59,8 @@ def os_sart(
     shrinks with a relaxation that is reduced.
 
     Convention: RTK and others divide by the column sum of the subset at work: see the module.
+
+    No gradient: views that require one are refused.
 
     Args:
         A: the operator.
@@ -94,7 +96,7 @@ def os_sart(
         relaxation *= reduction
         if watch.ends(number, x, partial(_residual, problem, x)):
             break
-    return x
+    return watch.result(x)
 
 
 def _subsets(

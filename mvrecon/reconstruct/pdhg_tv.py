@@ -10,19 +10,27 @@ from mvrecon.kernels.differences.choice import differences_for
 from mvrecon.kernels.differences.shrinkage import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.reconstruct.cgls import check_not_negative
-from mvrecon.reconstruct.problem import Common, Watch, posed
+from mvrecon.reconstruct.duality import Bound, PenalisedFit, closed
+from mvrecon.reconstruct.problem import Common, Problem, Watch, posed, without_gradient
+from mvrecon.reconstruct.stopping import combined
 from mvrecon.reconstruct.total_variation import voxel_steps
 from mvrecon.reconstruct.weighted_fit import WeightedFit
 
+#: How far a step is carried on; 1: not at all, from 2 on it need not converge.
+RELAXATION = 1.8
+#: The gap is computed for every so many iterates, and the last.
+EVERY = 10
 
-@torch.no_grad()
+
+@without_gradient
 def pdhg_tv(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     iterations: int = 200,
     weight: float = 1e-5,
-    balance: float = 0.1,
+    balance: float = 0.2,
     nonnegative: bool = True,
+    gap: float = 0.0,
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Total variation regularisation, min |y - A x|^2_R / (2 c) + weight sum |D x|, in the unit of
@@ -30,47 +38,77 @@ def pdhg_tv(
 
     The minimum is that of `fista_tv`, where weight and units are explained; there is no inner
     loop. Steps are preconditioned by the sums of the rows and columns of A and D (Pock and
-    Chambolle, Int. Conf. Computer Vision, 2011, alpha = 1).
+    Chambolle, Int. Conf. Computer Vision, 2011, alpha = 1) and carried on by `RELAXATION` (Condat,
+    J. Optim. Theory Appl. 158, 2013, algorithm 3.1).
+
+    No gradient: views that require one are refused.
 
     Args:
         A: the operator.
         views: measured integrals.
-        iterations: how many.
+        iterations: at most.
         weight: of the total variation, in (unit of the volume) mm; the default is for attenuation
             in 1/mm, densities of about one want 1e-4 to 1e-2.
         balance: of the dual steps to the primal ones; it changes the speed alone.
         nonnegative: only volumes without negative values.
-        common: start, support, monitor: see `Common`.
+        gap: a sample is done when its objective is at most so much above the minimum, relative to
+            the objective, as the duality gap tells every 10 iterations; 0: never.
+        common: start, support, monitor: see `Common`. A monitor sees the gap, too.
 
     Raises:
-        ValueError: as `posed`; a weight that is negative, a balance that is not positive.
+        ValueError: as `posed`; a weight or a gap that is negative, a balance that is not positive.
     """
-    check_not_negative(weight=weight)
+    check_not_negative(weight=weight, gap=gap)
     if not balance > 0:
         raise ValueError(f"Expected a positive balance, got {balance}")
     steps, support = voxel_steps(A), common.get("support")
-    A, views, x, monitor = posed(pdhg_tv, A, views, common)
-    fit = WeightedFit.of(A, views.dtype)
+    problem = posed(pdhg_tv, A, views, common)
+    inside = None if support is None else support.to(problem.start)
+    fit = WeightedFit.of(problem.A, problem.views.dtype)
+    objective = PenalisedFit(fit, weight, steps, nonnegative, inside)
+    if gap:
+        ends = closed(gap)
+        monitor = combined(problem.monitor, ends) if problem.monitor else ends
+        problem = problem._replace(monitor=monitor)
+    return _descend(problem, objective, balance, iterations)
+
+
+def _descend(
+    problem: Problem, objective: PenalisedFit, balance: float, iterations: int
+) -> Float[Tensor, "b c d h w"]:
+    A, views, x, monitor = problem
+    fit, weight, steps, nonnegative, support = objective
     # D is scaled so that its column sums are c, as those of A are in the mean
     primal = 1 / (balance * (fit.columns + fit.level))
     if support is not None:
-        primal = primal * support.to(primal.device)
-    spread = 4 * weight * sum(1 / step for step in steps)
-    rate = balance * min(steps) / spread if weight else 0.0
+        primal = primal * support
+    rate = balance * min(steps) / (4 * weight * sum(1 / step for step in steps)) if weight else 0.0
     shrinkage = Shrinkage(weight * fit.level * primal, steps, nonnegative)
-    kernels, dual_views, dual = differences_for(x), None, x.new_zeros(3, *x.shape)
-    ahead, watch = x, Watch(monitor)
-    for number in range(iterations):
-        residual = views - A(ahead)
-        if watch.ends(number, x, lambda: residual, beta=min(number, 1)):  # noqa: B023
-            return x
-        pull = fit.weights.row * residual
-        dual_views = pull if dual_views is None else dual_views.lerp_(pull, balance / (1 + balance))
-        last, x = x, torch.addcmul(x, primal, A.T(dual_views))
-        if weight:
-            x = kernels.primal(x, kernels.dual_step(ahead, dual, rate, steps), shrinkage)
+    kernels, watch, volume = differences_for(x), Watch(monitor), x
+    field = kernels.dual_step(x, x.new_zeros(3, *x.shape), rate, steps) if weight else None
+    fresh, residual = field, views - A(x) if x.any() else views
+    multiplier = fit.weights.row * residual * (balance / (1 + balance))
+    for number in range(1, iterations + 1):
+        back = A.T(multiplier)
+        volume = torch.addcmul(x, primal, back)
+        if field is not None:
+            volume = kernels.primal(volume, field, shrinkage)
         elif nonnegative:
-            x = x.clamp_min_(0)
-        ahead = torch.lerp(last, x, 2)
-    watch.ends(iterations, x, lambda: views - A(x))
-    return x
+            volume = volume.clamp_min_(0)
+        if number == iterations and monitor is None:
+            break
+        ahead = torch.lerp(x, volume, 2)
+        beyond = views - A(ahead)
+        own = (beyond + residual) / 2  # of the volume, by linearity
+        gap = None
+        if monitor is not None and (number % EVERY == 0 or number == iterations):
+            gap = objective.gap(volume, own, Bound(multiplier, back, fresh))
+        if watch.ends(number, volume, lambda: own, gap=gap):  # noqa: B023
+            break
+        target = (multiplier + balance * fit.weights.row * beyond) / (1 + balance)
+        multiplier = multiplier.lerp(target, RELAXATION)
+        x, residual = x.lerp(volume, RELAXATION), residual.lerp(own, RELAXATION)
+        if field is not None:
+            fresh = kernels.dual_step(ahead, field.clone(), rate, steps)
+            field = field.lerp_(fresh, RELAXATION)
+    return watch.result(volume)

@@ -4,7 +4,8 @@ that looks at each iterate.
 
 import inspect
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypedDict
+from functools import wraps
+from typing import Any, NamedTuple, ParamSpec, TypedDict
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,6 +16,8 @@ from mvrecon.kernels.precision import wide
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.registry import hint
 
+P = ParamSpec("P")
+
 
 class Iterate(NamedTuple):
     """An iterate x_n of a method, as a monitor sees it; its tensors must not be written into.
@@ -23,15 +26,19 @@ class Iterate(NamedTuple):
         number: n, from 1.
         volume: x_n, in the unit of the volume.
         residual: y - A x_n, in the unit of the views.
+        gap: how far the objective is above its minimum at most, relative to the objective; None for
+            methods, and for iterates, without this number.
     """
 
     number: int
     volume: Float[Tensor, "b c d h w"]
     residual: Float[Tensor, "b c m v u"]
+    gap: Float[Tensor, "b c"] | None = None
 
 
-#: Looks at every iterate; the method ends with the one for which it returns true.
-Monitor = Callable[[Iterate], bool | None]
+#: Looks at every iterate; the method ends with the one for which it returns true. A mask [b] ends
+#: single samples: each keeps its iterate, and the method goes on until all have ended.
+Monitor = Callable[[Iterate], bool | Bool[Tensor, " b"] | None]
 
 
 class Common(TypedDict, total=False):
@@ -46,6 +53,31 @@ class Common(TypedDict, total=False):
     start: Float[Tensor, "b c d h w"] | None
     support: Bool[Tensor, "d h w"] | None
     monitor: Monitor | None
+
+
+def without_gradient(method: Callable[P, Tensor]) -> Callable[P, Tensor]:
+    """A reconstructor that computes without gradients, and refuses views or a start that want one,
+    instead of a volume that silently is a constant.
+
+    Raises:
+        ValueError: of the method that is returned, where gradients are recorded and a tensor among
+            its arguments requires one.
+    """
+
+    @wraps(method)
+    def checked(*args: P.args, **options: P.kwargs) -> Tensor:
+        tensors = [value for value in (*args, *options.values()) if isinstance(value, Tensor)]
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+            name = getattr(method, "__name__", "the method")
+            raise ValueError(
+                f"Expected tensors without gradient for {name}, which has none, got one that "
+                f"requires it; take tikhonov, sirt, fbp or fdk, which are differentiable, or "
+                f"views.detach()"
+            )
+        with torch.no_grad():
+            return method(*args, **options)
+
+    return checked
 
 
 class Problem(NamedTuple):
@@ -127,15 +159,23 @@ class Watch:
     """Shows a monitor the iterates of a method whose steps begin at x + beta (x - last).
 
     The residual at that point gives the one at x by linearity, so that no iterate is projected for
-    the monitor but the last. Without a monitor nothing is kept.
+    the monitor but the last. Without a monitor nothing is kept. A sample that has ended before the
+    others keeps its iterate, so that a batch gives what its samples alone would.
     """
 
     def __init__(self, monitor: Monitor | None):
         self.monitor = monitor
         self.residual: Tensor | None = None
+        self._done: Tensor | None = None
+        self._kept: Tensor | None = None
 
     def ends(
-        self, number: int, volume: Tensor, residual: Callable[[], Tensor], beta: float | Tensor = 0
+        self,
+        number: int,
+        volume: Tensor,
+        residual: Callable[[], Tensor],
+        beta: float | Tensor = 0,
+        gap: Tensor | None = None,
     ) -> bool:
         """Whether the method ends with iterate `number`.
 
@@ -144,6 +184,7 @@ class Watch:
             volume: x.
             residual: y - A (x + beta (x - last)), asked for only where a monitor looks.
             beta: how far the step begins beyond x.
+            gap: of the iterate, where it is known.
         """
         if self.monitor is None:
             return False
@@ -151,7 +192,29 @@ class Watch:
         if self.residual is not None:
             own = (own + beta * self.residual) / (1 + beta)
         self.residual = own
-        return number > 0 and bool(self.monitor(Iterate(number, volume, own)))
+        if number == 0:
+            return False
+        verdict = self.monitor(Iterate(number, volume, own, gap))
+        return self._ended(verdict, volume) if isinstance(verdict, Tensor) else bool(verdict)
+
+    def result(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
+        """The volume that a method returns: of every sample the iterate with which it has ended."""
+        if self._done is None or self._kept is None:
+            return volume
+        return torch.where(_of_samples(self._done), self._kept, volume)
+
+    def _ended(self, verdict: Bool[Tensor, " b"], volume: Tensor) -> bool:
+        """Keep the samples that end here; whether all have ended."""
+        verdict = verdict.to(volume.device)
+        kept = self.result(volume)
+        self._done = verdict if self._done is None else self._done | verdict
+        if self._done.any():
+            self._kept = kept
+        return bool(self._done.all())
+
+
+def _of_samples(mask: Bool[Tensor, " b"]) -> Bool[Tensor, "b 1 1 1 1"]:
+    return mask[:, None, None, None, None]
 
 
 def _check(tensor: Any, what: str, sizes: tuple[int, ...], device: torch.device) -> None:

@@ -2,17 +2,19 @@
 
 import math
 from collections.abc import Sequence
+from functools import reduce
+from operator import or_
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.reconstruct.problem import Iterate, Monitor
 
 
 def discrepancy(sigma: float | Float[Tensor, "#b #c #m #v #u"]) -> Monitor:
-    """A monitor that stops where the noise explains the residual: chi^2 per measurement, the mean
-    of ((y - A x) / sigma)^2, is at most 1 in every sample.
+    """A monitor that ends each sample where the noise explains its residual: chi^2 per measurement,
+    the mean of ((y - A x) / sigma)^2, is at most 1.
 
     Morozov's discrepancy principle (Soviet Math. Dokl. 7, 1966). Pixels whose sigma is infinite do
     not count.
@@ -27,26 +29,27 @@ def discrepancy(sigma: float | Float[Tensor, "#b #c #m #v #u"]) -> Monitor:
     if not (spread > 0).all():
         raise ValueError(f"Expected a positive sigma, got {spread.min().item()}")
 
-    def explained(iterate: Iterate) -> bool:
+    def explained(iterate: Iterate) -> Bool[Tensor, " b"]:
         chi = (iterate.residual / spread.to(iterate.residual)).square()
         known = spread.to(chi).isfinite().expand_as(chi).flatten(1).sum(dim=1)
-        return bool((chi.flatten(1).sum(dim=1) <= known).all())
+        return chi.flatten(1).sum(dim=1) <= known
 
     return explained
 
 
 def combined(*monitors: Monitor) -> Monitor:
-    """A monitor that calls several, and stops where any of them does."""
+    """A monitor that calls several, and ends the run, or a sample, where any of them does."""
 
-    def all_of_them(iterate: Iterate) -> bool:
-        return any([monitor(iterate) for monitor in monitors])
+    def all_of_them(iterate: Iterate) -> bool | Bool[Tensor, " b"]:
+        verdicts = [monitor(iterate) for monitor in monitors]
+        return reduce(or_, (v if isinstance(v, Tensor) else bool(v) for v in verdicts), False)
 
     return all_of_them
 
 
 class Curve:
     """A monitor that records the convergence: |y - A x_n| and |x_n| of every iterate, over the
-    whole batch.
+    whole batch, samples that have ended before the others included.
 
     `residuals` and `norms` are lists, in the unit of the views and of the volume.
     """

@@ -31,7 +31,9 @@ def test_the_file_is_plain_json_with_a_line_for_each_camera(rig):
     assert sum('"source"' in line for line in rig.read_text().splitlines()) == 5
 
 
+@pytest.mark.door
 def test_writing_is_all_or_nothing(rig, monkeypatch):
+    """A camera file whose writing fails keeps what it held before, and nothing lies beside it."""
     before = rig.read_text()
     monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
@@ -39,20 +41,26 @@ def test_writing_is_all_or_nothing(rig, monkeypatch):
     assert rig.read_text() == before and list(rig.parent.iterdir()) == [rig]
 
 
+@pytest.mark.door
 def test_a_missing_file_is_named(tmp_path):
+    """A camera file that is not there is an error with its name and what was expected."""
     with pytest.raises(FileNotFoundError, match="no camera file .*none.json; expected JSON"):
         from_file(tmp_path / "none.json")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("text", ["", "{", "not json", b"\xff\xfe\x00binary"])
 def test_files_that_are_not_json_are_refused(text, tmp_path):
+    """A camera file that is empty or not JSON is refused by name."""
     path = tmp_path / "bad.json"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ValueError, match="bad.json is truncated or not JSON"):
         from_file(path)
 
 
+@pytest.mark.door
 def test_a_truncated_file_is_refused_wherever_it_ends(rig):
+    """A camera file that is cut short is refused, wherever it ends."""
     text = rig.read_text().rstrip()
     for length in range(0, len(text), 97):
         rig.write_text(text[:length])
@@ -69,6 +77,7 @@ def with_camera(record, **changes):
     return {**record, "cameras": [{**first, **changes}, *rest]}
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -101,6 +110,7 @@ def with_camera(record, **changes):
     ],
 )
 def test_files_with_wrong_entries_are_refused(change, message, rig):
+    """A camera file with wrong entries is refused, with the entry and what was expected of it."""
     rig.write_text(json.dumps(change(json.loads(rig.read_text()))))
     with pytest.raises(ValueError, match=f"rig.json is not valid: .*{message}"):
         from_file(rig)

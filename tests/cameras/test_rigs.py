@@ -143,6 +143,7 @@ def test_a_dome_puts_its_detector_on_the_side_that_the_extent_says(extent, side)
     torch.testing.assert_close(middle, cameras.source * (1 + side * 50 / 200), rtol=0, atol=1e-10)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -175,6 +176,7 @@ def test_a_dome_puts_its_detector_on_the_side_that_the_extent_says(extent, side)
     ],
 )
 def test_bad_numbers_are_refused(options, message):
+    """A rig given by numbers that make no sense is refused, with the number and its range."""
     with pytest.raises(ValueError, match=message):
         CAMERAS.build("circular", **(OPTIONS["circular"] | options))
 

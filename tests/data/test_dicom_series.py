@@ -6,7 +6,7 @@ import pytest
 import SimpleITK as sitk
 import torch
 
-from mvrecon.data.dicom_series import open_series
+from mvrecon.data.dicom_series import AIR, open_series
 from mvrecon.data.volume_files import read_volume
 from mvrecon.files.checks import Refused
 from mvrecon.geometry.rigid import euler_rotation
@@ -73,6 +73,96 @@ def test_slope_and_intercept_are_each_slices_own(tmp_path):
     odd = expected[1::2]
     assert torch.equal(values[::2], expected[::2])
     assert (values[1::2] - odd).abs().max() <= 1  # a slope of 2 keeps every second number
+
+
+def group(**macros):
+    """A functional group of an enhanced image: sequences of one item, by their names."""
+    item = pydicom.Dataset()
+    for sequence, values in macros.items():
+        one = pydicom.Dataset()
+        for name, value in values.items():
+            setattr(one, name, value)
+        setattr(item, f"{sequence}Sequence", [one])
+    return item
+
+
+def enhanced(folder, plain):
+    """The slices of a plain series as frames of one file, in an order that is not theirs."""
+    slices = [pydicom.dcmread(file) for file in sorted(plain.iterdir())]
+    frames = [
+        group(
+            PlanePosition={"ImagePositionPatient": item.ImagePositionPatient},
+            PixelValueTransformation={
+                "RescaleSlope": item.RescaleSlope,
+                "RescaleIntercept": item.RescaleIntercept,
+            },
+        )
+        for item in slices
+    ]
+    shared = group(
+        PlaneOrientation={"ImageOrientationPatient": slices[0].ImageOrientationPatient},
+        PixelMeasures={"PixelSpacing": slices[0].PixelSpacing},
+    )
+    folder.mkdir()
+    tags = {"Modality": "CT", "SeriesInstanceUID": SERIES}
+    groups = {
+        "PerFrameFunctionalGroupsSequence": frames,
+        "SharedFunctionalGroupsSequence": [shared],
+    }
+    pixels = np.stack([item.pixel_array for item in slices])
+    dicom_image(folder / "all.dcm", pixels, **tags, **groups)
+    return folder
+
+
+def test_frames_of_an_enhanced_image_are_the_slices_of_a_series(tmp_path):
+    plain = written(tmp_path / "plain", turn=(20.0, -10.0, 5.0))
+    (values, grid), (expected, there) = map(
+        read_volume, (enhanced(tmp_path / "frames", plain), plain)
+    )
+    assert torch.equal(values, expected) and torch.equal(grid.affine, there.affine)
+
+
+def test_slices_of_a_tilted_gantry_are_shifted_to_their_places(tmp_path):
+    """Values that rise linearly in space are the same at every place, exact for linear steps."""
+    slope, lean = torch.tensor([3.0, -5.0, 7.0], dtype=torch.float64), np.array([0.7, -0.9, 3.0])
+
+    def change(k, tags):
+        return {
+            "ImagePositionPatient": (np.array([-10.0, 20.0, 30.0]) + lean * k).tolist(),
+            "RescaleSlope": 1,
+            "RescaleIntercept": -1024,
+        }
+
+    folder = written(tmp_path / "ct", change=change)
+    for file in folder.iterdir():
+        dataset = pydicom.dcmread(file)
+        x, y, z = dataset.ImagePositionPatient
+        lps = (x + 2.0 * np.arange(COLUMNS), y + 1.5 * np.arange(ROWS)[:, None], z)
+        plane = -3.0 * lps[0] + 5.0 * lps[1] + 7.0 * lps[2]
+        dataset.PixelData = np.rint(plane * 10).astype("i2").tobytes()
+        dataset.RescaleSlope, dataset.RescaleIntercept = 0.1, 0
+        dataset.save_as(file)
+    values, grid = read_volume(folder, resample=True)
+    inside = values != AIR
+    for z, y, x in inside.nonzero().tolist():
+        expected = (world(grid, z, y, x) * slope).sum().item()
+        assert values[z, y, x].item() == pytest.approx(expected, abs=0.11)
+    assert COUNT * (ROWS - 1) * (COLUMNS - 1) <= int(inside.sum()) <= COUNT * ROWS * COLUMNS
+
+
+@pytest.mark.door
+def test_frames_that_do_not_say_where_they_are_are_refused(tmp_path):
+    """An image of several frames whose functional groups are missing or too few is refused."""
+    file = enhanced(tmp_path / "frames", written(tmp_path / "plain")) / "all.dcm"
+    dataset = pydicom.dcmread(file)
+    del dataset.PerFrameFunctionalGroupsSequence[-1]
+    dataset.save_as(file)
+    with pytest.raises(Refused, match="7 with 6 groups"):
+        read_volume(file.parent)
+    del dataset.PerFrameFunctionalGroupsSequence
+    dataset.save_as(file)
+    with pytest.raises(Refused, match="an image of several frames"):
+        read_volume(file.parent)
 
 
 @pytest.mark.parametrize("code", ["RLE", "JPEG"])

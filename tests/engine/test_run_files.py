@@ -28,6 +28,8 @@ def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     given = {
         "scene": {"path": "a.h5", "scenes": [{"path": "/b.h5"}, {"path": None}]},
+        "views": {"path": "scan", "dark": "dark.tif", "flat": 5e4},
+        "grid": {"like": "ct.nii.gz"},
         "name": "path",
     }
     found = run_folder.anchored(given)
@@ -35,6 +37,8 @@ def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
         "path": str(tmp_path / "a.h5"),
         "scenes": [{"path": "/b.h5"}, {"path": None}],
     }
+    assert found["views"]["dark"] == str(tmp_path / "dark.tif") and found["views"]["flat"] == 5e4
+    assert found["grid"]["like"] == str(tmp_path / "ct.nii.gz")
     assert found["name"] == "path" and run_folder.anchored(found) == found
 
 

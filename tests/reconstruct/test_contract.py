@@ -149,6 +149,40 @@ def test_views_or_a_start_that_do_not_fit_are_refused(name):
         run(name, A, y, suport=None)
 
 
+@pytest.mark.parametrize("name", sorted({*NAMES} - {"sirt", "tikhonov"}))
+def test_a_gradient_that_would_silently_be_zero_is_refused(name):
+    """With views that require a gradient, methods without one say so, and are silent where none is
+    recorded.
+    """
+    A = Dense()
+    views = A(truth(A)).requires_grad_()
+    with pytest.raises(ValueError, match=f"without gradient for {name}"):
+        run(name, A, views, iterations=2)
+    with torch.no_grad():
+        assert torch.equal(
+            run(name, A, views, iterations=2), run(name, A, views.detach(), iterations=2)
+        )
+
+
+@pytest.mark.parametrize("penalty", ["gradient", "identity"])
+def test_the_gradient_of_tikhonov_is_that_of_its_minimum(penalty, A):
+    """It is linear: a change of the views times the gradient is the change of the functional."""
+    torch.manual_seed(0)
+    views = A(truth(A, batch=2)).requires_grad_()
+    support = torch.ones(A.domain_shape, dtype=torch.bool)
+    support[:2, :2] = False
+    options = {"iterations": 300, "weight": 0.3, "penalty": penalty, "support": support}
+    slope = torch.randn(2, 1, *A.domain_shape, dtype=torch.float64)
+    x = run("tikhonov", A, views, **options)
+    (gradient,) = torch.autograd.grad((slope * x).sum(), views)
+    change = torch.randn_like(views)
+    after = run("tikhonov", A, views.detach() + change, **options)
+    expected = (slope * (after - x)).sum()
+    assert ((gradient * change).sum() - expected).abs() < 1e-8 * expected.abs()
+    with pytest.raises(ValueError, match="weight above 0"):
+        run("tikhonov", A, views, weight=0.0)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_precision_of_the_views_is_kept(name, A):
     y = A(truth(A))

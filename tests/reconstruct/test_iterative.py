@@ -86,7 +86,9 @@ def test_gradients_flow_through_it():
     torch.autograd.gradcheck(lambda y: sirt(A, y, 2, nonnegative=False), (y,))
 
 
+@pytest.mark.door
 def test_the_logarithm_of_no_intensity_is_refused(A):
+    """Views with logarithms of no or negative intensity are refused with their number."""
     views = A(torch.rand(1, 1, *GRID.shape))
     views[0, 0, 1, 2, :2] = torch.tensor([0.0, -1.0]).log()
     with pytest.raises(ValueError, match="must be finite, got 2 of"):

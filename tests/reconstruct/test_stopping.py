@@ -8,7 +8,7 @@ from mvrecon.reconstruct.held_out import held_out
 from mvrecon.reconstruct.iterative import sirt
 from mvrecon.reconstruct.stopping import Curve, combined, corner, discrepancy
 from mvrecon.reconstruct.tikhonov import tikhonov
-from tests.reconstruct.methods import gap
+from tests.reconstruct.methods import NAMES, gap, projector, run, truth
 from tests.reconstruct.test_total_variation import slice_operator
 
 
@@ -60,8 +60,8 @@ def test_the_corner_of_an_l_is_its_corner(turn):
 def test_views_that_were_left_out_choose_better_than_the_end(noisy):
     truth, A, y, _ = noisy
     choice = held_out(cgls, A, y, options={"iterations": 40}, patience=8)
-    assert 1 <= choice.iterations < 40 and choice.weight is None
-    assert torch.equal(choice.volume, cgls(A, y, choice.iterations))
+    assert 1 <= choice.iterations[0] < 40 and choice.weights is None
+    assert torch.equal(choice.volume, cgls(A, y, choice.iterations[0]))
     assert gap(choice.volume, truth) < 0.7 * gap(cgls(A, y, 40), truth)
 
 
@@ -71,9 +71,45 @@ def test_views_that_were_left_out_choose_a_weight(noisy):
     options = {"iterations": 30}
     choice = held_out(tikhonov, A, y, weights, options=options, every=4)
     errors = [gap(tikhonov(A, y, 30, weight), truth) for weight in weights]
-    assert choice.weight == weights[errors.index(min(errors))] == 0.3
+    assert choice.weights == [weights[errors.index(min(errors))]] == [0.3]
     assert [t.weight for t in choice.trials] == weights
     assert gap(choice.volume, truth) <= 1.2 * min(errors)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_noise_ends_every_sample_of_a_batch_where_it_would_end_alone(name):
+    A, x = projector(), truth(projector(), batch=3)
+    x[0], x[1] = 0.1 * x[0], 1
+    views = A(x)
+    options = {"iterations": 30, "monitor": discrepancy(0.02 * views.max().item())}
+    alone = [run(name, A, y[None], **options) for y in views]
+    whole = run(name, A, views, **options)
+    for n in range(3):
+        assert gap(whole[n], alone[n][0]) < 1e-9
+    options["monitor"] = curve = Curve()
+    run(name, A, views, **options)
+    steps = len(curve.residuals)
+    last = run(name, A, views, iterations=steps)
+    assert any(not torch.equal(x[0], end) for x, end in zip(alone, last, strict=True))
+
+
+@pytest.mark.parametrize(("method", "weights"), [(cgls, None), (tikhonov, [1e-2, 0.3, 3.0])])
+def test_every_sample_of_a_batch_has_the_choice_that_it_would_have_alone(noisy, method, weights):
+    _, A, y, sigma = noisy
+    torch.manual_seed(1)
+    batch = torch.cat([y, y + 4 * sigma * torch.randn_like(y)])
+    seen = []
+    options = {"iterations": 20, "monitor": lambda iterate: seen.append(iterate.number)}
+    whole = held_out(method, A, batch, weights, patience=4, options=options)
+    assert seen.count(1) >= 2 + len(whole.trials)
+    choices = set()
+    for n, views in enumerate(batch):
+        alone = held_out(method, A, views[None], weights, patience=4, options={"iterations": 20})
+        assert alone.iterations == [whole.iterations[n]]
+        assert weights is None or alone.weights == [whole.weights[n]]
+        assert gap(alone.volume[0], whole.volume[n]) < 1e-9
+        choices.add((alone.iterations[0], str(alone.weights)))
+    assert len(choices) == 2
 
 
 @pytest.mark.door

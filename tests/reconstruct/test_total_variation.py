@@ -129,6 +129,44 @@ def test_all_ways_to_the_minimum_agree(blocks):
             assert tv_objective(A, y, other, weight) > least
 
 
+@pytest.mark.parametrize("nonnegative", [True, False])
+def test_the_duality_gap_bounds_the_distance_from_the_minimum_and_ends_the_run(blocks, nonnegative):
+    torch.manual_seed(0)
+    A, weight = slice_operator(size=14), 3e-3
+    y = A(torch.cat([blocks, 0.2 * blocks.flip(3)])[..., 4:18, 4:18])
+    y = y + 0.01 * y.max() * torch.randn_like(y)
+    options = {"weight": weight, "nonnegative": nonnegative}
+    least = tv_objective(A, y, pdhg_tv(A, y, 1500, **options), weight)
+    seen = []
+
+    def monitor(iterate):
+        if iterate.gap is not None:
+            value = tv_objective(A, y, iterate.volume, weight)
+            assert (iterate.gap >= 1 - least / value - 1e-7).all()
+            seen.append((iterate.number, iterate.gap))
+
+    x = pdhg_tv(A, y, 800, gap=1e-3, monitor=monitor, **options)
+    assert seen[-1][0] < 700 and (1 - least / tv_objective(A, y, x, weight)).max() < 1e-3
+    ends = [next(n for n, gap in seen if gap[k] <= 1e-3) for k in range(2)]
+    assert ends[0] != ends[1] and seen[-1][0] == max(ends)
+    for k, number in enumerate(ends):
+        assert gap(x[k], pdhg_tv(A, y[k : k + 1], number, **options)[0]) < 1e-9
+
+
+def test_total_variation_within_a_support_closes_its_gap(blocks):
+    A, gaps = slice_operator(), []
+    support = blocks[0, 0] > 0
+    support[:, 5:18, 7:16] = True
+    y = A(blocks) + 0.01
+
+    def monitor(iterate):
+        if iterate.gap is not None:
+            gaps.append(iterate.gap.item())
+
+    x = pdhg_tv(A, y, 400, 1e-2, support=support, monitor=monitor)
+    assert not x[..., ~support].any() and gaps[-1] < 1e-2 < gaps[0]
+
+
 def test_the_weight_means_the_same_on_every_rig(blocks):
     """The data term of the same error hardly depends on the number of views and pixels."""
     error, values = blocks.roll(3, 3) - 0.3 * blocks, []

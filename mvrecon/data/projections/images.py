@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mvrecon.data.dicom import dicom_file, header_of, pixels_of
-from mvrecon.data.projections.order import ordered
+from mvrecon.data.dicom import dicom_file, frames_of, header_of, pixels_of
+from mvrecon.data.projections.order import by_number, ordered
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 from mvrecon.files.checks import EDGE, Refused, blaming
 
@@ -63,7 +63,8 @@ class ImageFiles(ProjectionStack):
 
 
 def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -> ImageFiles:
-    """The images of a folder in the order of their numbers, without dark and flat fields.
+    """The images of a folder in the order of their numbers, without dark and flat fields: the
+    InstanceNumber of DICOM images where each has its own, else the numbers in their names.
 
     Args:
         folder: whose images are views; those whose names begin with dark or flat are none, unless
@@ -77,7 +78,7 @@ def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -
     images = _images(folder, pattern)
     views = [file for file in images if not FIELD.match(file.name)] or images
     _check_kind(folder, views, f" named {pattern}" if pattern else "")
-    return ImageFiles(ordered(views, gaps))
+    return ImageFiles(by_number(_instances(views), gaps) or ordered(views, gaps))
 
 
 def field_files(folder: Path, field: str) -> list[Path]:
@@ -112,6 +113,19 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
         raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
 
 
+def _instances(files: Sequence[Path]) -> dict[Path, int]:
+    """InstanceNumber of DICOM images that have one."""
+    if _ending(files[0]) != "DICOM":
+        return {}
+    numbers = {}
+    for file in files:
+        with blaming(file, "has an InstanceNumber that cannot be read"):
+            if (number := header_of(file).get("InstanceNumber")) is None:
+                return {}
+            numbers[file] = int(number)
+    return numbers
+
+
 def _ending(file: Path) -> str:
     """TIFF, PNG or DICOM; empty for other files."""
     return PILLOW.get(file.suffix.lower()) or ("DICOM" if dicom_file(file) else "")
@@ -129,7 +143,7 @@ def header(file: Path) -> Header:
     with blaming(file, "cannot be read as an image"):
         if file.suffix.lower() not in PILLOW:
             dataset = header_of(file)
-            return Header((dataset.Rows, dataset.Columns), np.dtype("f4"), _frames(dataset))
+            return Header((dataset.Rows, dataset.Columns), np.dtype("f4"), frames_of(dataset))
         with _opened(file) as image:
             pages = getattr(image, "n_frames", 1)
             if pages > VIEWS:
@@ -144,10 +158,6 @@ def header(file: Path) -> Header:
                         f"{_words(heads[-1])} on page {page}"
                     )
             return heads[0]
-
-
-def _frames(dataset: Any) -> int:
-    return int(dataset.get("NumberOfFrames") or 1)
 
 
 def _head(file: Path, image: Any, pages: int) -> Header:

@@ -1,8 +1,8 @@
-"""The order of the files of a scan, by the numbers in their names."""
+"""The order of the files of a scan, by their numbers."""
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mvrecon.files.checks import Refused, shown
@@ -47,6 +47,24 @@ def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
             )
     if not gaps:
         _check_steps(where, [keys[path][1::2] for path in files])  # type: ignore[misc]
+    return files
+
+
+def by_number(numbers: Mapping[Path, int], gaps: bool = False) -> list[Path]:
+    """Files in the order of the numbers that they hold; none where two have the same.
+
+    Args:
+        numbers: of the files of one folder.
+        gaps: allow numbers in unequal steps.
+
+    Raises:
+        Refused: a number that is missing between others.
+    """
+    if len({*numbers.values()}) < len(numbers):
+        return []
+    files = sorted(numbers, key=lambda path: numbers[path])
+    if not gaps and len(files) > 1:
+        _check_steps(files[0].parent, [[numbers[path]] for path in files])
     return files
 
 

@@ -7,7 +7,8 @@ import torch
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.order import ordered
 from mvrecon.files import memory
-from tests.data.projections.conftest import FORMS, VIEWS, grey
+from mvrecon.files.checks import Refused
+from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -62,3 +63,26 @@ def test_numbers_in_names_decide_the_order(tmp_path):
     steps = [tmp_path / f"{k}.tif" for k in (0, 4, 8, 12)]
     assert ordered(steps[::-1]) == steps
     assert ordered([*steps, tmp_path / "14.tif"], gaps=True)[-1].name == "14.tif"
+
+
+def test_the_instance_number_of_dicom_views_decides_their_order(tmp_path):
+    values = grey()
+    for k, view in enumerate(values):
+        name = f"view_{(5 * k) % VIEWS}.dcm"
+        dicom_image(tmp_path / name, view, InstanceNumber=k + 1)
+    expected = torch.from_numpy(values.astype("f4"))
+    assert torch.equal(open_projections(tmp_path).read(0, VIEWS), expected)
+    dicom_image(tmp_path / "view_0.dcm", values[0], InstanceNumber=2)  # one twice: names decide
+    stack = open_projections(tmp_path)
+    assert list(stack.names) == [f"view_{k}" for k in range(VIEWS)]
+
+
+@pytest.mark.door
+def test_a_dicom_view_that_is_missing_by_its_instance_number_is_refused(tmp_path):
+    """DICOM projections among whose InstanceNumbers one is missing are refused, but with gaps."""
+    for k, view in enumerate(grey()):
+        if k != 4:
+            dicom_image(tmp_path / f"{k if k < 4 else k - 1}.dcm", view, InstanceNumber=k)
+    with pytest.raises(Refused, match="equal steps, got 3 and then 5"):
+        open_projections(tmp_path)
+    assert open_projections(tmp_path, gaps=True).n_views == VIEWS - 1
