@@ -12,8 +12,8 @@ class Reconstruction:
 
     Args:
         volume: in the unit of (views / mm).
-        opinions: each camera's own volume, on cells of 2 x 2 x 2 voxels of the grid where a model in
-            rounds has half the resolution; so are `visible` and `weights`.
+        opinions: each camera's own volume; like `visible` and `weights` in cells of 2 x 2 x 2
+            voxels where a model in rounds works at half the resolution.
         visible: which voxels each camera's frustum holds.
         weights: how much each camera counts at each voxel; they sum to one over the cameras that
             see it.
