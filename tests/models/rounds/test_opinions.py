@@ -1,15 +1,20 @@
 """Opinions within a round: what is exact, what depends on what, and what their loss teaches."""
 
+import inspect
 from dataclasses import replace
 
 import pytest
 import torch
+import yaml
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from mvrecon.config import conf_dir
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.output import Reconstruction
+from mvrecon.models.rounds.evidence import Evidence
 from mvrecon.models.rounds.model import Rounds
+from mvrecon.models.rounds.settings import OpinionOptions
 from mvrecon.models.rounds.views import means
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.testing import check_model
@@ -61,6 +66,22 @@ def test_a_hull_of_odd_sizes_and_a_grid_of_one_slice_keep_the_contract():
     projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
     check_model("rounds", projector, rounds=CHOICES["weighted"], support="hull")
     check_model("rounds", projector, rounds=CHOICES["frustum3d"])
+
+
+def test_the_presets_are_the_defaults_and_have_as_many_weights_as_in_the_docs():
+    projector, counts = small_projector(), []
+    for name in ("rounds_opinions", "rounds_frustum3d"):
+        options = yaml.safe_load((conf_dir() / "model" / f"{name}.yaml").read_text())
+        first = options["rounds"][0]
+        if first["opinions"] is not None:
+            assert OpinionOptions.of(first["opinions"]) == OpinionOptions()
+        model = Rounds(projector, **{key: value for key, value in options.items() if key != "name"})
+        counts.append(round(sum(p.numel() for p in model.parameters()) / 1e6, 2))
+        part = inspect.signature(type(model.rounds[0].cameras)).parameters
+        for option in ("widths", "depths", "binning", "memory"):
+            own = first["cameras"][option]
+            assert (tuple(own) if isinstance(own, list) else own) == part[option].default
+    assert counts == [1.91, 1.87]
 
 
 def test_before_training_a_round_with_opinions_is_the_round_without():
@@ -135,8 +156,6 @@ def test_in_a_frustum_the_others_are_all_but_the_camera_itself():
 
 
 def _evidence(projector, network):
-    from mvrecon.models.rounds.evidence import Evidence
-
     torch.manual_seed(4)
     views, x = torch.rand(1, 1, 4, 12, 12), blob(projector)
     return Evidence(views, 0.1 * views, x, 0.1 * x, torch.zeros(1, *network.memory_shape))
