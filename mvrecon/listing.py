@@ -16,7 +16,10 @@ from mvrecon.parts import REGISTRIES
 from mvrecon.registry import installed, locate
 
 #: What the apps and the models pass in, no options.
-GIVEN = {"self", "grid", "cameras", "projector", "inputs", "outputs", "A", "views", "counts"}
+GIVEN = {
+    *("self", "grid", "cameras", "projector", "task"),
+    *("inputs", "outputs", "A", "views", "counts"),
+}
 
 Definition = ast.ClassDef | ast.FunctionDef
 

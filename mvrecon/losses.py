@@ -3,14 +3,19 @@
 The weights of a training run are those of `conf/train.yaml`.
 """
 
+from dataclasses import asdict, dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.models.output import Reconstruction
 
 #: Weight of a round's volume relative to that of the round behind it.
 EARLIER = 0.4
+#: Of the truth's power: as much counts each start's error where opinions are compared with it.
+LEAST = 1e-6
 
 
 def edge_difference(
@@ -43,6 +48,40 @@ def _neighbours(support: Bool[Tensor, "b 1 d h w"], axis: int) -> Tensor:
     return support.narrow(axis, 0, count) & support.narrow(axis, 1, count)
 
 
+def at_cells(volume: Float[Tensor, "b c d h w"], like: Tensor) -> Float[Tensor, "b c e i x"]:
+    """Means of a volume in the cells of a coarser one, in the volume's unit."""
+    edges = [-(-n // k) for n, k in zip(volume.shape[-3:], like.shape[-3:], strict=True)]
+    return volume if max(edges) == 1 else avg_pool3d(volume, edges, ceil_mode=True)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the terms of a training loss; 0 leaves a term out.
+
+    Args:
+        volume: of the mean squared error.
+        edges: of the squared error of first differences.
+        opinions: of the mean squared error of the opinions, where the cameras see.
+        opinions_gain: of the squared error of each camera's opinion relative to that of the start
+            where this camera sees, the mean over the cameras, and the same of the weighted opinion;
+            both are 1 where every opinion is the start.
+        cross_view: of the squared error of opinions projected to the other cameras, relative to
+            the views.
+        rounds: of the mean squared errors of the volumes after earlier rounds, each less than the
+            one behind it by the factor `EARLIER`.
+        corrected_views: of the mean squared error of the views as the cameras' networks have
+            corrected them, against the truth's own views A x_true, as mean densities along rays.
+    """
+
+    volume: float = 1.0
+    edges: float = 0.0
+    opinions: float = 0.0
+    opinions_gain: float = 0.0
+    cross_view: float = 0.0
+    rounds: float = 0.0
+    corrected_views: float = 0.0
+
+
 class ReconstructionLoss(nn.Module):
     """Weighted sum of the errors of the volume, of each camera's own volume (its opinion), and of
     the views that opinions predict for the other cameras.
@@ -51,41 +90,16 @@ class ReconstructionLoss(nn.Module):
     others are 0 by definition, and have no gradient. The figures of merit cover the whole grid.
 
     Args:
-        data_range: value range of the volumes, in their unit. A weight of 0 leaves its term out.
-        volume: weight of the mean squared error.
-        edges: weight of the squared error of first differences.
-        opinions: weight of the mean squared error of the opinions, where the cameras see.
-        cross_view: weight of the squared error of opinions projected to the other cameras,
-            relative to the views.
-        rounds: weight of the mean squared errors of the volumes after earlier rounds, each less
-            than the one behind it by the factor `EARLIER`.
-        corrected_views: weight of the mean squared error of the views as the cameras' networks
-            have corrected them, against the truth's own views A x_true, as mean densities along
-            rays.
+        data_range: value range of the volumes, in their unit.
+        weights: of `Weights`.
     """
 
-    def __init__(
-        self,
-        data_range: float,
-        volume: float = 1.0,
-        edges: float = 0.0,
-        opinions: float = 0.0,
-        cross_view: float = 0.0,
-        rounds: float = 0.0,
-        corrected_views: float = 0.0,
-    ):
+    def __init__(self, data_range: float, **weights: float):
         super().__init__()
         if not data_range > 0:
             raise ValueError(f"data_range must be positive, got {data_range}")
         self.data_range = data_range
-        self.weights = {
-            "volume": volume,
-            "edges": edges,
-            "opinions": opinions,
-            "cross_view": cross_view,
-            "rounds": rounds,
-            "corrected_views": corrected_views,
-        }
+        self.weights = asdict(Weights(**weights))
 
     def forward(
         self, out: Reconstruction, batch: dict[str, Tensor]
@@ -102,12 +116,7 @@ class ReconstructionLoss(nn.Module):
         terms = {"volume": mean_where((volume - truth).square(), out.support)}
         if self.weights["edges"]:
             terms["edges"] = edge_difference(volume, truth, out.support)
-        if out.opinions is not None and out.visible is not None and self.weights["opinions"]:
-            error = (out.opinions / self.data_range - truth[:, None]).square()
-            terms["opinions"] = self._opinions(error, out.visible, out.support)
-        if out.cross_views is not None and self.weights["cross_view"]:
-            power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
-            terms["cross_view"] = (out.cross_views - views).square().mean() / power
+        terms |= self._of_cameras(out, truth, views)
         if out.earlier and self.weights["rounds"]:
             terms["rounds"] = self._rounds(out, truth)
         if self.compares_views(out):
@@ -134,8 +143,53 @@ class ReconstructionLoss(nn.Module):
         errors = [(weight * (views - true_views)).square().mean() for views in out.corrected_views]
         return torch.stack(errors).mean()
 
+    def _of_cameras(
+        self, out: Reconstruction, truth: Tensor, views: Float[Tensor, "b 1 m v u"]
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The terms of the opinions, at their resolution."""
+        terms = {}
+        if out.opinions is not None and out.visible is not None:
+            opinions, support = out.opinions / self.data_range, out.support
+            if support is not None:
+                support = at_cells(support.to(truth.dtype), opinions) > 0
+            truth = at_cells(truth, opinions)
+            error = (opinions - truth[:, None]).square()
+            if self.weights["opinions"]:
+                terms["opinions"] = self._opinions(error, out.visible, support)
+            if self.weights["opinions_gain"]:
+                terms["opinions_gain"] = self._gain(out, error, truth, support)
+        if out.cross_views is not None and self.weights["cross_view"]:
+            if out.cross_views.shape[-1] < views.shape[-1]:
+                edge = views.shape[-1] // out.cross_views.shape[-1]
+                views = avg_pool2d(views.flatten(0, 2), edge).unflatten(0, views.shape[:3])
+            power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
+            terms["cross_view"] = (out.cross_views - views).square().mean() / power
+        return terms
+
     @staticmethod
     def _opinions(error: Tensor, visible: Tensor, support: Tensor | None) -> Float[Tensor, ""]:
         if support is None:
             return (error * visible).mean() / visible.float().mean()
         return mean_where(error, visible & support[:, None])
+
+    def _gain(
+        self, out: Reconstruction, error: Tensor, truth: Tensor, support: Tensor | None
+    ) -> Float[Tensor, ""]:
+        assert out.opinions is not None and out.visible is not None
+        visible = out.visible if support is None else out.visible & support[:, None]
+        start = 0 * truth if out.start is None else at_cells(out.start / self.data_range, truth)
+        before = (start - truth).square()[:, None]
+        least = LEAST * truth.square()[:, None] + torch.finfo(truth.dtype).tiny
+
+        def relative(error: Tensor, where: Tensor) -> Float[Tensor, ""]:
+            axes = tuple(range(2, 6))
+            whole = ((before + least) * where).sum(dim=axes)
+            gain = (error * where).sum(dim=axes) / whole.clamp_min(torch.finfo(whole.dtype).tiny)
+            return gain.mean()
+
+        gain = relative(error, visible)
+        if out.weights is None:
+            return gain
+        seen = visible.any(dim=-5, keepdim=True)
+        fused = (out.weights * out.opinions).sum(dim=1, keepdim=True) / self.data_range
+        return gain + relative((fused - truth[:, None]).square(), seen)

@@ -48,6 +48,7 @@ NETWORKS = Registry(
 CAMERA_NETWORKS = Registry(
     "camera_network",
     rays2d="mvrecon.models.rounds.rays2d:Rays2d",
+    frustum3d="mvrecon.models.rounds.frustum3d:Frustum3d",
 )
 RECONSTRUCTORS = Registry(
     "reconstructor",

@@ -176,6 +176,17 @@ class Grid:
         affine[:3, 3] = self.to_world(first)
         return Grid(shape, affine)  # type: ignore[arg-type]
 
+    def coarsened(self, factor: int) -> "Grid":
+        """Voxels of `factor` x `factor` x `factor` of these, from the first on; at the ends they
+        may stand out of the box, but not along an axis of fewer voxels than `factor`.
+        """
+        joined = [min(factor, n) for n in self.shape]
+        affine, per_axis = self.affine.clone(), torch.tensor(joined[::-1], dtype=torch.float64)
+        affine[:3, :3] *= per_axis
+        affine[:3, 3] = self.to_world((per_axis - 1) / 2)
+        z, y, x = (-(-n // k) for n, k in zip(self.shape, joined, strict=True))
+        return Grid((z, y, x), affine)
+
 
 def _check_shape(shape: Sequence[int], name: str = "shape", order: str = "(z, y, x)") -> None:
     if len(shape) != 3 or min(shape) < 1:

@@ -12,11 +12,14 @@ class Reconstruction:
 
     Args:
         volume: in the unit of (views / mm).
-        opinions: each camera's own volume.
+        opinions: each camera's own volume; like `visible` and `weights` in cells of 2 x 2 x 2
+            voxels where a model in rounds works at half the resolution.
         visible: which voxels each camera's frustum holds.
         weights: how much each camera counts at each voxel; they sum to one over the cameras that
             see it.
-        cross_views: opinion m projected into camera n, in the unit of the views.
+        cross_views: opinion m projected into camera n, in the unit of the views; of a model in
+            rounds what the opinions of all others together predict for camera n, m = 1, in cells of
+            pixels.
         support: where the volume may differ from zero; none for everywhere.
         start: the classical reconstruction that the network began with.
         start_views: the start projected into every camera, in the unit of the views.

@@ -149,10 +149,17 @@ def gallery(views: Float[Tensor, "m v u"], edge: int = 256) -> Image:
 def opinions(
     volumes: Float[Tensor, "m d h w"], data_range: float, spacing: Spacing = CUBES
 ) -> Image:
-    """Three middle planes (rows) of every camera's own volume (columns), to scale; values from 0 to
-    data_range.
+    """Three middle planes (rows) of the mean of the cameras' volumes, and of how every camera's own
+    differs from it (columns), to scale.
+
+    The mean from 0 to data_range; a difference from -data_range / 4 (blue) to data_range / 4 (red).
     """
-    return _per_camera(volumes, data_range, spacing)
+    mean = volumes.mean(dim=0)
+    columns = {"mean": [grey(p, (0, data_range)) for p in middle_planes(mean, spacing)]}
+    for m, volume in enumerate(volumes):
+        planes = middle_planes(volume - mean, spacing)
+        columns[f"camera {m}"] = [signed(p, data_range / 4) for p in planes]
+    return _captioned(columns, PLANES)
 
 
 def weights(volumes: Float[Tensor, "m d h w"], spacing: Spacing = CUBES) -> Image:
@@ -160,10 +167,7 @@ def weights(volumes: Float[Tensor, "m d h w"], spacing: Spacing = CUBES) -> Imag
 
     Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
     """
-    return _per_camera(volumes, 3 / len(volumes), spacing)
-
-
-def _per_camera(volumes: Float[Tensor, "m d h w"], top: float, spacing: Spacing) -> Image:
+    top = 3 / len(volumes)
     columns = {
         f"camera {m}": [grey(p, (0, top)) for p in middle_planes(v, spacing)]
         for m, v in enumerate(volumes)

@@ -31,6 +31,18 @@ def test_index_and_world_are_inverse_on_an_oblique_grid():
     assert torch.allclose(grid.to_world(grid.to_index(xyz)), xyz)
 
 
+def test_coarser_voxels_lie_about_those_that_they_join():
+    """Undoes `refined`; of five voxels the third pair stands out; an axis of one stays as it is."""
+    grid = Grid.centred(size=(3, 4, 5), spacing=(1.0, 2.0, 3.0), centre=(5.0, -1.0, 2.0))
+    same = grid.refined(2).coarsened(2)
+    assert same.shape == grid.shape and torch.allclose(same.affine, grid.affine)
+    flat = Grid.centred(size=(5, 4, 1), spacing=(1.0, 2.0, 3.0))
+    coarse = flat.coarsened(2)
+    assert coarse.size == (3, 2, 1) and coarse.spacing == (2.0, 4.0, 3.0)
+    pairs = voxel_centres(flat)[:, :, :4].unflatten(1, (2, 2)).unflatten(3, (2, 2))
+    assert torch.allclose(voxel_centres(coarse)[:, :, :2], pairs.mean(dim=(2, 4)))
+
+
 def test_refined_grid_fills_the_same_box():
     grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 3.0))
     assert torch.allclose(grid.refined(3).corners(), grid.corners())

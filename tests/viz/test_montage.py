@@ -69,9 +69,20 @@ def test_equal_weights_are_one_third_grey_for_any_number_of_cameras():
         assert set(image[LABEL + 48, LEFT + 48 :: 98, 0].tolist()) == {85}
 
 
+def test_opinions_are_shown_as_differences_from_their_mean():
+    """Equal opinions are white beside the mean; what one has more of is red, and less blue."""
+    volumes = torch.full((2, 96, 96, 96), 0.5)
+    row, columns = LABEL + 48, [LEFT + 48 + 98 * k for k in range(3)]
+    image = montage.opinions(volumes, 1.0)
+    assert [image[row, c].tolist() for c in columns] == [[128] * 3, [255] * 3, [255] * 3]
+    volumes[0] += 0.5  # a fourth more than the mean, and a fourth less
+    image = montage.opinions(volumes, 1.0)
+    assert [image[row, c].tolist() for c in columns[1:]] == [[255, 0, 0], [0, 0, 255]]
+
+
 def test_opinions_and_projections_have_a_column_each():
     volumes = torch.rand(5, 8, 8, 8)
-    assert montage.opinions(volumes, 1.0).shape[1] == LEFT + 5 * EDGE + 4 * GAP
+    assert montage.opinions(volumes, 1.0).shape[1] == LEFT + 6 * EDGE + 5 * GAP
     assert (
         montage.projections(volumes[0], {"ours": volumes[1]}, 1.0).shape[1] == LEFT + 2 * EDGE + GAP
     )

@@ -34,7 +34,7 @@ class Rounds(nn.Module):
 
     Args:
         projector: its grid and its rig.
-        rounds: options of each round: `{resolution, widths, cameras}`.
+        rounds: options of each round: `{resolution, widths, cameras, opinions}`.
         start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
             ..., **options}`.
         consistency: learned gradient steps towards the corrected views at the end.
@@ -67,7 +67,7 @@ class Rounds(nn.Module):
                 f"{len(rounds)} and {precision!r}"
             )
         options = [RoundOptions.of(one) for one in rounds]
-        first = next((i for i, one in enumerate(options) if one.cameras), len(options))
+        first = next((i for i, one in enumerate(options) if one.corrects), len(options))
         self.cropping = Cropping(projector, Options(support=support, noise=noise))
         self.start = checked_start(start)
         self.rounds = nn.ModuleList(
@@ -96,7 +96,7 @@ class Rounds(nn.Module):
         for one in self.rounds:
             state = one(measured, state)
             volumes.append(state.volume * scale)
-            if one.cameras is not None:
+            if one.corrects:
                 corrected.append((y + chord * state.correction) * scale)
         if state.correction is not None and self.trust is not None:
             y = y + self.trust * chord * state.correction
@@ -108,6 +108,7 @@ class Rounds(nn.Module):
             earlier=tuple(volumes[:-1]),
             corrected_views=tuple(corrected),
             row=geometry.row if corrected else None,
+            **_opinions(state, scale),
         )
 
     def _geometry(self, views: Float[Tensor, "b 1 m v u"]) -> Geometry:
@@ -122,3 +123,16 @@ class Rounds(nn.Module):
         within = whole.with_mask(self.cropping.mask(views), masked=False)
         of_longest = torch.where(within.row > 0, within.row, torch.inf).amin((1, 2, 3, 4), True)
         return replace(within, row=within.row.minimum(of_longest / SHORTEST))
+
+
+def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Tensor]:
+    """The last opinions of the cameras, in the unit of (views / mm)."""
+    fused = state.fused
+    if fused is None:
+        return {}
+    return {
+        "opinions": fused.opinions * scale[:, None],
+        "visible": fused.visible,
+        "weights": fused.weights,
+        "cross_views": fused.expected * scale,
+    }

@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.models.rounds.cells import from_cells, to_cells
-from mvrecon.models.rounds.evidence import MAGNIFIED, SMALL, Evidence
+from mvrecon.models.rounds.evidence import MAGNIFIED, Answer, Evidence, Task
 from mvrecon.models.rounds.sampling import RaySamples
+from mvrecon.models.rounds.shared import for_cameras
 from mvrecon.models.rounds.unet import PlainUNet, Precision
+from mvrecon.models.rounds.views import IMAGES, Binned, correction_of, image_cells
 from mvrecon.projectors.operator import Projector
 
 
@@ -21,10 +19,12 @@ class Rays2d(nn.Module):
 
     One U-Net for all cameras looks at cells of pixels of the view, of its residual and of its
     sharp part (the view less its mean over 3 x 3 pixels), and at the volume and its correction at
-    some depths along each ray, one channel each.
+    some depths along each ray, one channel each. Logits and features in the frusta are channels,
+    too.
 
     Args:
         projector: its grid and its rig.
+        task: what the round asks for.
         widths: channels of each scale, the finest first.
         depths: samples along a ray.
         binning: detector pixels joined into a cell along each axis, at most; the largest number
@@ -39,6 +39,7 @@ class Rays2d(nn.Module):
     def __init__(
         self,
         projector: Projector,
+        task: Task,
         widths: Sequence[int] = (32, 48),
         depths: int = 16,
         binning: int = 3,
@@ -46,35 +47,32 @@ class Rays2d(nn.Module):
         precision: Precision = "float32",
     ):
         super().__init__()
-        cameras = projector.cameras
-        if not isinstance(cameras, Cameras):
-            raise ValueError(
-                f"Expected a rig of cameras for 'rays2d', got {type(cameras).__name__}"
-            )
-        rows, columns = cameras.shape
-        edge = max(k for k in range(1, binning + 1) if rows % k == 0 and columns % k == 0)
-        self.edge = edge
-        self.samples = RaySamples(projector.grid, cameras.binned(edge), depths)
-        self.memory_shape = len(cameras), memory, rows // edge, columns // edge
-        inputs, outputs = 3 * edge**2 + 2 * depths + memory, edge**2 + memory
-        self.unet = PlainUNet(2, inputs, outputs, widths, zero=edge**2, precision=precision)
+        cameras, edge = Binned.of(projector, binning)
+        self.binning, self.depths, self.task = edge, depths, task
+        self.samples = RaySamples(projector.grid, cameras, depths)
+        self.memory_shape = len(cameras), memory, *cameras.shape
+        logits = task.correct * edge**2, task.logits * depths
+        inputs = IMAGES * edge**2 + 2 * depths + memory
+        self.sizes = [*logits, task.features * depths, memory]
+        self.unet = for_cameras(
+            task.shared,
+            len(cameras),
+            lambda: PlainUNet(
+                2, inputs, sum(self.sizes), widths, zero=sum(logits), precision=precision
+            ),
+        )
 
-    def forward(
-        self, evidence: Evidence
-    ) -> tuple[Float[Tensor, "b 1 m v u"], Float[Tensor, "b m k r s"]]:
-        """The correction R e of every view, and the memory."""
+    def forward(self, evidence: Evidence) -> Answer:
+        """The correction of every view, the memory, and what is placed in the frusta."""
         b, m = evidence.memory.shape[:2]
-        images = self._images(evidence).flatten(0, 1)
+        images = image_cells(evidence, self.binning).flatten(0, 1)
         volumes = torch.cat([evidence.volume, MAGNIFIED * evidence.change], dim=1)
         along = self.samples(volumes).flatten(2, 3).flatten(0, 1)
         answer = self.unet(torch.cat([images, along, evidence.memory.flatten(0, 1)], dim=1))
-        cells, memory = answer.split([self.edge**2, evidence.memory.shape[2]], dim=1)
-        correction = from_cells(cells, self.edge).unflatten(0, (b, m)).transpose(1, 2)
-        return SMALL * correction, memory.unflatten(0, (b, m))
-
-    def _images(self, evidence: Evidence) -> Float[Tensor, "b m k r s"]:
-        measured = evidence.measured.squeeze(1)
-        mean = F.avg_pool2d(measured, 3, stride=1, padding=1, count_include_pad=False)
-        residual = MAGNIFIED * evidence.residual.squeeze(1)
-        views = torch.stack([residual, measured, MAGNIFIED * (measured - mean)], dim=2)
-        return to_cells(views.flatten(0, 1), self.edge).unflatten(0, measured.shape[:2])
+        cells, logits, features, memory = answer.split(self.sizes, dim=1)
+        correction = correction_of(cells, self.binning, b) if self.task.correct else None
+        placed = None
+        if self.task.logits:
+            placed = torch.cat([logits, features], dim=1)
+            placed = placed.unflatten(0, (b, m)).unflatten(2, (-1, self.depths))
+        return Answer(memory.unflatten(0, (b, m)), correction, placed)

@@ -12,6 +12,7 @@ from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps
 from mvrecon.kernels.warps.warp import warp
+from mvrecon.models.frusta import Frusta
 
 
 class RaySamples(nn.Module):
@@ -40,3 +41,22 @@ class RaySamples(nn.Module):
 
     def forward(self, volumes: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b m c D v u"]:
         return warp(volumes[:, None], self.maps, self.shape)[:, 0]
+
+
+class FixedFrusta(nn.Module):
+    """The frusta of a rig over a grid, which move with a model to its device and dtype.
+
+    Args:
+        grid: where volumes in the world lie.
+        cameras: the rig; its pixels are the frusta's rows and columns.
+        depths: bins along a ray.
+    """
+
+    def __init__(self, grid: Grid, cameras: Cameras, depths: int):
+        super().__init__()
+        self.frusta = Frusta.of(grid, cameras, depths)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "FixedFrusta":
+        super()._apply(fn, recurse)
+        self.frusta = self.frusta.to(fn(self.frusta.step))
+        return self

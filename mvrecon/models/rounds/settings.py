@@ -1,33 +1,105 @@
 """Options of the rounds of a model, checked once."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Literal, Self
 
+from mvrecon.models.rounds.evidence import Task
 from mvrecon.registry import hint
 
 #: Voxels of a cell along each axis, by the resolution of a round.
 EDGES = {"half": 2, "full": 1}
 
 
+class Checked:
+    """Dataclass that is made from a mapping; `what` begins the message of an unknown option."""
+
+    what: ClassVar[str]
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> Self:
+        """The options of a mapping.
+
+        Raises:
+            TypeError: an unknown option; the message gives the nearest and all.
+        """
+        known = [one.name for one in fields(cls)]  # type: ignore[arg-type]
+        for option in options:
+            if option not in known:
+                raise TypeError(f"{cls.what} no option {option!r}{hint(str(option), known)}")
+        return cls(**options)
+
+
 @dataclass(frozen=True)
-class RoundOptions:
-    """One round's resolution, widths and cameras.
+class OpinionOptions(Checked):
+    """How the opinions of a round are formed and compared.
+
+    Args:
+        head: `{name: ..., **options}`; from logits along a ray to the density there.
+        features: channels that a camera hands to the network in the world besides its density.
+        fusion: "weighted" by a network over the cameras, or the plain "mean".
+        prior: "learned": the cameras' network moves the density of x along the rays; "uniform": no
+            network, all depths equally likely.
+
+    Raises:
+        ValueError: an unknown fusion or prior, or less than no feature.
+    """
+
+    what: ClassVar[str] = "The opinions of a round have"
+
+    head: Mapping[str, Any] = field(default_factory=lambda: {"name": "softmax_depth"})
+    features: int = 4
+    fusion: Literal["weighted", "mean"] = "weighted"
+    prior: Literal["learned", "uniform"] = "learned"
+
+    def __post_init__(self) -> None:
+        if self.fusion not in ("weighted", "mean"):
+            raise ValueError(f"Expected the fusion weighted or mean, got {self.fusion!r}")
+        if self.prior not in ("learned", "uniform"):
+            raise ValueError(f"Expected the prior learned or uniform, got {self.prior!r}")
+        if self.features < 0:
+            raise ValueError(f"Expected features of at least 0, got {self.features}")
+
+    @property
+    def learned(self) -> bool:
+        """Whether the cameras' network moves density along the rays."""
+        return self.prior == "learned"
+
+    @property
+    def weighted(self) -> bool:
+        """Whether a network weighs the opinions."""
+        return self.fusion == "weighted"
+
+    @property
+    def handed(self) -> int:
+        """Channels of features that a camera's network gives."""
+        return self.features if self.learned else 0
+
+
+@dataclass(frozen=True)
+class RoundOptions(Checked):
+    """One round's resolution, widths, cameras and opinions.
 
     Args:
         resolution: of the network in the world: "half", cells of 8 voxels as its channels, or
             "full".
         widths: channels of each of its scales, the finest first.
-        cameras: the cameras' network that corrects the views before: `{name: ..., **options}`;
-            none for a round in the world alone.
+        cameras: the cameras' network: `{name: ..., correct: true, shared: true, **options}`:
+            whether it corrects the views, and is one for all cameras or one each; none for a
+            round in the world alone.
+        opinions: fields of `OpinionOptions`, for a round with cameras; none for none.
 
     Raises:
-        ValueError: an unknown resolution, no scale, or a width below 1.
+        ValueError: an unknown resolution, no scale, a width below 1, opinions without cameras, or
+            cameras that have nothing to do.
     """
+
+    what: ClassVar[str] = "A round has"
 
     resolution: Literal["half", "full"] = "half"
     widths: Sequence[int] = (32, 48, 64)
     cameras: Mapping[str, Any] | None = None
+    opinions: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.resolution not in EDGES:
@@ -38,24 +110,39 @@ class RoundOptions:
             raise ValueError(
                 f"Expected the widths of a round as positive numbers, got {self.widths}"
             )
+        if self.cameras is None and self.opinions is not None:
+            raise ValueError("Expected opinions in a round with cameras, got cameras: null")
+        if self.cameras is not None and not (self.corrects or self.task.logits):
+            raise ValueError(
+                "Expected cameras that correct views or have opinions with a learned prior, got "
+                "neither"
+            )
 
     @property
     def edge(self) -> int:
         """Voxels of a cell along each axis."""
         return EDGES[self.resolution]
 
-    @classmethod
-    def of(cls, options: Mapping[str, Any]) -> "RoundOptions":
-        """The options of a mapping.
+    @property
+    def corrects(self) -> bool:
+        """Whether the cameras correct their views."""
+        return self.cameras is not None and bool(self.cameras.get("correct", True))
 
-        Raises:
-            TypeError: an unknown option; the message gives the nearest and all.
-        """
-        known = [field.name for field in fields(cls)]
-        for option in options:
-            if option not in known:
-                raise TypeError(f"A round has no option {option!r}{hint(str(option), known)}")
-        return cls(**options)
+    @property
+    def network(self) -> Mapping[str, Any]:
+        """Name and own options of the cameras' network."""
+        own = dict(self.cameras or {})
+        return {name: value for name, value in own.items() if name not in ("correct", "shared")}
+
+    @property
+    def task(self) -> Task:
+        """What the round asks of its cameras' network."""
+        shared = bool((self.cameras or {}).get("shared", True))
+        if self.opinions is None:
+            return Task(self.corrects, shared)
+        opinions = OpinionOptions.of(self.opinions)
+        logits = 1 + opinions.weighted if opinions.learned else 0
+        return Task(self.corrects, shared, logits, opinions.handed)
 
 
 #: Two rounds at half resolution, the first with the cameras' network, and one at full resolution.

@@ -1,4 +1,4 @@
-"""One round: residual views, the cameras' corrections, and the network in the world."""
+"""One round: residual views, the cameras' corrections and opinions, the network in the world."""
 
 from typing import Any, NamedTuple
 
@@ -8,8 +8,9 @@ from torch import Tensor, nn
 
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.rounds.cells import from_cells, padded, to_cells, trimmed
-from mvrecon.models.rounds.evidence import MAGNIFIED, Evidence
-from mvrecon.models.rounds.settings import RoundOptions
+from mvrecon.models.rounds.evidence import MAGNIFIED, Answer, Evidence
+from mvrecon.models.rounds.opinions import Fused, Opinions
+from mvrecon.models.rounds.settings import OpinionOptions, RoundOptions
 from mvrecon.models.rounds.unet import PlainUNet, Precision
 from mvrecon.parts import CAMERA_NETWORKS
 from mvrecon.projectors.operator import Projector
@@ -24,12 +25,14 @@ class State(NamedTuple):
         correction: R e, what the cameras have corrected so far, as mean densities along rays; none
             before any camera has.
         camera_memory: of the cameras' networks.
+        fused: the last opinions of cameras.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
     memory: Float[Tensor, "b 1 d h w"]
     correction: Float[Tensor, "b 1 m v u"] | None = None
     camera_memory: Float[Tensor, "b m k r s"] | None = None
+    fused: Fused | None = None
 
 
 class Measured(NamedTuple):
@@ -68,53 +71,96 @@ class Round(nn.Module):
         self.cameras: Any = None
         if options.cameras is not None:
             self.cameras = CAMERA_NETWORKS.from_config(
-                options.cameras, projector, precision=precision
+                options.network, projector, options.task, precision=precision
             )
-        self.trust = nn.Parameter(torch.ones(())) if corrected or options.cameras else None
+        self.corrects = options.corrects
+        self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
-        cells = self.edge**3
+        self.opinions = self._opinions(projector, options, precision, self.cameras)
+        cells, extra = self.edge**3, 0
+        if options.opinions is not None:
+            extra = 2 + OpinionOptions.of(options.opinions).handed
         self.world = PlainUNet(
-            3, 4 * cells, 2 * cells, options.widths, zero=cells, precision=precision
+            3, 4 * cells + extra, 2 * cells, options.widths, zero=cells, precision=precision
+        )
+        if extra:  # before training a round with opinions is the round without
+            nn.init.zeros_(self.world.first.weight[:, -extra:])
+
+    @staticmethod
+    def _opinions(
+        projector: Projector, options: RoundOptions, precision: Precision, network: Any
+    ) -> Opinions | None:
+        if options.opinions is None:
+            return None
+        return Opinions(
+            projector,
+            OpinionOptions.of(options.opinions),
+            options.edge,
+            network.binning,
+            network.depths,
+            precision,
         )
 
     def forward(self, measured: Measured, state: State) -> State:
         """The state after the round."""
-        geometry, x = measured.geometry, state.volume
-        residual = measured.views - geometry.A(x)
-        if state.correction is not None and self.trust is not None:
-            residual = residual + self.trust * measured.chord * state.correction
+        geometry, x, views = measured.geometry, state.volume, measured.views
+        residual = views - geometry.A(x)
+        if state.correction is not None:
+            residual = residual + self._views(measured, state.correction)
         change = geometry.back(residual)
-        if self.cameras is not None and self.trust is not None:
-            state, added = self._corrected(measured, state, residual, change)
-            change = change + geometry.back(self.trust * measured.chord * added)
-        learned, memory = self._world(geometry, state, change)
+        extra: list[Tensor] = []
+        if self.cameras is not None:
+            state, answer = self._asked(measured, state, residual, change)
+            if answer.correction is not None:
+                change = change + geometry.back(self._views(measured, answer.correction))
+            if self.opinions is not None:
+                if state.correction is not None:
+                    views = views + self._views(measured, state.correction)
+                fused = self.opinions(x, views, answer.placed, geometry.mask)
+                state, extra = state._replace(fused=fused), [fused.evidence]
+        learned, memory = self._world(geometry, state, change, extra)
         x = x + geometry.within(learned + self.step * change)
         return state._replace(volume=x, memory=memory)
 
-    def _corrected(
+    def _views(
+        self, measured: Measured, correction: Float[Tensor, "b 1 m v u"]
+    ) -> Float[Tensor, "b 1 m v u"]:
+        """What a correction adds to the views, as far as the round trusts it."""
+        assert self.trust is not None  # where a camera corrects, here or before
+        return self.trust * measured.chord * correction
+
+    def _asked(
         self,
         measured: Measured,
         state: State,
         residual: Float[Tensor, "b 1 m v u"],
         change: Float[Tensor, "b 1 d h w"],
-    ) -> tuple[State, Float[Tensor, "b 1 m v u"]]:
-        """The state with this round's corrections in it, and these alone."""
+    ) -> tuple[State, Answer]:
+        """The state with this round's corrections in it, and the cameras' answer."""
         row, memory = measured.geometry.row, state.camera_memory
         if memory is None:
             memory = row.new_zeros(len(residual), *self.cameras.memory_shape)
         evidence = Evidence(row * measured.views, row * residual, state.volume, change, memory)
-        added, memory = self.cameras(evidence)
-        added = added * (row > 0)
+        answer = self.cameras(evidence)
+        state = state._replace(camera_memory=answer.memory)
+        if answer.correction is None:
+            return state, answer
+        added = answer.correction * (row > 0)
         total = added if state.correction is None else state.correction + added
-        return state._replace(correction=total, camera_memory=memory), added
+        return state._replace(correction=total), answer._replace(correction=added)
 
     def _world(
-        self, geometry: Geometry, state: State, change: Float[Tensor, "b 1 d h w"]
+        self,
+        geometry: Geometry,
+        state: State,
+        change: Float[Tensor, "b 1 d h w"],
+        extra: list[Tensor],
     ) -> tuple[Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 d h w"]]:
         x = state.volume
         hull = torch.ones_like(x) if geometry.mask is None else geometry.mask.to(x.dtype)
         evidence = torch.cat([x, MAGNIFIED * change, hull, state.memory], dim=1)
-        answer = self.world(to_cells(padded(evidence, self.edge), self.edge))
+        cells = to_cells(padded(evidence, self.edge), self.edge)
+        answer = self.world(torch.cat([cells, *extra], dim=1) if extra else cells)
         volumes = trimmed(from_cells(answer, self.edge), x.shape[2:])
         learned, memory = volumes.split(1, dim=1)
         return learned, memory

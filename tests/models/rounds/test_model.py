@@ -208,7 +208,7 @@ def test_samples_along_rays_are_those_of_the_frusta():
 def test_pixels_are_joined_where_the_detector_divides(pixels, edge):
     projector = small_projector(pixels=pixels)
     model = stirred(projector)
-    assert model.rounds[0].cameras.edge == edge
+    assert model.rounds[0].cameras.binning == edge
     assert model(projector(blob(projector))).volume.isfinite().all()
 
 

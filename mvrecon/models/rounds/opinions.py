@@ -1,0 +1,163 @@
+"""The cameras' opinions within a round: each places its corrected view along its rays, all are
+compared, and a network weighs them.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
+
+from mvrecon.models.networks import halved
+from mvrecon.models.pooling import deviation, leave_one_out, pooled
+from mvrecon.models.rounds.evidence import MAGNIFIED
+from mvrecon.models.rounds.sampling import FixedFrusta
+from mvrecon.models.rounds.settings import OpinionOptions
+from mvrecon.models.rounds.unet import PlainUNet, Precision
+from mvrecon.models.rounds.views import Binned, means
+from mvrecon.models.weighting import fuse
+from mvrecon.parts import HEADS
+from mvrecon.projectors.operator import Projector
+
+#: Channels of the weighting network's scales.
+WIDTHS = (8, 16)
+
+
+class Fused(NamedTuple):
+    """Opinions and what they come to, at the resolution of the round.
+
+    Args:
+        opinions: of each camera, relative to the content's scale.
+        visible: which voxels each camera's frustum holds.
+        weights: of each camera; they sum to one over those that see a voxel.
+        expected: what the others' opinions together predict of each camera's view, in cells of
+            pixels.
+        evidence: for the network in the world: the fused change, the deviation over the cameras,
+            and the fused features.
+    """
+
+    opinions: Float[Tensor, "b m 1 d h w"]
+    visible: Bool[Tensor, "m 1 d h w"]
+    weights: Float[Tensor, "b m 1 d h w"]
+    expected: Float[Tensor, "b 1 m r s"]
+    evidence: Float[Tensor, "b e d h w"]
+
+
+class Opinions(nn.Module):
+    """M camera volumes as changes of the volume x, compared and fused, in the unit of x.
+
+    In its frustum each camera's density meets its own corrected view (in cells of pixels, to
+    rounding; heads whose `keeps_views` is true). The change goes to the world by inverse
+    projection, the mean of all others' changes comes back along the rays (leave-one-out), and what
+    of the camera's view they do not explain is evidence for the weights. Of each camera all this
+    is at the round's resolution: with cells of 8 voxels an eighth of a volume.
+
+    Args:
+        projector: its grid and its rig.
+        options: of the opinions.
+        edge: voxels of the round's cells along each axis.
+        binning: detector pixels joined along each axis.
+        depths: bins along a ray.
+        precision: of the convolutions.
+    """
+
+    def __init__(
+        self,
+        projector: Projector,
+        options: OpinionOptions,
+        edge: int,
+        binning: int,
+        depths: int,
+        precision: Precision = "float32",
+    ):
+        super().__init__()
+        self.edge, self.binning, self.learned = edge, binning, options.learned
+        cameras = Binned.of(projector, binning).cameras
+        self.inside = FixedFrusta(projector.grid.coarsened(edge), cameras, depths)
+        self.head = HEADS.from_config(options.head)
+        self.weighting: PlainUNet | None = None
+        if options.weighted:
+            inputs = 5 + options.learned
+            self.weighting = PlainUNet(3, inputs, 1, WIDTHS, zero=1, precision=precision)
+            self.weighting.last.bias = None  # one number for all cameras weighs none
+
+    def forward(
+        self,
+        volume: Float[Tensor, "b 1 d h w"],
+        views: Float[Tensor, "b 1 m v u"],
+        placed: Float[Tensor, "b m c D r s"] | None,
+        mask: Bool[Tensor, "b 1 d h w"] | None,
+    ) -> Fused:
+        """The opinions about a volume.
+
+        Args:
+            volume: x, relative to the content's scale.
+            views: corrected, relative to the content's scale.
+            placed: of the cameras' network: logits of depth and of confidence, and features; none
+                without a network.
+            mask: voxels whose density may differ from zero; none for all.
+        """
+        frusta, x = self.inside.frusta, self._cells(volume)
+        measured = means(views, self.binning)
+        prior = frusta.to_frusta(x[:, None]).expand(-1, len(frusta.step), -1, -1, -1, -1)
+        density, rest = self._density(prior, measured, placed)
+        # The change is carried to the world, not the density: two warps would blur what x has.
+        prior = prior * frusta.occupied
+        carried = frusta.to_world(torch.cat([density - prior, *rest], dim=2))
+        if mask is not None:
+            carried = carried * self._cells(mask.to(x.dtype), largest=True)[:, None]
+        change, confidence, features = self._parts(carried)
+        mean, variance, _ = leave_one_out(change, frusta.visible)
+        expected = frusta.integrate(prior + frusta.to_frusta(mean) * frusta.occupied)
+        logits = torch.zeros_like(change)
+        if self.weighting is not None:
+            with torch.no_grad():  # a hint for the weights
+                unexplained = frusta.to_world(frusta.spread(measured - expected))
+            ours = x[:, None].expand(-1, change.shape[1], -1, -1, -1, -1)
+            small = MAGNIFIED * torch.cat([change, mean, deviation(variance), unexplained], dim=2)
+            logits = self._logits(torch.cat([small, ours, confidence], dim=2), confidence)
+        fused, weights = fuse(torch.cat([change, features], dim=2), logits, frusta.visible)
+        _, spread = pooled(change, frusta.visible)
+        average, features = fused.split([1, fused.shape[1] - 1], dim=1)
+        small = MAGNIFIED * torch.cat([average, deviation(spread)[:, 0]], dim=1)
+        evidence = torch.cat([small, features], dim=1)
+        return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence)
+
+    def _cells(
+        self, volume: Float[Tensor, "b 1 d h w"], largest: bool = False
+    ) -> Float[Tensor, "b 1 e i x"]:
+        """The mean, or the largest, value of each cell."""
+        if self.edge == 1:
+            return volume
+        return max_pool3d(volume, 2, ceil_mode=True) if largest else halved(volume)
+
+    def _density(
+        self,
+        prior: Float[Tensor, "b m 1 D r s"],
+        measured: Float[Tensor, "b 1 m r s"],
+        placed: Float[Tensor, "b m c D r s"] | None,
+    ) -> tuple[Float[Tensor, "b m 1 D r s"], list[Tensor]]:
+        """The density of each frustum, and what else goes to the world."""
+        frusta = self.inside.frusta
+        if placed is None:
+            even = torch.ones_like(prior)
+            return self.head(torch.zeros_like(prior), even, measured, frusta), []
+        logits, rest = placed.split([1, placed.shape[2] - 1], dim=2)
+        return self.head(logits, prior, measured, frusta), [rest]
+
+    def _parts(self, carried: Float[Tensor, "b m c d h w"]) -> tuple[Tensor, ...]:
+        """Change, confidence (none without a network that gives it) and features."""
+        n_confidence = int(self.learned and self.weighting is not None)
+        rest = carried.shape[2] - 1 - n_confidence
+        return carried.split([1, n_confidence, rest], dim=2)
+
+    def _logits(
+        self,
+        evidence: Float[Tensor, "b m c d h w"],
+        confidence: Float[Tensor, "b m #k d h w"],
+    ) -> Float[Tensor, "b m 1 d h w"]:
+        """One logit for each voxel and camera, camera by camera: fewer features are held."""
+        assert self.weighting is not None
+        logits = torch.stack([self.weighting(one) for one in evidence.unbind(1)], dim=1)
+        return logits + confidence.sum(dim=2, keepdim=True)

@@ -1,0 +1,69 @@
+"""The views of a rig as a cameras' network sees them: cells of pixels as channels."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.models.rounds.cells import from_cells, to_cells
+from mvrecon.models.rounds.evidence import MAGNIFIED, SMALL, Evidence
+from mvrecon.projectors.operator import Projector
+
+#: Images of one camera: its residual, its view, and the sharp part of that.
+IMAGES = 3
+
+
+class Binned(NamedTuple):
+    """A rig whose detector pixels are joined into cells.
+
+    Args:
+        cameras: with cells as pixels.
+        edge: of a cell along each axis, in pixels.
+    """
+
+    cameras: Cameras
+    edge: int
+
+    @classmethod
+    def of(cls, projector: Projector, binning: int) -> "Binned":
+        """The rig of a projector in cells of at most `binning` pixels along each axis: the largest
+        number that divides rows and columns.
+
+        Raises:
+            ValueError: explicit rays, which have no image.
+        """
+        cameras = projector.cameras
+        if not isinstance(cameras, Cameras):
+            raise ValueError(
+                f"Expected a rig of cameras for a cameras' network, got {type(cameras).__name__}"
+            )
+        rows, columns = cameras.shape
+        edge = max(k for k in range(1, binning + 1) if rows % k == 0 and columns % k == 0)
+        return cls(cameras.binned(edge), edge)
+
+
+def image_cells(evidence: Evidence, edge: int) -> Float[Tensor, "b m k r s"]:
+    """Residual, view, and view less its mean over 3 x 3 pixels, with cells as channels."""
+    measured = evidence.measured.squeeze(1)
+    mean = F.avg_pool2d(measured, 3, stride=1, padding=1, count_include_pad=False)
+    residual = MAGNIFIED * evidence.residual.squeeze(1)
+    views = torch.stack([residual, measured, MAGNIFIED * (measured - mean)], dim=2)
+    return to_cells(views.flatten(0, 1), edge).unflatten(0, measured.shape[:2])
+
+
+def correction_of(
+    cells: Float[Tensor, "n k r s"], edge: int, samples: int
+) -> Float[Tensor, "b 1 m v u"]:
+    """The correction of every view, from the cells of all cameras of so many samples."""
+    views = from_cells(cells, edge).unflatten(0, (samples, -1)).transpose(1, 2)
+    return SMALL * views
+
+
+def means(views: Float[Tensor, "b 1 m v u"], edge: int) -> Float[Tensor, "b 1 m r s"]:
+    """The views at a detector of cells: the mean of each cell's pixels."""
+    if edge == 1:
+        return views
+    return F.avg_pool2d(views.flatten(0, 2), edge).unflatten(0, views.shape[:3])

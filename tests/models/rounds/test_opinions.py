@@ -1,0 +1,287 @@
+"""Opinions within a round: what is exact, what depends on what, and what their loss teaches."""
+
+import inspect
+from dataclasses import replace
+
+import pytest
+import torch
+import yaml
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from mvrecon.config import conf_dir
+from mvrecon.geometry.grid import Grid
+from mvrecon.losses import ReconstructionLoss
+from mvrecon.models.output import Reconstruction
+from mvrecon.models.rounds.evidence import Evidence
+from mvrecon.models.rounds.model import Rounds
+from mvrecon.models.rounds.settings import OpinionOptions
+from mvrecon.models.rounds.views import means
+from mvrecon.parts import CAMERAS, PROJECTORS
+from mvrecon.testing import check_model
+from tests.models.rig import small_projector, small_rig
+from tests.models.rounds.test_model import blob
+
+WORLD = {"widths": [4], "resolution": "full"}
+RAYS = {"name": "rays2d", "widths": [4, 6], "depths": 4}
+FRUSTA = {"name": "frustum3d", "widths": [4, 6], "depths": 4}
+
+
+def rounds(cameras=RAYS, **options) -> list:
+    return [{"widths": [4, 6], "cameras": cameras, **options}, WORLD]
+
+
+CHOICES = {
+    "weighted": rounds(opinions={"features": 2}),
+    "mean": rounds(opinions={"fusion": "mean"}),
+    "uniform": rounds(opinions={"prior": "uniform"}),
+    "density": rounds(opinions={"head": {"name": "density"}}),
+    "full": rounds(opinions={}, resolution="full"),
+    "placed alone": rounds({**RAYS, "correct": False}, opinions={}),
+    "one each": rounds({**RAYS, "shared": False}, opinions={}),
+    "frustum3d": rounds(FRUSTA),
+    "frustum3d, one each": rounds({**FRUSTA, "shared": False}),
+    "frustum3d, placed": rounds({**FRUSTA, "correct": False}, opinions={}),
+}
+
+
+def stirred(projector, choice="weighted") -> Rounds:
+    """With random weights everywhere."""
+    torch.manual_seed(2)
+    model = Rounds(projector, CHOICES[choice]).eval()
+    for parameter in model.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    return model
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_choice_of_cameras_keeps_the_contract(choice):
+    check_model("rounds", small_projector(), rounds=CHOICES[choice])
+
+
+@pytest.mark.filterwarnings("ignore:Rays are up to")
+def test_a_hull_of_odd_sizes_and_a_grid_of_one_slice_keep_the_contract():
+    detector = {"pixels": [3, 15], "pixel_mm": 4.0}
+    cameras = CAMERAS.build("circular", n_views=3, sid=100.0, sdd=200.0, detector=detector)
+    grid = Grid.centred(size=(11, 9, 1), spacing=2.0)
+    projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
+    check_model("rounds", projector, rounds=CHOICES["weighted"], support="hull")
+    check_model("rounds", projector, rounds=CHOICES["frustum3d"])
+
+
+def test_the_presets_are_the_defaults_and_have_as_many_weights_as_in_the_docs():
+    projector, counts = small_projector(), []
+    for name in ("rounds_opinions", "rounds_frustum3d"):
+        options = yaml.safe_load((conf_dir() / "model" / f"{name}.yaml").read_text())
+        first = options["rounds"][0]
+        if first["opinions"] is not None:
+            assert OpinionOptions.of(first["opinions"]) == OpinionOptions()
+        model = Rounds(projector, **{key: value for key, value in options.items() if key != "name"})
+        counts.append(round(sum(p.numel() for p in model.parameters()) / 1e6, 2))
+        part = inspect.signature(type(model.rounds[0].cameras)).parameters
+        for option in ("widths", "depths", "binning", "memory"):
+            own = first["cameras"][option]
+            assert (tuple(own) if isinstance(own, list) else own) == part[option].default
+    assert counts == [1.91, 1.87]
+
+
+def test_before_training_a_round_with_opinions_is_the_round_without():
+    projector = small_projector()
+    views = projector(blob(projector))
+    torch.manual_seed(3)
+    plain = Rounds(projector, rounds())
+    for parameter in plain.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    model, n_inputs = Rounds(projector, CHOICES["mean"]), 32
+    own, weights = plain.state_dict(), model.state_dict()
+    for name, value in weights.items():
+        if name == "rounds.0.world.first.weight":
+            value[:, :n_inputs] = own[name]
+            assert not value[:, n_inputs:].any() and value.shape[1] == n_inputs + 6
+        elif "rounds.0.cameras.unet.last" in name:  # correction, depth, features, memory
+            value[:9], value[-8:] = own[name][:9], own[name][9:]
+        elif name in own:
+            value.copy_(own[name])
+    model.load_state_dict(weights)
+    assert torch.allclose(model(views).volume, plain(views).volume, rtol=1e-5, atol=1e-7)
+
+
+def test_choices_at_their_defaults_change_no_bit_of_a_round_without_opinions():
+    projector = small_projector()
+    views = projector(blob(projector))
+    said = rounds({**RAYS, "correct": True, "shared": True}, opinions=None)
+    models = []
+    for options in (rounds(), said):
+        torch.manual_seed(0)
+        models.append(Rounds(projector, options))
+    assert list(models[0].state_dict()) == list(models[1].state_dict())
+    assert not any("opinions" in name for name in models[0].state_dict())
+    assert torch.equal(models[0](views).volume, models[1](views).volume)
+
+
+def test_in_its_frustum_every_camera_meets_its_own_view_whatever_the_network_says():
+    projector = small_projector()
+    opinions = stirred(projector).rounds[0].opinions
+    frusta = opinions.inside.frusta
+    measured = means(projector(blob(projector)), 3)
+    placed = 3 * torch.randn(1, 4, 4, 4, 4, 4)
+    prior = torch.rand(1, 4, 1, 4, 4, 4)
+    density, _ = opinions._density(prior, measured, placed)
+    rays = (frusta.chord > 0).transpose(0, 1).expand_as(measured[:, 0, :, None]).squeeze(2)
+    met = frusta.integrate(density)[:, 0]
+    assert rays.any() and torch.allclose(met[rays], measured[:, 0][rays], rtol=1e-5, atol=1e-5)
+
+
+def test_what_the_others_predict_of_a_view_does_not_depend_on_it():
+    projector = small_projector()
+    opinions = stirred(projector).rounds[0].opinions
+    volume = blob(projector)
+    views = projector(volume).requires_grad_()
+    placed = torch.randn(1, 4, 4, 4, 4, 4)
+    expected = opinions(volume, views, placed, None).expected
+    for m in range(4):
+        (gradient,) = torch.autograd.grad(expected[:, :, m].sum(), views, retain_graph=True)
+        own, others = gradient[:, :, m].abs().max(), gradient.abs().max()
+        assert own < 1e-5 * others
+
+
+def test_in_a_frustum_the_others_are_all_but_the_camera_itself():
+    projector = small_projector()
+    network = stirred(projector, "frustum3d").rounds[0].cameras
+    evidence = _evidence(projector, network)
+    own = evidence.measured.requires_grad_()
+    where = network.inside.frusta.occupied.float()
+    others = network._volumes(evidence, where)[:, :, 4:8]
+    (gradient,) = torch.autograd.grad(others[:, 1].sum(), own)
+    assert gradient[:, :, 1].abs().max() < 1e-5 * gradient.abs().max()
+
+
+def _evidence(projector, network):
+    torch.manual_seed(4)
+    views, x = torch.rand(1, 1, 4, 12, 12), blob(projector)
+    return Evidence(views, 0.1 * views, x, 0.1 * x, torch.zeros(1, *network.memory_shape))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("choice", ["weighted", "frustum3d, placed"])
+def test_weights_belong_to_their_camera_whatever_the_order(choice):
+    grid, cameras = small_rig()
+    order = torch.tensor([2, 0, 3, 1])
+    fields = {name: getattr(cameras, name)[order] for name in ("source", "origin", "u", "v")}
+    turned = PROJECTORS.build("drr", grid=grid, cameras=replace(cameras, **fields))
+    projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
+    views = projector(blob(projector))
+    out, other = stirred(projector, choice)(views), stirred(turned, choice)(views[:, :, order])
+    assert torch.allclose(out.volume, other.volume, atol=1e-5 * out.volume.abs().max())
+    for name in ("opinions", "weights"):
+        own, turned = getattr(out, name)[:, order], getattr(other, name)
+        assert torch.allclose(own, turned, atol=1e-5 * own.abs().max()), name
+    weighed = out.weights.sum(dim=1, keepdim=True)[out.visible.any(dim=0)[None, None]]
+    assert torch.allclose(weighed, torch.ones(()), atol=1e-5)
+    assert out.weights.std(dim=1).max() > 0.01
+
+
+class Largest(TorchDispatchMode):
+    """The number of elements of the largest tensor that any operation gives."""
+
+    size = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for tensor in out if isinstance(out, tuple | list) else [out]:
+            if isinstance(tensor, torch.Tensor) and tensor.is_contiguous():
+                self.size = max(self.size, tensor.untyped_storage().nbytes() // 4)
+        return out
+
+
+@torch.no_grad()
+def test_no_operation_at_half_resolution_gives_a_volume_for_each_camera():
+    projector = small_projector(n_views=16, size=16)
+    model, views = stirred(projector), projector(blob(projector))
+    with Largest() as largest:
+        out = model(views)
+    assert out.opinions is not None and out.opinions.shape == (1, 16, 1, 8, 8, 8)
+    assert largest.size < 16 * 16**3
+
+
+def test_a_loss_relative_to_the_start_is_two_for_the_start_and_knows_no_unit():
+    """One for each camera's opinion, and one for the weighted one; zero where they are right."""
+    torch.manual_seed(0)
+    truth = torch.rand(2, 1, 6, 6, 6)
+    start = truth + 0.1 * torch.rand(2, 1, 6, 6, 6)
+    coarse = torch.nn.functional.avg_pool3d
+    opinions = coarse(start, 2)[:, None].expand(-1, 3, -1, -1, -1, -1)
+    visible = torch.ones(3, 1, 3, 3, 3, dtype=torch.bool)
+    weights = torch.full((2, 3, 1, 3, 3, 3), 1 / 3)
+
+    def gain(opinions, factor=1.0):
+        out = Reconstruction(
+            factor * start, factor * opinions, visible, weights, start=factor * start
+        )
+        loss = ReconstructionLoss(1.0, opinions_gain=1.0)
+        return float(loss(out, {"volume": factor * truth, "views": truth})["opinions_gain"])
+
+    assert gain(opinions) == pytest.approx(2.0, rel=1e-3)
+    assert gain(opinions, 1e-2) == pytest.approx(2.0, rel=1e-3)
+    right = coarse(truth, 2)[:, None].expand_as(opinions)
+    assert gain(right) == pytest.approx(0.0, abs=1e-6)
+    assert gain((opinions + right) / 2) == pytest.approx(0.5, rel=1e-3)
+
+
+def test_with_a_loss_of_their_own_opinions_leave_the_start_and_differ():
+    """Views of one camera are 20 % too bright: opinions come nearer to the truth than the start is,
+    and they are no longer one picture."""
+    projector = small_projector()
+    truth = blob(projector)
+    views = projector(truth)
+    views[:, :, 1] *= 1.2
+    torch.manual_seed(0)
+    model = Rounds(projector, CHOICES["weighted"], start=6)
+    loss = ReconstructionLoss(1.0, volume=0.0, opinions_gain=1.0)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    batch, errors = {"volume": truth, "views": views}, []
+    for _ in range(25):
+        out = model(views)
+        terms = loss(out, batch)
+        errors.append(float(terms["opinions_gain"].detach()))
+        optimizer.zero_grad()
+        terms["total"].backward()
+        optimizer.step()
+    assert errors[-1] < 0.7 * errors[0]
+    opinions = out.opinions.detach()
+    spread = (opinions - opinions.mean(dim=1, keepdim=True)).square().mean()
+    start = torch.nn.functional.avg_pool3d(out.start, 2)[:, None]
+    assert spread > 0.05 * (opinions - start).square().mean()
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"opinions": {}}, ValueError, "opinions in a round with cameras, got cameras: null"),
+        ({"cameras": {"name": "rays2d", "correct": False}}, ValueError, "got neither"),
+        (
+            {"cameras": {"name": "rays2d"}, "opinions": {"fusion": "median"}},
+            ValueError,
+            "weighted or mean, got 'median'",
+        ),
+        (
+            {"cameras": {"name": "rays2d"}, "opinions": {"prior": "flat"}},
+            ValueError,
+            "learned or uniform, got 'flat'",
+        ),
+        (
+            {"cameras": {"name": "rays2d"}, "opinions": {"feature": 3}},
+            TypeError,
+            "no option 'feature'; did you mean 'features'",
+        ),
+        (
+            {"cameras": {"name": "rays2d"}, "opinions": {"head": {"name": "softmax"}}},
+            LookupError,
+            "did you mean 'softmax_depth'",
+        ),
+    ],
+)
+def test_opinions_that_make_no_sense_are_refused(options, error, message):
+    """Opinions of cameras that there are not, and options that they do not have, are refused."""
+    with pytest.raises(error, match=message):
+        Rounds(small_projector(), [options])
