@@ -43,13 +43,8 @@ def rays_of(
     """Where every ray runs, to `reach` voxels beyond the box; formed in float64, then cast to the
     volume's type.
     """
-    centre = lines.new_tensor([(detector[1] - 1) / 2, (detector[0] - 1) / 2])
-    uv = pixel_centres(detector).to(lines) - centre
-    p = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1).reshape(-1, 3)[:, -lines.shape[-1] :]
-    maps = torch.einsum("mkxc,rc->kxmr", lines, p).flatten(2)
+    maps, main = _maps(lines, detector)
     direction, moment = maps[DIRECTION], maps[MOMENT]
-    preference = 1 + TIE * torch.arange(2, -1, -1, device=lines.device, dtype=lines.dtype)
-    main = (direction.detach().abs() * preference[:, None]).argmax(dim=0)
     order = torch.stack([main, (main + 1) % 3, (main + 2) % 3])
     D = direction.gather(0, order)
     M = moment.gather(0, order)
@@ -68,6 +63,24 @@ def rays_of(
         sizes=sizes[order],
         strides=steps[order],
     )
+
+
+def _maps(lines: Tensor, detector: Sequence[int]) -> tuple[Tensor, Int[Tensor, " r"]]:
+    """The linear maps [4 3 r] of `lines.py` at every pixel of every view, and the main axes."""
+    centre = lines.new_tensor([(detector[1] - 1) / 2, (detector[0] - 1) / 2])
+    uv = pixel_centres(detector).to(lines) - centre
+    p = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1).reshape(-1, 3)[:, -lines.shape[-1] :]
+    maps = torch.einsum("mkxc,rc->kxmr", lines, p).flatten(2)
+    direction = maps[DIRECTION]
+    preference = 1 + TIE * torch.arange(2, -1, -1, device=lines.device, dtype=lines.dtype)
+    main = (direction.detach().abs() * preference[:, None]).argmax(dim=0)
+    return maps, main
+
+
+def directions(lines: Tensor, detector: Sequence[int]) -> Float[Tensor, " r"]:
+    """Voxels along its main axis that every ray goes from source to pixel; the sign is its way."""
+    maps, main = _maps(lines, detector)
+    return maps[DIRECTION].gather(0, main[None])[0]
 
 
 def _end(start: Tensor, D: Tensor, w: float) -> Tensor:
@@ -149,7 +162,7 @@ def _trilinear(rays: Rays, samples: int) -> Iterator[tuple[Tensor, Tensor]]:
             yield index, (end - begin) / samples * weight
 
 
-def _weights(
+def weights(
     lines: Tensor,
     window: Sequence[float],
     detector: Sequence[int],
@@ -198,7 +211,7 @@ def project(
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
     total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1])
-    for index, weight in _weights(lines, window, detector, volume.shape[1:], volume, method):
+    for index, weight in weights(lines, window, detector, volume.shape[1:], volume, method):
         total = total + weight * flat[:, index]
     return total.reshape(len(volume), len(lines), *detector)
 
@@ -213,6 +226,6 @@ def backproject(
     """The exact transpose of `project`."""
     d, h, w = shape
     flat, values = views.new_zeros(len(views), (d + 2) * (h + 2) * (w + 2)), views.flatten(1)
-    for index, weight in _weights(lines, window, views.shape[2:], shape, views, method):
+    for index, weight in weights(lines, window, views.shape[2:], shape, views, method):
         flat = flat.index_add(1, index, weight * values)
     return flat.reshape(len(views), d + 2, h + 2, w + 2)[:, 1:-1, 1:-1, 1:-1]

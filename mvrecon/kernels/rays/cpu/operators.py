@@ -42,7 +42,8 @@ class Copy(NamedTuple):
     rows: slice
 
 
-def _piece_sizes(piece: Rig) -> tuple[int, int, int]:
+def piece_sizes(piece: Rig) -> tuple[int, int, int]:
+    """The voxels (x, y, z) of a piece."""
     x, y, z = (high - low for low, high in zip(piece.box[:3], piece.box[3:], strict=True))
     return x, y, z
 
@@ -61,14 +62,14 @@ def _overlap(
     return slice(first - box.low[1], last - box.low[1]), (x, y, z)
 
 
-def _copies(volume: Tensor, occupancy: Occupancy, plan: Plan) -> Iterator[Copy]:
+def copies(volume: Tensor, occupancy: Occupancy, plan: Plan) -> Iterator[Copy]:
     """Pieces of volumes in each layout that the plan needs; `volume` is the occupied box."""
     # grad mode belongs to a thread: in the pool's threads it would be on
     volume = volume.detach()
     into, real = None, wide(volume[:0]).numpy().dtype
     for near, axes in plan.layouts:
         for rows, piece in plan.pieces:
-            into = empty(len(volume), _piece_sizes(piece), near, plan.lanes, real, into)
+            into = empty(len(volume), piece_sizes(piece), near, plan.lanes, real, into)
             overlap, where = _overlap(occupancy, rows, piece)
             to, values = part_of(into, near, where), volume[:, :, overlap]
 
@@ -96,7 +97,7 @@ def project(
     sizes, reads, columns = plan.rig.sizes, plan.reads, plan.upright
     views = np.zeros((len(volume), len(lines), *plan.rig.detector), real)
     upright = len(columns.views) * plan.rig.detector[1]
-    for copy in _copies(volume, occupancy, plan):
+    for copy in copies(volume, occupancy, plan):
 
         def add_rows(first: int, last: int, copy=copy) -> None:
             room, units = room_of(copy.rig, copy.store), Units(copy.axes, first, last)
@@ -125,7 +126,7 @@ def backproject(
     volume, into = np.zeros((len(views), *occupancy.box.shape), values.dtype), None
     for near, axes in plan.layouts:
         for rows, piece in plan.pieces:
-            into = empty(len(views), _piece_sizes(piece), near, plan.lanes, values.dtype, into)
+            into = empty(len(views), piece_sizes(piece), near, plan.lanes, values.dtype, into)
             overlap, where = _overlap(occupancy, rows, piece)
             source, part = part_of(into, near, where), volume[:, :, overlap]
             for axis in range(3):
@@ -148,7 +149,7 @@ def _spread_rows(values: Store, piece: Rig, axis: int, reads: Reads, views: np.n
         slabs = Slabs(axis, piece.box[axis] + low, piece.box[axis] + high)
         backproject_slabs(values, piece, room_of(piece, values), reads, views, slabs)
 
-    share(add_slabs, _piece_sizes(piece)[axis], views.size * max(piece.sizes))
+    share(add_slabs, piece_sizes(piece)[axis], views.size * max(piece.sizes))
 
 
 def _spread_columns(
@@ -161,7 +162,7 @@ def _spread_columns(
         slabs = Slabs(axis, piece.box[axis] + low, piece.box[axis] + high)
         backproject_columns(values, piece, room, columns, views, slabs)
 
-    share(add_slabs, _piece_sizes(piece)[axis], views.size * max(piece.sizes))
+    share(add_slabs, piece_sizes(piece)[axis], views.size * max(piece.sizes))
 
 
 def lines_vjp(
@@ -180,7 +181,7 @@ def lines_vjp(
     plan = ray_plan_of(scene, occupancy, len(volume), wide(volume[:0]).element_size())
     sizes, reads = plan.rig.sizes, plan.reads
     total = torch.zeros(lines.shape, dtype=torch.float64)
-    for copy in _copies(volume, occupancy, plan):
+    for copy in copies(volume, occupancy, plan):
         # a row or column of pixels has its own sum, so that threads change no bit
         change = np.zeros((len(lines), max(plan.rig.detector), *lines.shape[1:]))
 

@@ -157,6 +157,12 @@ def ray_plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int)
     return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, parts)
 
 
+def whole_plan_of(scene: Scene, occupancy: Occupancy) -> Plan:
+    """The plan that goes ray by ray, a ray through all of the volume at once."""
+    rig = scene.rig(occupancy)
+    return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, 1)
+
+
 def _made(rig: Rig, occupancy: Occupancy, lanes: int, parts: int) -> Plan:
     upright = columnar(rig) if rig.method != TRILINEAR else np.zeros(len(rig.lines), bool)
     return _plan(rig, occupancy, upright, lanes, parts)

@@ -1,0 +1,88 @@
+"""The oracle of attenuated rays: the operators of `attenuated_ops.py` in plain torch.
+
+It goes through the cells of `reference.py`; derivatives of any order, in the rays too, by torch
+itself.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.kernels.rays.reference import directions, weights
+
+#: Cells that one segment of constant attenuation has.
+CELLS = {"joseph": 4, "siddon": 1, "trilinear": 8}
+#: Below this optical depth (1 - exp(-m)) / m is its series.
+SERIES = 1e-3
+
+
+def project(
+    volume: Float[Tensor, "n d h w"],
+    mu: Float[Tensor, "d h w"],
+    lines: Float[Tensor, "m 4 3 3"],
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+) -> Float[Tensor, "n m v u"]:
+    """Attenuated line integrals of volumes, in mm times their unit.
+
+    A segment i of a ray that emits l_i, of the optical depth m_i, gives l_i exp(-A_i)
+    (1 - exp(-m_i)) / m_i, where A_i is the sum of the depths on its way to the detector.
+
+    Args:
+        volume: emission per mm.
+        mu: linear attenuation in 1/mm on the same grid.
+        lines, window, detector, method: as in `reference.project`.
+    """
+    flat = F.pad(volume, (1, 1) * 3).flatten(1)
+    total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1])
+    for index, weight in _attenuated(mu.to(volume), lines, window, detector, method):
+        total = total + weight * flat[:, index]
+    return total.reshape(len(volume), len(lines), *detector)
+
+
+def backproject(
+    views: Float[Tensor, "n m v u"],
+    mu: Float[Tensor, "d h w"],
+    lines: Float[Tensor, "m 4 3 3"],
+    window: Sequence[float],
+    method: str,
+) -> Float[Tensor, "n d h w"]:
+    """The exact transpose of `project` in the emission."""
+    d, h, w = mu.shape
+    flat, values = views.new_zeros(len(views), (d + 2) * (h + 2) * (w + 2)), views.flatten(1)
+    for index, weight in _attenuated(mu.to(views), lines, window, views.shape[2:], method):
+        flat = flat.index_add(1, index, weight * values)
+    return flat.reshape(len(views), d + 2, h + 2, w + 2)[:, 1:-1, 1:-1, 1:-1]
+
+
+def _attenuated(
+    mu: Tensor, lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Every flat index and weight, in mm, with the transmission from there to the detector."""
+    entries = list(weights(lines, window, detector, mu.shape, mu, method))
+    flat, size = F.pad(mu, (1, 1) * 3).flatten(), CELLS[method.partition(":")[0]]
+    each = torch.stack([weight * flat[index] for index, weight in entries])
+    depth = each.unflatten(0, (-1, size)).sum(dim=1)
+    # counts run along the ray's direction, to its end on the detector's side
+    upwards = directions(lines, detector) > 0
+    before = torch.where(upwards, _above(depth), _above(depth.flip(0)).flip(0))
+    shares = torch.exp(-before) * mean_transmission(depth)
+    for i, (index, weight) in enumerate(entries):
+        yield index, weight * shares[i // size]
+
+
+def _above(depth: Float[Tensor, "k r"]) -> Float[Tensor, "k r"]:
+    """The sum of the depths of all later segments."""
+    later = depth.flip(0).cumsum(dim=0)[:-1].flip(0)
+    return torch.cat([later, torch.zeros_like(depth[:1])])
+
+
+def mean_transmission(m: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Mean transmission (1 - exp(-m)) / m within segments of optical depth m >= 0, no unit."""
+    safe = torch.where(m < SERIES, torch.ones_like(m), m)
+    series = 1 - m / 2 * (1 - m / 3 * (1 - m / 4 * (1 - m / 5)))
+    return torch.where(m < SERIES, series, -torch.expm1(-safe) / safe)

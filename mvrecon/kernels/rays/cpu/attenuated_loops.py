@@ -1,0 +1,133 @@
+"""The compiled loops over attenuated rays: those of `loops.py`, each cell times the transmission
+from it to the detector.
+
+The volume of attenuation is volume `at` of a store of its own, in the layout of the emission's.
+Counts run towards the end where w, see `cameras/camera.py`, is greatest.
+"""
+
+from collections import namedtuple
+
+from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon.kernels.rays.cpu import joseph, siddon
+from mvrecon.kernels.rays.cpu.loops import silent, walk
+from mvrecon.kernels.rays.cpu.rig import steps_of
+from mvrecon.kernels.rays.cpu.summation import visit
+from mvrecon.kernels.rays.cpu.transmission import (
+    bend,
+    cells,
+    integrals,
+    segments_of,
+    transmit,
+    weigh,
+)
+from mvrecon.kernels.rays.trace import SIDDON, from_centre, main_axis, trace, within
+from mvrecon.kernels.rays.trace import at as component
+
+#: A store and which of its volumes is the attenuation; what one thread works in: see `loops.Room`
+#: and `transmission.Path`.
+Matter = namedtuple("Matter", ["store", "at"])
+Desk = namedtuple("Desk", ["room", "path"])
+
+
+@scalar
+def _attenuate(matter, rig, ray, line, pixel, steps, desk):
+    """Make the cells of a whole ray, and the shares of its segments; returns what `visit` does."""
+    visited = visit(rig, ray, (ray.first, ray.last), desk.room)
+    cells(rig, ray, visited[0], steps, desk.room)
+    integrals(matter.store, matter.at, rig, ray, steps, desk.room, visited[0], desk.path.depth)
+    ascending = component(line, 0, ray.axis, pixel[0], pixel[1]) < 0
+    transmit(desk.path, segments_of(rig, visited[0]), ascending)
+    return visited
+
+
+@scalar
+def _spread(store, n, rig, ray, span, steps, desk, value):
+    """Add a value to volume n along a span of a ray, each segment with its share."""
+    visited = visit(rig, ray, span, desk.room)
+    cells(rig, ray, visited[0], steps, desk.room)
+    weigh(rig, desk.room, desk.path, span[0] - ray.first, visited[0])
+    if rig.method == SIDDON:
+        siddon.spread(store, n, visited[0], desk.room, value)
+    else:
+        joseph.spread(store, n, steps, visited[0], desk.room, value)
+
+
+@compiled
+def project_rows(store, matter, rig, desk, reads, views, units):
+    """Add to views [n m v u] the attenuated sums of volumes along the rays of some units."""
+    for unit in range(units.first, units.last):
+        view, place, start, stop = walk(rig, reads.spans, unit)
+        m, tall = reads.views[view], reads.tall[view]
+        line = rig.lines[m]
+        for other in range(start, stop):
+            u, v = (place, other) if tall else (other, place)
+            pixel = from_centre(rig, u, v)
+            axis = main_axis(line, pixel[0], pixel[1])
+            if not units.axes[axis]:
+                continue
+            ray = trace(line, axis, store.near, pixel, rig, rig.method)
+            steps = steps_of(rig, store, axis)
+            visited = _attenuate(matter, rig, ray, line, pixel, steps, desk)
+            weigh(rig, desk.room, desk.path, 0, visited[0])
+            length = store.values.dtype.type(ray.length)
+            for n in range(len(views)):
+                if rig.method == SIDDON:
+                    views[n, m, v, u] += length * siddon.sum(store, n, visited, desk.room)
+                else:
+                    views[n, m, v, u] += length * joseph.sum(store, n, steps, visited, desk.room)
+
+
+@compiled
+def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
+    """Spread views [n m v u] into slabs along attenuated rays: the transpose of `project_rows`."""
+    steps = steps_of(rig, store, slabs.axis)
+    for unit in range(len(reads.views) * max(rig.detector)):
+        view, place, start, stop = walk(rig, reads.spans, unit)
+        m, tall = reads.views[view], reads.tall[view]
+        line = rig.lines[m]
+        for other in range(start, stop):
+            u, v = (place, other) if tall else (other, place)
+            pixel = from_centre(rig, u, v)
+            if silent(views, m, v, u) or main_axis(line, pixel[0], pixel[1]) != slabs.axis:
+                continue
+            ray = trace(line, slabs.axis, store.near, pixel, rig, rig.method)
+            span = within(ray, slabs.low, slabs.high)
+            if span[0] >= span[1]:
+                continue
+            _attenuate(matter, rig, ray, line, pixel, steps, desk)
+            length = store.values.dtype.type(ray.length)
+            for n in range(len(views)):
+                _spread(store, n, rig, ray, span, steps, desk, length * views[n, m, v, u])
+
+
+@compiled
+def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
+    """Spread into volume 0 of a store the derivative of sum(views * projections of the sources) by
+    the attenuation.
+    """
+    steps, source = steps_of(rig, store, slabs.axis), desk.path.source
+    for unit in range(len(reads.views) * max(rig.detector)):
+        view, place, start, stop = walk(rig, reads.spans, unit)
+        m, tall = reads.views[view], reads.tall[view]
+        line = rig.lines[m]
+        for other in range(start, stop):
+            u, v = (place, other) if tall else (other, place)
+            pixel = from_centre(rig, u, v)
+            if silent(views, m, v, u) or main_axis(line, pixel[0], pixel[1]) != slabs.axis:
+                continue
+            ray = trace(line, slabs.axis, store.near, pixel, rig, rig.method)
+            span = within(ray, slabs.low, slabs.high)
+            if span[0] >= span[1]:
+                continue
+            visited = _attenuate(matter, rig, ray, line, pixel, steps, desk)
+            count = segments_of(rig, visited[0])
+            emission = desk.path.emission
+            for i in range(count):
+                source[i] = 0
+            for n in range(len(views)):
+                integrals(sources, n, rig, ray, steps, desk.room, visited[0], emission)
+                for i in range(count):
+                    source[i] += views[n, m, v, u] * emission[i]
+            bend(desk.path, count, component(line, 0, slabs.axis, pixel[0], pixel[1]) < 0)
+            length = store.values.dtype.type(ray.length)
+            _spread(store, 0, rig, ray, span, steps, desk, length)

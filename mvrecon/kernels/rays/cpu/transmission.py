@@ -1,0 +1,150 @@
+"""The transmission to each segment of one ray, from its optical depths; the step of `attenuated.py`.
+
+A segment is the part of a ray in which attenuation is taken as constant: a slab for Joseph's
+method, the part in one cell for Siddon's. Of what it emits the share
+
+    exp(-A) (1 - exp(-m)) / m
+
+comes out at the ray's end on the detector's side: m its optical depth mu D, A the sum of those on
+the way out (Gullberg et al., Phys. Med. Biol. 30 (1985) 799).
+"""
+
+from collections import namedtuple
+from math import exp, expm1
+
+import numpy as np
+
+from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.rays.cpu import joseph, siddon
+from mvrecon.kernels.rays.cpu.lanes import between
+from mvrecon.kernels.rays.trace import SIDDON
+
+#: Per segment: optical depth, mean transmission within the segment and then from all of it to the
+#: end, transmission from its near end, what it emits, and that of one volume.
+Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission"])
+#: Up to this optical depth (1 - exp(-m)) / m and its slope are series; the terms that are left out
+#: are below the last digit of double precision.
+SERIES = 0.5
+
+
+def path_of(room) -> Path:
+    """Room for the segments of one ray of a thread."""
+    return Path(*np.empty((5, 3 * len(room.one)), room.one.dtype))
+
+
+@scalar
+def segments_of(rig, slabs):
+    """How many segments so many slabs are, or where those of the next slab begin."""
+    return 3 * slabs if rig.method == SIDDON else slabs
+
+
+@scalar
+def mean_transmission(m):
+    """(1 - exp(-m)) / m for 0 <= m <= SERIES: a segment's own, sum (-m)^k / (k + 1)!."""
+    sums = type(m)(1)
+    for k in range(14, 1, -1):
+        sums = type(m)(1) - m * sums * type(m)(1.0 / k)
+    return sums
+
+
+@scalar
+def slope_of_mean(m):
+    """The derivative of (1 - exp(-m)) / m by m >= 0."""
+    if m > SERIES:
+        return (exp(-m) * (1 + m) - 1) / (m * m)
+    sums = 1.0
+    for k in range(14, 2, -1):  # -sum (k + 1) (-m)^k / (k + 2)!
+        sums = 1.0 - m * sums * (k - 1) / (k * (k - 2.0))
+    return -0.5 * sums
+
+
+@scalar
+def cells(rig, ray, count, steps, room):
+    """The cells of a ray in the slabs that were visited; see `joseph.cells`, `siddon.cells`."""
+    if rig.method == SIDDON:
+        siddon.cells(ray, count, steps, room)
+    else:
+        joseph.cells(ray, count, steps, room)
+
+
+@scalar
+def integrals(store, n, rig, ray, steps, room, count, into):
+    """The integrals of volume n over the segments of a ray, in mm times its unit."""
+    real = into.dtype.type
+    length = real(ray.length)
+    if rig.method == SIDDON:
+        index0, index1, index2, part0, part1, part2 = siddon.crossed(room)
+        flat, offset = store.values, np.uint64(n * store.size)
+        for i in range(np.uint32(count)):
+            into[3 * i] = length * part0[i] * flat[np.uint64(index0[i]) + offset]
+            into[3 * i + 1] = length * part1[i] * flat[np.uint64(index1[i]) + offset]
+            into[3 * i + 2] = length * part2[i] * flat[np.uint64(index2[i]) + offset]
+        return
+    joseph.fetch(store.pairs, n * store.size, steps.far, count, room)
+    y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
+    one = real(1)
+    for i in range(np.uint32(count)):
+        rest = one - z[i]
+        lower = between(low[2 * i], low[2 * i + 1], z[i], rest)
+        upper = between(high[2 * i], high[2 * i + 1], z[i], rest)
+        into[i] = length * share[i] * between(lower, upper, y[i], one - y[i])
+
+
+@scalar
+def transmit(path, number, ascending):
+    """From optical depths to shares: from the first segment on when `ascending`, else from the
+    last.
+    """
+    depth, share, passed = path.depth, path.share, path.passed
+    real = depth.dtype.type
+    largest = real(0)
+    for i in range(np.uint32(number)):
+        largest = max(largest, depth[i])
+    if largest <= real(SERIES):
+        for i in range(np.uint32(number)):
+            share[i] = mean_transmission(depth[i])
+    else:
+        for i in range(np.uint32(number)):
+            m = depth[i]
+            share[i] = real(-expm1(-m) / m) if m > real(SERIES) else mean_transmission(m)
+    left = 1.0  # in double, since it is a product of as many factors as there are segments
+    for j in range(np.uint32(number)):
+        i = j if ascending else np.uint32(number) - np.uint32(1) - j
+        passed[i] = real(left)
+        mean = share[i]
+        share[i] = real(left * mean)
+        left -= left * (depth[i] * mean)
+
+
+@scalar
+def weigh(rig, room, path, first, count):
+    """The cells of a room with their shares, those of the slabs from `first` on."""
+    share = path.share
+    if rig.method == SIDDON:
+        part0, part1, part2 = siddon.crossed(room)[3:]
+        for i in range(np.uint32(count)):
+            k = 3 * (first + i)
+            part0[i] *= share[k]
+            part1[i] *= share[k + 1]
+            part2[i] *= share[k + 2]
+        return
+    one = room.three
+    for i in range(np.uint32(count)):
+        one[i] *= share[first + i]
+
+
+@scalar
+def bend(path, number, ascending):
+    """Into `share`: the derivative of the sum of what all segments send out by their optical
+    depths.
+
+    A segment weakens itself and all those beyond it.
+    """
+    depth, share, passed, source = path.depth, path.share, path.passed, path.source
+    beyond = 0.0
+    for j in range(np.uint32(number)):
+        i = np.uint32(number) - np.uint32(1) - j if ascending else j
+        sent = np.float64(share[i]) * source[i]
+        own = np.float64(passed[i]) * source[i] * slope_of_mean(np.float64(depth[i]))
+        share[i] = share.dtype.type(own - beyond)
+        beyond += sent
