@@ -107,7 +107,9 @@ def _in_torch(volume, mu, lines, window, detector, method):
 
 
 def _act(volume, mu, **rays):
-    return reference.project(volume.to(torch.promote_types(volume.dtype, torch.float32)), mu, **rays)
+    return reference.project(
+        volume.to(torch.promote_types(volume.dtype, torch.float32)), mu, **rays
+    )
 
 
 def _back_in_torch(views, mu, lines, window, method):

@@ -30,22 +30,31 @@ Desk = namedtuple("Desk", ["room", "path"])
 
 
 @scalar
-def _attenuate(matter, rig, ray, line, pixel, steps, desk):
-    """Make the cells of a whole ray, and the shares of its segments; returns what `visit` does."""
-    visited = visit(rig, ray, (ray.first, ray.last), desk.room)
+def ascends(line, ray, pixel):
+    """Whether the slab at the detector's end of a ray is its first."""
+    return component(line, 0, ray.axis, pixel[0], pixel[1]) < 0
+
+
+@scalar
+def _attenuate(matter, rig, ray, part, ascending, steps, desk):
+    """Make the cells of a part of a ray that begins at the detector's end, and the shares of its
+    segments; returns what `visit` does.
+    """
+    visited = visit(rig, ray, part, desk.room)
     cells(rig, ray, visited[0], steps, desk.room)
     integrals(matter.store, matter.at, rig, ray, steps, desk.room, visited[0], desk.path.depth)
-    ascending = component(line, 0, ray.axis, pixel[0], pixel[1]) < 0
     transmit(desk.path, segments_of(rig, visited[0]), ascending)
     return visited
 
 
 @scalar
-def _spread(store, n, rig, ray, span, steps, desk, value):
-    """Add a value to volume n along a span of a ray, each segment with its share."""
+def _spread(store, n, rig, ray, span, first, steps, desk, value):
+    """Add a value to volume n along a span of a ray, each segment with its share; these begin with
+    slab `first`.
+    """
     visited = visit(rig, ray, span, desk.room)
     cells(rig, ray, visited[0], steps, desk.room)
-    weigh(rig, desk.room, desk.path, span[0] - ray.first, visited[0])
+    weigh(rig, desk.room, desk.path, span[0] - first, visited[0])
     if rig.method == SIDDON:
         siddon.spread(store, n, visited[0], desk.room, value)
     else:
@@ -67,7 +76,8 @@ def project_rows(store, matter, rig, desk, reads, views, units):
                 continue
             ray = trace(line, axis, store.near, pixel, rig, rig.method)
             steps = steps_of(rig, store, axis)
-            visited = _attenuate(matter, rig, ray, line, pixel, steps, desk)
+            part, ascending = (ray.first, ray.last), ascends(line, ray, pixel)
+            visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
             weigh(rig, desk.room, desk.path, 0, visited[0])
             length = store.values.dtype.type(ray.length)
             for n in range(len(views)):
@@ -94,10 +104,13 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
             span = within(ray, slabs.low, slabs.high)
             if span[0] >= span[1]:
                 continue
-            _attenuate(matter, rig, ray, line, pixel, steps, desk)
+            ascending = ascends(line, ray, pixel)
+            part = (ray.first, span[1]) if ascending else (span[0], ray.last)
+            _attenuate(matter, rig, ray, part, ascending, steps, desk)
             length = store.values.dtype.type(ray.length)
             for n in range(len(views)):
-                _spread(store, n, rig, ray, span, steps, desk, length * views[n, m, v, u])
+                value = length * views[n, m, v, u]
+                _spread(store, n, rig, ray, span, part[0], steps, desk, value)
 
 
 @compiled
@@ -119,7 +132,8 @@ def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
             span = within(ray, slabs.low, slabs.high)
             if span[0] >= span[1]:
                 continue
-            visited = _attenuate(matter, rig, ray, line, pixel, steps, desk)
+            part, ascending = (ray.first, ray.last), ascends(line, ray, pixel)
+            visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
             count = segments_of(rig, visited[0])
             emission = desk.path.emission
             for i in range(count):
@@ -128,6 +142,6 @@ def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
                 integrals(sources, n, rig, ray, steps, desk.room, visited[0], emission)
                 for i in range(count):
                     source[i] += views[n, m, v, u] * emission[i]
-            bend(desk.path, count, component(line, 0, slabs.axis, pixel[0], pixel[1]) < 0)
+            bend(desk.path, count, ascending)
             length = store.values.dtype.type(ray.length)
-            _spread(store, 0, rig, ray, span, steps, desk, length)
+            _spread(store, 0, rig, ray, span, ray.first, steps, desk, length)

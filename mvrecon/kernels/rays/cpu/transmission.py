@@ -20,8 +20,8 @@ from mvrecon.kernels.rays.cpu.lanes import between
 from mvrecon.kernels.rays.trace import SIDDON
 
 #: Per segment: optical depth, mean transmission within the segment and then from all of it to the
-#: end, transmission from its near end, what it emits, and that of one volume.
-Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission"])
+#: end, transmission from its near end, what it emits, that of one volume, and its own derivative.
+Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "own"])
 #: Up to this optical depth (1 - exp(-m)) / m and its slope are series; the terms that are left out
 #: are below the last digit of double precision.
 SERIES = 0.5
@@ -29,7 +29,7 @@ SERIES = 0.5
 
 def path_of(room) -> Path:
     """Room for the segments of one ray of a thread."""
-    return Path(*np.empty((5, 3 * len(room.one)), room.one.dtype))
+    return Path(*np.empty((6, 3 * len(room.one)), room.one.dtype))
 
 
 @scalar
@@ -49,13 +49,12 @@ def mean_transmission(m):
 
 @scalar
 def slope_of_mean(m):
-    """The derivative of (1 - exp(-m)) / m by m >= 0."""
-    if m > SERIES:
-        return (exp(-m) * (1 + m) - 1) / (m * m)
-    sums = 1.0
-    for k in range(14, 2, -1):  # -sum (k + 1) (-m)^k / (k + 2)!
-        sums = 1.0 - m * sums * (k - 1) / (k * (k - 2.0))
-    return -0.5 * sums
+    """The derivative of (1 - exp(-m)) / m for 0 <= m <= SERIES, -sum k (-m)^(k - 1) / (k + 1)!."""
+    real = type(m)
+    sums = real(1)
+    for k in range(14, 2, -1):
+        sums = real(1) - m * sums * real((k - 1.0) / (k * (k - 2.0)))
+    return real(-0.5) * sums
 
 
 @scalar
@@ -91,22 +90,27 @@ def integrals(store, n, rig, ray, steps, room, count, into):
 
 
 @scalar
+def deepest(depth, number):
+    """The greatest of the optical depths."""
+    most = depth.dtype.type(0)
+    for i in range(np.uint32(number)):
+        most = max(most, depth[i])
+    return most
+
+
+@scalar
 def transmit(path, number, ascending):
     """From optical depths to shares: from the first segment on when `ascending`, else from the
     last.
     """
     depth, share, passed = path.depth, path.share, path.passed
     real = depth.dtype.type
-    largest = real(0)
     for i in range(np.uint32(number)):
-        largest = max(largest, depth[i])
-    if largest <= real(SERIES):
+        share[i] = mean_transmission(depth[i])
+    if deepest(depth, number) > real(SERIES):  # rare
         for i in range(np.uint32(number)):
-            share[i] = mean_transmission(depth[i])
-    else:
-        for i in range(np.uint32(number)):
-            m = depth[i]
-            share[i] = real(-expm1(-m) / m) if m > real(SERIES) else mean_transmission(m)
+            if depth[i] > real(SERIES):
+                share[i] = real(-expm1(-depth[i]) / depth[i])
     left = 1.0  # in double, since it is a product of as many factors as there are segments
     for j in range(np.uint32(number)):
         i = j if ascending else np.uint32(number) - np.uint32(1) - j
@@ -141,10 +145,19 @@ def bend(path, number, ascending):
     A segment weakens itself and all those beyond it.
     """
     depth, share, passed, source = path.depth, path.share, path.passed, path.source
+    own, real = path.own, depth.dtype.type
+    for i in range(np.uint32(number)):
+        own[i] = slope_of_mean(depth[i])
+    if deepest(depth, number) > real(SERIES):
+        for i in range(np.uint32(number)):
+            m = np.float64(depth[i])
+            if m > SERIES:
+                own[i] = real((exp(-m) * (1 + m) - 1) / (m * m))
+    for i in range(np.uint32(number)):
+        own[i] *= passed[i] * source[i]
+        source[i] *= share[i]
     beyond = 0.0
     for j in range(np.uint32(number)):
         i = np.uint32(number) - np.uint32(1) - j if ascending else j
-        sent = np.float64(share[i]) * source[i]
-        own = np.float64(passed[i]) * source[i] * slope_of_mean(np.float64(depth[i]))
-        share[i] = share.dtype.type(own - beyond)
-        beyond += sent
+        share[i] = real(own[i] - beyond)
+        beyond += source[i]
