@@ -1,11 +1,10 @@
 """The attenuated ray transform: what emitters send along rays, weakened on the way to the detector."""
 
 from collections.abc import Sequence
-from copy import copy
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
@@ -20,11 +19,13 @@ from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.pixel_integral import PixelIntegral
 from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.projectors.skipping import check_support, within
+from mvrecon.projectors.skipping import within
 
 #: Linear attenuation in 1/mm that nothing in a patient reaches from 70 keV up (cortical bone 0.058,
 #: titanium 0.07), and that water and tissue in 1/cm exceed.
 DENSEST = 0.1
+#: The options of `RayTransform` that an operator for some of the cameras shares.
+OPTIONS = ("method", "backend", "rays_per_pixel", "skip", "support")
 
 
 class AttenuatedTransform(RayTransform):
@@ -66,7 +67,6 @@ class AttenuatedTransform(RayTransform):
         check_mu(mu, grid)
         self.register_buffer("mu", mu.to(self.device), persistent=False)
         self.clear = not mu.requires_grad and not bool((mu != 0).any())
-        self.options = options
 
     def project_along(
         self,
@@ -81,10 +81,9 @@ class AttenuatedTransform(RayTransform):
         check_floating(volume, "a volume")
         x = volume.flatten(0, 1)
         x = wide(x if self.support is None else within(x, self.support))
-        rays = lines, self.ray_extent, list(detector), self.kernel
-        if self._compiled(volume, lines):
-            return attenuated_ops.project(x, self.mu, *rays)
-        return attenuated_reference.project(x, self.mu, *rays)
+        kernels = attenuated_ops if self._compiled(volume, lines) else attenuated_reference
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector), self.kernel
+        return kernels.project(x, self.mu, *rays)[..., 0]
 
     def backproject_along(
         self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]
@@ -92,9 +91,9 @@ class AttenuatedTransform(RayTransform):
         """The transpose of `project_along`."""
         if self.clear:
             return super().backproject_along(views, lines)
-        rays = lines, self.ray_extent, self.kernel
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, self.kernel
         kernels = attenuated_ops if self._compiled(views, lines) else attenuated_reference
-        volumes = kernels.backproject(views, self.mu, *rays)
+        volumes = kernels.backproject(views[..., None], self.mu, *rays)
         return volumes if self.support is None else within(volumes, self.support)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
@@ -103,12 +102,6 @@ class AttenuatedTransform(RayTransform):
             return super().cropped(box, views)
         some = self if views is None else self._of_views(list(views))
         return LinearOperator.cropped(some, box)
-
-    def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
-        """The same for emission in another support, or anywhere; attenuation is not cut."""
-        other = copy(super().with_support(check_support(support, self.grid)))
-        other.options = {**self.options, "support": support}
-        return other
 
     def mirror(self) -> Mirror | None:
         """A plane that mirrors the attenuation into itself, too."""
@@ -120,8 +113,10 @@ class AttenuatedTransform(RayTransform):
         return super().pixel_integral() if self.clear else None
 
     def _of_views(self, views: list[int]) -> "AttenuatedTransform":
-        rig = self.rays[torch.tensor(views, device=self.rays.source.device)]
-        return AttenuatedTransform(self.grid, rig, self.mu, **self.options).to(self.device)
+        rig = self.cameras
+        options = {name: getattr(self, name) for name in OPTIONS}
+        some = rig[torch.tensor(views, device=rig.source.device)]
+        return AttenuatedTransform(self.grid, some, self.mu, **options).to(self.device)
 
     def _compiled(self, tensor: Tensor, lines: Tensor) -> bool:
         """Whether the CPU's kernels serve; they know no gradient in the rays."""
@@ -142,7 +137,7 @@ def check_mu(mu: Tensor, grid: Grid) -> None:
     check_floating(mu, "mu")
     if not mu.isfinite().all():
         raise ValueError("Expected finite attenuation in 1/mm, got values that are not")
-    least, most = (value.item() for value in mu.detach().aminmax())
+    least, most = mu.detach().min().item(), mu.detach().max().item()
     if least < 0:
         raise ValueError(f"Expected attenuation in 1/mm, zero or more, got {least:g}; is it HU?")
     if most > DENSEST:

@@ -22,26 +22,27 @@ def _project(
     volume: Tensor,
     mu: Tensor,
     lines: Tensor,
+    layers: Tensor,
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
 ) -> Tensor:
-    """Attenuated integrals of volumes [n d h w] as views [n m v u]; see
+    """Attenuated integrals of volumes [n d h w] as views [n m v u k]; see
     `attenuated_reference.project`.
     """
     from mvrecon.kernels.rays.cpu import attenuated as cpu
 
-    return cpu.project(volume, mu, lines, window, detector, method)
+    return cpu.project(volume, mu, lines, layers, window, detector, method)
 
 
 @torch.library.custom_op("mvrecon::backproject_attenuated", mutates_args=(), device_types="cpu")
 def _backproject(
-    views: Tensor, mu: Tensor, lines: Tensor, window: Sequence[float], method: str
+    views: Tensor, mu: Tensor, lines: Tensor, layers: Tensor, window: Sequence[float], method: str
 ) -> Tensor:
-    """The exact transpose of `project` in the emission: views [n m v u] to volumes [n d h w]."""
+    """The exact transpose of `project` in the emission: views [n m v u k] to volumes [n d h w]."""
     from mvrecon.kernels.rays.cpu import attenuated as cpu
 
-    return cpu.backproject(views, mu, lines, window, method)
+    return cpu.backproject(views, mu, lines, layers, window, method)
 
 
 @torch.library.custom_op("mvrecon::attenuation_vjp", mutates_args=(), device_types="cpu")
@@ -50,59 +51,60 @@ def _mu_vjp(
     views: Tensor,
     mu: Tensor,
     lines: Tensor,
+    layers: Tensor,
     window: Sequence[float],
     method: str,
 ) -> Tensor:
     """The derivative of <views, project(volume, mu)> by the attenuation mu [d h w]."""
     from mvrecon.kernels.rays.cpu import attenuated as cpu
 
-    return cpu.mu_vjp(volume, views, mu, lines, window, method).to(mu.dtype)
+    return cpu.mu_vjp(volume, views, mu, lines, layers, window, method).to(mu.dtype)
 
 
 @_project.register_fake
-def _(volume, mu, lines, window, detector, method):
+def _(volume, mu, lines, layers, window, detector, method):
     wide = torch.float64 if volume.dtype == torch.float64 else torch.float32
-    return volume.new_empty(volume.shape[0], lines.shape[0], *detector, dtype=wide)
+    return volume.new_empty(volume.shape[0], lines.shape[0], *detector, layers.shape[1], dtype=wide)
 
 
 @_backproject.register_fake
-def _(views, mu, lines, window, method):
+def _(views, mu, lines, layers, window, method):
     return views.new_empty(views.shape[0], *mu.shape)
 
 
 @_mu_vjp.register_fake
-def _(volume, views, mu, lines, window, method):
+def _(volume, views, mu, lines, layers, window, method):
     return mu.new_empty(mu.shape)
 
 
 def _keep(ctx, inputs, output):
-    first, mu, lines, ctx.window, *rest = inputs
-    ctx.method, ctx.dtype, ctx.detector = rest[-1], first.dtype, list(first.shape[2:])
-    ctx.save_for_backward(first if ctx.needs_input_grad[1] else None, mu, lines)
+    first, mu, lines, layers, ctx.window, *rest = inputs
+    ctx.method, ctx.dtype, ctx.detector = rest[-1], first.dtype, list(first.shape[2:4])
+    ctx.save_for_backward(first if ctx.needs_input_grad[1] else None, mu, lines, layers)
 
 
 def _project_back(ctx, views):
-    volume, mu, lines = ctx.saved_tensors
+    volume, mu, lines, layers = ctx.saved_tensors
     by_volume = by_mu = None
     if ctx.needs_input_grad[0]:
-        by_volume = backproject(views, mu, lines, ctx.window, ctx.method).to(ctx.dtype)
+        by_volume = backproject(views, mu, lines, layers, ctx.window, ctx.method).to(ctx.dtype)
     if ctx.needs_input_grad[1]:
-        by_mu = mu_vjp(volume, views, mu, lines, ctx.window, ctx.method)
-    return by_volume, by_mu, None, None, None, None
+        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method)
+    return by_volume, by_mu, None, None, None, None, None
 
 
 def _backproject_back(ctx, volume):
-    views, mu, lines = ctx.saved_tensors
+    views, mu, lines, layers = ctx.saved_tensors
     by_views = by_mu = None
     if ctx.needs_input_grad[0]:
-        by_views = project(volume, mu, lines, ctx.window, ctx.detector, ctx.method)
+        by_views = project(volume, mu, lines, layers, ctx.window, ctx.detector, ctx.method)
     if ctx.needs_input_grad[1]:
-        by_mu = mu_vjp(volume, views, mu, lines, ctx.window, ctx.method)
-    return by_views, by_mu, None, None, None
+        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method)
+    return by_views, by_mu, None, None, None, None
 
 
-def _in_torch(volume, mu, lines, window, detector, method):
-    rays = {"lines": lines, "window": window, "detector": detector, "method": method}
+def _in_torch(volume, mu, lines, layers, window, detector, method):
+    rays = {"lines": lines, "layers": layers, "window": window, "detector": detector, "method": method}
     return partial(_act, **rays)
 
 
@@ -112,13 +114,13 @@ def _act(volume, mu, **rays):
     )
 
 
-def _back_in_torch(views, mu, lines, window, method):
-    act = _in_torch(None, mu, lines, window, views.shape[2:], method)
+def _back_in_torch(views, mu, lines, layers, window, method):
+    act = _in_torch(None, mu, lines, layers, window, views.shape[2:4], method)
     return transposed(act, (len(views), *mu.shape))
 
 
-def _vjp_in_torch(volume, views, mu, lines, window, method):
-    return bent(_in_torch(volume, mu, lines, window, views.shape[2:], method))
+def _vjp_in_torch(volume, views, mu, lines, layers, window, method):
+    return bent(_in_torch(volume, mu, lines, layers, window, views.shape[2:4], method))
 
 
 project = linear(_project, _in_torch, _keep, _project_back)

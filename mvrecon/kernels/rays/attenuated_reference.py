@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.rays.reference import directions, weights
+from mvrecon.kernels.rays.reference import directions, fractions, weights
 
 #: Cells that one segment of constant attenuation has.
-CELLS = {"joseph": 4, "siddon": 1, "trilinear": 8}
+CELLS = {"joseph": 4, "siddon": 1}
 #: Below this optical depth (1 - exp(-m)) / m is its series.
 SERIES = 1e-3
 
@@ -22,11 +22,12 @@ SERIES = 1e-3
 def project(
     volume: Float[Tensor, "n d h w"],
     mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 3"],
+    lines: Float[Tensor, "m 4 3 c"],
+    layers: Float[Tensor, "m k"],
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
-) -> Float[Tensor, "n m v u"]:
+) -> Float[Tensor, "n m v u k"]:
     """Attenuated line integrals of volumes, in mm times their unit.
 
     A segment i of a ray that emits l_i, of the optical depth m_i, gives l_i exp(-A_i)
@@ -35,27 +36,34 @@ def project(
     Args:
         volume: emission per mm.
         mu: linear attenuation in 1/mm on the same grid.
-        lines, window, detector, method: as in `reference.project`.
+        layers: of every view, equal steps of 1 / w over which the integral is shared out, linearly
+            between two; one: all of it.
+        lines, window, detector, method: as in `reference.project`, but for "trilinear".
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
-    total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1])
+    total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1], layers.shape[1])
+    dealt = _dealt(lines, layers, detector, mu.shape, method)
     for index, weight in _attenuated(mu.to(volume), lines, window, detector, method):
-        total = total + weight * flat[:, index]
-    return total.reshape(len(volume), len(lines), *detector)
+        total = total + (weight * flat[:, index])[..., None] * next(dealt).to(volume)
+    return total.reshape(len(volume), len(lines), *detector, layers.shape[1])
 
 
 def backproject(
-    views: Float[Tensor, "n m v u"],
+    views: Float[Tensor, "n m v u k"],
     mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 3"],
+    lines: Float[Tensor, "m 4 3 c"],
+    layers: Float[Tensor, "m k"],
     window: Sequence[float],
     method: str,
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project` in the emission."""
     d, h, w = mu.shape
-    flat, values = views.new_zeros(len(views), (d + 2) * (h + 2) * (w + 2)), views.flatten(1)
-    for index, weight in _attenuated(mu.to(views), lines, window, views.shape[2:], method):
-        flat = flat.index_add(1, index, weight * values)
+    flat, values = views.new_zeros(len(views), (d + 2) * (h + 2) * (w + 2)), views.flatten(1, 3)
+    detector = views.shape[2:4]
+    dealt = _dealt(lines, layers, detector, mu.shape, method)
+    for index, weight in _attenuated(mu.to(views), lines, window, detector, method):
+        seen = (values * next(dealt).to(views)).sum(dim=-1)
+        flat = flat.index_add(1, index, weight * seen)
     return flat.reshape(len(views), d + 2, h + 2, w + 2)[:, 1:-1, 1:-1, 1:-1]
 
 
@@ -64,7 +72,7 @@ def _attenuated(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Every flat index and weight, in mm, with the transmission from there to the detector."""
     entries = list(weights(lines, window, detector, mu.shape, mu, method))
-    flat, size = F.pad(mu, (1, 1) * 3).flatten(), CELLS[method.partition(":")[0]]
+    flat, size = F.pad(mu, (1, 1) * 3).flatten(), CELLS[method]
     each = torch.stack([weight * flat[index] for index, weight in entries])
     depth = each.unflatten(0, (-1, size)).sum(dim=1)
     # counts run along the ray's direction, to its end on the detector's side
@@ -73,6 +81,23 @@ def _attenuated(
     shares = torch.exp(-before) * mean_transmission(depth)
     for i, (index, weight) in enumerate(entries):
         yield index, weight * shares[i // size]
+
+
+def _dealt(
+    lines: Tensor, layers: Tensor, detector: Sequence[int], shape: Sequence[int], method: str
+) -> Iterator[Float[Tensor, "r k"]]:
+    """For every entry of `_attenuated`: the part of it that each layer has."""
+    last = layers.shape[1] - 1
+    per_slab = {"joseph": 4, "siddon": 3}[method]
+    nodes = layers.repeat_interleave(detector[0] * detector[1], dim=0)
+    for w in fractions(lines, detector, shape):
+        if not last:
+            hats = torch.ones_like(nodes)
+        else:
+            along = (1 / w - nodes[:, 0]) * last / (nodes[:, -1] - nodes[:, 0])
+            steps = torch.arange(last + 1, device=w.device)
+            hats = (1 - (along.clamp(0, last)[:, None] - steps).abs()).clamp_min(0)
+        yield from [hats] * per_slab
 
 
 def _above(depth: Float[Tensor, "k r"]) -> Float[Tensor, "k r"]:

@@ -83,6 +83,19 @@ def directions(lines: Tensor, detector: Sequence[int]) -> Float[Tensor, " r"]:
     return maps[DIRECTION].gather(0, main[None])[0]
 
 
+def fractions(
+    lines: Tensor, detector: Sequence[int], shape: Sequence[int]
+) -> Iterator[Float[Tensor, " r"]]:
+    """The fraction w of the way from source to pixel at which rays stand in the middle of their
+    slabs.
+    """
+    maps, main = _maps(lines, detector)
+    start, D = maps[START].gather(0, main[None])[0], maps[DIRECTION].gather(0, main[None])[0]
+    sizes = torch.tensor(shape[::-1], device=lines.device)[main]
+    for slab in range(max(shape)):
+        yield (torch.clamp(sizes - 1, max=slab) - (sizes - 1) / 2 - start) / D
+
+
 def _end(start: Tensor, D: Tensor, w: float) -> Tensor:
     """Where a ray ends along its main axis; infinity carries no derivative."""
     return start + w * D if abs(w) < torch.inf else w * D.detach().sign()

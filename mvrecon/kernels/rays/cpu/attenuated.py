@@ -34,34 +34,36 @@ Spread = Callable[[Store, Copy, Desk, Slabs], None]
 
 
 class Spreading(NamedTuple):
-    """What an adjoint spreads into: how many volumes, for how many values of views."""
+    """What an adjoint spreads into: how many volumes, for how many values of views in layers."""
 
     volumes: int
     values: int
+    layers: Tensor
 
 
-def _desk(rig: Rig, values: Store) -> Desk:
+def _desk(rig: Rig, values: Store, layers: Tensor) -> Desk:
     room = room_of(rig, values)
-    return Desk(room, path_of(room))
+    return Desk(room, path_of(room), layers.detach().double().numpy())
 
 
 def project(
     volume: Float[Tensor, "n d h w"],
     mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 k"],
+    lines: Float[Tensor, "m 4 3 c"],
+    layers: Float[Tensor, "m k"],
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
-) -> Float[Tensor, "n m v u"]:
+) -> Float[Tensor, "n m v u k"]:
     """Attenuated line integrals; see `attenuated_reference.project`."""
     both = torch.cat([wide(volume), mu.to(wide(volume[:0]).dtype)[None]])
     plan, occupancy = _plan(lines, window, detector, method, mu)
-    views = np.zeros((len(volume), len(lines), *plan.rig.detector), both.numpy().dtype)
+    views = np.zeros((len(volume), len(lines), *plan.rig.detector, layers.shape[1]), both.numpy().dtype)
     for copy in copies(both, occupancy, plan):
         matter, reads = Matter(copy.store, len(volume)), plan.reads[copy.store.near]
 
         def add_rows(first: int, last: int, copy=copy, matter=matter, reads=reads) -> None:
-            units, desk = Units(copy.axes, first, last), _desk(copy.rig, copy.store)
+            units, desk = Units(copy.axes, first, last), _desk(copy.rig, copy.store, layers)
             project_rows(copy.store, matter, copy.rig, desk, reads, views, units)
 
         share(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
@@ -69,14 +71,15 @@ def project(
 
 
 def backproject(
-    views: Float[Tensor, "n m v u"],
+    views: Float[Tensor, "n m v u k"],
     mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 k"],
+    lines: Float[Tensor, "m 4 3 c"],
+    layers: Float[Tensor, "m k"],
     window: Sequence[float],
     method: str,
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project` in the emission."""
-    plan, occupancy = _plan(lines, window, views.shape[2:], method, mu)
+    plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
     values = np.ascontiguousarray(views.numpy())
 
     def spread(into: Store, copy: Copy, desk: Desk, slabs: Slabs) -> None:
@@ -84,19 +87,20 @@ def backproject(
         backproject_slabs(into, Matter(copy.store, 0), copy.rig, desk, reads, values, slabs)
 
     made = copies(mu.to(views.dtype)[None], occupancy, plan)
-    return _gathered(made, spread, Spreading(len(views), views.numel()))
+    return _gathered(made, spread, Spreading(len(views), views.numel(), layers))
 
 
 def mu_vjp(
     volume: Float[Tensor, "n d h w"],
-    views: Float[Tensor, "n m v u"],
+    views: Float[Tensor, "n m v u k"],
     mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 k"],
+    lines: Float[Tensor, "m 4 3 c"],
+    layers: Float[Tensor, "m k"],
     window: Sequence[float],
     method: str,
 ) -> Float[Tensor, "d h w"]:
     """The derivative of <views, project(volume, mu)> by the attenuation mu."""
-    plan, occupancy = _plan(lines, window, views.shape[2:], method, mu)
+    plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
     values, count = np.ascontiguousarray(views.numpy()), len(volume)
 
     def spread(into: Store, copy: Copy, desk: Desk, slabs: Slabs) -> None:
@@ -105,7 +109,7 @@ def mu_vjp(
 
     both = torch.cat([wide(volume).to(views.dtype), mu.to(views.dtype)[None]])
     made = copies(both, occupancy, plan)
-    return _gathered(made, spread, Spreading(1, views.numel()))[0]
+    return _gathered(made, spread, Spreading(1, views.numel(), layers))[0]
 
 
 def _plan(
@@ -131,7 +135,7 @@ def _gathered(
             if copy.axes[axis]:
 
                 def fill(low: int, high: int, copy=copy, target=target, axis=axis) -> None:
-                    spread(target, copy, _desk(copy.rig, target), Slabs(axis, low, high))
+                    spread(target, copy, _desk(copy.rig, target, spreading.layers), Slabs(axis, low, high))
 
                 share(fill, (x, y, z)[axis], spreading.values * max(x, y, z))
         inner = part_of(into, near, (slice(0, x), slice(0, y), slice(0, z)))

@@ -1,7 +1,8 @@
 """The compiled loops over attenuated rays: those of `loops.py`, each cell times the transmission
 from it to the detector.
 
-The volume of attenuation is volume `at` of a store of its own, in the layout of the emission's.
+Views [n m v u k] have k layers of magnification (one: all of the ray), see `layers.py`. The volume
+of attenuation is volume `at` of a store of its own, in the layout of the emission's.
 Counts run towards the end where w, see `cameras/camera.py`, is greatest.
 """
 
@@ -9,7 +10,8 @@ from collections import namedtuple
 
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu import joseph, siddon
-from mvrecon.kernels.rays.cpu.loops import silent, walk
+from mvrecon.kernels.rays.cpu.layers import deal, gather, layer_of, silent
+from mvrecon.kernels.rays.cpu.loops import walk
 from mvrecon.kernels.rays.cpu.rig import steps_of
 from mvrecon.kernels.rays.cpu.summation import visit
 from mvrecon.kernels.rays.cpu.transmission import (
@@ -24,9 +26,9 @@ from mvrecon.kernels.rays.trace import SIDDON, from_centre, main_axis, trace, wi
 from mvrecon.kernels.rays.trace import at as component
 
 #: A store and which of its volumes is the attenuation; what one thread works in: see `loops.Room`
-#: and `transmission.Path`.
+#: and `transmission.Path`; and the layers [m k] of every view, see `layers.py`.
 Matter = namedtuple("Matter", ["store", "at"])
-Desk = namedtuple("Desk", ["room", "path"])
+Desk = namedtuple("Desk", ["room", "path", "layers"])
 
 
 @scalar
@@ -54,7 +56,7 @@ def _spread(store, n, rig, ray, span, first, steps, desk, value):
     """
     visited = visit(rig, ray, span, desk.room)
     cells(rig, ray, visited[0], steps, desk.room)
-    weigh(rig, desk.room, desk.path, span[0] - first, visited[0])
+    weigh(rig, desk.room, desk.path.own, span[0] - first, visited[0])
     if rig.method == SIDDON:
         siddon.spread(store, n, visited[0], desk.room, value)
     else:
@@ -78,13 +80,21 @@ def project_rows(store, matter, rig, desk, reads, views, units):
             steps = steps_of(rig, store, axis)
             part, ascending = (ray.first, ray.last), ascends(line, ray, pixel)
             visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
-            weigh(rig, desk.room, desk.path, 0, visited[0])
+            if len(desk.layers[m]) > 1:
+                layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
+                count, path = segments_of(rig, visited[0]), desk.path
+                for n in range(len(views)):
+                    integrals(store, n, rig, ray, steps, desk.room, visited[0], path.emission)
+                    deal(path, count, views[n, m, v, u])
+                continue
+            weigh(rig, desk.room, desk.path.share, 0, visited[0])
             length = store.values.dtype.type(ray.length)
             for n in range(len(views)):
                 if rig.method == SIDDON:
-                    views[n, m, v, u] += length * siddon.sum(store, n, visited, desk.room)
+                    total = siddon.sum(store, n, visited, desk.room)
                 else:
-                    views[n, m, v, u] += length * joseph.sum(store, n, steps, visited, desk.room)
+                    total = joseph.sum(store, n, steps, visited, desk.room)
+                views[n, m, v, u, 0] += length * total
 
 
 @compiled
@@ -106,11 +116,15 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
                 continue
             ascending = ascends(line, ray, pixel)
             part = (ray.first, span[1]) if ascending else (span[0], ray.last)
-            _attenuate(matter, rig, ray, part, ascending, steps, desk)
-            length = store.values.dtype.type(ray.length)
+            visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
+            layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
+            length, path = store.values.dtype.type(ray.length), desk.path
+            count = segments_of(rig, visited[0])
             for n in range(len(views)):
-                value = length * views[n, m, v, u]
-                _spread(store, n, rig, ray, span, part[0], steps, desk, value)
+                gather(path, count, views[n, m, v, u])
+                for i in range(count):
+                    path.own[i] *= path.share[i]
+                _spread(store, n, rig, ray, span, part[0], steps, desk, length)
 
 
 @compiled
@@ -118,7 +132,7 @@ def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
     """Spread into volume 0 of a store the derivative of sum(views * projections of the sources) by
     the attenuation.
     """
-    steps, source = steps_of(rig, store, slabs.axis), desk.path.source
+    steps = steps_of(rig, store, slabs.axis)
     for unit in range(len(reads.views) * max(rig.detector)):
         view, place, start, stop = walk(rig, reads.spans, unit)
         m, tall = reads.views[view], reads.tall[view]
@@ -134,14 +148,15 @@ def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
                 continue
             part, ascending = (ray.first, ray.last), ascends(line, ray, pixel)
             visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
-            count = segments_of(rig, visited[0])
-            emission = desk.path.emission
+            layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
+            count, path = segments_of(rig, visited[0]), desk.path
             for i in range(count):
-                source[i] = 0
+                path.source[i] = 0
             for n in range(len(views)):
-                integrals(sources, n, rig, ray, steps, desk.room, visited[0], emission)
+                integrals(sources, n, rig, ray, steps, desk.room, visited[0], path.emission)
+                gather(path, count, views[n, m, v, u])
                 for i in range(count):
-                    source[i] += views[n, m, v, u] * emission[i]
-            bend(desk.path, count, ascending)
+                    path.source[i] += path.own[i] * path.emission[i]
+            bend(path, count, ascending)
             length = store.values.dtype.type(ray.length)
             _spread(store, 0, rig, ray, span, ray.first, steps, desk, length)

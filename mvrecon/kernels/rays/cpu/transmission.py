@@ -20,8 +20,9 @@ from mvrecon.kernels.rays.cpu.lanes import between
 from mvrecon.kernels.rays.trace import SIDDON
 
 #: Per segment: optical depth, mean transmission within the segment and then from all of it to the
-#: end, transmission from its near end, what it emits, that of one volume, and its own derivative.
-Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "own"])
+#: end, transmission from its near end, what it emits, that of one volume, what is
+#: spread into it, and its place among the layers.
+Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "own", "layer"])
 #: Up to this optical depth (1 - exp(-m)) / m and its slope are series; the terms that are left out
 #: are below the last digit of double precision.
 SERIES = 0.5
@@ -29,7 +30,7 @@ SERIES = 0.5
 
 def path_of(room) -> Path:
     """Room for the segments of one ray of a thread."""
-    return Path(*np.empty((6, 3 * len(room.one)), room.one.dtype))
+    return Path(*np.empty((7, 3 * len(room.one)), room.one.dtype))
 
 
 @scalar
@@ -121,9 +122,8 @@ def transmit(path, number, ascending):
 
 
 @scalar
-def weigh(rig, room, path, first, count):
-    """The cells of a room with their shares, those of the slabs from `first` on."""
-    share = path.share
+def weigh(rig, room, share, first, count):
+    """The cells of a room with shares of their segments, those of the slabs from `first` on."""
     if rig.method == SIDDON:
         part0, part1, part2 = siddon.crossed(room)[3:]
         for i in range(np.uint32(count)):
@@ -139,7 +139,7 @@ def weigh(rig, room, path, first, count):
 
 @scalar
 def bend(path, number, ascending):
-    """Into `share`: the derivative of the sum of what all segments send out by their optical
+    """Into `own`: the derivative of the sum of what all segments send out by their optical
     depths.
 
     A segment weakens itself and all those beyond it.
@@ -159,5 +159,5 @@ def bend(path, number, ascending):
     beyond = 0.0
     for j in range(np.uint32(number)):
         i = np.uint32(number) - np.uint32(1) - j if ascending else j
-        share[i] = real(own[i] - beyond)
+        own[i] = real(own[i] - beyond)
         beyond += source[i]
