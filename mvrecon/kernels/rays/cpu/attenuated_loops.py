@@ -8,6 +8,8 @@ Counts run towards the end where w, see `cameras/camera.py`, is greatest.
 
 from collections import namedtuple
 
+import numpy as np
+
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu import joseph, siddon
 from mvrecon.kernels.rays.cpu.layers import deal, gather, layer_of, silent
@@ -50,17 +52,21 @@ def _attenuate(matter, rig, ray, part, ascending, steps, desk):
 
 
 @scalar
-def _spread(store, n, rig, ray, span, first, steps, desk, value):
-    """Add a value to volume n along a span of a ray, each segment with its share; these begin with
-    slab `first`.
+def _spread(store, n, rig, ray, span, made, steps, desk, value):
+    """Add a value to volume n along a span of a ray, each segment times its part in `own`.
+
+    `made` are the slabs whose segments are known, and whose cells may be in the room: none, where
+    it ends before it begins.
     """
-    visited = visit(rig, ray, span, desk.room)
-    cells(rig, ray, visited[0], steps, desk.room)
-    weigh(rig, desk.room, desk.path.own, span[0] - first, visited[0])
+    count = np.uint32(span[1] - span[0])
+    if made[0] != span[0] or made[1] != span[1]:
+        count = visit(rig, ray, span, desk.room)[0]
+        cells(rig, ray, count, steps, desk.room)
+    weigh(rig, desk.room, desk.path.own, span[0] - made[0], count)
     if rig.method == SIDDON:
-        siddon.spread(store, n, visited[0], desk.room, value)
+        siddon.spread(store, n, count, desk.room, value)
     else:
-        joseph.spread(store, n, steps, visited[0], desk.room, value)
+        joseph.spread(store, n, steps, count, desk.room, value)
 
 
 @compiled
@@ -124,7 +130,8 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
                     path.own[i] *= path.share[i]
-                _spread(store, n, rig, ray, span, part[0], steps, desk, length)
+                made = part if n == 0 else (part[0], part[0] - 1)
+                _spread(store, n, rig, ray, span, made, steps, desk, length)
 
 
 @compiled
@@ -159,4 +166,4 @@ def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
                     path.source[i] += path.own[i] * path.emission[i]
             bend(path, count, ascending)
             length = store.values.dtype.type(ray.length)
-            _spread(store, 0, rig, ray, span, ray.first, steps, desk, length)
+            _spread(store, 0, rig, ray, span, part, steps, desk, length)
