@@ -1,4 +1,4 @@
-"""The attenuated ray transform: what emitters send along rays, weakened on the way to the detector."""
+"""The attenuated ray transform: emission along rays, weakened on the way to the detector."""
 
 from collections.abc import Sequence
 from typing import Any

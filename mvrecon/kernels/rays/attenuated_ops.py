@@ -1,5 +1,5 @@
-"""Attenuated projections as torch operators: opaque to `torch.compile`, with derivatives in emission
-and attenuation.
+"""Attenuated projections as torch operators: opaque to `torch.compile`, with derivatives in
+emission and attenuation.
 
 The CPU has kernels for a single attenuation and rays without a gradient; all else is the
 reference's.
@@ -104,7 +104,13 @@ def _backproject_back(ctx, volume):
 
 
 def _in_torch(volume, mu, lines, layers, window, detector, method):
-    rays = {"lines": lines, "layers": layers, "window": window, "detector": detector, "method": method}
+    rays = {
+        "lines": lines,
+        "layers": layers,
+        "window": window,
+        "detector": detector,
+        "method": method,
+    }
     return partial(_act, **rays)
 
 

@@ -1,18 +1,21 @@
-"""Counts behind an ideal knife-edge pinhole.
+"""Counts behind pinholes.
 
 Along a detector pixel's line through the pinhole, the growth of the seen tube with r^2 cancels the
 1/r^2 of each point's solid angle, so a ray-driven projector has no factor of distance: with lambda
-in counts / mm^3,
+in counts / mm^3 and mu in 1/mm,
 
-    counts(u, v) = d^2 cos^4(phi) du dv / (16 l^2) * integral of lambda along the line on the
-    object's side,
+    counts(u, v) = Blur[ d_e^2 cos^4(phi) du dv / (16 l^2)
+                         * integral of lambda(s) exp(-integral_0^s mu) ds ],
 
-phi the angle from the pinhole's axis, l the distance from pinhole to detector, d the pinhole's
-diameter. Integrated over the detector this is a point source's d^2 cos^3(phi) / (16 h^2), h its
-distance from the pinhole's plane: Van Audenhaege et al., Med. Phys. 42 (2015) 4796.
+s from the pinhole outward, phi the angle from the pinhole's axis, l the distance from pinhole to
+detector, d_e the pinhole's effective diameter. Integrated over the detector, without attenuation,
+this is a point source's d^2 cos^3(phi) / (16 h^2), h its distance from the pinhole's plane: Van
+Audenhaege et al., Med. Phys. 42 (2015) 4796.
 """
 
+from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,47 +24,102 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.projectors.attenuated import AttenuatedTransform, check_mu
 from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.operator import Scaled
+from mvrecon.projectors.operator import Projector, Scaled
+from mvrecon_spect.blur import BlurredPinholes, Optics
+from mvrecon_spect.hole import Hole
+from mvrecon_spect.matter import attenuation_on
 
 
 class Spect(Scaled):
-    """Counts behind ideal pinholes, without attenuation and blur: volumes [b c d h w] in counts /
-    mm^3 to views [b c m v u] in counts.
+    """Counts behind pinholes: volumes [b c d h w] in counts / mm^3 to views [b c m v u] in counts.
 
-    The line integrals of `drr` times each pixel's sensitivity, so that ordered subsets, lists of
-    rays (bins that hold counts), crops, supports and a rig's mirror symmetry cost what they cost
-    with `drr`.
+    Ideal pinholes are the line integrals of `drr` times each pixel's sensitivity, so that ordered
+    subsets, lists of rays (bins that hold counts), crops, supports and a rig's mirror symmetry cost
+    what they cost with `drr`. Attenuation, blur and penetration are left out where they are not
+    asked for, and where they do nothing (mu = 0, blur below a pixel) to the last bit.
 
     Args:
         grid: where the activity lies.
         cameras: pinholes, each with its detector behind it and at a right angle to its axis.
-        diameter_mm: the pinholes' (effective) diameter.
-        options: those of `drr`.
+        diameter_mm: the pinholes' diameter, or the sides (u, v) of rectangular ones.
+        mu: linear attenuation in 1/mm: a tensor on the grid, a number for all of the grid, or the
+            path of a volume in 1/mm, which is resampled. None: none.
+        blur: whether the pinholes' images and `intrinsic_mm`, the detector's own FWHM in mm, blur.
+        intrinsic_mm: see `blur`.
+        options: of the edge, as in `Hole` (collimator_mu, opening_degrees, acceptance_degrees,
+            sensitivity), and those of `drr`; with blur `method` and `backend` of them.
 
     Raises:
-        ValueError: cameras whose detectors are not behind a pinhole, or a diameter that is not
-            positive.
+        ValueError: cameras whose detectors are not behind a pinhole, a pinhole in the grid, a
+            diameter that is not positive, or an attenuation that cannot be one in 1/mm.
     """
 
-    def __init__(self, grid: Grid, cameras: Cameras, diameter_mm: float = 2.3, **options: Any):
-        if cameras.extent != "behind" or cameras.parallel:
-            kind = "parallel" if cameras.parallel else cameras.extent
-            raise ValueError(
-                f"Pinhole SPECT needs central cameras of extent 'behind', got {kind!r}"
-            )
-        if not diameter_mm > 0:
-            raise ValueError(f"A pinhole's diameter must be positive mm, got {diameter_mm}")
-        A = Drr(grid, cameras, **options)
-        weight = partial(sensitivity, cameras, float(diameter_mm))
-        super().__init__(A, weight)
-        self.diameter_mm = float(diameter_mm)
+    def __init__(
+        self,
+        grid: Grid,
+        cameras: Cameras,
+        diameter_mm: float | Sequence[float] = 2.3,
+        mu: Float[Tensor, "d h w"] | float | str | Path | None = None,
+        blur: bool = False,
+        intrinsic_mm: float = 0.0,
+        **options: Any,
+    ):
+        check_pinholes(cameras, grid)
+        if not 0 <= intrinsic_mm < float("inf"):
+            raise ValueError(f"Expected an intrinsic FWHM of 0 mm or more, got {intrinsic_mm}")
+        edge = {name: options.pop(name) for name in EDGE if name in options}
+        hole = Hole(diameter_mm, **edge)
+        matter = None if mu is None else attenuation_on(grid, mu)
+        optics = Optics(hole, float(intrinsic_mm))
+        if blur and blurs(grid, cameras, optics):
+            super().__init__(BlurredPinholes(grid, cameras, matter, optics, **options))
+        else:
+            A = _sharp(grid, cameras, matter, options)
+            super().__init__(A, partial(hole.weight, cameras))
+        self.hole, self.diameter_mm = hole, diameter_mm
+
+
+#: Options of a hole's edge, see `Hole`.
+EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
+
+
+def _sharp(
+    grid: Grid, cameras: Cameras, mu: Tensor | None, options: Mapping[str, Any]
+) -> Projector:
+    if mu is None:
+        return Drr(grid, cameras, **options)
+    return AttenuatedTransform(grid, cameras, mu, **options)
+
+
+def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:
+    """Whether a hole's image or the detector's own FWHM is anywhere wider than a pixel."""
+    pixel = min(cameras.u.detach().norm(dim=-1).min(), cameras.v.detach().norm(dim=-1).min())
+    depth = -cameras.depth_range(grid)[:, 1].detach() / cameras.distance.detach()
+    image = max(optics.hole.blurring_mm) * (1 + 1 / depth)
+    return bool((depth <= 0).any() or image.max() > pixel or optics.intrinsic_mm > pixel)
+
+
+def check_pinholes(cameras: Cameras, grid: Grid) -> None:
+    """Check that cameras are pinholes with the detector behind them, outside of the grid.
+
+    Raises:
+        ValueError: parallel beams, another extent of the rays, or a pinhole in the grid's box.
+    """
+    if cameras.extent != "behind" or cameras.parallel:
+        kind = "parallel" if cameras.parallel else cameras.extent
+        raise ValueError(f"Pinhole SPECT needs central cameras of extent 'behind', got {kind!r}")
+    place = cameras.source.detach() - grid.centre.to(cameras.source)
+    voxels = place @ torch.linalg.inv(grid.affine[:3, :3]).to(place).T
+    inside = (voxels.abs() < voxels.new_tensor(grid.shape[::-1]) / 2).all(dim=1)
+    if inside.any():
+        raise ValueError(
+            f"Expected pinholes outside of the grid, got pinhole {int(inside.nonzero()[0, 0])} in "
+            "it, in the object; make the grid smaller, or look at mm and cm of camera and grid"
+        )
 
 
 def sensitivity(cameras: Cameras, diameter_mm: float) -> Float[Tensor, "m v u"]:
     """Sensitivity of each pixel, d^2 cos^4(phi) du dv / (16 l^2) in mm^2: counts per integral."""
-    start, end = cameras.rays()
-    distance = cameras.distance[:, None, None]
-    cosine = distance / (end - start).norm(dim=-1)
-    area = torch.linalg.cross(cameras.u, cameras.v).norm(dim=-1)[:, None, None]
-    return diameter_mm**2 * cosine**4 * area / (16 * distance**2)
+    return Hole(diameter_mm).weight(cameras)

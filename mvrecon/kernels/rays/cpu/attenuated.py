@@ -58,7 +58,9 @@ def project(
     """Attenuated line integrals; see `attenuated_reference.project`."""
     both = torch.cat([wide(volume), mu.to(wide(volume[:0]).dtype)[None]])
     plan, occupancy = _plan(lines, window, detector, method, mu)
-    views = np.zeros((len(volume), len(lines), *plan.rig.detector, layers.shape[1]), both.numpy().dtype)
+    views = np.zeros(
+        (len(volume), len(lines), *plan.rig.detector, layers.shape[1]), both.numpy().dtype
+    )
     for copy in copies(both, occupancy, plan):
         matter, reads = Matter(copy.store, len(volume)), plan.reads[copy.store.near]
 
@@ -135,7 +137,12 @@ def _gathered(
             if copy.axes[axis]:
 
                 def fill(low: int, high: int, copy=copy, target=target, axis=axis) -> None:
-                    spread(target, copy, _desk(copy.rig, target, spreading.layers), Slabs(axis, low, high))
+                    spread(
+                        target,
+                        copy,
+                        _desk(copy.rig, target, spreading.layers),
+                        Slabs(axis, low, high),
+                    )
 
                 share(fill, (x, y, z)[axis], spreading.values * max(x, y, z))
         inner = part_of(into, near, (slice(0, x), slice(0, y), slice(0, z)))

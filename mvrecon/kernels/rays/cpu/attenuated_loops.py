@@ -52,12 +52,14 @@ def _attenuate(matter, rig, ray, part, ascending, steps, desk):
 
 
 @scalar
-def _spread(store, n, rig, ray, span, made, steps, desk, value):
-    """Add a value to volume n along a span of a ray, each segment times its part in `own`.
+def _spread(target, rig, ray, parts, steps, desk, value):
+    """Add a value to a volume, (store, n), along a part of a ray, each segment times its number in
+    `own`.
 
-    `made` are the slabs whose segments are known, and whose cells may be in the room: none, where
-    it ends before it begins.
+    `parts`: the slabs to spread into; those whose segments are known, whose cells are in the room
+    unless it ends before it begins.
     """
+    (store, n), (span, made) = target, parts
     count = np.uint32(span[1] - span[0])
     if made[0] != span[0] or made[1] != span[1]:
         count = visit(rig, ray, span, desk.room)[0]
@@ -131,7 +133,7 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
                 for i in range(count):
                     path.own[i] *= path.share[i]
                 made = part if n == 0 else (part[0], part[0] - 1)
-                _spread(store, n, rig, ray, span, made, steps, desk, length)
+                _spread((store, n), rig, ray, (span, made), steps, desk, length)
 
 
 @compiled
@@ -166,4 +168,4 @@ def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
                     path.source[i] += path.own[i] * path.emission[i]
             bend(path, count, ascending)
             length = store.values.dtype.type(ray.length)
-            _spread(store, 0, rig, ray, span, part, steps, desk, length)
+            _spread((store, 0), rig, ray, (span, part), steps, desk, length)

@@ -1,4 +1,5 @@
-"""The transmission to each segment of one ray, from its optical depths; the step of `attenuated.py`.
+"""The transmission to each segment of one ray, from its optical depths; the step of
+`attenuated.py`.
 
 A segment is the part of a ray in which attenuation is taken as constant: a slab for Joseph's
 method, the part in one cell for Siddon's. Of what it emits the share

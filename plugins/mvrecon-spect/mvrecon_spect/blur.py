@@ -1,0 +1,252 @@
+"""Collimator and intrinsic blur of pinholes, matched, by layers of magnification.
+
+A point at the depth z before a pinhole, whose detector is l behind it, has the image of the hole on
+the detector, of the width d_re (1 + l / z), blurred by the detector's own resolution R_i: at the
+object R^2 = (d_re (z + l) / l)^2 + (R_i z / l)^2 (Anger; Metzler & Accorsi, Phys. Med. Biol. 50
+(2005) 5005). The width is linear in l / z, so integrals are shared out linearly to a few layers at
+equal steps of l / z, and each layer is blurred as a whole: with 8 layers over a heart's depths the
+variance of a profile is right to 0.1 %.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Grid
+from mvrecon.kernels import backends
+from mvrecon.kernels.precision import wide
+from mvrecon.kernels.rays import attenuated_ops, attenuated_reference
+from mvrecon.kernels.rays.lines import lines_of
+from mvrecon.projectors.attenuated import check_mu
+from mvrecon.projectors.checks import check, check_floating
+from mvrecon.projectors.operator import LinearOperator, Projector
+from mvrecon.projectors.selection import ViewSelection
+from mvrecon_spect.hole import Hole
+
+#: Layers of magnification of a view; cameras whose layers are in memory at a time.
+LAYERS, TOGETHER = 8, 8
+#: Parts each way of a pixel on which a hole's image is drawn; FWHM in standard deviations.
+PARTS, FWHM = 16, 2 * math.sqrt(2 * math.log(2))
+
+
+class Optics(NamedTuple):
+    """The hole, and the detector's own resolution as a FWHM in mm, 0: none."""
+
+    hole: Hole
+    intrinsic_mm: float = 0.0
+
+
+class BlurredPinholes(Projector):
+    """Counts [b c m v u] behind blurring pinholes of volumes [b c d h w] in counts / mm^3, Blur(w *
+    attenuated integral), and the matched adjoint.
+
+    What lies beside the detector's field blurs into it. Differentiable in the volume and mu; in the
+    cameras by the reference.
+
+    Args:
+        grid: where the activity lies; no pinhole may stand in its box.
+        cameras: pinholes, their detectors at a right angle to their axes.
+        mu: linear attenuation on the grid in 1/mm; None: none.
+        optics: hole and intrinsic resolution.
+        method, backend: as in `RayTransform`; "joseph" or "siddon".
+
+    Raises:
+        ValueError: an attenuation as `AttenuatedTransform`, another method, or a grid that reaches
+            to a pinhole.
+    """
+
+    mu: Tensor
+
+    def __init__(
+        self,
+        grid: Grid,
+        cameras: Cameras,
+        mu: Float[Tensor, "d h w"] | None,
+        optics: Optics,
+        method: str = "joseph",
+        backend: str = "auto",
+    ):
+        super().__init__()
+        if method not in ("joseph", "siddon"):
+            raise ValueError(f"Blur needs method 'joseph' or 'siddon', got {method!r}")
+        self.grid, self.cameras, self.optics = grid, cameras, optics
+        self.method, self.backend = method, backend
+        mu = torch.zeros(grid.shape) if mu is None else mu
+        check_mu(mu, grid)
+        self.register_buffer("mu", mu, persistent=False)
+        self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
+        self.kernels = kernels_of(cameras, self.magnification(), optics)
+        margin = [(n - 1) // 2 for n in self.kernels.shape[-2:]]
+        self.wider = grown(cameras, margin)
+
+    @property
+    def device(self) -> torch.device:
+        return self.mu.device
+
+    @property
+    def pose_gradient(self) -> bool:
+        """Whether the cameras require a gradient."""
+        rig = self.cameras
+        return any(tensor.requires_grad for tensor in (rig.source, rig.origin, rig.u, rig.v))
+
+    def magnification(self) -> Float[Tensor, "m k"]:
+        """Magnification l / z of the layers of each view, at equal steps, from near to far.
+
+        Raises:
+            ValueError: a pinhole in the grid's box, or before it.
+        """
+        depth = -self.cameras.depth_range(self.grid) / self.cameras.distance[:, None]
+        if not (depth > 0).all():
+            first = int((depth <= 0).any(dim=1).nonzero()[0, 0])
+            raise ValueError(
+                f"Expected all of the grid in front of every pinhole, got pinhole {first} in its "
+                "box or beside it; make the grid smaller"
+            )
+        near, far = (1 / depth.detach()).unbind(dim=1)[::-1]
+        steps = torch.linspace(0, 1, LAYERS, dtype=near.dtype, device=near.device)
+        return near[:, None] + (far - near)[:, None] * steps
+
+    def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
+        """Views of volumes.
+
+        Raises:
+            ValueError: a wrong rank, size, device or dtype.
+        """
+        check(x, "a volume [b c d h w]", self.domain_shape, self.device)
+        check_floating(x, "a volume")
+        volume, views = wide(x).flatten(0, 1), []
+        ops, (window, detector) = self._ops(x), self._extent
+        for part in self._parts(volume):
+            rays = part.lines, part.layers, window, detector, self.method
+            layers = ops.project(volume, self.mu, *rays) * part.weight[..., None]
+            planes = layers.movedim(-1, 2).flatten(1, 2)
+            views.append(F.conv2d(planes, part.kernels, groups=len(part.lines)))
+        return torch.cat(views, dim=1).unflatten(0, x.shape[:2])
+
+    def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
+        """The matched adjoint: volumes of views.
+
+        Raises:
+            ValueError: a wrong rank, size, device or dtype.
+        """
+        check(y, "views [b c m v u]", self.range_shape, self.device)
+        check_floating(y, "views")
+        views, volume, first = wide(y).flatten(0, 1), None, 0
+        ops, (window, _) = self._ops(y), self._extent
+        for part in self._parts(views):
+            count = len(part.lines)
+            some = views[:, first : first + count]
+            planes = F.conv_transpose2d(some, part.kernels, groups=count)
+            layers = planes.unflatten(1, (count, -1)).movedim(2, -1) * part.weight[..., None]
+            rays = part.lines, part.layers, window, self.method
+            one = ops.backproject(layers.contiguous(), self.mu, *rays)
+            volume, first = one if volume is None else volume + one, first + count
+        assert volume is not None  # a rig has a camera
+        return volume.unflatten(0, y.shape[:2])
+
+    def subset(self, selection: LinearOperator) -> LinearOperator:
+        """The views of some cameras alone; pixels by all of their views."""
+        if not isinstance(selection, ViewSelection):
+            return super().subset(selection)
+        return self._of_views(selection.views)
+
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
+        """The same for activity in a box and for some cameras; all of the attenuation stays."""
+        some = self if views is None else self._of_views(views)
+        return LinearOperator.cropped(some, box)
+
+    def _of_views(self, views: Sequence[int]) -> "BlurredPinholes":
+        some = self.cameras[torch.tensor(list(views), device=self.cameras.source.device)]
+        return BlurredPinholes(self.grid, some, self.mu, self.optics, self.method, self.backend)
+
+    @property
+    def _extent(self) -> tuple[list[float], list[int]]:
+        return list(self.wider.ray_extent), list(self.wider.shape)
+
+    def _ops(self, tensor: Tensor):
+        """The kernels that serve a tensor; compiled ones know no gradient in the cameras."""
+        name, _ = backends.kernels_for(tensor, self.backend, self.method)
+        return attenuated_ops if name == "cpu" and not self.pose_gradient else attenuated_reference
+
+    def _parts(self, like: Tensor) -> Iterator["Part"]:
+        """A few cameras at a time."""
+        lines = lines_of(self.wider, self.grid).to(like.device)
+        weight = self.optics.hole.weight(self.wider).to(like)
+        layers = -self.magnification().to(like.device)
+        kernels = self.kernels.to(like)
+        for first in range(0, len(lines), TOGETHER):
+            some = slice(first, first + TOGETHER)
+            yield Part(lines[some], layers[some], weight[some], kernels[some])
+
+
+class Part(NamedTuple):
+    """A few cameras: their rays, layers of 1 / w, sensitivities and kernels of blur."""
+
+    lines: Float[Tensor, "m 4 3 c"]
+    layers: Float[Tensor, "m k"]
+    weight: Float[Tensor, "m v u"]
+    kernels: Float[Tensor, "m k i j"]
+
+
+def grown(cameras: Cameras, margin: Sequence[int]) -> Cameras:
+    """The same detectors with (rows, columns) more pixels on every side."""
+    rows, columns = margin
+    shape = (cameras.shape[0] + 2 * rows, cameras.shape[1] + 2 * columns)
+    first = cameras.source.new_tensor([[-columns, -rows]])
+    return replace(cameras.shifted(first), shape=shape)
+
+
+def kernels_of(
+    cameras: Cameras, magnification: Float[Tensor, "m k"], optics: Optics
+) -> Float[Tensor, "m k i j"]:
+    """Kernels of blur in pixels (row, column), each of the sum 1: the hole's image, convolved with
+    the detector's own Gaussian. A hole's image that is smaller than a pixel is one pixel.
+    """
+    pitch = torch.stack([cameras.u.detach().norm(dim=-1), cameras.v.detach().norm(dim=-1)], dim=1)
+    widths = magnification.new_tensor(optics.hole.blurring_mm) * (1 + magnification)[..., None]
+    sides = widths / pitch[:, None]  # in pixels (u, v)
+    reach = [int(math.ceil(sides[..., axis].max().item() / 2 - 0.5)) for axis in range(2)]
+    places = [_places(max(r, 0)).to(sides) for r in reach]
+    u, v = places[0][None, :], places[1][:, None]
+    half = sides[..., None, None, :] / 2
+    if optics.hole.round:
+        distance = ((u / half[..., 0]) ** 2 + (v / half[..., 1]) ** 2).sqrt()
+    else:
+        distance = torch.maximum(
+            *torch.broadcast_tensors((u / half[..., 0]).abs(), (v / half[..., 1]).abs())
+        )
+    edge = PARTS * half.amin(dim=-1)  # an edge a part of a pixel wide, so that widths count in full
+    inside = ((1 - distance) * edge + 0.5).clamp(0, 1)
+    image = F.avg_pool2d(inside, PARTS)
+    image = image / image.sum(dim=(-2, -1), keepdim=True)
+    if not optics.intrinsic_mm:
+        return image
+    sigma = optics.intrinsic_mm / FWHM / pitch
+    across, down = _gaussian(sigma[:, 0]), _gaussian(sigma[:, 1])
+    own = (down[:, :, None] * across[:, None, :])[:, None]
+    rows, columns = own.shape[-2:]
+    padded = F.pad(image, (columns - 1, columns - 1, rows - 1, rows - 1))
+    return F.conv2d(padded.transpose(0, 1), own, groups=len(own)).transpose(0, 1)
+
+
+def _places(reach: int) -> Float[Tensor, " n"]:
+    """The middles of the parts of pixels from -reach to reach, in pixels."""
+    count = (2 * reach + 1) * PARTS
+    return (torch.arange(count, dtype=torch.float64) + 0.5) / PARTS - reach - 0.5
+
+
+def _gaussian(sigma: Float[Tensor, " m"]) -> Float[Tensor, "m n"]:
+    """The shares of pixels in Gaussians about the middle one, sigma in pixels, cut at 4 sigma."""
+    reach = max(int(math.ceil(4 * sigma.max().item() - 0.5)), 0)
+    edges = torch.arange(-reach, reach + 2, dtype=sigma.dtype, device=sigma.device) - 0.5
+    total = torch.special.ndtr(edges / sigma[:, None])
+    shares = total.diff(dim=1)
+    return shares / shares.sum(dim=1, keepdim=True)

@@ -1,0 +1,35 @@
+"""Linear attenuation on a grid, in 1/mm, from a tensor, a number or a file."""
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.projectors.attenuated import check_mu
+
+
+def attenuation_on(
+    grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path
+) -> Float[Tensor, "d h w"]:
+    """Linear attenuation in 1/mm on a grid.
+
+    Args:
+        grid: the voxels.
+        mu: a tensor on the grid, a number for all of it, or the path of a volume in 1/mm, which is
+            resampled to the grid, and zero outside of its own.
+
+    Raises:
+        ValueError: values that cannot be attenuation in 1/mm, or a tensor of another shape.
+    """
+    if isinstance(mu, str | Path):
+        from mvrecon.data.resample import resample
+        from mvrecon.data.volume_files import read_volume
+
+        values, source = read_volume(mu)
+        check_mu(values, source)
+        return resample(values, source, grid).clamp_min(0)
+    values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))
+    check_mu(values, grid)
+    return values
