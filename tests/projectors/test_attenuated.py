@@ -7,9 +7,9 @@ import torch
 
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.rigs import parallel
+from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.projectors.attenuated import AttenuatedTransform
-from mvrecon.geometry.box import Box
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.projectors.selection import ray_subset, view_subset

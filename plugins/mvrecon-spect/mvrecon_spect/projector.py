@@ -24,7 +24,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.attenuated import AttenuatedTransform, check_mu
+from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.operator import Projector, Scaled
 from mvrecon_spect.blur import BlurredPinholes, Optics
