@@ -19,6 +19,7 @@ def dcspect80(
     pixels: int | Sequence[int] = 48,
     rows: Sequence[int] | None = None,
     columns: Sequence[int] | None = None,
+    field: float = 1.0,
 ) -> Cameras:
     """The 80-pinhole cardiac camera DC-SPECT: pinholes about the chest, all aimed at the heart's
     centre, the origin.
@@ -31,6 +32,8 @@ def dcspect80(
         pixels: the detector's pixels (rows, columns), or one number for both.
         rows: which of the 4 rows of modules, from -z to +z; all by default.
         columns: which of the 20 columns, from the azimuth 14 degrees on to 256; all by default.
+        field: detectors so many times as wide and high, with as many pixels; 2: the enlarged field
+            of the project's design slides.
 
     Published: pinhole positions, detector size, and the collimator lengths of 8 modules (16 with
     the mirror symmetry). Fitted: the other 64 lengths, linear in the distance to the heart. Not
@@ -38,7 +41,8 @@ def dcspect80(
     file.
 
     Raises:
-        ValueError: a row or a column that the camera does not have.
+        ValueError: a row or a column that the camera does not have, or a field that is not
+            positive.
     """
     chosen = [
         20 * row + column
@@ -49,8 +53,12 @@ def dcspect80(
     pinhole, length = table[:, :3], table[:, 3:]
     heart = torch.zeros_like(pinhole)
     centre = pinhole + length * torch.nn.functional.normalize(pinhole, dim=-1)
+    if not 0 < field < float("inf"):
+        raise ValueError(f"Expected a positive factor of the field, got {field}")
     count = (pixels, pixels) if isinstance(pixels, int) else tuple(pixels)
-    detector = Detector.of({"pixels": count, "pixel_mm": [DETECTOR_MM / max(n, 1) for n in count]})
+    detector = Detector.of(
+        {"pixels": count, "pixel_mm": [field * DETECTOR_MM / max(n, 1) for n in count]}
+    )
     return detector.carried(pinhole, centre, look_at(pinhole, heart), extent="behind")
 
 

@@ -1,12 +1,14 @@
-"""Linear attenuation in 1/mm from Hounsfield units and back, at about 70 keV.
+"""Linear attenuation in 1/mm from Hounsfield units and back, at about 70 keV or at the energy of an
+isotope.
 
 By definition HU = 1000 (mu - mu_water) / mu_water; that line serves up to water. Above, a second
 line leads to bone, whose photoelectric share is larger: the bilinear form of CT-based attenuation
 correction (Carney et al., Med. Phys. 33 (2006) 976), here with the constants of the DRR renderer
-nanodrr.
+nanodrr. For emission the same lines lead to attenuation at the isotope's energy: at 140.5 keV
+(Tc-99m) 0.01536 / mm for water and 0.0295 / mm for cortical bone (NIST XCOM).
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
@@ -23,8 +25,22 @@ BONE = 0.0573
 DENSE = 20.0
 
 
-def physical(values: Float[Tensor, "*n"], stored: StoredUnit) -> Float[Tensor, "*n"]:
-    """What is projected, attenuation in 1/mm or activity, from the numbers in a file.
+class Tissue(NamedTuple):
+    """Linear attenuation in 1/mm of water, and of cortical bone, what 1000 HU stands for."""
+
+    water: float
+    bone: float
+
+
+#: By the energy in keV: of CT, about 70, and of Tc-99m.
+TISSUES = {70.0: Tissue(WATER, BONE), 140.5: Tissue(0.01536, 0.0295)}
+
+
+def physical(
+    values: Float[Tensor, "*n"], stored: StoredUnit, energy_kev: float = 70.0
+) -> Float[Tensor, "*n"]:
+    """What is projected, attenuation in 1/mm or activity, from the numbers in a file; HU become
+    attenuation at an energy in keV.
 
     Raises:
         ValueError: values that are not finite, or that cannot be attenuation in 1/mm.
@@ -36,23 +52,43 @@ def physical(values: Float[Tensor, "*n"], stored: StoredUnit) -> Float[Tensor, "
             f"has values up to {values.abs().max().item():g}, expected attenuation in 1/mm within "
             f"{DENSE:g}; are they HU?"
         )
-    return attenuation(values) if stored == "HU" else values
+    return attenuation(values, energy_kev) if stored == "HU" else values
 
 
-def attenuation(hu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+def attenuation(hu: Float[Tensor, "*n"], energy_kev: float = 70.0) -> Float[Tensor, "*n"]:
     """Linear attenuation in 1/mm of Hounsfield units: two lines that meet at water, never below
     zero.
 
-    mu = WATER (1 + HU/1000) below 0 HU, WATER + (BONE - WATER) HU/1000 above. What scanners write
-    outside of their field of view (-1024, -2048) becomes air, 0.
+    mu = water (1 + HU/1000) below 0 HU, water + (bone - water) HU/1000 above, at 70 or 140.5 keV.
+    What scanners write outside of their field of view (-1024, -2048) becomes air, 0.
+
+    Raises:
+        ValueError: an energy that is not known.
     """
-    return WATER * (1 + hu.clamp(-1000, 0) / 1000) + (BONE - WATER) * hu.clamp(min=0) / 1000
+    water, bone = tissue_at(energy_kev)
+    return water * (1 + hu.clamp(-1000, 0) / 1000) + (bone - water) * hu.clamp(min=0) / 1000
 
 
-def hounsfield(mu: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Hounsfield units of a linear attenuation in 1/mm: the inverse of `attenuation`.
+def hounsfield(mu: Float[Tensor, "*n"], energy_kev: float = 70.0) -> Float[Tensor, "*n"]:
+    """Hounsfield units of a linear attenuation in 1/mm at an energy in keV: the inverse of
+    `attenuation`.
 
-    HU = 1000 (mu - WATER) / WATER up to water, 1000 (mu - WATER) / (BONE - WATER) above.
+    HU = 1000 (mu - water) / water up to water, 1000 (mu - water) / (bone - water) above.
+
+    Raises:
+        ValueError: an energy that is not known.
     """
-    above = mu - WATER
-    return 1000 * (above.clamp(max=0) / WATER + above.clamp(min=0) / (BONE - WATER))
+    water, bone = tissue_at(energy_kev)
+    above = mu - water
+    return 1000 * (above.clamp(max=0) / water + above.clamp(min=0) / (bone - water))
+
+
+def tissue_at(energy_kev: float) -> Tissue:
+    """Linear attenuation of water and bone at an energy in keV, in 1/mm.
+
+    Raises:
+        ValueError: an energy that is not known.
+    """
+    if energy_kev not in TISSUES:
+        raise ValueError(f"Expected one of the energies {sorted(TISSUES)} keV, got {energy_kev}")
+    return TISSUES[energy_kev]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.data.attenuation import BONE, WATER, attenuation
+from mvrecon.data.attenuation import BONE, WATER, attenuation, hounsfield
 
 
 @pytest.mark.parametrize(
@@ -29,3 +29,12 @@ def test_the_two_lines_meet_at_water_with_their_own_slopes():
     below, above = attenuation(hu).diff() / 1e-3
     assert below.item() == pytest.approx(WATER / 1000)
     assert above.item() == pytest.approx((BONE - WATER) / 1000)
+
+
+def test_at_the_energy_of_technetium_water_and_bone_are_those_of_nist():
+    hu = torch.tensor([-1000.0, 0.0, 400.0, 1000.0], dtype=torch.float64)
+    mu = attenuation(hu, 140.5)
+    assert mu[[0, 1, 3]].tolist() == pytest.approx([0, 0.01536, 0.0295])
+    torch.testing.assert_close(hounsfield(mu, 140.5), hu)
+    with pytest.raises(ValueError, match="energies"):
+        attenuation(hu, 141.0)

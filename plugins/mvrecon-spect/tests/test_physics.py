@@ -1,0 +1,189 @@
+"""Attenuation, blur and the edge of pinholes: closed forms, matched adjoints, doors."""
+
+import math
+
+import pytest
+import torch
+
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.grid import Grid
+from mvrecon.projectors.selection import view_subset
+from mvrecon_spect.hole import Hole
+from mvrecon_spect.multiplexed import Multiplexed
+from mvrecon_spect.projector import Spect
+
+BLUR = {"blur": True, "intrinsic_mm": 4.0}
+
+
+def scene(dtype=torch.float64):
+    torch.manual_seed(0)
+    grid = Grid.centred(size=(10, 9, 8), spacing=12.0)
+    return (
+        grid,
+        dcspect80(pixels=[12, 10], columns=[0, 5, 11], rows=[0, 1]),
+        0.03 * torch.rand(grid.shape, dtype=dtype),
+    )
+
+
+def width(profile):
+    """Full width at half of the maximum, in samples, linear between them."""
+    half = profile.max().item() / 2
+    above = (profile > half).nonzero().flatten()
+    first, last = int(above[0]), int(above[-1])
+    before, low, high, after = (profile[i].item() for i in (first - 1, first, last, last + 1))
+    return last - first + (low - half) / (low - before) + (high - half) / (high - after)
+
+
+@pytest.mark.parametrize("module", [0, 10, 25])
+def test_a_point_at_the_heart_has_the_image_of_the_hole_and_a_line_its_half_chord(module):
+    camera = dcspect80(pixels=201)[[module]]
+    grid = Grid.centred(size=(3, 3, 3), spacing=0.3)
+    x = torch.zeros(1, 1, 3, 3, 3, dtype=torch.float64)
+    x[..., 1, 1, 1] = 1
+    image = Spect(grid, camera, 2.3, blur=True)(x)[0, 0, 0]
+    z, length = camera.source.norm().item(), camera.distance.item()
+    at_object = 50 / 201 * z / length
+    point, line = width(image[100]) * at_object, width(image.sum(dim=0)) * at_object
+    assert point == pytest.approx(2.3 * (z + length) / length, rel=0.015)
+    assert 9.8 < point < 10.4
+    assert line == pytest.approx(math.sqrt(3) / 2 * 2.3 * (z + length) / length, rel=0.04)
+
+
+def test_the_detector_adds_its_own_width_in_quadrature():
+    camera = dcspect80(pixels=151)[[0]]
+    grid = Grid.centred(size=(3, 3, 3), spacing=0.3)
+    x = torch.zeros(1, 1, 3, 3, 3, dtype=torch.float64)
+    x[..., 1, 1, 1] = 1
+    place = torch.arange(151, dtype=torch.float64) - 75
+
+    def variance(**options):
+        image = Spect(grid, camera, 2.3, **options)(x)[0, 0, 0].sum(dim=0)
+        return ((image * place**2).sum() / image.sum()).item() * (50 / 151) ** 2
+
+    own = 4.0**2 / (8 * math.log(2))
+    added = variance(blur=True, intrinsic_mm=4.0) - variance(blur=True)
+    assert added == pytest.approx(own, rel=0.03)
+
+
+def test_blur_keeps_counts_of_what_lies_in_the_field():
+    grid = Grid.centred(size=(6, 6, 6), spacing=4.0)
+    cameras = dcspect80(pixels=24, columns=[0, 9], rows=[1])
+    x = torch.rand(1, 1, 6, 6, 6, dtype=torch.float64)
+    sharp, soft = Spect(grid, cameras)(x), Spect(grid, cameras, **BLUR)(x)
+    torch.testing.assert_close(soft.sum(dim=(-2, -1)), sharp.sum(dim=(-2, -1)), rtol=5e-3, atol=0)
+
+
+@pytest.mark.parametrize("method", ["joseph", "siddon"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_blurred_and_attenuated_adjoints_match_and_agree_with_the_oracle(method, dtype, tolerance):
+    grid, cameras, mu = scene(dtype)
+    x = torch.rand(1, 2, *grid.shape, dtype=dtype)
+    results = []
+    for backend in ("cpu", "reference"):
+        m = mu.clone().requires_grad_()
+        A = Spect(grid, cameras, 6.0, m, **BLUR, method=method, backend=backend)
+        y = A(x)
+        z = torch.linspace(-1, 2, y.numel(), dtype=dtype).reshape(y.shape)
+        back = A.T(z)
+        products = (y.double() * z).sum().item(), (x.double() * back).sum().item()
+        assert products[0] == pytest.approx(products[1], rel=tolerance)
+        results.append((y, back, torch.autograd.grad((y * z).sum(), m)[0]))
+    for one, other in zip(*results, strict=True):
+        assert (one - other).norm() <= tolerance * other.norm()
+
+
+def test_subsets_crops_and_supports_are_those_of_the_whole():
+    from mvrecon.geometry.box import Box
+
+    grid, cameras, mu = scene()
+    x = torch.rand(1, 1, *grid.shape, dtype=torch.float64)
+    for options in (BLUR, {}):
+        A = Spect(grid, cameras, 6.0, mu, **options)
+        y = A(x)
+        torch.testing.assert_close(view_subset(A, [4, 1])(x), y[:, :, [4, 1]])
+        support = torch.rand(grid.shape) > 0.5
+        torch.testing.assert_close(A.with_support(support)(x), A(x * support))
+        box = Box((1, 2, 3), (8, 9, 10))
+        inside = torch.zeros_like(x)
+        inside[:, :, *box.slices] = x[:, :, *box.slices]
+        part = A.cropped(box, [5, 0])(x[:, :, *box.slices])
+        torch.testing.assert_close(part, A(inside)[:, :, [5, 0]])
+
+
+def test_what_does_nothing_costs_nothing_to_the_last_bit():
+    grid, cameras, _ = scene()
+    x = torch.rand(1, 1, *grid.shape)
+    plain = Spect(grid, cameras, 0.94)(x)
+    nothing = Spect(grid, cameras, 0.94, mu=0.0, blur=True, intrinsic_mm=1.0)
+    assert torch.equal(nothing(x), plain)
+
+
+def test_a_rim_that_lets_counts_through_widens_the_hole():
+    mu, tangent = 2.692, math.tan(math.radians(45))
+    edge = {"collimator_mu": mu, "opening_degrees": 90.0}
+    assert Hole(2.3, **edge).effective_mm[0] == pytest.approx((2.3 * (2.3 + 2 / mu)) ** 0.5)
+    paix = (2.3**2 + 2 * 2.3 / mu * tangent + 2 / mu**2) ** 0.5
+    assert Hole(2.3, **edge, sensitivity="paix").effective_mm[0] == pytest.approx(paix)
+    assert Hole(2.3, **edge).blurring_mm[0] == pytest.approx(2.3 + math.log(2) / mu)
+    assert Hole(2.3).effective_mm == Hole(2.3).blurring_mm == (2.3, 2.3)
+
+
+def test_the_shape_of_a_hole_counts_by_its_area_and_the_cone_cuts():
+    _, cameras, _ = scene()
+    square = Hole([2.0, 3.0]).weight(cameras)
+    round_ = Hole(2.0).weight(cameras)
+    torch.testing.assert_close(square / round_, torch.full_like(square, 6 / math.pi))
+    cone = Hole(2.0, acceptance_degrees=10.0).weight(cameras)
+    start, end = cameras.rays()
+    cosine = cameras.distance[:, None, None] / (end - start).norm(dim=-1)
+    accepted = cosine >= math.cos(math.radians(10))
+    assert 0 < int(accepted.sum()) < accepted.numel()
+    assert torch.equal(cone, round_ * accepted)
+
+
+def test_the_images_of_holes_on_one_detector_add_up():
+    grid, cameras, mu = scene()
+    pinholes = Spect(grid, cameras, 2.3, mu)
+    A = Multiplexed(pinholes, 2)
+    x = torch.rand(1, 1, *grid.shape, dtype=torch.float64)
+    y = pinholes(x)
+    torch.testing.assert_close(A(x), y[:, :, 0::2] + y[:, :, 1::2])
+    z = torch.rand_like(A(x))
+    assert (A(x) * z).sum().item() == pytest.approx((x * A.T(z)).sum().item(), rel=1e-12)
+    torch.testing.assert_close(view_subset(A, [2])(x), A(x)[:, :, [2]])
+
+
+def test_a_volume_in_a_file_is_resampled_to_the_grid(tmp_path):
+    from mvrecon.data.nifti import save_nifti
+
+    grid, cameras, _ = scene()
+    save_nifti(tmp_path / "mu.nii.gz", torch.full((16, 18, 20), 0.015), grid.refined(2))
+    A = Spect(grid, cameras, mu=str(tmp_path / "mu.nii.gz"))
+    torch.testing.assert_close(A.A.mu, torch.full(grid.shape, 0.015))
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"mu": 0.15}, "1/cm"),
+        ({"mu": -0.01}, "zero or more"),
+        ({"diameter_mm": -1.0}, "positive mm"),
+        ({"diameter_mm": [1.0, 2.0, 3.0]}, "two sides"),
+        ({"collimator_mu": 0.0}, "attenuation"),
+        ({"opening_degrees": 180.0}, "opening angle"),
+        ({"acceptance_degrees": 100.0}, "acceptance"),
+        ({"sensitivity": "none"}, "law"),
+        ({"intrinsic_mm": -1.0}, "FWHM"),
+    ],
+)
+def test_impossible_options_are_refused(options, told):
+    grid, cameras, _ = scene()
+    with pytest.raises(ValueError, match=told):
+        Spect(grid, cameras, **options)
+
+
+@pytest.mark.door
+def test_a_pinhole_in_the_object_is_refused():
+    with pytest.raises(ValueError, match="pinhole 0 in it"):
+        Spect(Grid.centred(10, spacing=60.0), dcspect80(pixels=4))
