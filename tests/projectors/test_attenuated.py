@@ -182,6 +182,7 @@ def test_every_bit_is_the_same_for_any_number_of_threads():
     [(0.15, "1/cm"), (-0.01, "zero or more"), (torch.nan, "finite")],
 )
 def test_impossible_attenuation_is_refused(value, told):
+    """Attenuation that is negative, not finite or in 1/cm is refused, with the unit."""
     grid, mu, _ = scene()
     mu[3, 3, 3] = value
     with pytest.raises(ValueError, match=told):
@@ -190,6 +191,7 @@ def test_impossible_attenuation_is_refused(value, told):
 
 @pytest.mark.door
 def test_attenuation_of_another_grid_and_sampled_rays_are_refused():
+    """Attenuation of another grid, or along rays of samples, is refused."""
     grid, mu, _ = scene()
     with pytest.raises(ValueError, match="sizes"):
         AttenuatedTransform(grid, rig(), mu[1:])

@@ -178,6 +178,7 @@ def test_a_volume_in_a_file_is_resampled_to_the_grid(tmp_path):
     ],
 )
 def test_impossible_options_are_refused(options, told):
+    """Options of a pinhole, its blur and attenuation that cannot be are refused."""
     grid, cameras, _ = scene()
     with pytest.raises(ValueError, match=told):
         Spect(grid, cameras, **options)
@@ -185,5 +186,6 @@ def test_impossible_options_are_refused(options, told):
 
 @pytest.mark.door
 def test_a_pinhole_in_the_object_is_refused():
+    """A pinhole inside the grid of the activity is refused."""
     with pytest.raises(ValueError, match="pinhole 0 in it"):
         Spect(Grid.centred(10, spacing=60.0), dcspect80(pixels=4))

@@ -107,7 +107,7 @@ def mu_vjp(
 
     def spread(into: Store, copy: Copy, desk: Desk, slabs: Slabs) -> None:
         reads, matter = plan.reads[into.near], Matter(copy.store, count)
-        bend_slabs(into, matter, copy.store, copy.rig, desk, reads, values, slabs)
+        bend_slabs(into, matter, copy.rig, desk, reads, values, slabs)
 
     both = torch.cat([wide(volume).to(views.dtype), mu.to(views.dtype)[None]])
     made = copies(both, occupancy, plan)

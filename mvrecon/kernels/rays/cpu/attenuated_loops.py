@@ -27,7 +27,7 @@ from mvrecon.kernels.rays.cpu.transmission import (
 from mvrecon.kernels.rays.trace import SIDDON, from_centre, main_axis, trace, within
 from mvrecon.kernels.rays.trace import at as component
 
-#: A store and which of its volumes is the attenuation; what one thread works in: see `loops.Room`
+#: A store and one of its volumes, as of attenuation; what one thread works in: see `loops.Room`
 #: and `transmission.Path`; and the layers [m k] of every view, see `layers.py`.
 Matter = namedtuple("Matter", ["store", "at"])
 Desk = namedtuple("Desk", ["room", "path", "layers"])
@@ -46,29 +46,28 @@ def _attenuate(matter, rig, ray, part, ascending, steps, desk):
     """
     visited = visit(rig, ray, part, desk.room)
     cells(rig, ray, visited[0], steps, desk.room)
-    integrals(matter.store, matter.at, rig, ray, steps, desk.room, visited[0], desk.path.depth)
+    integrals(matter, rig, ray, steps, desk.room, visited[0], desk.path.depth)
     transmit(desk.path, segments_of(rig, visited[0]), ascending)
     return visited
 
 
 @scalar
-def _spread(target, rig, ray, parts, steps, desk, value):
-    """Add a value to a volume, (store, n), along a part of a ray, each segment times its number in
-    `own`.
+def _spread(volume, rig, ray, span, made, steps, desk):
+    """Add to a volume, along a span of a ray, every segment's length times its number in `own`.
 
-    `parts`: the slabs to spread into; those whose segments are known, whose cells are in the room
-    unless it ends before it begins.
+    `made` are the slabs whose segments are known, and whose cells are in the room unless it ends
+    before it begins.
     """
-    (store, n), (span, made) = target, parts
+    store, n, real = volume.store, volume.at, volume.store.values.dtype.type
     count = np.uint32(span[1] - span[0])
     if made[0] != span[0] or made[1] != span[1]:
         count = visit(rig, ray, span, desk.room)[0]
         cells(rig, ray, count, steps, desk.room)
     weigh(rig, desk.room, desk.path.own, span[0] - made[0], count)
     if rig.method == SIDDON:
-        siddon.spread(store, n, count, desk.room, value)
+        siddon.spread(store, n, count, desk.room, real(ray.length))
     else:
-        joseph.spread(store, n, steps, count, desk.room, value)
+        joseph.spread(store, n, steps, count, desk.room, real(ray.length))
 
 
 @compiled
@@ -92,7 +91,9 @@ def project_rows(store, matter, rig, desk, reads, views, units):
                 layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
                 count, path = segments_of(rig, visited[0]), desk.path
                 for n in range(len(views)):
-                    integrals(store, n, rig, ray, steps, desk.room, visited[0], path.emission)
+                    integrals(
+                        Matter(store, n), rig, ray, steps, desk.room, visited[0], path.emission
+                    )
                     deal(path, count, views[n, m, v, u])
                 continue
             weigh(rig, desk.room, desk.path.share, 0, visited[0])
@@ -126,20 +127,19 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
             part = (ray.first, span[1]) if ascending else (span[0], ray.last)
             visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
             layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
-            length, path = store.values.dtype.type(ray.length), desk.path
-            count = segments_of(rig, visited[0])
+            count, path = segments_of(rig, visited[0]), desk.path
             for n in range(len(views)):
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
                     path.own[i] *= path.share[i]
                 made = part if n == 0 else (part[0], part[0] - 1)
-                _spread((store, n), rig, ray, (span, made), steps, desk, length)
+                _spread(Matter(store, n), rig, ray, span, made, steps, desk)
 
 
 @compiled
-def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
-    """Spread into volume 0 of a store the derivative of sum(views * projections of the sources) by
-    the attenuation.
+def bend_slabs(store, matter, rig, desk, reads, views, slabs):
+    """Spread into volume 0 of a store the derivative of sum(views * projections) by the
+    attenuation, of the volumes before it in its own store.
     """
     steps = steps_of(rig, store, slabs.axis)
     for unit in range(len(reads.views) * max(rig.detector)):
@@ -162,10 +162,11 @@ def bend_slabs(store, matter, sources, rig, desk, reads, views, slabs):
             for i in range(count):
                 path.source[i] = 0
             for n in range(len(views)):
-                integrals(sources, n, rig, ray, steps, desk.room, visited[0], path.emission)
+                integrals(
+                    Matter(matter.store, n), rig, ray, steps, desk.room, visited[0], path.emission
+                )
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
                     path.source[i] += path.own[i] * path.emission[i]
             bend(path, count, ascending)
-            length = store.values.dtype.type(ray.length)
-            _spread((store, 0), rig, ray, (span, part), steps, desk, length)
+            _spread(Matter(store, 0), rig, ray, span, part, steps, desk)

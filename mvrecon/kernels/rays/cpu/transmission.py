@@ -69,9 +69,9 @@ def cells(rig, ray, count, steps, room):
 
 
 @scalar
-def integrals(store, n, rig, ray, steps, room, count, into):
-    """The integrals of volume n over the segments of a ray, in mm times its unit."""
-    real = into.dtype.type
+def integrals(volume, rig, ray, steps, room, count, into):
+    """The integrals of a volume over the segments of a ray, in mm times its unit."""
+    store, n, real = volume.store, volume.at, into.dtype.type
     length = real(ray.length)
     if rig.method == SIDDON:
         index0, index1, index2, part0, part1, part2 = siddon.crossed(room)
