@@ -100,3 +100,13 @@ def test_a_subset_that_does_not_exist_is_refused(options, message):
 
 def test_the_table_is_a_part_of_the_package():
     assert len(modules()) == 80 and modules()[0] == (277.002, 70.37124, -70.0363, 89.07020616)
+
+
+def test_a_field_of_two_has_detectors_twice_as_wide_about_the_same_axes():
+    plain, wide = dcspect80(pixels=8), dcspect80(pixels=8, field=2)
+    torch.testing.assert_close(wide.u, 2 * plain.u)
+    torch.testing.assert_close(wide.v, 2 * plain.v)
+    middle = [c.origin + 3.5 * (c.u + c.v) for c in (plain, wide)]
+    torch.testing.assert_close(*middle)
+    with pytest.raises(ValueError, match="positive factor"):
+        dcspect80(field=0)
