@@ -232,7 +232,7 @@ def test_the_truth_on_the_files_own_voxels_is_the_file(tmp_path, cameras):
 
 
 def test_exact_moves_are_those_of_every_series_and_keep_the_patient_s_mass(volume_file, cameras):
-    """Mirrored and shifted by any length, voxels' means are exact: nothing is lost within the grid."""
+    """Mirrored and shifted by any length, voxels' means stay exact."""
     roomy = Grid.centred((16, 16, 16), 6.0)
     scene = Hdf5Volumes(path=str(volume_file), vary="exact", fine=2)
     still = scene.sample(2, 0, roomy, cameras)

@@ -1,11 +1,13 @@
 """One round: residual views, the cameras' corrections, and the network in the world."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.geometry.box import Box, placed
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.rounds.cells import from_cells, padded, to_cells, trimmed
 from mvrecon.models.rounds.evidence import MAGNIFIED, Evidence
@@ -39,11 +41,13 @@ class Measured(NamedTuple):
         geometry: the operator and SIRT's weights; C is zero outside the support.
         views: y, relative to the content's scale.
         chord: 1 / R in mm, zero where R is.
+        boxes: of each sample, what the networks in the world see; none for the whole grid.
     """
 
     geometry: Geometry
     views: Float[Tensor, "b 1 m v u"]
     chord: Float[Tensor, "#b 1 m v u"]
+    boxes: Sequence[Box] | None = None
 
 
 class Round(nn.Module):
@@ -87,7 +91,7 @@ class Round(nn.Module):
         if self.cameras is not None and self.trust is not None:
             state, added = self._corrected(measured, state, residual, change)
             change = change + geometry.back(self.trust * measured.chord * added)
-        learned, memory = self._world(geometry, state, change)
+        learned, memory = self._world(measured, state, change)
         x = x + geometry.within(learned + self.step * change)
         return state._replace(volume=x, memory=memory)
 
@@ -109,12 +113,26 @@ class Round(nn.Module):
         return state._replace(correction=total, camera_memory=memory), added
 
     def _world(
-        self, geometry: Geometry, state: State, change: Float[Tensor, "b 1 d h w"]
+        self, measured: Measured, state: State, change: Float[Tensor, "b 1 d h w"]
     ) -> tuple[Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 d h w"]]:
-        x = state.volume
-        hull = torch.ones_like(x) if geometry.mask is None else geometry.mask.to(x.dtype)
+        x, mask = state.volume, measured.geometry.mask
+        hull = torch.ones_like(x) if mask is None else mask.to(x.dtype)
         evidence = torch.cat([x, MAGNIFIED * change, hull, state.memory], dim=1)
+        if measured.boxes is None:
+            return self._answer(evidence)
+        samples = zip(evidence.split(1), measured.boxes, strict=True)
+        volumes = [
+            placed(torch.cat(self._answer(one[..., *box.slices]), dim=1), box, x.shape[2:])
+            for one, box in samples
+        ]
+        learned, memory = torch.cat(volumes).split(1, dim=1)
+        return learned, memory
+
+    def _answer(
+        self, evidence: Float[Tensor, "b 4 d h w"]
+    ) -> tuple[Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 d h w"]]:
+        """The change that the network in the world has learned, and its memory."""
         answer = self.world(to_cells(padded(evidence, self.edge), self.edge))
-        volumes = trimmed(from_cells(answer, self.edge), x.shape[2:])
+        volumes = trimmed(from_cells(answer, self.edge), evidence.shape[2:])
         learned, memory = volumes.split(1, dim=1)
         return learned, memory
