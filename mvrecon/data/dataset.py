@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.progress import track
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -60,21 +60,22 @@ class SceneDataset(Dataset[dict[str, Any]]):
             raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
         if self.cache:
             return {key: values[item] for key, values in self.prepare().items()}
-        return self._made(item)
+        return self.made(item)
 
-    def prepare(self, what: str = "cases") -> dict[str, Any]:
-        """Compute every case once and stack them, so that worker processes share a few blocks of
-        memory and not thousands.
+    def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
+        """Compute every case once, in so many processes beside this one, and stack them, so that
+        worker processes share a few blocks of memory and not thousands.
         """
         if self._ready is None:
             console = Console(stderr=True)
-            steps = track(range(len(self)), f"Preparing {what}", transient=True, console=console)
-            items = [self._made(item) for item in steps]
+            made = DataLoader(_Making(self), batch_size=None, num_workers=workers)
+            items = list(track(made, f"Preparing {what}", transient=True, console=console))
             self._ready = {key: torch.stack([i[key] for i in items]) for key in TENSORS if items}
             self._ready["name"] = [i["name"] for i in items]
         return self._ready
 
-    def _made(self, item: int) -> dict[str, Any]:
+    def made(self, item: int) -> dict[str, Any]:
+        """The case, made anew."""
         index = self.indices[item]
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
@@ -85,6 +86,19 @@ class SceneDataset(Dataset[dict[str, Any]]):
                     f"{sample.name}: expected finite {key}, got {bad} values that are not"
                 )
         return {**made, "name": sample.name}
+
+
+class _Making(Dataset[dict[str, Any]]):
+    """The cases of a set, made anew whenever they are asked for."""
+
+    def __init__(self, cases: SceneDataset):
+        self.cases = cases
+
+    def __len__(self) -> int:
+        return len(self.cases)
+
+    def __getitem__(self, item: int) -> dict[str, Any]:
+        return self.cases.made(item)
 
 
 class EpochOrder(Sampler[int]):

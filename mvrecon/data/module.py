@@ -9,9 +9,11 @@ import lightning.pytorch as L
 import torch
 from torch.utils.data import DataLoader
 
+from mvrecon import __version__
 from mvrecon.acquisition.acquired import Acquired
 from mvrecon.acquisition.settings import Acquisition
 from mvrecon.data import digests as sha256
+from mvrecon.data.case_store import CaseStore
 from mvrecon.data.dataset import EpochOrder, SceneDataset
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
@@ -39,11 +41,12 @@ class SceneData(L.LightningDataModule):
             integrals; `acquisition`, options of `Acquisition`, None: a perfect detector.
         sizes: the number of cases for "train", "val" and "test"; a file may hold fewer.
         batch_size: cases in a batch.
-        workers: processes that load batches; cases are made once, so 0 is as fast for all but huge
-            sets.
+        workers: processes that make the cases before training, and load batches.
         overlap: training, validation and test take the first cases of a file, the same ones: for a
             file with one volume.
         seed: of the training cases and their order.
+        cache: folder in which cases are kept from run to run, without their noise; None: they are
+            made anew by every run. All cases of a run are kept in memory either way.
 
     Raises:
         TypeError: an unknown option of the acquisition.
@@ -60,6 +63,7 @@ class SceneData(L.LightningDataModule):
         workers: int = 0,
         overlap: bool = False,
         seed: int = 0,
+        cache: str | None = None,
     ):
         super().__init__()
         if missing := {"train", "val", "test"} ^ set(sizes):
@@ -78,7 +82,8 @@ class SceneData(L.LightningDataModule):
         self.projector = measurement.get("projector")
         self.acquisition = Acquisition.of(measurement.get("acquisition"))
         self.sizes, self.batch_size, self.workers = dict(sizes), batch_size, workers
-        self.overlap, self.seed = overlap, seed
+        self.overlap, self.seed, self.cache = overlap, seed, cache
+        self._settings = {key: dict(scenes[key]) for key in ("train", "test")}
         self.scenes: dict[str, Scene] = {
             key: SCENES.from_config(scenes[key]) for key in ("train", "test")
         }
@@ -134,15 +139,29 @@ class SceneData(L.LightningDataModule):
         series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}
         for part in STAGES[stage] if stage else ("train", "val", "test"):
             if part not in self.sets:
-                scene = self.scenes["test" if part == "test" else "train"]
-                measured = Acquired(scene, self.projector, self.acquisition)
+                measured = self._measured("test" if part == "test" else "train")
                 made = SceneDataset(
                     measured, self.grid, self.cameras, self.indices(part), series[part]
                 )
-                made.prepare(f"{part} cases")
+                made.prepare(f"{part} cases", self.workers)
                 self.sets[part] = made
         if "train" in self.sets:
             self._order = EpochOrder(len(self.sets["train"]), self.seed)
+
+    def _measured(self, key: str) -> Acquired:
+        """The scene "train" or "test" behind its detector, with the cases that are kept of it."""
+        scene, store = self.scenes[key], None
+        if self.cache is not None:
+            digests = self.digests(key)
+            made_of = {
+                "version": __version__,
+                "scene": self._settings[key],
+                "files": {path: digests[path] for path in self._files[key]},
+                "projector": self.projector,
+                "fine": self.acquisition.fine,
+            }
+            store = CaseStore(self.cache, made_of, scene)
+        return Acquired(scene, self.projector, self.acquisition, store)
 
     def train_dataloader(self) -> DataLoader[dict[str, Any]]:
         """Training batches, in another random order in every epoch."""

@@ -5,9 +5,10 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from mvrecon.geometry.box import Box
 from mvrecon.models.consistency import Consistency, Start, checked_start, normalised
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.door import admitted
@@ -21,6 +22,9 @@ from mvrecon.projectors.operator import Projector
 
 #: Of the longest chord of a support: as long counts each ray that meets it, at least.
 SHORTEST = 0.1
+#: Voxels around a support that networks see, and of whose multiples their boxes have bounds: cells
+#: and coarser voxels keep their places for networks of three scales.
+MARGIN, ALIGNED = 4, 8
 
 
 class Rounds(nn.Module):
@@ -41,13 +45,15 @@ class Rounds(nn.Module):
         support: where the density may differ from zero, from the views: the visual "hull", its
             "box", "auto", or "none" for the whole grid.
         noise: of the views, as `support_from_views` wants it; none for exact views.
+        crop: whether the networks in the world see no more of the grid than the box around a
+            sample's support, with a margin of 4 voxels.
         precision: of the convolutions, "float32", or "auto": bfloat16 where the processor has
             instructions for it.
 
     Raises:
         TypeError: an option that a round does not have.
-        ValueError: no round, an unknown support or precision, or cameras' networks whose memories
-            do not fit one another.
+        ValueError: no round, an unknown support or precision, a crop without a support, or cameras'
+            networks whose memories do not fit one another.
     """
 
     def __init__(
@@ -59,6 +65,7 @@ class Rounds(nn.Module):
         support: str = "none",
         noise: Mapping[str, Any] | None = None,
         precision: Precision = "float32",
+        crop: bool = False,
     ):
         super().__init__()
         if not rounds or precision not in ("float32", "auto"):
@@ -69,7 +76,9 @@ class Rounds(nn.Module):
         options = [RoundOptions.of(one) for one in rounds]
         first = next((i for i, one in enumerate(options) if one.corrects), len(options))
         self.cropping = Cropping(projector, Options(support=support, noise=noise))
-        self.start = checked_start(start)
+        if crop and support == "none":
+            raise ValueError("Expected a support to crop to, got crop=True and support='none'")
+        self.crop, self.start = crop, checked_start(start)
         self.rounds = nn.ModuleList(
             Round(projector, one, first < i, precision) for i, one in enumerate(options)
         )
@@ -91,7 +100,8 @@ class Rounds(nn.Module):
         geometry = self._geometry(views)
         y, x0, scale = normalised(geometry, views, self.start)
         chord = torch.where(geometry.row > 0, 1 / geometry.row, 0)
-        measured, state = Measured(geometry, y, chord), State(x0, torch.zeros_like(x0))
+        boxes = boxes_of(geometry.mask) if self.crop and geometry.mask is not None else None
+        measured, state = Measured(geometry, y, chord, boxes), State(x0, torch.zeros_like(x0))
         volumes, corrected = [], []
         for one in self.rounds:
             state = one(measured, state)
@@ -136,3 +146,12 @@ def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Tens
         "weights": fused.weights,
         "cross_views": fused.expected * scale,
     }
+
+
+def boxes_of(mask: Bool[Tensor, "b 1 d h w"]) -> list[Box]:
+    """The box around each sample's mask, with its margin and bounds that the networks divide; of
+    none, the whole grid.
+    """
+    shape = mask.shape[2:]
+    boxes = [Box.around(own).grown(MARGIN, shape).aligned(ALIGNED, shape) for own in mask]
+    return [box if box.size else Box.whole(shape) for box in boxes]
