@@ -3,6 +3,7 @@ makes of their volumes.
 """
 
 import csv
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,21 +23,41 @@ CONSISTENT = 300
 
 
 class Training(NamedTuple):
-    """One network of the experiment, trained from one seed."""
+    """One network of the experiment, trained from one seed.
+
+    Args:
+        method: label of the experiment.
+        seed: of weights and training slices.
+        changed: one of `LOSSES`; none for the experiment's own loss.
+    """
 
     method: str
     seed: int
+    changed: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name in the table."""
+        return self.changed or self.method
 
 
-TRAININGS = tuple(
-    Training(method, seed)
-    for methods in (
-        ("fbp_unet", "sinogram_unet", "dual_domain", "itnet_1", "itnet"),
-        ("itnet_2", "primal_dual"),
-        ("itnet_8",),
-    )
-    for seed in (0, 1)
-    for method in methods
+#: Losses of the sinogram network beside that of the experiment, which is of both.
+LOSSES = {
+    "sinogram_unet, volume's loss": "loss.corrected_views=0",
+    "sinogram_unet, sinogram's loss": "loss.volume=0",
+}
+TRAININGS = (
+    *(
+        Training(method, seed)
+        for methods in (
+            ("fbp_unet", "sinogram_unet", "dual_domain", "itnet_1", "itnet"),
+            ("itnet_2", "primal_dual"),
+        )
+        for seed in (0, 1)
+        for method in methods
+    ),
+    *(Training("sinogram_unet", 0, changed) for changed in LOSSES),
+    Training("itnet_8", 0),
 )
 
 
@@ -45,9 +66,10 @@ def rows(training: Training, outputs: Path) -> Iterator[dict[str, Any]]:
 
     The training goes on from its last checkpoint where it broke off.
     """
-    settings = compose("experiment=sparse_view", f"seed={training.seed}")
+    changes = [LOSSES[training.changed]] if training.changed else []
+    settings = compose("experiment=sparse_view", f"seed={training.seed}", *changes)
     settings |= {"model": fit.methods(settings)[training.method], "compare": {}}
-    folder = outputs / f"{training.method}_{training.seed}"
+    folder = outputs / f"{plain(training.label)}_{training.seed}"
     table = train(settings, folder)
     (figures,) = table["methods"].values()
     with (folder / "metrics.csv").open(encoding="utf-8") as file:
@@ -55,7 +77,7 @@ def rows(training: Training, outputs: Path) -> Iterator[dict[str, Any]]:
     size, views = settings["grid"]["size"][0], settings["camera"]["n_views"]
     for steps in STEPS:
         yield {
-            "method": training.method,
+            "method": training.label,
             "size": size,
             "views": views,
             "seed": training.seed,
@@ -68,6 +90,11 @@ def rows(training: Training, outputs: Path) -> Iterator[dict[str, Any]]:
             "parameters": figures["parameters"],
             "nrmse_consistent": consistent(settings, folder) if steps == STEPS[-1] else "",
         }
+
+
+def plain(label: str) -> str:
+    """A label as a folder's name."""
+    return re.sub(r"\W+", "_", label)
 
 
 @torch.no_grad()

@@ -60,7 +60,7 @@ def main() -> None:
             write(table, out)
     size = str(classical.SMALL.size)
     for training in learned.TRAININGS:
-        if (training.method, size, str(training.seed)) not in known:
+        if (training.label, size, str(training.seed)) not in known:
             table += learned.rows(training, options.outputs)
             write(table, out)
     figure.draw(list(csv.DictReader(out.open(encoding="utf-8"))), out.with_name("convergence.png"))
