@@ -28,36 +28,40 @@ class Training(NamedTuple):
     Args:
         method: label of the experiment.
         seed: of weights and training slices.
-        changed: one of `LOSSES`; none for the experiment's own loss.
+        variant: one of `VARIANTS`; none for the network as the experiment has it.
     """
 
     method: str
     seed: int
-    changed: str = ""
+    variant: str = ""
 
     @property
     def label(self) -> str:
         """Name in the table."""
-        return self.changed or self.method
+        return self.variant or self.method
 
 
-#: Losses of the sinogram network beside that of the experiment, which is of both.
-LOSSES = {
+#: Networks with one setting of the experiment changed: the loss, which is of volume and sinogram,
+#: and the number of unrolled iterations, which is four.
+VARIANTS = {
     "sinogram_unet, volume's loss": "loss.corrected_views=0",
     "sinogram_unet, sinogram's loss": "loss.volume=0",
+    "itnet_2": "model.iterations=2",
+    "itnet_8": "model.iterations=8",
 }
+SEEDS = (0, 1)
 TRAININGS = (
     *(
         Training(method, seed)
-        for methods in (
-            ("fbp_unet", "sinogram_unet", "dual_domain", "itnet_1", "itnet"),
-            ("itnet_2", "primal_dual"),
-        )
-        for seed in (0, 1)
-        for method in methods
+        for seed in SEEDS
+        for method in ("fbp_unet", "sinogram_unet", "dual_domain", "itnet_1", "itnet")
     ),
-    *(Training("sinogram_unet", 0, changed) for changed in LOSSES),
-    Training("itnet_8", 0),
+    *(
+        Training("itnet" if "itnet" in variant else "sinogram_unet", seed, variant)
+        for seed in SEEDS
+        for variant in VARIANTS
+    ),
+    *(Training("primal_dual", seed) for seed in SEEDS),
 )
 
 
@@ -66,7 +70,7 @@ def rows(training: Training, outputs: Path) -> Iterator[dict[str, Any]]:
 
     The training goes on from its last checkpoint where it broke off.
     """
-    changes = [LOSSES[training.changed]] if training.changed else []
+    changes = [VARIANTS[training.variant]] if training.variant else []
     settings = compose("experiment=sparse_view", f"seed={training.seed}", *changes)
     settings |= {"model": fit.methods(settings)[training.method], "compare": {}}
     folder = outputs / f"{plain(training.label)}_{training.seed}"
