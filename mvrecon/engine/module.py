@@ -1,6 +1,7 @@
 """One model in training, as a LightningModule: its loss, figures of merit and optimiser."""
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import lightning.pytorch as L
@@ -86,8 +87,20 @@ class ReconstructionModule(L.LightningModule):
     def _terms(self, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
         """The loss, with the truth's own views where views are corrected towards them."""
         if self.loss.compares_views(out):
-            batch = {**batch, "true_views": self.projector(batch["volume"])}
+            A = self.corrected_projector.to(batch["volume"].device)
+            batch = {**batch, "true_views": A(batch["volume"])}
         return self.loss(out, batch)
+
+    @cached_property
+    def corrected_projector(self) -> Projector:
+        """The operator of the views that the model corrects: its own, or one of the same kind for
+        the model's `corrected_cameras`.
+        """
+        cameras = getattr(self.model, "corrected_cameras", None)
+        if cameras is None:
+            return self.projector
+        options = self.hparams["geometry"]["projector"]
+        return PROJECTORS.from_config(options, grid=self.projector.grid, cameras=cameras)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
         """Log the loss and the figures of merit; hand the reconstruction on to the board."""
