@@ -127,6 +127,8 @@ class Acquired:
                 views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
         if errors is not None:
             views = views * errors.gain.to(views)
+            gain = errors.gain[:, 0, 0].to(views)
+            sample = replace(sample, shift_px=errors.offset_px.to(views), gain=gain)
         return replace(sample, views=detected(views, self.acquisition, cameras, rng))
 
     def _source_of(self, grid: Grid, cameras: Cameras) -> Lines | Projection:

@@ -8,17 +8,16 @@ and a prior towards a camera as it should be.
 Convention: shifts are those of `Misalignment.offset_px`: of the detector, along (u, v).
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-#: Pixels of each side that count in `translated`, and the longest shift in pixels.
-REACH = LONGEST = 4
-#: Blur of both views before they are compared, standard deviation in pixels.
-BLUR = 1.0
+from mvrecon.calibration.translation import LONGEST, blurred, translated
+
 #: Huber's threshold in standard deviations, the factor from a median to these, fits by weights.
 HUBER, DEVIATION, REWEIGHTED = 1.345, 1.4826, 3
 #: Pixels among which errors of an expected view are alike.
@@ -37,6 +36,10 @@ class Prior(NamedTuple):
 
     shift_px: float = 1.0
     gain: float = 0.05
+
+
+#: A pixel and 5 %.
+USUAL = Prior()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +65,43 @@ class Alignment:
         pair = zero[..., None].expand(-1, -1, 2)
         return cls(pair, zero + 1, pair, zero)
 
-    def deviation(self, prior: Prior = Prior()) -> Float[Tensor, "b m"]:
+    @classmethod
+    def joined(cls, parts: Sequence["Alignment"]) -> "Alignment":
+        """The alignments of batches, one behind the other."""
+        columns = zip(*(one.tensors() for one in parts), strict=True)
+        return cls(*(torch.cat(same) for same in columns))
+
+    def split(self) -> list["Alignment"]:
+        """The alignment of each sample of the batch."""
+        columns = (value.split(1) for value in self.tensors())
+        return [Alignment(*parts) for parts in zip(*columns, strict=True)]
+
+    def to(self, *where: Any) -> "Alignment":
+        """On another device, or in another type."""
+        return Alignment(*(value.to(*where) for value in self.tensors()))
+
+    def tensors(self) -> list[Tensor]:
+        """Shifts, gains, and the errors of both."""
+        return [getattr(self, field.name) for field in fields(self)]
+
+    def deviation(self, prior: Prior = USUAL) -> Float[Tensor, "b m"]:
         """How wrong each camera is, without a unit: shift and gain relative to what is to be
         expected.
         """
         shift = (self.shift_px / prior.shift_px).square().sum(dim=-1)
         return (shift + ((self.gain - 1) / prior.gain).square()).sqrt()
+
+
+class CorrectedViews(NamedTuple):
+    """Views after a correction.
+
+    Args:
+        views: in the unit of the measured ones.
+        alignment: what was wrong with the cameras, where the correction tells.
+    """
+
+    views: Float[Tensor, "b 1 m v u"]
+    alignment: Alignment | None = None
 
 
 def alignment(
@@ -76,13 +110,13 @@ def alignment(
     weight: Float[Tensor, "#b 1 #m #v #u"] | None = None,
     start: Alignment | None = None,
     steps: int = 2,
-    prior: Prior = Prior(),
+    prior: Prior = USUAL,
 ) -> Alignment:
     """Least-squares shift in pixels and gain of every view, such that the expected view, moved and
     multiplied, is the measured one.
 
-    Differentiable in both. The errors are those of the fit alone: an expected view that was made
-    from the measured ones has part of their errors itself.
+    Differentiable in both, for the weights that pixels then have. The errors are those of the fit
+    alone: an expected view that was made from the measured ones has part of their errors itself.
 
     Args:
         views: measured.
@@ -153,34 +187,11 @@ class _Fit(NamedTuple):
         return (DEVIATION * median).nan_to_num(1.0).clamp_min(ROUNDING)
 
 
-def aligned(
-    views: Float[Tensor, "b 1 m v u"], by: Alignment
-) -> Float[Tensor, "b 1 m v u"]:
+def aligned(views: Float[Tensor, "b 1 m v u"], by: Alignment) -> Float[Tensor, "b 1 m v u"]:
     """Views as cameras without these errors would have measured them, in their unit; differentiable
     in views and errors.
     """
     return translated(views, -by.shift_px) / by.gain[:, None, :, None, None]
-
-
-def translated(
-    views: Float[Tensor, "b c m v u"], shift_px: Float[Tensor, "b m 2"]
-) -> Float[Tensor, "b c m v u"]:
-    """Views as detectors shifted by up to `LONGEST` pixels measure them, y(p) = x(p + s), in their
-    unit; beyond the edge the edge's values go on.
-
-    By a windowed sinc along columns and along rows (Lanczos, 8 pixels).
-    """
-    along_u, along_v = (
-        _interpolation(shift_px[..., axis].to(views.dtype), views.shape[size])[:, None]
-        for axis, size in ((0, -1), (1, -2))
-    )
-    return along_v @ views @ along_u.mT
-
-
-def blurred(views: Float[Tensor, "b c m v u"], sigma: float = BLUR) -> Float[Tensor, "b c m v u"]:
-    """Views after a Gaussian of a standard deviation in pixels, in their unit."""
-    rows, columns = (_gaussian(views, size, sigma) for size in views.shape[-2:])
-    return rows @ views @ columns.mT
 
 
 def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
@@ -194,20 +205,3 @@ def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
     )
     moved = [one - other for one, other in zip(ahead, behind, strict=True)]
     return torch.stack([*moved, smooth], dim=-1)[:, 0].flatten(2, 3)
-
-
-def _interpolation(shift: Float[Tensor, "b m"], count: int) -> Float[Tensor, "b m n n"]:
-    """Weights of pixels for values at their places plus a shift."""
-    beyond = REACH + LONGEST
-    places = torch.arange(count, dtype=shift.dtype, device=shift.device)
-    pixels = torch.arange(-beyond, count + beyond, device=shift.device)
-    apart = places[:, None] + shift[..., None, None] - pixels
-    kernel = torch.sinc(apart) * torch.sinc(apart / REACH) * (apart.abs() < REACH)
-    edge = torch.eye(count, dtype=shift.dtype, device=shift.device)[pixels.clamp(0, count - 1)]
-    return kernel @ edge / kernel.sum(dim=-1, keepdim=True)
-
-
-def _gaussian(views: Tensor, count: int, sigma: float) -> Float[Tensor, "n n"]:
-    places = torch.arange(count, dtype=views.dtype, device=views.device)
-    kernel = torch.exp(-0.5 * ((places[:, None] - places) / sigma).square())
-    return kernel / kernel.sum(dim=-1, keepdim=True)

@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.calibration.alignment import Alignment, aligned, alignment
+from mvrecon.calibration.alignment import Alignment, CorrectedViews, aligned, alignment
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.field import isocentre
 from mvrecon.cameras.views import check_finite
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import sirt, sirt_weights
@@ -26,11 +25,27 @@ REWEIGHTED = 20
 
 
 @torch.no_grad()
+def self_aligned(
+    A: Projector,
+    views: Float[Tensor, "b 1 m v u"],
+    alternations: int = 4,
+    iterations: int = 8,
+) -> CorrectedViews:
+    """Views as cameras without shift (pixels) and wrong gain would have measured them, both told by
+    the views alone.
+
+    Arguments and errors as `self_alignment`.
+    """
+    by = self_alignment(A, views, alternations, iterations)
+    return CorrectedViews(aligned(views, by), by)
+
+
+@torch.no_grad()
 def self_alignment(
     A: Projector,
     views: Float[Tensor, "b 1 m v u"],
     alternations: int = 4,
-    iterations: int = 12,
+    iterations: int = 8,
 ) -> Alignment:
     """Shift in pixels and gain of every camera, from its view and those of the others.
 
@@ -51,28 +66,31 @@ def self_alignment(
         volume = sirt(
             A, aligned(views, by), iterations, weights=weights, momentum=True, start=volume
         )
-        by = standing_still(A.cameras, alignment(views, A(volume), start=by, steps=1))
+        fitted = alignment(views, A(volume), start=by, steps=1)
+        by = standing_still(fitted, motions(A.cameras, A.grid.centre))
     return by
 
 
-def standing_still(cameras: Cameras, by: Alignment) -> Alignment:
+def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
     """The alignment, its shifts (pixels) less a motion of the object and its gains over a common
     factor, such that most cameras have no error.
 
     Without it an object that wrong cameras have drawn aside is taken for the right one.
+
+    Args:
+        by: the alignment.
+        moves: what a motion of the object is in the views, by `motions`.
     """
-    moves = motions(cameras).to(by.shift_px)
+    moves = moves.to(by.shift_px)
     shift = least_deviations(by.shift_px, moves, STILL_PX)
     common = torch.ones_like(moves[:, :1, :1])
     gain = least_deviations(by.gain.log()[..., None], common, STILL_GAIN)
     return replace(by, shift_px=shift, gain=gain[..., 0].exp())
 
 
-def motions(cameras: Cameras) -> Float[Tensor, "m 2 3"]:
-    """Pixels by which a point at the isocentre moves in each view (u, v), for a mm along x, y and
-    z.
-    """
-    centre = isocentre(cameras)
+def motions(cameras: Cameras, centre: Float[Tensor, "3"]) -> Float[Tensor, "m 2 3"]:
+    """Pixels by which a point in world mm moves in each view (u, v), for a mm along x, y and z."""
+    centre = centre.to(cameras.origin)
     points = torch.cat([centre[None], centre + torch.eye(3).to(centre)])
     uv = cameras.project(points)[..., :2]
     return (uv[:, 1:] - uv[:, :1]).mT
@@ -89,14 +107,11 @@ def least_deviations(
         modes: what all cameras may share.
         floor: lengths below count as zero.
     """
-    small = torch.finfo(values.dtype).eps * modes.square().sum()
-    ridge = small * torch.eye(modes.shape[-1]).to(modes)
     rest, flat = values, modes.flatten(0, 1)
     for _ in range(REWEIGHTED):
         weight = (rest.square().sum(dim=-1, keepdim=True) + floor**2).rsqrt()
         weighted = (modes * weight[..., None]).flatten(1, 2).mT
-        normal = (weighted @ flat) / weight.mean() + ridge
-        slope = weighted @ values.flatten(1)[..., None] / weight.mean()
-        shared = flat @ torch.linalg.solve(normal, slope)
+        slope = weighted @ values.flatten(1)[..., None]
+        shared = flat @ torch.linalg.pinv(weighted @ flat, hermitian=True) @ slope
         rest = values - shared.view_as(values)
     return rest

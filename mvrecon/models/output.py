@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.calibration.alignment import Alignment
+
 
 @dataclass
 class Reconstruction:
@@ -24,6 +26,7 @@ class Reconstruction:
         corrected_views: the views as the cameras' networks of each round have corrected them, in
             the unit of the views.
         row: R, the inverse row sums of A in 1/mm, where views are corrected.
+        alignment: what was wrong with each camera, where views were aligned before.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -37,3 +40,4 @@ class Reconstruction:
     earlier: tuple[Float[Tensor, "b 1 d h w"], ...] = ()
     corrected_views: tuple[Float[Tensor, "b 1 m v u"], ...] = ()
     row: Float[Tensor, "#b 1 m v u"] | None = None
+    alignment: Alignment | None = None
