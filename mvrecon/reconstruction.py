@@ -26,7 +26,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.cameras import files
     from mvrecon.data.attenuation import hounsfield
     from mvrecon.data.volume_files import check_ending, save_volume
-    from mvrecon.engine import export, run_folder, scan, solve
+    from mvrecon.engine import correction, export, run_folder, scan, solve, wrong_cameras
     from mvrecon.engine.evaluation import device_of
     from mvrecon.viz import montage, rig
 
@@ -36,10 +36,13 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     check_ending(out)
     case = scan.open_scan(settings)
     solve.check(settings)  # what does not fit is told before the folder is anybody's
+    correction.check(settings)
+    device = device_of(settings["device"])
     with run_folder.taken(folder, settings):
+        case, alignment = correction.corrected_scan(case, settings, device)
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
-        outcome = solve.solve(case, settings, device_of(settings["device"]))
+        outcome = solve.solve(case, settings, device)
         volume = outcome.volume
         spacing = case.grid.spacing
         export.save_png(folder / "planes.png", montage.slices(volume, spacing))
@@ -56,6 +59,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             "view_nrmse": solve.residual(case, volume),
             "residuals": outcome.residuals,
             "chosen": outcome.chosen,
+            "left_out": solve.left_out(case, settings, device) if settings["left_out"] else None,
+            **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
         }
         run_folder.write_results(folder, table)
     return table
@@ -66,6 +71,7 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.engine.run_folder import anchored
+    from mvrecon.engine.wrong_cameras import sentences
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     table = reconstruct(anchored(to_plain(config)), folder)
@@ -74,6 +80,8 @@ def task(config: DictConfig) -> None:
     Console(markup=False, highlight=False).print(
         f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
         f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
+        *sentences(table.get("cameras")),
+        sep="\n",
         soft_wrap=True,
     )
 

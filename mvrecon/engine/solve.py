@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -16,6 +17,7 @@ from mvrecon.engine.scan import Scan
 from mvrecon.files.memory import peak
 from mvrecon.parts import RECONSTRUCTORS, STREAMED
 from mvrecon.reconstruct.held_out import held_out
+from mvrecon.reconstruct.left_out import left_out_residual
 from mvrecon.reconstruct.stopping import Curve, combined, discrepancy
 
 #: Views whose residual is computed at a time.
@@ -88,6 +90,14 @@ def residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
         squares += (rest[part.mask].double()).square().sum().item()
         total += (part.views[part.mask].double()).square().sum().item()
     return (squares / total) ** 0.5 if total else float("nan")
+
+
+def left_out(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> list[float]:
+    """The relative error of each view as the method predicts it from the others."""
+    options = dict(settings["reconstructor"])
+    method = partial(RECONSTRUCTORS.build, options.pop("name"), **options)
+    views = scan.measured.whole().views[None, None].to(device)
+    return left_out_residual(method, scan.operator().to(device), views)[0].tolist()
 
 
 def _iterated(
