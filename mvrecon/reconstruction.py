@@ -16,7 +16,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Reconstruct a measured scan; returns what `results.json` then holds.
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
-    `results.json` and, unless `out` names another file, the volume.
+    `results.json` and, unless `out` names another file, the volume; with `correct=align` also
+    `cameras.png`.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -28,7 +29,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.data.volume_files import check_ending, save_volume
     from mvrecon.engine import correction, export, run_folder, scan, solve, wrong_cameras
     from mvrecon.engine.evaluation import device_of
-    from mvrecon.viz import montage, rig
+    from mvrecon.viz import cameras, montage, rig
 
     if settings["unit"] not in UNITS:
         raise ValueError(f"Expected the unit 1/mm or HU, got {settings['unit']!r}")
@@ -40,6 +41,9 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     device = device_of(settings["device"])
     with run_folder.taken(folder, settings):
         case, alignment = correction.corrected_scan(case, settings, device)
+        if alignment is not None:
+            image = cameras.alignments(alignment.shift_px[0], alignment.gain[0])
+            export.save_png(folder / "cameras.png", image)
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = solve.solve(case, settings, device)

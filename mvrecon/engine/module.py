@@ -103,7 +103,8 @@ class ReconstructionModule(L.LightningModule):
         ]
         means = {name: torch.tensor([f[name] for f in figures]).nanmean() for name in figures[0]}
         if out.alignment is not None and "gain" in batch:
-            means |= camera_metrics(out.alignment, batch["shift_px"], batch["gain"])
+            known = camera_metrics(out.alignment, batch["shift_px"], batch["gain"])
+            means |= {f"cameras_{name}": torch.tensor(value) for name, value in known.items()}
         for name, value in (terms | means).items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr", batch_size=len(predicted))
         return {"out": out}
