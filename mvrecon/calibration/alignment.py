@@ -198,9 +198,9 @@ def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
     """Derivatives by the two shifts (difference quotients of half a pixel to each side) and by the
     gain.
     """
-    halves = 0.5 * torch.eye(2).to(smooth)
+    halves = 0.5 * torch.eye(2).to(smooth)[:, None, None]
     ahead, behind = (
-        [translated(smooth, side * half.expand(*smooth.shape[::2][:2], 2)) for half in halves]
+        [translated(smooth, side * half) for half in halves]
         for side in (1, -1)
     )
     moved = [one - other for one, other in zip(ahead, behind, strict=True)]

@@ -21,7 +21,7 @@ from mvrecon.reconstruct.iterative import sirt, sirt_weights
 #: Shifts in pixels, and gains, below which a camera counts as standing still.
 STILL_PX, STILL_GAIN = 0.03, 0.003
 #: Least squares, reweighted, for the least absolute deviations.
-REWEIGHTED = 20
+REWEIGHTED = 10
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ BLUR = 1.0
 
 
 def translated(
-    views: Float[Tensor, "b c m v u"], shift_px: Float[Tensor, "b m 2"]
+    views: Float[Tensor, "b c m v u"], shift_px: Float[Tensor, "#b #m 2"]
 ) -> Float[Tensor, "b c m v u"]:
     """Views as detectors shifted by up to `LONGEST` pixels measure them, y(p) = x(p + s), in their
     unit; beyond the edge the edge's values go on.
@@ -31,7 +31,7 @@ def blurred(views: Float[Tensor, "b c m v u"], sigma: float = BLUR) -> Float[Ten
     return rows @ views @ columns.mT
 
 
-def _interpolation(shift: Float[Tensor, "b m"], count: int) -> Float[Tensor, "b m n n"]:
+def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "#b #m n n"]:
     """Weights of pixels for values at their places plus a shift."""
     beyond = REACH + LONGEST
     places = torch.arange(count, dtype=shift.dtype, device=shift.device)
