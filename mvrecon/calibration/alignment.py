@@ -199,9 +199,6 @@ def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
     gain.
     """
     halves = 0.5 * torch.eye(2).to(smooth)[:, None, None]
-    ahead, behind = (
-        [translated(smooth, side * half) for half in halves]
-        for side in (1, -1)
-    )
+    ahead, behind = ([translated(smooth, side * half) for half in halves] for side in (1, -1))
     moved = [one - other for one, other in zip(ahead, behind, strict=True)]
     return torch.stack([*moved, smooth], dim=-1)[:, 0].flatten(2, 3)
