@@ -69,6 +69,12 @@ STREAMED = Registry(
     "streamed reconstructor",
     fdk="mvrecon.reconstruct.filtered.streaming:fdk_streamed",
 )
+#: What corrects views before they are reconstructed: f(A, views, **options) -> CorrectedViews.
+CORRECTIONS = Registry(
+    "correct",
+    align="mvrecon.calibration.self_alignment:self_aligned",
+    trained="mvrecon.engine.trained_correction:corrected_by",
+)
 MODELS = Registry(
     "model",
     cross_view="mvrecon.models.cross_view:CrossView",
@@ -84,6 +90,7 @@ MODELS = Registry(
     backprojection="mvrecon.models.baselines:Backprojection",
     sirt="mvrecon.models.baselines:Sirt",
     classical="mvrecon.models.classical:Classical",
+    corrected="mvrecon.models.corrected:Corrected",
 )
 
 REGISTRIES = {
@@ -96,6 +103,7 @@ REGISTRIES = {
         NETWORKS,
         CAMERA_NETWORKS,
         RECONSTRUCTORS,
+        CORRECTIONS,
         MODELS,
     )
 }

@@ -130,8 +130,11 @@ class Acquired:
             return self._ideal(index, seed, grid, rig)
 
         sample = self.store(index, seed, grid, rig, ideal) if self.store else ideal()
-        views = sample.views if errors is None else sample.views * errors.gain.to(sample.views)
-        return replace(sample, views=detected(views, self.acquisition, cameras, rng))
+        if errors is not None:
+            gain = errors.gain.to(sample.views)
+            shift = errors.offset_px.to(sample.views)
+            sample = replace(sample, views=sample.views * gain, shift_px=shift, gain=gain[:, 0, 0])
+        return replace(sample, views=detected(sample.views, self.acquisition, cameras, rng))
 
     def _ideal(self, index: int, seed: int, grid: Grid, rig: Any) -> Sample:
         """The case as a perfect detector measures it."""

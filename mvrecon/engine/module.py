@@ -11,7 +11,7 @@ from torch import Tensor
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.metrics import view_metrics, volume_metrics
+from mvrecon.metrics import camera_metrics, view_metrics, volume_metrics
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
@@ -115,6 +115,9 @@ class ReconstructionModule(L.LightningModule):
             )
         ]
         means = {name: torch.tensor([f[name] for f in figures]).nanmean() for name in figures[0]}
+        if out.alignment is not None and "gain" in batch:
+            known = camera_metrics(out.alignment, batch["shift_px"], batch["gain"])
+            means |= {f"cameras_{name}": torch.tensor(value) for name, value in known.items()}
         for name, value in (terms | means).items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr", batch_size=len(predicted))
         return {"out": out}

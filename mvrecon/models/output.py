@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.calibration.alignment import Alignment
+
 
 @dataclass
 class Reconstruction:
@@ -29,6 +31,7 @@ class Reconstruction:
             `corrected_cameras`, if it has them, else of its rig.
         row: R, the inverse row sums of A, or of one typical chord, in 1/mm, where views are
             corrected.
+        alignment: what was wrong with each camera, where views were aligned before.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -42,3 +45,4 @@ class Reconstruction:
     earlier: tuple[Float[Tensor, "b 1 d h w"], ...] = ()
     corrected_views: tuple[Float[Tensor, "b 1 n v u"], ...] = ()
     row: Float[Tensor, "#b 1 #n #v #u"] | None = None
+    alignment: Alignment | None = None

@@ -15,9 +15,8 @@ from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.rounds.settings import ROUNDS, RoundOptions
+from mvrecon.models.rounds.settings import ROUNDS, Computing, RoundOptions
 from mvrecon.models.rounds.step import Measured, Round, State
-from mvrecon.models.rounds.unet import Precision
 from mvrecon.projectors.operator import Projector
 
 #: Of the longest chord of a support: as long counts each ray that meets it, at least.
@@ -45,13 +44,10 @@ class Rounds(nn.Module):
         support: where the density may differ from zero, from the views: the visual "hull", its
             "box", "auto", or "none" for the whole grid.
         noise: of the views, as `support_from_views` wants it; none for exact views.
-        crop: whether the networks in the world see no more of the grid than the box around a
-            sample's support, with a margin of 4 voxels.
-        precision: of the convolutions, "float32", or "auto": bfloat16 where the processor has
-            instructions for it.
+        computing: of `Computing`: precision and crop of the networks.
 
     Raises:
-        TypeError: an option that a round does not have.
+        TypeError: an option that a round or the model does not have.
         ValueError: no round, an unknown support or precision, a crop without a support, or cameras'
             networks whose memories do not fit one another.
     """
@@ -64,23 +60,20 @@ class Rounds(nn.Module):
         consistency: int = 2,
         support: str = "none",
         noise: Mapping[str, Any] | None = None,
-        precision: Precision = "float32",
-        crop: bool = False,
+        **computing: Any,
     ):
         super().__init__()
-        if not rounds or precision not in ("float32", "auto"):
-            raise ValueError(
-                f"Expected at least one round, and the precision float32 or auto, got "
-                f"{len(rounds)} and {precision!r}"
-            )
+        if not rounds:
+            raise ValueError("Expected at least one round, got none")
+        how = Computing.of(computing)
         options = [RoundOptions.of(one) for one in rounds]
         first = next((i for i, one in enumerate(options) if one.corrects), len(options))
         self.cropping = Cropping(projector, Options(support=support, noise=noise))
-        if crop and support == "none":
+        if how.crop and support == "none":
             raise ValueError("Expected a support to crop to, got crop=True and support='none'")
-        self.crop, self.start = crop, checked_start(start)
+        self.crop, self.start = how.crop, checked_start(start)
         self.rounds = nn.ModuleList(
-            Round(projector, one, first < i, precision) for i, one in enumerate(options)
+            Round(projector, one, first < i, how.precision) for i, one in enumerate(options)
         )
         self.trust = nn.Parameter(torch.ones(())) if first < len(options) else None
         self.consistency = Consistency(consistency)
@@ -135,7 +128,7 @@ class Rounds(nn.Module):
         return replace(within, row=within.row.minimum(of_longest / SHORTEST))
 
 
-def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Tensor]:
+def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Any]:
     """The last opinions of the cameras, in the unit of (views / mm)."""
     fused = state.fused
     if fused is None:
