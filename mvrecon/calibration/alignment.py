@@ -16,10 +16,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.calibration.translation import LONGEST, blurred, translated
+from mvrecon.calibration.blur import blurred
+from mvrecon.calibration.translation import LONGEST, translated
 
 #: Huber's threshold in standard deviations, the factor from a median to these, fits by weights.
 HUBER, DEVIATION, REWEIGHTED = 1.345, 1.4826, 3
+#: Standard deviation in pixels of the blur under which views are compared.
+BLUR = 1.0
 #: Pixels among which errors of an expected view are alike.
 ALIKE = 64.0
 #: Of the greatest value: pixels below see no object; scales of residuals below are rounding.
@@ -135,7 +138,7 @@ def alignment(
             f"got {tuple(views.shape)}, {tuple(expected.shape)} and {steps}"
         )
     one = start or Alignment.none(views)
-    smooth = blurred(expected)
+    smooth = blurred(expected, BLUR)
     peak = smooth.detach().abs().amax((1, 2, 3, 4), keepdim=True)
     tiny = torch.finfo(views.dtype).tiny
     counts = (smooth.detach().abs() > EMPTY * peak) * (1 if weight is None else weight)
@@ -145,7 +148,7 @@ def alignment(
         views.new_tensor([prior.shift_px, prior.shift_px, prior.gain]).pow(-2),
     )
     for _ in range(steps):
-        rest = (blurred(aligned(views, one)) - smooth) / peak.clamp_min(tiny)
+        rest = (blurred(aligned(views, one), BLUR) - smooth) / peak.clamp_min(tiny)
         one = fit.step(rest[:, 0].flatten(2), one)
     return one
 

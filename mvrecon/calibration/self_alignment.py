@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.calibration.alignment import Alignment, CorrectedViews, aligned, alignment
-from mvrecon.cameras.camera import Cameras
+from mvrecon.calibration.unknowns import motions
 from mvrecon.cameras.views import check_finite
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import sirt, sirt_weights
@@ -86,14 +86,6 @@ def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
     common = torch.ones_like(moves[:, :1, :1])
     gain = least_deviations(by.gain.log()[..., None], common, STILL_GAIN)
     return replace(by, shift_px=shift, gain=gain[..., 0].exp())
-
-
-def motions(cameras: Cameras, centre: Float[Tensor, "3"]) -> Float[Tensor, "m 2 3"]:
-    """Pixels by which a point in world mm moves in each view (u, v), for a mm along x, y and z."""
-    centre = centre.to(cameras.origin)
-    points = torch.cat([centre[None], centre + torch.eye(3).to(centre)])
-    uv = cameras.project(points)[..., :2]
-    return (uv[:, 1:] - uv[:, :1]).mT
 
 
 def least_deviations(

@@ -1,4 +1,4 @@
-"""Views moved by parts of a pixel, and blurred, by products with small matrices."""
+"""Views moved by parts of a pixel, by products with small matrices."""
 
 import torch
 from jaxtyping import Float
@@ -6,8 +6,6 @@ from torch import Tensor
 
 #: Pixels of each side that count in `translated`, and the longest shift in pixels.
 REACH = LONGEST = 4
-#: Standard deviation in pixels of a blur.
-BLUR = 1.0
 
 
 def translated(
@@ -25,12 +23,6 @@ def translated(
     return along_v @ views @ along_u.mT
 
 
-def blurred(views: Float[Tensor, "b c m v u"], sigma: float = BLUR) -> Float[Tensor, "b c m v u"]:
-    """Views after a Gaussian of a standard deviation in pixels, in their unit."""
-    rows, columns = (_gaussian(views, size, sigma) for size in views.shape[-2:])
-    return rows @ views @ columns.mT
-
-
 def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "#b #m n n"]:
     """Weights of pixels for values at their places plus a shift."""
     beyond = REACH + LONGEST
@@ -40,9 +32,3 @@ def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "
     kernel = torch.sinc(apart) * torch.sinc(apart / REACH) * (apart.abs() < REACH)
     edge = torch.eye(count, dtype=shift.dtype, device=shift.device)[pixels.clamp(0, count - 1)]
     return kernel @ edge / kernel.sum(dim=-1, keepdim=True)
-
-
-def _gaussian(views: Tensor, count: int, sigma: float) -> Float[Tensor, "n n"]:
-    places = torch.arange(count, dtype=views.dtype, device=views.device)
-    kernel = torch.exp(-0.5 * ((places[:, None] - places) / sigma).square())
-    return kernel / kernel.sum(dim=-1, keepdim=True)

@@ -10,7 +10,8 @@ from mvrecon.calibration.alignment import (
     aligned,
     alignment,
 )
-from mvrecon.calibration.translation import blurred, translated
+from mvrecon.calibration.blur import blurred
+from mvrecon.calibration.translation import translated
 from tests.models.rig import small_projector
 
 

@@ -7,12 +7,12 @@ from mvrecon.acquisition.disturbances import Disturbance, rig_errors
 from mvrecon.calibration.alignment import Alignment
 from mvrecon.calibration.self_alignment import (
     least_deviations,
-    motions,
     self_aligned,
     self_alignment,
     standing_still,
 )
 from mvrecon.calibration.translation import translated
+from mvrecon.calibration.unknowns import motions
 from mvrecon.parts import PROJECTORS, SCENES
 from tests.models.rig import small_rig
 
