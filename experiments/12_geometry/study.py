@@ -26,7 +26,8 @@ from mvrecon.engine.fit import build_module
 HERE = Path(__file__).parent
 BASE = (
     "experiment=open_kbp_rounds",
-    "compare={}",
+    "~compare.rounds_world",
+    "~compare.world_unet",
     "scene.vary=exact",
     "data.sizes.train=648",
     "callbacks=quiet",
