@@ -2,6 +2,7 @@
 of the cameras.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Unpack
 
@@ -152,7 +153,7 @@ def likelihood_of_residual(counts: Tensor, volume: Tensor, residual: Tensor) -> 
 
 
 def uniform(
-    parts: list[PoissonLikelihood], every: Float[Tensor, "1 1 d h w"]
+    parts: Sequence[PoissonLikelihood], every: Float[Tensor, "1 1 d h w"]
 ) -> Float[Tensor, "b c d h w"]:
     """As many counts as are measured, from the same number in each voxel."""
     measured = torch.stack([part.counts.flatten(2).sum(dim=2) for part in parts]).sum(dim=0)
