@@ -8,6 +8,7 @@ from mvrecon.models.geometry import whole_geometry
 from mvrecon.parts import MODELS
 from mvrecon.testing import check_model
 from tests.models.rig import small_projector
+from tests.models.rounds.test_model import SMALL
 from tests.models.test_cross_view import OPTIONS
 
 COUNTED = {"steps": 3, "noise": "poisson"}
@@ -69,10 +70,11 @@ def test_bright_pixels_count_less_than_with_equal_noise(geometry):
     assert weighted < plain
 
 
-@pytest.mark.parametrize("name", ["cross_view", "backprojection_unet"])
+@pytest.mark.parametrize("name", ["cross_view", "backprojection_unet", "rounds"])
 def test_a_model_of_counts_starts_from_osem_and_keeps_the_contract(name):
     start = {"name": "osem", "iterations": 5, "subsets": 2}
-    options = {**OPTIONS.get(name, {}), "start": start, "consistency": COUNTED}
+    own = {**OPTIONS, "rounds": {"rounds": SMALL["M3"]}}.get(name, {})
+    options = {**own, "start": start, "consistency": COUNTED}
     check_model(name, small_projector(), **options)
 
 
