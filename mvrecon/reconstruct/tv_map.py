@@ -26,7 +26,7 @@ def tv_map(
     counts: Float[Tensor, "b c m v u"],
     iterations: int = 200,
     weight: float = 0.05,
-    balance: float = 1.0,
+    balance: float = 0.3,
     background: float | Float[Tensor, "b c m v u"] = 0.0,
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
@@ -50,7 +50,8 @@ def tv_map(
         background: expected counts of other origin, one number or views that broadcast to the
             counts.
         common: start, support, monitor: see `Common`. The start is uniform by default. A monitor
-            sees the objective, and costs one projection an iteration.
+            sees the objective, and costs one projection an iteration; it is infinite where an early
+            iterate still allows no counts in a bin that has some and no background.
 
     Raises:
         ValueError: as `mlem`; a weight that is negative, a balance that is not positive.

@@ -82,6 +82,9 @@ def test_wells_are_where_the_phantom_has_them_in_any_pose():
     assert min(s.resolved for s in right) == 1.0 and all(s.ratios.max() < 0.25 for s in right)
     wrong = valley_to_peak(volume, grid, wells, **{**pose, "euler_degrees": (50.0, 40.0, -70.0)})
     assert min(s.resolved for s in wrong) < 1.0
+    wide = Grid.centred(64, spacing=2.0)
+    alone = valley_to_peak(torch.ones(wide.shape), wide, (16,) * 6, 60.0, 40.0)[0]
+    assert len(alone.ratios) == 0 and math.isnan(alone.resolved)
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0, 0), (0, 0, 1.0)])

@@ -23,7 +23,8 @@ class Sector(NamedTuple):
 
     Args:
         diameter: in mm.
-        ratios: valley to peak of each pair of neighbours; infinite without a peak.
+        ratios: valley to peak of each pair of neighbours; infinite without a peak. A single well
+            has none.
     """
 
     diameter: float
@@ -31,7 +32,7 @@ class Sector(NamedTuple):
 
     @property
     def resolved(self) -> float:
-        """Share of the pairs that are resolved."""
+        """Share of the pairs that are resolved; nan without a pair."""
         return (self.ratios <= RESOLVED).double().mean().item()
 
 
@@ -57,8 +58,7 @@ def valley_to_peak(
         well_diameters, radius, height, centre, euler_degrees: of the phantom, as for `derenzo`.
 
     Raises:
-        ValueError: a volume of another shape than the grid, a sector with one well, or a phantom
-            that is not inside the grid.
+        ValueError: a volume of another shape than the grid, or wells that are not inside it.
     """
     if tuple(volume.shape) != grid.shape:
         raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")
@@ -90,10 +90,6 @@ def _neighbours(
     """Both wells of all pairs that are twice the diameter apart."""
     near = (torch.cdist(wells, wells) < 2.01 * diameter).triu(diagonal=1)
     one, other = near.nonzero().unbind(dim=1)
-    if not len(one):
-        raise ValueError(
-            f"Expected neighbouring wells of {diameter:g} mm, got a sector of {len(wells)}"
-        )
     return wells[one], wells[other]
 
 
