@@ -23,7 +23,7 @@ from mvrecon_spect.projector import Spect
 GRID = mv.Grid.centred(64, spacing=2.5)
 RATIO, COUNTS = 5.0, 5e6
 DIAMETERS = torch.tensor([10.0, 13.0, 17.0, 22.0])
-WELLS = (14, 12, 10, 8, 7, 6)
+WELLS = (10, 8, 7, 6, 5, 4)
 #: Iterations, and the method up to a number of them.
 METHODS = {
     "mlem": (100, lambda A, y, n, **o: mv.mlem(A, y, n, **o)),
