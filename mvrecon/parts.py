@@ -63,6 +63,8 @@ RECONSTRUCTORS = Registry(
     pdhg_tv="mvrecon.reconstruct.pdhg_tv:pdhg_tv",
     mlem="mvrecon.reconstruct.mlem:mlem",
     osem="mvrecon.reconstruct.mlem:osem",
+    bsrem="mvrecon.reconstruct.bsrem:bsrem",
+    tv_map="mvrecon.reconstruct.tv_map:tv_map",
 )
 #: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
 STREAMED = Registry(

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.geometry.box import Box
-from mvrecon.models.consistency import Consistency, Start, checked_start, normalised
+from mvrecon.models.consistency import Consistency, Start, Steps, checked_start, normalised
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
@@ -40,7 +40,8 @@ class Rounds(nn.Module):
         rounds: options of each round: `{resolution, widths, cameras, opinions}`.
         start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
             ..., **options}`.
-        consistency: learned gradient steps towards the corrected views at the end.
+        consistency: learned gradient steps towards the corrected views at the end, or `{steps: ...,
+            noise: poisson}` for counts.
         support: where the density may differ from zero, from the views: the visual "hull", its
             "box", "auto", or "none" for the whole grid.
         noise: of the views, as `support_from_views` wants it; none for exact views.
@@ -57,7 +58,7 @@ class Rounds(nn.Module):
         projector: Projector,
         rounds: Sequence[Mapping[str, Any]] = ROUNDS,
         start: Start = 12,
-        consistency: int = 2,
+        consistency: Steps = 2,
         support: str = "none",
         noise: Mapping[str, Any] | None = None,
         **computing: Any,
