@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from mvrecon.projectors.drr import Drr as Drr
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
     from mvrecon.projectors.radon import Radon as Radon
+    from mvrecon.reconstruct.bsrem import bsrem as bsrem
     from mvrecon.reconstruct.cgls import cgls as cgls
     from mvrecon.reconstruct.filtered.fdk import fbp as fbp
     from mvrecon.reconstruct.filtered.fdk import fdk as fdk
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from mvrecon.reconstruct.os_sart import os_sart as os_sart
     from mvrecon.reconstruct.pdhg_tv import pdhg_tv as pdhg_tv
     from mvrecon.reconstruct.tikhonov import tikhonov as tikhonov
+    from mvrecon.reconstruct.tv_map import tv_map as tv_map
 
 __version__ = "0.1.0"
 
@@ -53,6 +55,7 @@ _DOOR = {
     "LinearOperator": "mvrecon.projectors.operator:LinearOperator",
     "Radon": "mvrecon.projectors.radon:Radon",
     "arc": "mvrecon.cameras.rigs:arc",
+    "bsrem": "mvrecon.reconstruct.bsrem:bsrem",
     "calibrated": "mvrecon.calibration.from_data:calibrated",
     "cgls": "mvrecon.reconstruct.cgls:cgls",
     "circular": "mvrecon.cameras.rigs:circular",
@@ -75,6 +78,7 @@ _DOOR = {
     "save_volume": "mvrecon.data.volume_files:save_volume",
     "sirt": "mvrecon.reconstruct.iterative:sirt",
     "tikhonov": "mvrecon.reconstruct.tikhonov:tikhonov",
+    "tv_map": "mvrecon.reconstruct.tv_map:tv_map",
 }
 
 

@@ -70,7 +70,8 @@ class Weights:
         rounds: of the mean squared errors of the volumes after earlier rounds, each less than the
             one behind it by the factor `EARLIER`.
         corrected_views: of the mean squared error of the views as the cameras' networks have
-            corrected them, against the truth's own views A x_true, as mean densities along rays.
+            corrected them, or of the completed sinogram, against the truth's own views A x_true,
+            as mean densities along rays.
     """
 
     volume: float = 1.0
@@ -109,7 +110,7 @@ class ReconstructionLoss(nn.Module):
         Args:
             out: of the model.
             batch: "volume" and "views", and where `compares_views` is true of the reconstruction
-                "true_views", the truth's own views.
+                "true_views", the truth's own views of the same cameras.
         """
         truth, views = batch["volume"] / self.data_range, batch["views"]
         volume = out.volume / self.data_range
@@ -136,7 +137,7 @@ class ReconstructionLoss(nn.Module):
         return torch.stack(errors).sum()
 
     def _corrected(
-        self, out: Reconstruction, true_views: Float[Tensor, "b 1 m v u"]
+        self, out: Reconstruction, true_views: Float[Tensor, "b 1 n v u"]
     ) -> Float[Tensor, ""]:
         assert out.row is not None
         weight = out.row / self.data_range

@@ -1,4 +1,5 @@
-"""Figures of merit: PSNR (dB), SSIM and NRMSE of a volume against the truth, NRMSE of its views.
+"""Figures of merit: PSNR (dB), SSIM and NRMSE of a volume against the truth, NRMSE of its views,
+and how well wrong cameras are told.
 
 PSNR and SSIM are torchmetrics' (imported late: it is slow); SSIM has a Gaussian window of 1.5
 voxels and reflected borders (Wang et al. 2004, IEEE TIP 13(4)). The data range is an argument,
@@ -10,6 +11,8 @@ import math
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from mvrecon.calibration.alignment import Alignment
 
 #: Unit of each figure.
 UNITS = {
@@ -94,6 +97,38 @@ def view_metrics(
             f"{tuple(measured.shape)}"
         )
     return {"view_nrmse": nrmse(views.detach().double(), measured.double())}
+
+
+def camera_metrics(
+    by: Alignment, shift_px: Float[Tensor, "b m 2"], gain: Float[Tensor, "b m"]
+) -> dict[str, float]:
+    """Root-mean-square errors of estimated shifts (pixels) and gains over all cameras, beside those
+    of estimating nothing, and the AUC of telling which cameras are disturbed.
+
+    Args:
+        by: the estimates of b cases.
+        shift_px, gain: the truth.
+    """
+    disturbed = (shift_px != 0).any(dim=-1) | (gain != 1)
+    return {
+        "auc": auc(by.deviation(), disturbed),
+        "shift_rms_px": _rms(by.shift_px - shift_px),
+        "gain_rms": _rms(by.gain - gain),
+        "true_shift_rms_px": _rms(shift_px),
+        "true_gain_rms": _rms(gain - 1),
+    }
+
+
+def auc(score: Float[Tensor, "*n"], positive: Bool[Tensor, "*n"]) -> float:
+    """Area under the ROC curve, without a unit: the share of pairs of a positive and a negative in
+    which the positive has the higher score; ties count half. nan without such a pair.
+    """
+    higher = score[positive][:, None] - score[~positive]
+    return ((higher.sign() + 1) / 2).double().mean().item()
+
+
+def _rms(error: Tensor) -> float:
+    return error.double().square().mean().sqrt().item()
 
 
 def _psnr(x: Tensor, truth: Tensor, data_range: float) -> float:

@@ -63,11 +63,19 @@ RECONSTRUCTORS = Registry(
     pdhg_tv="mvrecon.reconstruct.pdhg_tv:pdhg_tv",
     mlem="mvrecon.reconstruct.mlem:mlem",
     osem="mvrecon.reconstruct.mlem:osem",
+    bsrem="mvrecon.reconstruct.bsrem:bsrem",
+    tv_map="mvrecon.reconstruct.tv_map:tv_map",
 )
 #: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
 STREAMED = Registry(
     "streamed reconstructor",
     fdk="mvrecon.reconstruct.filtered.streaming:fdk_streamed",
+)
+#: What corrects views before they are reconstructed: f(A, views, **options) -> CorrectedViews.
+CORRECTIONS = Registry(
+    "correct",
+    align="mvrecon.calibration.self_alignment:self_aligned",
+    trained="mvrecon.engine.trained_correction:corrected_by",
 )
 MODELS = Registry(
     "model",
@@ -84,6 +92,7 @@ MODELS = Registry(
     backprojection="mvrecon.models.baselines:Backprojection",
     sirt="mvrecon.models.baselines:Sirt",
     classical="mvrecon.models.classical:Classical",
+    corrected="mvrecon.models.corrected:Corrected",
 )
 
 REGISTRIES = {
@@ -96,6 +105,7 @@ REGISTRIES = {
         NETWORKS,
         CAMERA_NETWORKS,
         RECONSTRUCTORS,
+        CORRECTIONS,
         MODELS,
     )
 }

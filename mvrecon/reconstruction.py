@@ -1,7 +1,7 @@
 """`mvrecon-reconstruct`: a volume from measured views, with its pictures, time and memory."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -9,18 +9,30 @@ from omegaconf import DictConfig
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
 
+if TYPE_CHECKING:
+    from mvrecon.engine.scan import Scan
+
 UNITS = ("1/mm", "HU")
 #: What a run writes into its folder beside the volume.
-WRITTEN = ("config.yaml", "versions.txt", "rig.json", "rig.png", "planes.png", "results.json")
+WRITTEN = (
+    "config.yaml",
+    "versions.txt",
+    "rig.json",
+    "rig.png",
+    "planes.png",
+    "cameras.png",
+    "results.json",
+)
 
 
 def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Reconstruct a measured scan; returns what `results.json` then holds.
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
-    `results.json` and, unless `out` names another file, the volume. A rig that was calibrated
-    (`calibrate`) lies beside the volume, too: `<volume>.cameras.json`. A run that fails leaves none
-    of them, so that the folder is free for a second try.
+    `results.json` and, unless `out` names another file, the volume; with `correct=align` also
+    `cameras.png`. A rig that was calibrated (`calibrate`) lies beside the volume, too:
+    `<volume>.cameras.json`. A run that fails leaves none of them, so that the folder is free for a
+    second try.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -30,9 +42,9 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.cameras import files
     from mvrecon.data.attenuation import hounsfield
     from mvrecon.data.volume_files import check_ending, save_volume
-    from mvrecon.engine import calibrate, export, run_folder, scan, solve
+    from mvrecon.engine import calibrate, correction, export, run_folder, scan, solve, wrong_cameras
     from mvrecon.engine.evaluation import device_of
-    from mvrecon.viz import montage, rig
+    from mvrecon.viz import cameras, montage, rig
 
     if settings["unit"] not in UNITS:
         raise ValueError(f"Expected the unit 1/mm or HU, got {settings['unit']!r}")
@@ -42,39 +54,44 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     if free := settings["calibrate"]:
         calibrate.check(free, case)
     solve.check(settings)  # what does not fit is told before the folder is anybody's
+    correction.check(settings)
     estimate, device = None, device_of(settings["device"])
     with run_folder.taken(folder, settings, own=WRITTEN):
         if free:
             case, estimate = calibrate.calibrate(case, free, device)
             files.save(case.cameras, beside(out))
+        case, alignment = correction.corrected_scan(case, settings, device)
+        if alignment is not None:
+            image = cameras.alignments(alignment.shift_px[0], alignment.gain[0])
+            export.save_png(folder / "cameras.png", image)
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = solve.solve(case, settings, device)
         volume = outcome.volume
-        spacing = case.grid.spacing
-        export.save_png(folder / "planes.png", montage.slices(volume, spacing))
+        export.save_png(folder / "planes.png", montage.slices(volume, case.grid.spacing))
         save_volume(out, hounsfield(volume) if settings["unit"] == "HU" else volume, case.grid)
         table = {
-            "name": settings["name"],
-            "method": settings["reconstructor"]["name"],
-            "volume": str(out),
-            "unit": settings["unit"],
-            "grid": {"shape": list(case.grid.shape), "spacing_mm": list(spacing)},
-            "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
-            "seconds": outcome.seconds,
-            "peak_bytes": outcome.peak_bytes,
-            "view_nrmse": outcome.view_nrmse,
-            "residuals": outcome.residuals,
-            "chosen": outcome.chosen,
+            **_row(settings, case, out),
+            **outcome.row(),
+            "left_out": solve.left_out(case, settings, device) if settings["left_out"] else None,
+            **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
         }
         if estimate is not None:
-            table["calibration"] = {
-                **calibrate.table(estimate, free),
-                "cameras": str(beside(out)),
-                "words": calibrate.in_words(estimate, free),
-            }
+            table["calibration"] = calibrate.table(estimate, free) | {"cameras": str(beside(out))}
         run_folder.write_results(folder, table)
     return table
+
+
+def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
+    """What was reconstructed, from what."""
+    return {
+        "name": settings["name"],
+        "method": settings["reconstructor"]["name"],
+        "volume": str(out),
+        "unit": settings["unit"],
+        "grid": {"shape": list(case.grid.shape), "spacing_mm": list(case.grid.spacing)},
+        "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
+    }
 
 
 def beside(volume: Path) -> Path:
@@ -87,6 +104,7 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.engine.run_folder import anchored
+    from mvrecon.engine.wrong_cameras import sentences
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     table = reconstruct(anchored(to_plain(config)), folder)
@@ -98,6 +116,8 @@ def task(config: DictConfig) -> None:
     console.print(
         f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
         f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
+        *sentences(table.get("cameras")),
+        sep="\n",
         soft_wrap=True,
     )
 

@@ -158,12 +158,7 @@ class Registry:
         part = self.get(name)
         parameters = inspect.signature(part).parameters
         if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-            for option in options:
-                if option not in parameters:
-                    raise TypeError(
-                        f"The {self.kind} {name!r} has no option "
-                        f"{option!r}{hint(option, parameters)}"
-                    )
+            check_options(f"The {self.kind} {name!r}", options, parameters)
         return part
 
     def check(self, config: Mapping[str, Any]) -> None:
@@ -188,6 +183,18 @@ class Registry:
                 f"{', '.join(self.names())}"
             )
         return config["name"], {key: value for key, value in config.items() if key != "name"}
+
+
+def check_options(owner: str, options: Iterable[Any], known: Iterable[str]) -> None:
+    """Check the names of options.
+
+    Raises:
+        TypeError: an option that is not known; the message gives the nearest, and all.
+    """
+    names = list(known)
+    for option in options:
+        if option not in names:
+            raise TypeError(f"{owner} has no option {option!r}{hint(str(option), names)}")
 
 
 def _where(part: Any) -> str:

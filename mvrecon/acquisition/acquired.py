@@ -1,9 +1,9 @@
 """A scene whose views are made by a projector and a detector."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -44,6 +44,16 @@ class Projection(NamedTuple):
     rays: int
 
 
+class Store(Protocol):
+    """Where cases are kept, as a perfect detector measures them."""
+
+    def __call__(
+        self, index: int, seed: int, grid: Grid, cameras: Any, make: Callable[[], Sample]
+    ) -> Sample:
+        """The case that is kept, or else the one that `make` makes."""
+        ...
+
+
 class Acquired:
     """A scene whose views are those of an acquisition, in the projector's unit.
 
@@ -55,6 +65,7 @@ class Acquired:
         scene: the objects.
         projector: name and options; None: line integrals.
         acquisition: the detector.
+        store: keeps cases as a perfect detector measures them; none: all are made anew.
     """
 
     def __init__(
@@ -62,9 +73,10 @@ class Acquired:
         scene: Scene,
         projector: Mapping[str, Any] | None = None,
         acquisition: Acquisition | None = None,
+        store: Store | None = None,
     ):
         self.scene, self.projector = scene, None if projector is None else dict(projector)
-        self.acquisition = acquisition or Acquisition()
+        self.acquisition, self.store = acquisition or Acquisition(), store
         self._source: tuple[Grid, Cameras, Lines | Projection] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -108,26 +120,38 @@ class Acquired:
         Raises:
             ValueError: a projector that takes neither the finer grid nor finer pixels with it.
         """
-        rng, errors = generator(NOISE, mixed(seed, index)), None
-        source, rig = self._source_of(grid, cameras), cameras
+        rng, errors, rig = generator(NOISE, mixed(seed, index)), None, cameras
         if self.acquisition.disturbed is not None:
             drawn = generator(ERRORS, mixed(seed, index))
             errors = rig_errors(self.acquisition.disturbed, cameras, drawn)
             rig = errors.rig(cameras)
+
+        def ideal() -> Sample:
+            return self._ideal(index, seed, grid, rig)
+
+        sample = self.store(index, seed, grid, rig, ideal) if self.store else ideal()
+        if errors is not None:
+            gain = errors.gain.to(sample.views)
+            shift = errors.offset_px.to(sample.views)
+            sample = replace(sample, views=sample.views * gain, shift_px=shift, gain=gain[:, 0, 0])
+        return replace(sample, views=detected(sample.views, self.acquisition, cameras, rng))
+
+    def _ideal(self, index: int, seed: int, grid: Grid, rig: Any) -> Sample:
+        """The case as a perfect detector measures it."""
+        if self.acquisition.disturbed is None:
+            source = self._source_of(grid, rig)
+        else:  # a rig of this case alone
             source = source_of(self.projector, grid, rig, self.acquisition.fine)
         if isinstance(source, Lines):
             sample = self.scene.sample(index, seed, grid, source.rig)
             views = _pooled(sample.views, source.pixel.rays)
-            views = views * source.pixel.weight.to(views)
-        else:
-            sample = self.scene.sample(index, seed, grid, rig)
-            with case_numbers(seed, index):  # the numbers that drew the sample
-                volume = finer(self.scene, index, seed, grid, rig, self.acquisition.fine)
-            with torch.no_grad():
-                views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
-        if errors is not None:
-            views = views * errors.gain.to(views)
-        return replace(sample, views=detected(views, self.acquisition, cameras, rng))
+            return replace(sample, views=views * source.pixel.weight.to(views))
+        sample = self.scene.sample(index, seed, grid, rig)
+        with case_numbers(seed, index):  # the numbers that drew the sample
+            volume = finer(self.scene, index, seed, grid, rig, self.acquisition.fine)
+        with torch.no_grad():
+            views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
+        return replace(sample, views=views)
 
     def _source_of(self, grid: Grid, cameras: Cameras) -> Lines | Projection:
         if self._source is None or self._source[0] is not grid or self._source[1] is not cameras:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.registry import hint
+from mvrecon.registry import check_options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +57,7 @@ class Disturbance:
         known = [field.name for field in fields(cls)]
         if not isinstance(options, Mapping):
             raise TypeError(f"disturbed is a mapping of {', '.join(known)}, got {options!r}")
-        for option in options:
-            if option not in known:
-                raise TypeError(f"disturbed has no option {option!r}{hint(str(option), known)}")
+        check_options("disturbed", options, known)
         return cls(**options)
 
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from mvrecon.acquisition.disturbances import Disturbance
-from mvrecon.registry import hint
+from mvrecon.registry import check_options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,11 +75,7 @@ class Acquisition:
                 f"An acquisition is a mapping of {', '.join(known)}, got {options!r}; choose a "
                 f"file by acquisition=<name>"
             )
-        for option in options or {}:
-            if option not in known:
-                raise TypeError(
-                    f"An acquisition has no option {option!r}{hint(str(option), known)}"
-                )
+        check_options("An acquisition", options or {}, known)
         values = {**(options or {})}
         if values.get("disturbed") is not None:
             values["disturbed"] = Disturbance.of(values["disturbed"])

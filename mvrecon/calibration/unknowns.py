@@ -108,7 +108,7 @@ def without_motion(cameras: Cameras, shifts: Float[Tensor, "m 2"]) -> Float[Tens
     """Shifts of views in pixels, less those that a moved object would cause as well (three degrees
     of freedom, at the isocentre).
     """
-    rest = _complement(_motions(cameras))
+    rest = _complement(motions(cameras, isocentre(cameras)).flatten(0, 1))
     return (rest @ (rest.T @ shifts.reshape(-1, 1))).reshape(-1, 2)
 
 
@@ -128,7 +128,7 @@ def _check(cameras: Cameras, free: Sequence[str]) -> None:
 
 def _columns(cameras: Cameras, name: str) -> Float[Tensor, "rows n"]:
     if name == "shifts":
-        return _complement(_motions(cameras))
+        return _complement(motions(cameras, isocentre(cameras)).flatten(0, 1))
     same = torch.full((len(cameras), 1), len(cameras) ** -0.5, dtype=torch.float64)
     return _complement(same) if name in SINGLE else same
 
@@ -138,9 +138,9 @@ def _complement(columns: Float[Tensor, "rows n"]) -> Float[Tensor, "rows k"]:
     return torch.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
 
 
-def _motions(cameras: Cameras) -> Float[Tensor, "rows 3"]:
-    """Shifts of all views, pixels a mm, that a move of the object causes along x, y and z."""
-    centre = isocentre(cameras)
+def motions(cameras: Cameras, centre: Float[Tensor, "3"]) -> Float[Tensor, "m 2 3"]:
+    """Pixels by which a point in world mm moves in each view (u, v), for a mm along x, y and z."""
+    centre = centre.to(cameras.origin)
     points = torch.cat([centre[None], centre + torch.eye(3).to(centre)])
     uv = cameras.project(points)[..., :2]
-    return (uv[:, 1:] - uv[:, :1]).permute(0, 2, 1).reshape(-1, 3)
+    return (uv[:, 1:] - uv[:, :1]).mT

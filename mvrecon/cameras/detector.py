@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras, Extent
-from mvrecon.registry import hint
+from mvrecon.registry import check_options
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,7 @@ class Detector:
         known = [field.name for field in fields(cls)]
         if not isinstance(options, Mapping):
             raise TypeError(f"A detector must be a mapping of {', '.join(known)}, got {options!r}")
-        for option in options:
-            if option not in known:
-                raise TypeError(f"A detector has no option {option!r}{hint(str(option), known)}")
+        check_options("A detector", options, known)
         if absent := {"pixels", "pixel_mm"} - set(options):
             raise TypeError(
                 f"A detector needs {' and '.join(sorted(absent))}, got only {sorted(options)}"

@@ -58,6 +58,9 @@ class ScanSettings:
     projector: Any = None
     grid: Any = MISSING
     reconstructor: Any = None
+    correct: Any = None
+    self_calibrate: bool = False
+    left_out: bool = False
     out: str | None = None
     unit: str = MISSING
     stop: Any = None

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.progress import track
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -15,12 +15,15 @@ from mvrecon.scenes.sample import Sample, Scene, Thin
 from mvrecon.visual_hull.support import warn_of_gaps
 
 TENSORS = ("views", "volume", "inside")
+#: What a case has where its rig is disturbed.
+ERRORS = ("shift_px", "gain")
 
 
 class SceneDataset(Dataset[dict[str, Any]]):
     """Cases of one scene; each item is a pure function of its index, whichever process asks for it.
 
-    An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name".
+    An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; where the rig is
+    disturbed also "shift_px" [m 2] and "gain" [m].
 
     Args:
         scene: where the cases come from.
@@ -60,31 +63,47 @@ class SceneDataset(Dataset[dict[str, Any]]):
             raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
         if self.cache:
             return {key: values[item] for key, values in self.prepare().items()}
-        return self._made(item)
+        return self.made(item)
 
-    def prepare(self, what: str = "cases") -> dict[str, Any]:
-        """Compute every case once and stack them, so that worker processes share a few blocks of
-        memory and not thousands.
+    def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
+        """Compute every case once, in so many processes beside this one, and stack them, so that
+        worker processes share a few blocks of memory and not thousands.
         """
         if self._ready is None:
             console = Console(stderr=True)
-            steps = track(range(len(self)), f"Preparing {what}", transient=True, console=console)
-            items = [self._made(item) for item in steps]
-            self._ready = {key: torch.stack([i[key] for i in items]) for key in TENSORS if items}
+            made = DataLoader(_Making(self), batch_size=None, num_workers=workers)
+            items = list(track(made, f"Preparing {what}", transient=True, console=console))
+            keys = [key for key in (*TENSORS, *ERRORS) if items and key in items[0]]
+            self._ready = {key: torch.stack([i[key] for i in items]) for key in keys}
             self._ready["name"] = [i["name"] for i in items]
         return self._ready
 
-    def _made(self, item: int) -> dict[str, Any]:
+    def made(self, item: int) -> dict[str, Any]:
+        """The case, made anew."""
         index = self.indices[item]
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
-        made = {key: getattr(sample, key) for key in TENSORS}
+        wrong = [key for key in ERRORS if getattr(sample, key) is not None]
+        made = {key: getattr(sample, key) for key in (*TENSORS, *wrong)}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
                 raise ValueError(
                     f"{sample.name}: expected finite {key}, got {bad} values that are not"
                 )
         return {**made, "name": sample.name}
+
+
+class _Making(Dataset[dict[str, Any]]):
+    """The cases of a set, made anew whenever they are asked for."""
+
+    def __init__(self, cases: SceneDataset):
+        self.cases = cases
+
+    def __len__(self) -> int:
+        return len(self.cases)
+
+    def __getitem__(self, item: int) -> dict[str, Any]:
+        return self.cases.made(item)
 
 
 class EpochOrder(Sampler[int]):

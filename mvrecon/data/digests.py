@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.files.checks import Refused
+from mvrecon.geometry.grid import Grid
 
 RIG = "rig"
 #: Decimals of a mm that count: a rig that another processor's sine and cosine make is the same rig.
@@ -30,6 +31,12 @@ def of_rig(cameras: Cameras) -> str:
         "parallel": cameras.parallel,
         "extent": cameras.extent,
     }
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def of_grid(grid: Grid) -> str:
+    """Digest of a grid: its shape, and where its voxels lie in mm."""
+    record = {"shape": list(grid.shape), "affine": _rounded(grid.affine.tolist())}
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,15 @@ import lightning.pytorch as L
 import torch
 from torch.utils.data import DataLoader
 
+from mvrecon import __version__
 from mvrecon.acquisition.acquired import Acquired
 from mvrecon.acquisition.settings import Acquisition
 from mvrecon.data import digests as sha256
+from mvrecon.data.case_store import CaseStore
 from mvrecon.data.dataset import EpochOrder, SceneDataset
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
+from mvrecon.registry import check_options
 from mvrecon.scenes.sample import Scene
 
 #: Series of random cases. Every run is judged on the same ones; its own seed makes the cases that
@@ -22,6 +26,42 @@ from mvrecon.scenes.sample import Scene
 TEST, VAL, TRAIN = 0, 1, 2
 #: Which parts of the data each stage of Lightning needs.
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
+
+
+@dataclass(frozen=True)
+class Loading:
+    """How cases are made and put into batches.
+
+    Args:
+        batch_size: cases in a batch.
+        workers: processes that make the cases before training, and load batches.
+        cache: folder in which cases are kept from run to run, without their noise; None: they are
+            made anew by every run. All cases of a run are kept in memory either way.
+
+    Raises:
+        ValueError: a number that is too small.
+    """
+
+    batch_size: int = 1
+    workers: int = 0
+    cache: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1 or self.workers < 0:
+            raise ValueError(
+                f"Expected a batch_size of at least 1 and workers of at least 0, got "
+                f"{self.batch_size} and {self.workers}"
+            )
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> "Loading":
+        """The options of a mapping.
+
+        Raises:
+            TypeError: an unknown option; the message gives the nearest and all.
+        """
+        check_options("data", options, (field.name for field in fields(cls)))
+        return cls(**options)
 
 
 class SceneData(L.LightningDataModule):
@@ -38,15 +78,13 @@ class SceneData(L.LightningDataModule):
             options of the rig; `projector`, name and options of what makes the views, None: line
             integrals; `acquisition`, options of `Acquisition`, None: a perfect detector.
         sizes: the number of cases for "train", "val" and "test"; a file may hold fewer.
-        batch_size: cases in a batch.
-        workers: processes that load batches; cases are made once, so 0 is as fast for all but huge
-            sets.
         overlap: training, validation and test take the first cases of a file, the same ones: for a
             file with one volume.
         seed: of the training cases and their order.
+        loading: of `Loading`: cases in a batch, processes, and where cases are kept.
 
     Raises:
-        TypeError: an unknown option of the acquisition.
+        TypeError: an unknown option of the acquisition or of loading.
         ValueError: sizes that leave nothing to train on, scenes of different data range, a number
             that is too small.
     """
@@ -56,10 +94,9 @@ class SceneData(L.LightningDataModule):
         scenes: Mapping[str, Mapping[str, Any]],
         measurement: Mapping[str, Any],
         sizes: Mapping[str, int],
-        batch_size: int = 1,
-        workers: int = 0,
         overlap: bool = False,
         seed: int = 0,
+        **loading: Any,
     ):
         super().__init__()
         if missing := {"train", "val", "test"} ^ set(sizes):
@@ -67,18 +104,17 @@ class SceneData(L.LightningDataModule):
                 f"sizes must give train, val and test; missing or unknown: "
                 f"{', '.join(sorted(missing))}"
             )
-        if min(sizes.values()) < 0 or batch_size < 1 or workers < 0 or seed < 0:
-            got = f"sizes {dict(sizes)}, batch_size {batch_size}, workers {workers}, seed {seed}"
+        if min(sizes.values()) < 0 or seed < 0:
             raise ValueError(
-                f"Expected sizes, workers and seed of at least 0 and a batch_size of at least 1, "
-                f"got {got}"
+                f"Expected sizes and seed of at least 0, got sizes {dict(sizes)}, seed {seed}"
             )
         self.grid = Grid.centred(**measurement["grid"])
         self.cameras = CAMERAS.from_config(measurement["camera"])
         self.projector = measurement.get("projector")
         self.acquisition = Acquisition.of(measurement.get("acquisition"))
-        self.sizes, self.batch_size, self.workers = dict(sizes), batch_size, workers
+        self.sizes, self.loading = dict(sizes), Loading.of(loading)
         self.overlap, self.seed = overlap, seed
+        self._settings = {key: dict(scenes[key]) for key in ("train", "test")}
         self.scenes: dict[str, Scene] = {
             key: SCENES.from_config(scenes[key]) for key in ("train", "test")
         }
@@ -134,15 +170,29 @@ class SceneData(L.LightningDataModule):
         series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}
         for part in STAGES[stage] if stage else ("train", "val", "test"):
             if part not in self.sets:
-                scene = self.scenes["test" if part == "test" else "train"]
-                measured = Acquired(scene, self.projector, self.acquisition)
+                measured = self._measured("test" if part == "test" else "train")
                 made = SceneDataset(
                     measured, self.grid, self.cameras, self.indices(part), series[part]
                 )
-                made.prepare(f"{part} cases")
+                made.prepare(f"{part} cases", self.loading.workers)
                 self.sets[part] = made
         if "train" in self.sets:
             self._order = EpochOrder(len(self.sets["train"]), self.seed)
+
+    def _measured(self, key: str) -> Acquired:
+        """The scene "train" or "test" behind its detector, with the cases that are kept of it."""
+        scene, store = self.scenes[key], None
+        if self.loading.cache is not None:
+            digests = self.digests(key)
+            made_of = {
+                "version": __version__,
+                "scene": self._settings[key],
+                "files": {path: digests[path] for path in self._files[key]},
+                "projector": self.projector,
+                "fine": self.acquisition.fine,
+            }
+            store = CaseStore(self.loading.cache, made_of, scene)
+        return Acquired(scene, self.projector, self.acquisition, store)
 
     def train_dataloader(self) -> DataLoader[dict[str, Any]]:
         """Training batches, in another random order in every epoch."""
@@ -161,10 +211,10 @@ class SceneData(L.LightningDataModule):
     def _loader(self, part: str, order: EpochOrder | None = None) -> DataLoader[dict[str, Any]]:
         return DataLoader(
             self.sets[part],
-            self.batch_size,
+            self.loading.batch_size,
             sampler=order,
-            num_workers=self.workers,
-            persistent_workers=self.workers > 0,
+            num_workers=self.loading.workers,
+            persistent_workers=self.loading.workers > 0,
             pin_memory=torch.cuda.is_available(),
             generator=order.generator
             if order
@@ -192,7 +242,7 @@ class SceneData(L.LightningDataModule):
         if loop is None or self._order is None:
             return {}
         n_batches = int(loop.epoch_loop.batch_progress.current.processed)  # pyright: ignore[reportAttributeAccessIssue]
-        n_done = n_batches * self.batch_size
+        n_done = n_batches * self.loading.batch_size
         whole = n_done >= len(self._order)  # the epoch: then the next one goes on
         place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}
         cases = self.sets["train"].prepare()

@@ -28,15 +28,20 @@ class Placed(NamedTuple):
 
 
 def moved(
-    grid: Grid, pivot: Float[Tensor, "3"], target: Float[Tensor, "3"], rng: torch.Generator | None
+    grid: Grid,
+    pivot: Float[Tensor, "3"],
+    target: Float[Tensor, "3"],
+    rng: torch.Generator | None,
+    exact: bool = False,
 ) -> Grid:
     """A grid carried from one point to another, with `rng` also turned, scaled and shifted about it
-    at random.
+    at random; an exact move shifts alone, so that axes stay parallel.
     """
     linear = torch.eye(3, dtype=torch.float64)
-    if rng is not None:
+    if rng is not None and not exact:
         angles = [uniform(rng, -TURN, TURN) for _ in range(3)]
         linear = uniform(rng, 1 - SCALE, 1 + SCALE) * euler_rotation(angles, "xyz")
+    if rng is not None:
         target = target + torch.tensor(
             [uniform(rng, -SHIFT, SHIFT) for _ in range(3)], dtype=torch.float64
         )

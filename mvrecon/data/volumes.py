@@ -51,8 +51,9 @@ class FileScene(ABC):
                 128^3. With 2 an iterative method is
             still flattered: the views are nearly those of its own voxels.
         rays: a pixel measures the mean over rays x rays lines of sight.
-        vary: beyond the last case, count on with copies that are mirrored left to right, turned,
-            scaled and shifted at random, others every time round.
+        vary: beyond the last case, count on with copies, others every time round: True mirrors
+            left to right, turns, scales and shifts at random; "exact" mirrors and shifts alone,
+            which interpolates nothing, the same for every seed.
         data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to
             1000 HU. Of activity, in its unit.
         stored_unit: of the numbers in the file: HU (made attenuation by `data.attenuation`), 1/mm,
@@ -66,7 +67,7 @@ class FileScene(ABC):
     crop: Crop = "body"
     fine: int | None = None
     rays: int = 2
-    vary: bool = False
+    vary: bool | Literal["exact"] = False
     data_range: float = 0.04
     stored_unit: StoredUnit | None = None
     unit: str = field(default="1/mm", init=False)
@@ -75,6 +76,8 @@ class FileScene(ABC):
         if self.stored not in UNITS:
             raise ValueError(f"stored_unit must be one of {UNITS}, got {self.stored_unit!r}")
         self.unit = "activity" if self.stored == "activity" else "1/mm"
+        if self.vary not in (True, False, "exact"):
+            raise ValueError(f"vary must be true, false or 'exact', got {self.vary!r}")
         if self.crop not in ("body", "none"):
             raise ValueError(f"crop must be 'body' or 'none', got {self.crop!r}")
         if (self.fine is not None and self.fine < 2) or self.rays < 1 or not self.data_range > 0:
@@ -101,6 +104,12 @@ class FileScene(ABC):
     @abstractmethod
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
         """Name, values in the stored unit and grid of a case as it lies in the file."""
+
+    def seed_of(self, index: int, seed: int) -> int:
+        """On which seed the case `index` of the series `seed` depends: 0 for cases as they lie in
+        the file, and their exact moves, which are those of all series.
+        """
+        return seed if index >= self.length and self.vary != "exact" else 0
 
     def factor(self, grid: Grid) -> int:
         """How many times finer than `grid` the grid is that views are projected from."""
@@ -156,6 +165,7 @@ class FileScene(ABC):
             )
         name, hu, source = self.case(case)
         mu = hu.mapped(lambda slab: self._physical(name, slab))
+        seed = self.seed_of(index, seed)
         rng = generator(seed, index) if turn else None
         if rng is not None and uniform(rng, 0, 1) < 0.5:
             mu = mu.flipped([2])
@@ -163,7 +173,7 @@ class FileScene(ABC):
             self._pivot(name, mu, source) if self.crop == "body" or rng is not None else grid.centre
         )
         target = grid.centre if self.crop == "body" else pivot
-        placed = moved(source, pivot, target, rng)
+        placed = moved(source, pivot, target, rng, self.vary == "exact")
         return Placed(f"{name}-{seed}-{turn}" if turn else name, mu, source, placed)
 
     def _pivot(self, name: str, mu: Slabs, source: Grid) -> Float[Tensor, "3"]:

@@ -105,9 +105,10 @@ def in_words(estimate: Estimate, free: Sequence[str]) -> str:
 
 
 def table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]:
-    """The estimate as plain numbers, for `results.json`."""
+    """The estimate in words and as plain numbers, for `results.json`."""
     by = estimate.misalignment
     return {
+        "words": in_words(estimate, free),
         "free": list(free),
         "offset_px": by.offset_px.tolist(),
         "tilt_degrees": by.tilt_degrees.tolist(),

@@ -19,7 +19,7 @@ from mvrecon.files.memory import peak
 from mvrecon.files.places import check_places
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
-from mvrecon.viz import montage
+from mvrecon.viz import cameras, montage
 from mvrecon.viz.planes import Image
 
 
@@ -210,6 +210,9 @@ class BoardReview(L.Callback):
             shown["opinions"] = montage.opinions(out.opinions[case, :, 0], top, spacing)
         if out.weights is not None:
             shown["weights"] = montage.weights(out.weights[case, :, 0], spacing)
+        if (by := out.alignment) is not None:
+            truth = batch["shift_px"][case] if "shift_px" in batch else None
+            shown["cameras"] = cameras.alignments(by.shift_px[case], by.gain[case], truth)
         return shown
 
     def _baselines(self, module: Any, views: Tensor) -> dict[str, Tensor]:

@@ -18,11 +18,13 @@ from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
 from mvrecon.engine.module import Settings
+from mvrecon.engine.wrong_cameras import camera_row, cameras_of
 from mvrecon.metrics import UNITS, view_metrics, volume_metrics
+from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
 from mvrecon.registry import hint
 
-Scores = dict[str, list[dict[str, float]]]
+Scores = dict[str, list[dict[str, Any]]]
 #: Where evaluation can run, by Lightning's names.
 ACCELERATORS = ("auto", "cpu", "gpu", "cuda")
 
@@ -38,7 +40,8 @@ def evaluate(
     device: str = "cpu",
     see: See | None = None,
 ) -> Scores:
-    """Figures of merit, and milliseconds of one reconstruction ("ms"), of each model on each scene.
+    """Figures of merit, milliseconds of one reconstruction ("ms"), and what was wrong with the
+    cameras ("cameras", where a model tells), of each model on each scene.
 
     Args:
         models: by label, all for the grid and the rig of `A`.
@@ -56,10 +59,13 @@ def evaluate(
         for label, model in ready.items():
             if not scores[label]:
                 model(scene["views"])  # the first call compiles and fills caches
-            milliseconds, volume = _timed(model, scene["views"])
+            milliseconds, out = _timed(model, scene["views"])
+            volume = out.volume
             figures = volume_metrics(volume[0], scene["volume"][0], scene["inside"][0], data_range)
             figures |= view_metrics(A(volume), scene["views"])
-            scores[label].append({**figures, "ms": milliseconds})
+            scores[label].append(
+                {**figures, "ms": milliseconds, **cameras_of(out.alignment, scene)}
+            )
             volumes[label] = volume
         if see is not None:
             see(scene, volumes)
@@ -132,13 +138,14 @@ def results(
     }
 
 
-def _row(method: Trained, scores: list[dict[str, float]]) -> dict[str, Any]:
+def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "parameters": sum(p.numel() for p in method.module.model.parameters() if p.requires_grad),
         "train_steps": method.steps,
         "train_seconds": method.seconds,
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
         **{name: mean_and_spread([score[name] for score in scores]) for name in UNITS},
+        **camera_row(scores),
     }
 
 
@@ -186,9 +193,9 @@ def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:
         }
 
 
-def _timed(model: nn.Module, views: Tensor) -> tuple[float, Tensor]:
+def _timed(model: nn.Module, views: Tensor) -> tuple[float, Reconstruction]:
     start = time.perf_counter()
-    volume = model(views).volume
-    if volume.is_cuda:
+    out = model(views)
+    if out.volume.is_cuda:
         torch.cuda.synchronize()
-    return 1e3 * (time.perf_counter() - start), volume
+    return 1e3 * (time.perf_counter() - start), out

@@ -1,6 +1,7 @@
 """One model in training, as a LightningModule: its loss, figures of merit and optimiser."""
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import lightning.pytorch as L
@@ -10,7 +11,7 @@ from torch import Tensor
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.metrics import view_metrics, volume_metrics
+from mvrecon.metrics import camera_metrics, view_metrics, volume_metrics
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
@@ -86,8 +87,20 @@ class ReconstructionModule(L.LightningModule):
     def _terms(self, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
         """The loss, with the truth's own views where views are corrected towards them."""
         if self.loss.compares_views(out):
-            batch = {**batch, "true_views": self.projector(batch["volume"])}
+            A = self.corrected_projector.to(batch["volume"].device)
+            batch = {**batch, "true_views": A(batch["volume"])}
         return self.loss(out, batch)
+
+    @cached_property
+    def corrected_projector(self) -> Projector:
+        """The operator of the views that the model corrects: its own, or one of the same kind for
+        the model's `corrected_cameras`.
+        """
+        cameras = getattr(self.model, "corrected_cameras", None)
+        if cameras is None:
+            return self.projector
+        options = self.hparams["geometry"]["projector"]
+        return PROJECTORS.from_config(options, grid=self.projector.grid, cameras=cameras)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
         """Log the loss and the figures of merit; hand the reconstruction on to the board."""
@@ -102,6 +115,9 @@ class ReconstructionModule(L.LightningModule):
             )
         ]
         means = {name: torch.tensor([f[name] for f in figures]).nanmean() for name in figures[0]}
+        if out.alignment is not None and "gain" in batch:
+            known = camera_metrics(out.alignment, batch["shift_px"], batch["gain"])
+            means |= {f"cameras_{name}": torch.tensor(value) for name, value in known.items()}
         for name, value in (terms | means).items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr", batch_size=len(predicted))
         return {"out": out}

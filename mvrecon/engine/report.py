@@ -60,9 +60,20 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
         lines.append(f"The views' detector: {spoilt}")
     if got and (run := results.get("acquisition_of_run", got)) != got:
         lines.append(f"The run's detector was another: {_spoilt(run) or 'perfect'}")
+    for label, row in results.get("methods", {}).items():
+        if "auc" in (cameras := row.get("cameras", {})):
+            lines.append(f"{label} tells which cameras are disturbed: {_accuracy(cameras)}")
     if results.get("overlap"):
         lines.append("data.overlap: training, validation and test share their cases")
     return lines
+
+
+def _accuracy(cameras: Mapping[str, Any]) -> str:
+    return (
+        f"AUC {cameras['auc']:.3f}; shifts to {cameras['shift_rms_px']:.3f} pixels of "
+        f"{cameras['true_shift_rms_px']:.3f}, gains to {cameras['gain_rms']:.2%} of "
+        f"{cameras['true_gain_rms']:.2%} (root mean square)"
+    )
 
 
 def _spoilt(acquisition: Mapping[str, Any]) -> str:

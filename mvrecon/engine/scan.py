@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,7 +12,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.field import auto_grid, check_rig_sees
 from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Corrected
 from mvrecon.data.volume_files import read_volume
 from mvrecon.files.checks import check_memory
 from mvrecon.geometry.grid import Grid
@@ -21,6 +21,26 @@ from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
 VOLUMES = 3
+
+
+class Views(Protocol):
+    """Views of a scan, whole or a few at a time."""
+
+    def read(self, first: int, last: int) -> Corrected:
+        """Views `first` to `last - 1` as line integrals."""
+        ...
+
+    def whole(self) -> Corrected:
+        """All views."""
+        ...
+
+    def divided_by(self, gains: Float[Tensor, " m"]) -> "Views":
+        """The same views with each one's integrals divided by its gain."""
+        ...
+
+    def warn_of_values(self, saturated: int, floored: int) -> None:
+        """Warn how many pixels were saturated or at the floor, where any was."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +54,7 @@ class Scan:
         projector: name and options of the operator.
     """
 
-    measured: MeasuredViews
+    measured: Views
     cameras: Cameras
     grid: Grid
     projector: Mapping[str, Any]

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from mvrecon.engine.scan import Scan
 from mvrecon.files.memory import peak
 from mvrecon.parts import RECONSTRUCTORS, STREAMED
 from mvrecon.reconstruct.held_out import Choice, held_out
+from mvrecon.reconstruct.left_out import left_out_residual
 from mvrecon.reconstruct.problem import Iterate
 from mvrecon.reconstruct.stopping import Curve, combined, discrepancy
 
@@ -43,6 +45,10 @@ class Outcome:
     view_nrmse: float
     residuals: list[float] = field(default_factory=list)
     chosen: dict[str, Any] = field(default_factory=dict)
+
+    def row(self) -> dict[str, Any]:
+        """All but the volume, for `results.json`."""
+        return {name: value for name, value in vars(self).items() if name != "volume"}
 
 
 def check(settings: Mapping[str, Any]) -> None:
@@ -107,6 +113,14 @@ class _Runs:
             self.curve, self._before = Curve(), self._before + self._length
         self._advance(self._before + iterate.number)
         return self.curve(iterate)
+
+
+def left_out(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> list[float]:
+    """The relative error of each view as the method predicts it from the others."""
+    options = dict(settings["reconstructor"])
+    method = partial(RECONSTRUCTORS.build, options.pop("name"), **options)
+    views = scan.measured.whole().views[None, None].to(device)
+    return left_out_residual(method, scan.operator().to(device), views)[0].tolist()
 
 
 def _iterated(

@@ -4,7 +4,7 @@ import warnings
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from mvrecon.data import digests
 from mvrecon.parts import MODELS
@@ -32,12 +32,23 @@ def trained(
         ValueError: a network that was trained for another number of cameras or voxels.
         FileNotFoundError, LookupError, Refused: as `load`.
     """
+    model, data_range = model_for(A, checkpoint, method)
+    with torch.inference_mode():
+        volume = model(views).volume
+    _warn_of_values(volume, data_range, checkpoint)
+    return volume.clone()
+
+
+def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple[nn.Module, float]:
+    """A trained network on an operator, ready to reconstruct, and the value range of its training.
+
+    Arguments, warnings and errors as `trained`.
+    """
     from mvrecon.engine.trained import load  # Lightning's import takes seconds
 
-    network = load(checkpoint, method)
-    module = network.module
+    module = load(checkpoint, method).module
     for difference in _differences(A, module.projector):
-        warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=2)
+        warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=3)
     model = MODELS.from_config(module.hparams["model"], projector=A)
     try:
         model.load_state_dict(module.model.state_dict())
@@ -46,10 +57,7 @@ def trained(
             f"{checkpoint}: expected the rig and the grid of its training, got "
             f"{len(A.cameras)} cameras and {A.grid.shape} voxels: {error}"
         ) from error
-    with torch.inference_mode():
-        volume = model.to(A.device).eval()(views).volume
-    _warn_of_values(volume, module.hparams["data_range"], checkpoint)
-    return volume.clone()
+    return model.to(A.device).eval(), module.hparams["data_range"]
 
 
 def _differences(A: Projector, other: Projector) -> list[str]:

@@ -8,10 +8,10 @@ map between two lattices (projective coordinates: Hartley & Zisserman, Multiple 
 and 3).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
@@ -122,24 +122,59 @@ def places(
     return rows[..., NUMERATORS] / torch.where(counts[..., None], under, 1.0), counts
 
 
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """Samples of volumes that lie in a convex body: of each row those from `first` to before `end`.
+
+    Args:
+        first: index of the first sample along a row.
+        end: of the one behind the last; a row without a sample has no greater one than `first`.
+        width: samples of a row.
+    """
+
+    first: Int[Tensor, "*n d h"]
+    end: Int[Tensor, "*n d h"]
+    width: int
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Samples (d, h, w)."""
+        d, h = self.first.shape[-2:]
+        return d, h, self.width
+
+    @property
+    def mask(self) -> Bool[Tensor, "*n d h w"]:
+        """Whether each sample lies in the body."""
+        i = torch.arange(self.width, dtype=self.first.dtype, device=self.first.device)
+        return (i >= self.first[..., None]) & (i < self.end[..., None])
+
+    def to(self, device: torch.device) -> "Spans":
+        """On another device."""
+        return replace(self, first=self.first.to(device), end=self.end.to(device))
+
+
 def enclosed(
     maps: Float[Tensor, "*n 5 2 3"], source: tuple[int, int, int], shape: tuple[int, int, int]
-) -> Bool[Tensor, "*n d h w"]:
+) -> Spans:
     """Which samples of an output of `shape` lie in the source lattice's box, ahead of its source;
     its faces count.
 
     Every face is a half-space, which cuts a row of samples at one place: no sample's own place is
     worked out.
     """
-    planes, j, i = _planes(maps, shape)
+    planes, j, _ = _planes(maps, shape)
     half = maps.new_tensor(source[::-1])[:, None, None] / 2 * (1 + FACE)
     top, under = planes[..., NUMERATORS, :, :], planes[..., [ACROSS, ACROSS, DEPTH], :, :] * half
-    x, y, one = torch.cat([under - top, under + top], dim=-3).unbind(
-        dim=-1
-    )  # [*n 6 d], positive within
-    rest = y[..., None] * j + one[..., None]
-    x = x[..., None].expand_as(rest)
-    cut, never = -rest / x, torch.where(rest > 0, -torch.inf, torch.inf)
-    low = torch.where(x > 0, cut, torch.where(x < 0, -torch.inf, never)).amax(dim=-3)
-    high = torch.where(x < 0, cut, torch.inf).amin(dim=-3)
-    return (i > low[..., None]) & (i < high[..., None])
+    low = high = maps.new_tensor(0.0)
+    low, high = low - torch.inf, high + torch.inf
+    for face in torch.cat([under - top, under + top], dim=-3).unbind(dim=-3):  # positive within
+        x, y, one = (part[..., None] for part in face.unbind(dim=-1))  # [*n d 1]
+        rest = y * j + one
+        cut, never = -rest / x, torch.where(rest > 0, -torch.inf, torch.inf)
+        low = low.maximum(torch.where(x > 0, cut, torch.where(x < 0, -torch.inf, never)))
+        high = high.minimum(torch.where(x < 0, cut, torch.inf))
+    width = shape[2]
+    first = (low + (width - 1) / 2).floor() + 1
+    end = (high + (width - 1) / 2).ceil()
+    first, end = (index.clamp(0, width).to(torch.int16) for index in (first, end))
+    return Spans(first, end, width)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from mvrecon.models.consistency import (
     Consistency,
     Start,
+    Steps,
     anything,
     checked_start,
     content_scale,
@@ -46,7 +47,7 @@ class MeanFusion(CrossView):
         head: Mapping[str, Any],
         opinion: Mapping[str, Any] | None = None,
         start: Start = 12,
-        consistency: int = 3,
+        consistency: Steps = 3,
         **options: Any,
     ):
         super().__init__(
@@ -71,7 +72,8 @@ class BackprojectionUNet(nn.Module):
         width: channels of the finest level, where the options name no network.
         start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
             ..., **options}`.
-        consistency: learned gradient steps towards the data at the end.
+        consistency: learned gradient steps towards the data at the end, or `{steps: ..., noise:
+            poisson}` for counts.
         options: of `Options`: what is left out (support, masked, ...), nothing by default, and the
             network.
 
@@ -84,7 +86,7 @@ class BackprojectionUNet(nn.Module):
         projector: Projector,
         width: int = 18,
         start: Start = 12,
-        consistency: int = 3,
+        consistency: Steps = 3,
         **options: Any,
     ):
         super().__init__()

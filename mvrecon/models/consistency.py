@@ -3,6 +3,7 @@ data-consistency steps.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,7 +13,13 @@ from torch import Tensor, nn
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import RECONSTRUCTORS
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstruct.iterative import inverse_sums, sirt
+from mvrecon.registry import check_options
+
+#: The least number of counts that a pixel is taken to expect, relative to the mean of its case.
+LEAST = 0.01
+#: How many steps, or a mapping of steps and noise.
+Steps = int | Mapping[str, Any]
 
 
 class Consistency(nn.Module):
@@ -20,15 +27,31 @@ class Consistency(nn.Module):
 
     C and R are the inverse column and row sums of A (SIRT, Gregor & Benson 2008), so a step of
     length one is stable for every rig. The steps' lengths are learned, as in ItNet (Genzel et al.
-    2022).
+    2022). For counts R is the inverse of those that the volume makes expect, their variance, and C
+    the inverse column sums that belong to it, as stable (De Pierro, IEEE Trans. Med. Imaging 14
+    (1995) 132).
 
     Args:
-        steps: how many; none leaves the volume as it is.
+        steps: how many; none leaves the volume as it is. Or `{steps: 3, noise: poisson}`, for
+            counts; noise gaussian is the default.
+
+    Raises:
+        TypeError: a mapping with other keys.
+        ValueError: a number of steps below 0, or another noise.
     """
 
-    def __init__(self, steps: int):
+    def __init__(self, steps: Steps):
         super().__init__()
-        self.lengths = nn.Parameter(torch.ones(steps))
+        options = dict(steps) if isinstance(steps, Mapping) else {"steps": steps}
+        check_options("Consistency", options, ("steps", "noise"))
+        count, noise = int(options.get("steps", 3)), options.get("noise", "gaussian")
+        if count < 0 or noise not in ("gaussian", "poisson"):
+            raise ValueError(
+                f"Expected 0 consistency steps or more, and the noise gaussian or poisson, got "
+                f"{count} and {noise!r}"
+            )
+        self.poisson = noise == "poisson"
+        self.lengths = nn.Parameter(torch.ones(count))
 
     def forward(
         self,
@@ -43,8 +66,11 @@ class Consistency(nn.Module):
         chi^2 per measurement, the mean of ((y - A x) / sigma)^2, is at most 1. In training every
         sample takes every step.
         """
-        for length in self.lengths:
-            residual = views - geometry.A(volume)
+        for number, length in enumerate(self.lengths):
+            expected = geometry.A(volume)
+            if self.poisson and number == 0:
+                geometry = weighted_for_counts(geometry, expected)
+            residual = views - expected
             if sigma is None or self.training:
                 volume = volume + length * geometry.back(residual)
                 continue
@@ -53,6 +79,26 @@ class Consistency(nn.Module):
                 break
             volume = volume + length * unmet * geometry.back(residual)
         return volume
+
+
+@torch.no_grad()
+def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]) -> Geometry:
+    """The geometry with R the inverse of expected counts, and C the inverse column sums of R A, in
+    the unit of the volume by that of the views.
+
+    Args:
+        geometry: with R and C of SIRT.
+        expected: counts; at least a hundredth of the mean of those that rays of the mask make.
+    """
+    reached = geometry.row > 0
+    number = reached.expand_as(expected).sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
+    total = (expected.clamp_min(0) * reached).sum(dim=(1, 2, 3, 4), keepdim=True)
+    least = (LEAST * total / number).clamp_min(torch.finfo(expected.dtype).tiny)
+    row = reached / expected.maximum(least)
+    chords = torch.where(reached, 1 / torch.where(reached, geometry.row, 1), 0)
+    sums = geometry.A.T(row * chords)
+    column = torch.cat([inverse_sums(own) for own in sums.split(1)]) * (geometry.column > 0)
+    return replace(geometry, row=row, column=column)
 
 
 #: Iterations of SIRT with momentum, or a reconstructor as a mapping: its name and options.

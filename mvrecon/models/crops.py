@@ -19,6 +19,7 @@ from mvrecon.cameras.culling import views_that_see
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.frustum import depth_index
 from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.lattice import Spans
 from mvrecon.models.frusta import Frusta, maps_between
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.networks import MULTIPLE
@@ -64,12 +65,28 @@ class Window:
         index = self.first[:, :1] + torch.arange(self.shape[0] + 1)
         return edges.gather(1, index.to(edges.device))
 
-    def bins(self, values: Shaped[Tensor, "m 1 D v u"]) -> Shaped[Tensor, "m 1 E r s"]:
-        """The values of the window's bins, of those of all."""
+    def parts(self, values: Shaped[Tensor, "m *n"], axes: Sequence[int]) -> Shaped[Tensor, "m *k"]:
+        """The window's part of each camera's values.
+
+        Args:
+            values: of all bins.
+            axes: what their last axes run along: 0 depth, 1 rows, 2 columns.
+        """
         # slices, since an index for each bin takes ten times as long
-        d, v, u = self.shape
-        starts = zip(values, self.first.tolist(), strict=True)
-        return torch.stack([x[:, k : k + d, j : j + v, i : i + u] for x, (k, j, i) in starts])
+        ranges = [
+            [slice(first[axis], first[axis] + self.shape[axis]) for axis in axes]
+            for first in self.first.tolist()
+        ]
+        return torch.stack([x[..., *part] for x, part in zip(values, ranges, strict=True)])
+
+    def spans(self, spans: Spans) -> Spans:
+        """The window's part of rows of bins."""
+        start = self.first[:, 2].to(spans.first).reshape(-1, 1, 1, 1)
+        first, end = (
+            (self.parts(index, (0, 1)) - start).clamp(0, self.shape[2])
+            for index in (spans.first, spans.end)
+        )
+        return Spans(first, end, self.shape[2])
 
 
 def cropped_geometry(
@@ -127,13 +144,29 @@ def _part(
         frusta_from_world,
         world_from_frusta,
         edges,
-        visible=whole.visible[index][..., *box.slices],
-        occupied=window.bins(whole.occupied[index]),
-        step=window.bins(whole.step[index]),
+        seen=_within(whole.seen, index, box),
+        inside=window.spans(_of_cameras(whole.inside, index)),
+        thickness=window.parts(whole.thickness[index], (0,)),
+        slant=window.parts(whole.slant[index], (1, 2)),
         n_depths=whole.n_depths,
         first=window.first,
     )
-    return part.to(whole.step.device)
+    return part.to(whole.slant.device)
+
+
+def _within(seen: Spans, index: Int[Tensor, " k"], box: Box) -> Spans:
+    """Rows of voxels of a box, for some cameras."""
+    rows, columns = box.slices[:2], box.slices[2]
+    width = columns.stop - columns.start
+    first, end = (
+        (place[index][..., *rows] - columns.start).clamp(0, width)
+        for place in (seen.first, seen.end)
+    )
+    return Spans(first, end, width)
+
+
+def _of_cameras(spans: Spans, index: Int[Tensor, " k"]) -> Spans:
+    return replace(spans, first=spans.first[index], end=spans.end[index])
 
 
 def window_of(

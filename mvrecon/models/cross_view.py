@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, Start, checked_start, normalised
+from mvrecon.models.consistency import Consistency, Start, Steps, checked_start, normalised
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
@@ -38,7 +38,8 @@ class CrossView(nn.Module):
             cannot create what no camera holds.
         start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
             ..., **options}`.
-        consistency: learned gradient steps towards the data at the end.
+        consistency: learned gradient steps towards the data at the end, or `{steps: ..., noise:
+            poisson}` for counts.
         options: of `Options`: what is left out (support, masked, ...), nothing by default, and the
             network that corrects the fused volume.
 
@@ -56,7 +57,7 @@ class CrossView(nn.Module):
         fusion: Literal["weighted", "mean"] = "weighted",
         refine: int = 16,
         start: Start = 12,
-        consistency: int = 3,
+        consistency: Steps = 3,
         **options: Any,
     ):
         super().__init__()

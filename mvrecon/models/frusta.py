@@ -17,7 +17,7 @@ from mvrecon.cameras.culling import seen_depth_range
 from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.grid import Grid
-from mvrecon.geometry.lattice import enclosed, grid_lattice, lattice_maps
+from mvrecon.geometry.lattice import Spans, enclosed, grid_lattice, lattice_maps
 from mvrecon.kernels.warps.warp import warp
 
 #: Of a voxel: a smaller share is a rounding error, of a bin and a voxel at equal places.
@@ -28,29 +28,35 @@ TOUCH = 1e-5
 class Frusta:
     """The frusta of M cameras over one grid; `Frusta.of` makes them.
 
+    Of each camera it holds images and rows, no volume: what has a value for every bin or voxel is
+    made where it is asked for.
+
     Convention: the sample's axis b of `occupied` is there only where it depends on the sample.
 
     Args:
         frusta_from_world: where each voxel lies in each frustum, float64.
         world_from_frusta: where each bin lies in the grid, float64.
         edges: planes between the depth bins in mm, float64.
-        visible: voxels inside a frustum.
-        occupied: bins that may be other than zero: those inside the grid's box, ahead of the
-            source, and with a mask those that touch it.
-        step: mm of ray in a bin.
+        seen: voxels inside a frustum.
+        inside: bins inside the grid's box, ahead of the source.
+        thickness: mm of depth of a bin.
+        slant: mm of ray per mm of depth.
         n_depths: depth bins of the frusta over the whole grid.
         first: where these are a part of larger frusta, the index (depth, row, column) of each
             camera's first bin in them, on the CPU.
+        touching: bins that touch the mask of a sample; none: all.
     """
 
     frusta_from_world: Float[Tensor, "m 1 5 2 3"]
     world_from_frusta: Float[Tensor, "1 m 5 2 3"]
     edges: Float[Tensor, "m e"]
-    visible: Bool[Tensor, "m 1 d h w"]
-    occupied: Bool[Tensor, "*b m 1 D v u"]
-    step: Float[Tensor, "m 1 D v u"]
+    seen: Spans
+    inside: Spans
+    thickness: Float[Tensor, "m D"]
+    slant: Float[Tensor, "m v u"]
     n_depths: int
     first: Int[Tensor, "m 3"] | None = None
+    touching: Bool[Tensor, "b m 1 D v u"] | None = None
 
     @classmethod
     def of(cls, grid: Grid, cameras: Cameras, depth: int) -> "Frusta":
@@ -63,29 +69,44 @@ class Frusta:
         """
         edges = depth_edges(seen_depth_range(cameras, grid), depth)
         frusta_from_world, world_from_frusta = maps_between(grid, cameras, edges)
-        ahead = frusta_lattice(cameras, grid, edges).ahead[:, None, :, None, None]
+        ahead = frusta_lattice(cameras, grid, edges).ahead[:, None, :, None]
         shape = depth, *cameras.shape
-        inside = enclosed(world_from_frusta, grid.shape, shape).transpose(0, 1)
+        inside = enclosed(world_from_frusta[0, :, None], grid.shape, shape)
         start, end = cameras.rays()
-        per_mm = (end - start).norm(dim=-1) / cameras.distance[
-            :, None, None
-        ]  # mm of ray per mm of depth
-        step = (edges[:, 1:] - edges[:, :-1]).abs()[:, :, None, None] * per_mm[:, None]
+        slant = (end - start).norm(dim=-1) / cameras.distance[:, None, None]
         return cls(
             frusta_from_world,
             world_from_frusta,
             edges,
-            visible=enclosed(frusta_from_world, shape, grid.shape),
-            occupied=inside & ahead,
-            step=step[:, None].float(),
+            seen=enclosed(frusta_from_world, shape, grid.shape),
+            inside=replace(inside, end=inside.end * ahead),
+            thickness=(edges[:, 1:] - edges[:, :-1]).abs().float(),
+            slant=slant.float(),
             n_depths=depth,
         )
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Bins (depth, row, column)."""
-        depth, v, u = self.step.shape[2:]
-        return depth, v, u
+        return self.inside.shape
+
+    @property
+    def step(self) -> Float[Tensor, "m 1 D v u"]:
+        """Length in mm of ray in a bin."""
+        return (self.thickness[:, :, None, None] * self.slant[:, None])[:, None]
+
+    @property
+    def visible(self) -> Bool[Tensor, "m 1 d h w"]:
+        """Voxels inside a frustum."""
+        return self.seen.mask
+
+    @property
+    def occupied(self) -> Bool[Tensor, "*b m 1 D v u"]:
+        """Bins that may be other than zero: those inside the grid's box, ahead of the source, and
+        with a mask those that touch it.
+        """
+        inside = self.inside.mask
+        return inside if self.touching is None else inside & self.touching
 
     @property
     def chord(self) -> Float[Tensor, "*m 1 1 v u"]:
@@ -94,10 +115,13 @@ class Frusta:
 
     def to(self, *where: Any) -> "Frusta":
         """On another device, or with steps of another dtype; the maps keep their digits."""
-        step = self.step.to(*where)
-        names = ("frusta_from_world", "world_from_frusta", "edges", "visible", "occupied")
-        moved = {name: getattr(self, name).to(step.device) for name in names}
-        return replace(self, step=step, **moved)
+        slant = self.slant.to(*where)
+        device = slant.device
+        names = ("frusta_from_world", "world_from_frusta", "edges", "seen", "inside")
+        moved = {name: getattr(self, name).to(device) for name in names}
+        touching = None if self.touching is None else self.touching.to(device)
+        thickness = self.thickness.to(slant)
+        return replace(self, slant=slant, thickness=thickness, touching=touching, **moved)
 
     def spread(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b m c D v u"]:
         """Uniform lift: each pixel's integral spread evenly along its ray's occupied bins."""
@@ -130,8 +154,7 @@ class Frusta:
 
     def to_world(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
         """Each frustum's density at the voxels of the grid; zero where the camera does not see."""
-        d, h, w = self.visible.shape[2:]
-        return warp(frusta, self.frusta_from_world, (d, h, w))[:, :, 0]
+        return warp(frusta, self.frusta_from_world, self.seen.shape)[:, :, 0]
 
     def to_frusta(self, volumes: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m c D v u"]:
         """World volumes at the bins of the frusta, one volume for each camera (or one for all, m =
@@ -146,9 +169,9 @@ class Frusta:
         is left out.
         """
         with torch.inference_mode(False), torch.enable_grad():
-            volume = mask.to(self.step.dtype, copy=True)[:, None]
-            m = len(self.step)
-            bins = self.step.new_zeros(len(mask), m, 1, *self.shape, requires_grad=True)
+            volume = mask.to(self.slant.dtype, copy=True)[:, None]
+            m = len(self.slant)
+            bins = self.slant.new_zeros(len(mask), m, 1, *self.shape, requires_grad=True)
             (read,) = torch.autograd.grad(
                 self.to_world(bins), bins, volume.expand(-1, m, -1, -1, -1, -1)
             )

@@ -143,9 +143,6 @@ def _touching(
     fine: Frusta, coarse: Frusta, mask: Bool[Tensor, "b 1 d h w"]
 ) -> tuple[Frusta, Frusta]:
     touched = fine.touched(mask)
-    pooled = adaptive_max_pool3d(touched.flatten(0, 1).to(fine.step.dtype), coarse.shape) > 0
+    pooled = adaptive_max_pool3d(touched.flatten(0, 1).to(fine.slant.dtype), coarse.shape) > 0
     pooled = pooled.unflatten(0, touched.shape[:2])
-    return (
-        replace(fine, occupied=fine.occupied & touched),
-        replace(coarse, occupied=coarse.occupied & pooled),
-    )
+    return replace(fine, touching=touched), replace(coarse, touching=pooled)

@@ -35,15 +35,14 @@ class SoftmaxDepth(nn.Module):
         views: Float[Tensor, "b 1 m v u"],
         frusta: Frusta,
     ) -> Float[Tensor, "b m 1 D v u"]:
-        prior = prior.clamp_min(0) * frusta.occupied
-        level = prior.sum(dim=3, keepdim=True) / frusta.occupied.sum(
-            dim=-3, keepdim=True
-        ).clamp_min(1)
+        occupied = frusta.occupied
+        prior = prior.clamp_min(0) * occupied
+        level = prior.sum(dim=3, keepdim=True) / occupied.sum(dim=-3, keepdim=True).clamp_min(1)
         relative = prior / level.clamp_min(torch.finfo(prior.dtype).tiny)
         logits = logits + (relative + FLOOR).log()
         # Finite, not -inf: a ray with no bin in the region must not turn into NaN.
-        masked = torch.where(frusta.occupied, logits, torch.finfo(logits.dtype).min)
-        share = masked.softmax(dim=3) * frusta.occupied
+        masked = torch.where(occupied, logits, torch.finfo(logits.dtype).min)
+        share = masked.softmax(dim=3) * occupied
         return share * views.transpose(1, 2)[:, :, :, None] / frusta.step
 
 

@@ -143,7 +143,8 @@ def convolution(
     halves.
     """
     n, channels, d, h = x.shape[:4]
-    if n > 1 or d < 2 or x.is_cuda or channels * d * h > ALONE:
+    quick = x.is_cuda or torch.is_autocast_enabled(x.device.type)  # bfloat16 is left to oneDNN
+    if n > 1 or d < 2 or quick or channels * d * h > ALONE:
         return F.conv3d(x, weight, bias, padding=1)
     half = (d + 1) // 2
     padded = F.pad(x, (0, 0, 0, 0, 1, 1 + 2 * half - d))

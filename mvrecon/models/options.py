@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
-from mvrecon.registry import hint
+from mvrecon.registry import check_options
 from mvrecon.visual_hull.support import KINDS
 
 #: Voxels that networks which do not know of the mask see around it.
@@ -78,7 +78,5 @@ class Options:
             p.name for p in inspect.signature(model).parameters.values() if p.kind != p.VAR_KEYWORD
         ]
         known = {*own, *(field.name for field in fields(cls))}
-        for option in options:
-            if option not in known:
-                raise TypeError(f"The model has no option {option!r}{hint(option, known)}")
+        check_options("The model", options, known)
         return cls(**options)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.calibration.alignment import Alignment
+
 
 @dataclass
 class Reconstruction:
@@ -24,9 +26,12 @@ class Reconstruction:
         start: the classical reconstruction that the network began with.
         start_views: the start projected into every camera, in the unit of the views.
         earlier: the volumes after each round but the last, of a model in rounds.
-        corrected_views: the views as the cameras' networks of each round have corrected them, in
-            the unit of the views.
-        row: R, the inverse row sums of A in 1/mm, where views are corrected.
+        corrected_views: the views as the cameras' networks of each round have corrected them, or
+            the completed sinogram, in the unit of the views. They are of the model's
+            `corrected_cameras`, if it has them, else of its rig.
+        row: R, the inverse row sums of A, or of one typical chord, in 1/mm, where views are
+            corrected.
+        alignment: what was wrong with each camera, where views were aligned before.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -38,5 +43,6 @@ class Reconstruction:
     start: Float[Tensor, "b 1 d h w"] | None = None
     start_views: Float[Tensor, "b 1 m v u"] | None = None
     earlier: tuple[Float[Tensor, "b 1 d h w"], ...] = ()
-    corrected_views: tuple[Float[Tensor, "b 1 m v u"], ...] = ()
-    row: Float[Tensor, "#b 1 m v u"] | None = None
+    corrected_views: tuple[Float[Tensor, "b 1 n v u"], ...] = ()
+    row: Float[Tensor, "#b 1 #n #v #u"] | None = None
+    alignment: Alignment | None = None

@@ -2,6 +2,7 @@
 of the cameras.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Unpack
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
-from mvrecon.reconstruct.poisson import PoissonLikelihood
+from mvrecon.reconstruct.poisson import PoissonLikelihood, negative_log_likelihood
 from mvrecon.reconstruct.problem import Common, Watch, check_start, supported, without_gradient
 
 
@@ -59,21 +60,17 @@ def mlem(
     A, start = supported(mlem, A, common), common.get("start")
     if start is not None:
         check_start(A, start, counts)
-    dealt = ordered_subsets(A.range_shape[0], subsets)
-    with torch.no_grad():
-        parts = [
-            PoissonLikelihood(A, counts, background, dealt[subset], skip_zero_bins)
-            for subset in distant_order(subsets)
-        ]
-        sums = [part.sensitivity(parts[0].counts.dtype) for part in parts]
-        x, watch = _admitted(parts, sums, start), Watch(common.get("monitor"))
-        for number in range(1, iterations + 1):
-            for part, s in zip(parts, sums, strict=True):
-                # a voxel that these views do not see, though others do, is left to the others
-                x = torch.where(s > 0, x * (part.explained(x) / torch.where(s > 0, s, 1)), x)
-            if watch.ends(number, x, partial(_unexplained, A, counts, background, x)):
-                break
-        return watch.result(x)
+    parts = subset_likelihoods(A, counts, background, subsets, skip_zero_bins)
+    sums = [part.sensitivity(parts[0].counts.dtype) for part in parts]
+    x = admitted(parts, sums, start)
+    watch = Watch(common.get("monitor"), partial(likelihood_of_residual, counts))
+    for number in range(1, iterations + 1):
+        for part, s in zip(parts, sums, strict=True):
+            # a voxel that these views do not see, though others do, is left to the others
+            x = torch.where(s > 0, x * (part.explained(x) / torch.where(s > 0, s, 1)), x)
+        if watch.ends(number, x, partial(unexplained, A, counts, background, x)):
+            break
+    return watch.result(x)
 
 
 @without_gradient
@@ -102,14 +99,40 @@ def osem(
     return mlem(A, counts, iterations, background, subsets, skip_zero_bins, **common)
 
 
-def _admitted(
+def subset_likelihoods(
+    A: LinearOperator,
+    counts: Float[Tensor, "b c m v u"],
+    background: float | Float[Tensor, "b c m v u"],
+    subsets: int,
+    skip_zero_bins: bool = True,
+) -> list[PoissonLikelihood]:
+    """The likelihood of each ordered subset of the cameras, in an order in which one is far from
+    those just before it.
+    """
+    dealt = ordered_subsets(A.range_shape[0], subsets)
+    return [
+        PoissonLikelihood(A, counts, background, dealt[subset], skip_zero_bins)
+        for subset in distant_order(subsets)
+    ]
+
+
+def admitted(
     parts: list[PoissonLikelihood], sums: list[Tensor], start: Float[Tensor, "b c d h w"] | None
 ) -> Float[Tensor, "b c d h w"]:
-    """The start, which must allow every count."""
+    """The start of a method of counts, uniform by default, in the unit of the volume.
+
+    Args:
+        parts: the likelihoods of all subsets.
+        sums: their sensitivities.
+        start: the user's.
+
+    Raises:
+        ValueError: a start that is negative somewhere or does not allow every count.
+    """
     every = torch.stack(sums).sum(dim=0)
-    x = _uniform(parts, every) if start is None else start
+    x = uniform(parts, every) if start is None else start
     if (x < 0).any():
-        raise ValueError("MLEM starts from a volume that is nowhere negative, got another")
+        raise ValueError("Expected a start that is nowhere negative, got another")
     # 0 / 0 is 0: no counts can come from a voxel that no ray passes
     x = x * (every > 0)
     for part in parts:
@@ -117,14 +140,20 @@ def _admitted(
     return x
 
 
-def _unexplained(
+def unexplained(
     A: LinearOperator, counts: Tensor, background: float | Tensor, x: Tensor
 ) -> Float[Tensor, "b c m v u"]:
+    """The residual y - (A x + r) of counts, in counts."""
     return counts - (A(x) + background)
 
 
-def _uniform(
-    parts: list[PoissonLikelihood], every: Float[Tensor, "1 1 d h w"]
+def likelihood_of_residual(counts: Tensor, volume: Tensor, residual: Tensor) -> Float[Tensor, " b"]:
+    """The negative log-likelihood of a volume whose residual is known, in float64."""
+    return negative_log_likelihood(counts, (counts - residual).clamp_min(0))
+
+
+def uniform(
+    parts: Sequence[PoissonLikelihood], every: Float[Tensor, "1 1 d h w"]
 ) -> Float[Tensor, "b c d h w"]:
     """As many counts as are measured, from the same number in each voxel."""
     measured = torch.stack([part.counts.flatten(2).sum(dim=2) for part in parts]).sum(dim=0)

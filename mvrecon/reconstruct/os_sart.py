@@ -58,9 +58,8 @@ def os_sart(
     that do not agree the iterates end in a cycle around the weighted least-squares solution; it
     shrinks with a relaxation that is reduced.
 
-    Convention: RTK and others divide by the column sum of the subset at work: see the module.
-
-    No gradient: views that require one are refused.
+    Convention: RTK and others divide by the column sum of the subset at work: see the module. No
+    gradient: views that require one are refused.
 
     Args:
         A: the operator.

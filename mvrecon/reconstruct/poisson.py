@@ -133,13 +133,10 @@ class PoissonLikelihood:
             ValueError: as `expected`.
         """
         expected = self.expected(volume)
-        counted = self.counts > 0
-        # an unexpected bin without counts has part 0, but would have the derivative 0 / 0
-        logs = self.counts * torch.where(counted, expected, 1).double().log()
         total = (
             (self.sensitivity(expected.dtype) * volume).flatten(1).sum(dim=1, dtype=torch.float64)
         )
-        return total + self._added - logs.flatten(1).sum(dim=1)
+        return total + self._added - _logs(self.counts, expected)
 
     @torch.no_grad()
     def gradient(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
@@ -169,6 +166,25 @@ class PoissonLikelihood:
                 f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got "
                 f"{tuple(volume.shape)}"
             )
+
+
+def negative_log_likelihood(
+    counts: Float[Tensor, "b c m v u"], expected: Float[Tensor, "b c m v u"]
+) -> Float[Tensor, " b"]:
+    """The negative log-likelihood of counts with these means, sum(ybar - y log ybar), in float64;
+    infinite where counts are impossible.
+
+    Args:
+        counts: y.
+        expected: ybar >= 0.
+    """
+    return expected.flatten(1).sum(dim=1, dtype=torch.float64) - _logs(counts, expected)
+
+
+def _logs(counts: Tensor, expected: Tensor) -> Float[Tensor, " b"]:
+    # an unexpected bin without counts has part 0, but would have the derivative 0 / 0
+    logs = counts * torch.where(counts > 0, expected, 1).double().log()
+    return logs.flatten(1).sum(dim=1)
 
 
 def _ratio(counts: Tensor, expected: Tensor) -> Tensor:

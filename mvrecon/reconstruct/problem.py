@@ -28,17 +28,21 @@ class Iterate(NamedTuple):
         residual: y - A x_n, in the unit of the views.
         gap: how far the objective is above its minimum at most, relative to the objective; None for
             methods, and for iterates, without this number.
+        objective: what the method minimises, of each sample; None for methods without this number.
     """
 
     number: int
     volume: Float[Tensor, "b c d h w"]
     residual: Float[Tensor, "b c m v u"]
     gap: Float[Tensor, "b c"] | None = None
+    objective: Float[Tensor, " b"] | None = None
 
 
 #: Looks at every iterate; the method ends with the one for which it returns true. A mask [b] ends
 #: single samples: each keeps its iterate, and the method goes on until all have ended.
 Monitor = Callable[[Iterate], bool | Bool[Tensor, " b"] | None]
+#: What a method minimises, of each sample [b], from a volume and its residual views.
+Objective = Callable[[Tensor, Tensor], Tensor]
 
 
 class Common(TypedDict, total=False):
@@ -161,10 +165,14 @@ class Watch:
     The residual at that point gives the one at x by linearity, so that no iterate is projected for
     the monitor but the last. Without a monitor nothing is kept. A sample that has ended before the
     others keeps its iterate, so that a batch gives what its samples alone would.
+
+    Args:
+        monitor: looks at every iterate.
+        objective: of each sample, from volume and residual; None: not shown.
     """
 
-    def __init__(self, monitor: Monitor | None):
-        self.monitor = monitor
+    def __init__(self, monitor: Monitor | None, objective: Objective | None = None):
+        self.monitor, self.objective = monitor, objective
         self.residual: Tensor | None = None
         self._done: Tensor | None = None
         self._kept: Tensor | None = None
@@ -194,7 +202,8 @@ class Watch:
         self.residual = own
         if number == 0:
             return False
-        verdict = self.monitor(Iterate(number, volume, own, gap))
+        objective = None if self.objective is None else self.objective(volume, own)
+        verdict = self.monitor(Iterate(number, volume, own, gap, objective))
         return self._ended(verdict, volume) if isinstance(verdict, Tensor) else bool(verdict)
 
     def result(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:

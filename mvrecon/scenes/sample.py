@@ -32,12 +32,16 @@ class Sample:
         volume: truth on the grid, float32.
         inside: the voxels that the object touches.
         name: of the case, the same for the same (seed, index).
+        shift_px: of each detector along (u, v), which nobody knows; none where there is none.
+        gain: of each view, likewise.
     """
 
     views: Float[Tensor, "1 m v u"]
     volume: Float[Tensor, "1 d h w"]
     inside: Bool[Tensor, "1 d h w"]
     name: str
+    shift_px: Float[Tensor, "m 2"] | None = None
+    gain: Float[Tensor, " m"] | None = None
 
 
 class Scene(Protocol):

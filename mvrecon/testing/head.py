@@ -18,7 +18,7 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
     torch.manual_seed(seed)
     head = HEADS.build(name, **options)
     depth, v, u = frusta.shape
-    m = len(frusta.step)
+    m = len(frusta.slant)
     views = torch.rand(2, 1, m, v, u) * (frusta.chord.reshape(1, 1, m, v, u) > 0)
     views[..., : u // 3] = 0
     logits, prior = 3 * torch.randn(2, m, 1, depth, v, u), torch.rand(2, m, 1, depth, v, u)

@@ -55,7 +55,7 @@ def pretend() -> None:
 
     def touched(self: Any, mask: torch.Tensor) -> torch.Tensor:
         launches["touched"] += 60
-        shape = len(mask), len(self.step), 1, *self.shape
+        shape = len(mask), len(self.slant), 1, *self.shape
         return OnGpu(torch.ones(shape, dtype=torch.bool))
 
     frusta.Frusta.touched = touched

@@ -17,7 +17,7 @@ RANDOM = {"name": "ellipsoids"}
 def build(scene=RANDOM, test_scene=None, seed=0, overlap=False, **sizes):
     scenes = {"train": scene, "test": test_scene or scene}
     sizes = {"train": 5, "val": 2, "test": 3, **sizes}
-    return SceneData(scenes, MEASUREMENT, sizes, 2, overlap=overlap, seed=seed)
+    return SceneData(scenes, MEASUREMENT, sizes, batch_size=2, overlap=overlap, seed=seed)
 
 
 def names(loader):
@@ -142,8 +142,16 @@ def test_wrong_settings_are_refused():
         ValueError, match="sizes must give train, val and test; missing or unknown: tset"
     ):
         build(tset=3)
-    with pytest.raises(ValueError, match="at least 0 .* got sizes .*'val': -1"):
+    with pytest.raises(ValueError, match="at least 0, got sizes .*'val': -1"):
         build(val=-1)
+    for wrong, message in (({"batch_size": 0}, "batch_size of at least 1"), ({"cash": 1}, "cache")):
+        with pytest.raises((ValueError, TypeError), match=message):
+            SceneData(
+                {"train": RANDOM, "test": RANDOM},
+                MEASUREMENT,
+                dict.fromkeys(("train", "val", "test"), 1),
+                **wrong,
+            )
     with pytest.raises(ValueError, match="share their data_range"):
         build(RANDOM, {"name": "ellipsoids", "value": 0.5})
     with pytest.raises(ValueError, match="spacing must be positive"):

@@ -229,3 +229,17 @@ def test_the_truth_on_the_files_own_voxels_is_the_file(tmp_path, cameras):
     grid = Grid.centred(size=hu.shape[::-1], spacing=SPACING[::-1])
     sample = Hdf5Volumes(path=one(tmp_path, hu), crop="none").sample(0, 0, grid, cameras)
     assert torch.allclose(sample.volume[0], attenuation(torch.from_numpy(hu).float()), atol=1e-8)
+
+
+def test_exact_moves_are_those_of_every_series_and_keep_the_patient_s_mass(volume_file, cameras):
+    """Mirrored and shifted by any length, voxels' means stay exact."""
+    roomy = Grid.centred((16, 16, 16), 6.0)
+    scene = Hdf5Volumes(path=str(volume_file), vary="exact", fine=2)
+    still = scene.sample(2, 0, roomy, cameras)
+    moves = [scene.sample(7 * turn + 2, 0, roomy, cameras) for turn in (1, 2, 3)]
+    for turn, move in enumerate(moves, start=1):
+        again = scene.sample(7 * turn + 2, 9, roomy, cameras)
+        assert torch.equal(again.views, move.views) and again.name == move.name
+        assert move.volume.sum().item() == pytest.approx(still.volume.sum().item(), rel=1e-5)
+        assert not torch.equal(move.volume, still.volume)
+    assert len({move.name for move in moves}) == 3

@@ -40,13 +40,13 @@ def test_a_box_holds_the_samples_whose_places_lie_in_it(case, depth):
     )
     for maps, source, shape in ways:
         reach = normalised_places(maps, source, shape).abs().amax(dim=-1) - 1 - 1e-9
-        within = enclosed(maps, source, shape)
+        within = enclosed(maps, source, shape).mask
         assert within[reach < -1e-12].all() and not within[reach > 1e-12].any()
 
 
 def measured(frusta: Frusta, data: st.DataObject) -> torch.Tensor:
     """Views [1 c m v u] with zeros, small and great numbers among them."""
-    sizes = (len(frusta.step), *frusta.shape[1:])
+    sizes = (len(frusta.slant), *frusta.shape[1:])
     return data.draw(volumes(sizes, torch.float32, signed=False)).clamp_max(1e20)
 
 
@@ -68,7 +68,7 @@ def test_the_lift_keeps_every_ray_s_integral(frusta, data):
 def test_heads_that_keep_views_keep_them_for_any_logits(name, frusta, data, size, shift, seed):
     views = measured(frusta, data)[:, :1]
     rng = torch.Generator().manual_seed(seed)
-    shape = (1, len(frusta.step), 1, *frusta.shape)
+    shape = (1, len(frusta.slant), 1, *frusta.shape)
     logits = size * torch.randn(shape, generator=rng) + shift
     prior = data.draw(volumes(shape[1:], torch.float32))[:, :1].reshape(shape)
     density = HEADS.build(name)(logits, prior, views, frusta)

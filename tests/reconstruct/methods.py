@@ -59,6 +59,8 @@ PROMISES = {
     "pdhg_tv": Promise({"iterations": 200, "weight": 1e-6}, penalised=True),
     "mlem": Promise({"iterations": 100}, rate=2e-2),
     "osem": Promise({"iterations": 30}, rate=2e-2),
+    "bsrem": Promise({"iterations": 100, "weight": 1e-5}, rate=2e-2),
+    "tv_map": Promise({"iterations": 300, "weight": 1e-5}, rate=2e-2),
 }
 #: Methods that need a rig of a certain kind or a checkpoint, and have tests of their own.
 GEOMETRIC = {"fbp", "fdk", "trained"}

@@ -107,6 +107,16 @@ def test_constant_pieces_from_few_views_come_back_by_total_variation_and_not_by_
     assert gap(fista_tv(A, y, 200, 1e-4), blocks) < 0.3 * plain
 
 
+def test_of_exact_views_the_error_falls_in_proportion_to_the_weight(blocks):
+    """Each weight starts from the minimum of the one before."""
+    A, truth, errors = slice_operator(views=12, size=16), blocks[..., 4:20, 4:20], []
+    x = torch.zeros_like(truth)
+    for weight in (1e-3, 1e-4, 1e-5):
+        x = fista_tv(A, A(truth), iterations=60, weight=weight, start=x)
+        errors.append(float((x - truth).norm() / truth.norm()))
+    assert errors[2] == pytest.approx(errors[1] / 10, rel=0.1)
+
+
 def test_all_ways_to_the_minimum_agree(blocks):
     torch.manual_seed(0)
     A, blocks, weight = slice_operator(size=14), blocks[..., 4:18, 4:18], 3e-3

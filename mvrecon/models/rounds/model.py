@@ -5,22 +5,25 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, Start, checked_start, normalised
+from mvrecon.geometry.box import Box
+from mvrecon.models.consistency import Consistency, Start, Steps, checked_start, normalised
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.rounds.settings import ROUNDS, RoundOptions
+from mvrecon.models.rounds.settings import ROUNDS, Computing, RoundOptions
 from mvrecon.models.rounds.step import Measured, Round, State
-from mvrecon.models.rounds.unet import Precision
 from mvrecon.projectors.operator import Projector
 
 #: Of the longest chord of a support: as long counts each ray that meets it, at least.
 SHORTEST = 0.1
+#: Voxels around a support that networks see, and of whose multiples their boxes have bounds: cells
+#: and coarser voxels keep their places for networks of three scales.
+MARGIN, ALIGNED = 4, 8
 
 
 class Rounds(nn.Module):
@@ -37,17 +40,17 @@ class Rounds(nn.Module):
         rounds: options of each round: `{resolution, widths, cameras, opinions}`.
         start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
             ..., **options}`.
-        consistency: learned gradient steps towards the corrected views at the end.
+        consistency: learned gradient steps towards the corrected views at the end, or `{steps: ...,
+            noise: poisson}` for counts.
         support: where the density may differ from zero, from the views: the visual "hull", its
             "box", "auto", or "none" for the whole grid.
         noise: of the views, as `support_from_views` wants it; none for exact views.
-        precision: of the convolutions, "float32", or "auto": bfloat16 where the processor has
-            instructions for it.
+        computing: of `Computing`: precision and crop of the networks.
 
     Raises:
-        TypeError: an option that a round does not have.
-        ValueError: no round, an unknown support or precision, or cameras' networks whose memories
-            do not fit one another.
+        TypeError: an option that a round or the model does not have.
+        ValueError: no round, an unknown support or precision, a crop without a support, or cameras'
+            networks whose memories do not fit one another.
     """
 
     def __init__(
@@ -55,23 +58,23 @@ class Rounds(nn.Module):
         projector: Projector,
         rounds: Sequence[Mapping[str, Any]] = ROUNDS,
         start: Start = 12,
-        consistency: int = 2,
+        consistency: Steps = 2,
         support: str = "none",
         noise: Mapping[str, Any] | None = None,
-        precision: Precision = "float32",
+        **computing: Any,
     ):
         super().__init__()
-        if not rounds or precision not in ("float32", "auto"):
-            raise ValueError(
-                f"Expected at least one round, and the precision float32 or auto, got "
-                f"{len(rounds)} and {precision!r}"
-            )
+        if not rounds:
+            raise ValueError("Expected at least one round, got none")
+        how = Computing.of(computing)
         options = [RoundOptions.of(one) for one in rounds]
         first = next((i for i, one in enumerate(options) if one.corrects), len(options))
         self.cropping = Cropping(projector, Options(support=support, noise=noise))
-        self.start = checked_start(start)
+        if how.crop and support == "none":
+            raise ValueError("Expected a support to crop to, got crop=True and support='none'")
+        self.crop, self.start = how.crop, checked_start(start)
         self.rounds = nn.ModuleList(
-            Round(projector, one, first < i, precision) for i, one in enumerate(options)
+            Round(projector, one, first < i, how.precision) for i, one in enumerate(options)
         )
         self.trust = nn.Parameter(torch.ones(())) if first < len(options) else None
         self.consistency = Consistency(consistency)
@@ -91,7 +94,8 @@ class Rounds(nn.Module):
         geometry = self._geometry(views)
         y, x0, scale = normalised(geometry, views, self.start)
         chord = torch.where(geometry.row > 0, 1 / geometry.row, 0)
-        measured, state = Measured(geometry, y, chord), State(x0, torch.zeros_like(x0))
+        boxes = boxes_of(geometry.mask) if self.crop and geometry.mask is not None else None
+        measured, state = Measured(geometry, y, chord, boxes), State(x0, torch.zeros_like(x0))
         volumes, corrected = [], []
         for one in self.rounds:
             state = one(measured, state)
@@ -125,7 +129,7 @@ class Rounds(nn.Module):
         return replace(within, row=within.row.minimum(of_longest / SHORTEST))
 
 
-def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Tensor]:
+def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Any]:
     """The last opinions of the cameras, in the unit of (views / mm)."""
     fused = state.fused
     if fused is None:
@@ -136,3 +140,12 @@ def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Tens
         "weights": fused.weights,
         "cross_views": fused.expected * scale,
     }
+
+
+def boxes_of(mask: Bool[Tensor, "b 1 d h w"]) -> list[Box]:
+    """The box around each sample's mask, with its margin and bounds that the networks divide; of
+    none, the whole grid.
+    """
+    shape = mask.shape[2:]
+    boxes = [Box.around(own).grown(MARGIN, shape).aligned(ALIGNED, shape) for own in mask]
+    return [box if box.size else Box.whole(shape) for box in boxes]

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, get_args
 
 from mvrecon.models.rounds.evidence import Task
-from mvrecon.registry import hint
+from mvrecon.models.rounds.unet import Precision
+from mvrecon.registry import check_options
 
 #: Voxels of a cell along each axis, by the resolution of a round.
 EDGES = {"half": 2, "full": 1}
@@ -23,10 +24,7 @@ class Checked:
         Raises:
             TypeError: an unknown option; the message gives the nearest and all.
         """
-        known = [one.name for one in fields(cls)]  # type: ignore[arg-type]
-        for option in options:
-            if option not in known:
-                raise TypeError(f"{cls.what} no option {option!r}{hint(str(option), known)}")
+        check_options(cls.what, options, (one.name for one in fields(cls)))  # type: ignore[arg-type]
         return cls(**options)
 
 
@@ -45,7 +43,7 @@ class OpinionOptions(Checked):
         ValueError: an unknown fusion or prior, or less than no feature.
     """
 
-    what: ClassVar[str] = "The opinions of a round have"
+    what: ClassVar[str] = "The opinion of a round"
 
     head: Mapping[str, Any] = field(default_factory=lambda: {"name": "softmax_depth"})
     features: int = 4
@@ -94,7 +92,7 @@ class RoundOptions(Checked):
             cameras that have nothing to do.
     """
 
-    what: ClassVar[str] = "A round has"
+    what: ClassVar[str] = "A round"
 
     resolution: Literal["half", "full"] = "half"
     widths: Sequence[int] = (32, 48, 64)
@@ -143,6 +141,30 @@ class RoundOptions(Checked):
         opinions = OpinionOptions.of(self.opinions)
         logits = 1 + opinions.weighted if opinions.learned else 0
         return Task(self.corrects, shared, logits, opinions.handed)
+
+
+@dataclass(frozen=True)
+class Computing(Checked):
+    """How the networks of the rounds compute, and on which part of the grid.
+
+    Args:
+        precision: of the convolutions, "float32", or "auto": bfloat16 where the processor has
+            instructions for it.
+        crop: whether the networks in the world see no more of the grid than the box around a
+            sample's support, with a margin of 4 voxels.
+
+    Raises:
+        ValueError: an unknown precision.
+    """
+
+    what: ClassVar[str] = "The model"
+
+    precision: Precision = "float32"
+    crop: bool = False
+
+    def __post_init__(self) -> None:
+        if self.precision not in get_args(Precision):
+            raise ValueError(f"Expected the precision float32 or auto, got {self.precision!r}")
 
 
 #: Two rounds at half resolution, the first with the cameras' network, and one at full resolution.

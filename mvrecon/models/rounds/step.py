@@ -1,11 +1,13 @@
 """One round: residual views, the cameras' corrections and opinions, the network in the world."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.geometry.box import Box, placed
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.rounds.cells import from_cells, padded, to_cells, trimmed
 from mvrecon.models.rounds.evidence import MAGNIFIED, Answer, Evidence
@@ -42,11 +44,13 @@ class Measured(NamedTuple):
         geometry: the operator and SIRT's weights; C is zero outside the support.
         views: y, relative to the content's scale.
         chord: 1 / R in mm, zero where R is.
+        boxes: of each sample, what the networks in the world see; none for the whole grid.
     """
 
     geometry: Geometry
     views: Float[Tensor, "b 1 m v u"]
     chord: Float[Tensor, "#b 1 m v u"]
+    boxes: Sequence[Box] | None = None
 
 
 class Round(nn.Module):
@@ -118,7 +122,7 @@ class Round(nn.Module):
                     views = views + self._views(measured, state.correction)
                 fused = self.opinions(x, views, answer.placed, geometry.mask)
                 state, extra = state._replace(fused=fused), [fused.evidence]
-        learned, memory = self._world(geometry, state, change, extra)
+        learned, memory = self._world(measured, state, change, extra)
         x = x + geometry.within(learned + self.step * change)
         return state._replace(volume=x, memory=memory)
 
@@ -151,16 +155,36 @@ class Round(nn.Module):
 
     def _world(
         self,
-        geometry: Geometry,
+        measured: Measured,
         state: State,
         change: Float[Tensor, "b 1 d h w"],
         extra: list[Tensor],
     ) -> tuple[Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 d h w"]]:
-        x = state.volume
-        hull = torch.ones_like(x) if geometry.mask is None else geometry.mask.to(x.dtype)
+        x, mask = state.volume, measured.geometry.mask
+        hull = torch.ones_like(x) if mask is None else mask.to(x.dtype)
         evidence = torch.cat([x, MAGNIFIED * change, hull, state.memory], dim=1)
+        if measured.boxes is None:
+            return self._answer(evidence, extra)
+        volumes = []
+        for i, box in enumerate(measured.boxes):
+            cells = [slice(s.start // self.edge, -(-s.stop // self.edge)) for s in box.slices]
+            own = [one[i : i + 1, :, *cells] for one in extra]
+            answer = self._answer(evidence[i : i + 1, :, *box.slices], own)
+            volumes.append(placed(torch.cat(answer, dim=1), box, x.shape[2:]))
+        learned, memory = torch.cat(volumes).split(1, dim=1)
+        return learned, memory
+
+    def _answer(
+        self, evidence: Float[Tensor, "b 4 d h w"], extra: list[Tensor]
+    ) -> tuple[Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 d h w"]]:
+        """The change that the network in the world has learned, and its memory.
+
+        Args:
+            evidence: volumes.
+            extra: more evidence, in cells already.
+        """
         cells = to_cells(padded(evidence, self.edge), self.edge)
         answer = self.world(torch.cat([cells, *extra], dim=1) if extra else cells)
-        volumes = trimmed(from_cells(answer, self.edge), x.shape[2:])
+        volumes = trimmed(from_cells(answer, self.edge), evidence.shape[2:])
         learned, memory = volumes.split(1, dim=1)
         return learned, memory

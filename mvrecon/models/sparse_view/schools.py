@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from mvrecon.cameras.camera import Cameras
 from mvrecon.models.consistency import typical_chord
 from mvrecon.models.door import admitted
 from mvrecon.models.output import Reconstruction
@@ -77,6 +78,8 @@ class _School(nn.Module):
 
     #: Only rigs whose sources lie on a circle are taken.
     needs_circle = True
+    #: The rig whose views the sinogram network makes; none without that network.
+    corrected_cameras: Cameras | None = None
 
     def __init__(self, projector: Projector, filter: Filter):
         super().__init__()
@@ -89,17 +92,21 @@ class _School(nn.Module):
     def _completed(self, factor: int, network: Mapping[str, Any] | None) -> None:
         geometry = Geometry(self.projector.grid, self.projector.cameras)
         self.completion = SinogramCompletion(geometry, factor, network)
+        self.corrected_cameras = self.completion.geometry.cameras
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         views = admitted(views, self.projector.cameras, next(self.parameters()))
         with in_full_precision(views):
             y, start, scale = scaled(self.projector, views, self.filter)
-            x = start
+            x, corrected = start, {}
             if self.completion is not None:
-                x = filtered(self.completion.geometry, self.completion(y), self.filter)
+                sinogram = self.completion(y)
+                x = filtered(self.completion.geometry, sinogram, self.filter)
+                row = scale.new_full((1, 1, 1, 1, 1), 1 / self.completion.chord)
+                corrected = {"corrected_views": (sinogram * scale,), "row": row}
             if self.net is not None:
                 x = x + self.net(x)
-        return Reconstruction(x * scale, start=start * scale)
+        return Reconstruction(x * scale, start=start * scale, **corrected)
 
 
 class FbpUNet(_School):
@@ -131,7 +138,8 @@ class SinogramUNet(_School):
     """Projection domain: sinograms interpolated in angle, corrected by a network, then filtered
     back-projection.
 
-    It is trained end to end through the back-projection, on the volume's error.
+    It is trained end to end through the back-projection on the volume's error, and on the completed
+    sinogram's with the loss term `corrected_views`; on that alone with `volume: 0`, as published.
 
     Args:
         projector: holds the grid and the rig.

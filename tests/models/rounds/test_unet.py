@@ -47,9 +47,9 @@ def test_bfloat16_is_taken_only_where_the_processor_has_it_and_it_is_asked_for(m
     network = PlainUNet(2, 2, 1, (4, 8), precision="auto").eval()
     x = torch.rand(1, 2, 8, 8)
     with torch.no_grad():
-        monkeypatch.setattr(unet, "has_amx", lambda: False)
+        monkeypatch.setattr(unet, "has_bfloat16", lambda: False)
         exact = network(x)
-        monkeypatch.setattr(unet, "has_amx", lambda: True)
+        monkeypatch.setattr(unet, "has_bfloat16", lambda: True)
         narrow = network(x)
         assert narrow.dtype == torch.float32
         difference = (narrow - exact).abs().max() / exact.abs().max()
@@ -58,3 +58,14 @@ def test_bfloat16_is_taken_only_where_the_processor_has_it_and_it_is_asked_for(m
         assert torch.equal(network(x), exact)
     with arithmetic("auto", x.double()):
         assert not torch.is_autocast_enabled("cpu")
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [(("amx_bf16",), True), (("avx512_bf16",), True), (("avx512_f",), False), ((), False)],
+)
+def test_bfloat16_needs_an_instruction_that_multiplies_it(monkeypatch, names, expected):
+    monkeypatch.setattr(
+        torch.cpu, "get_capabilities", lambda: dict.fromkeys(names, True), raising=False
+    )
+    assert unet.has_bfloat16.__wrapped__() is expected

@@ -7,11 +7,16 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, PROJECTORS, SCENES
 
 
+def rig(views: int = 8, size: int = 16):
+    """Options of a circle of fans."""
+    detector = {"pixels": [1, 2 * size], "pixel_mm": 360 / (2 * size)}
+    return {"n_views": views, "sid": 500.0, "sdd": 1000.0, "detector": detector}
+
+
 def fan(views: int = 8, size: int = 16, slices: int = 1, **options):
     grid = Grid.centred(size=(size, size, slices), spacing=160 / size)
-    detector = {"pixels": [1, 2 * size], "pixel_mm": 360 / (2 * size)}
-    rig = {"n_views": views, "sid": 500.0, "sdd": 1000.0, "detector": detector, **options}
-    return PROJECTORS.build("drr", grid=grid, cameras=CAMERAS.build("circular", **rig))
+    cameras = CAMERAS.build("circular", **{**rig(views, size), **options})
+    return PROJECTORS.build("drr", grid=grid, cameras=cameras)
 
 
 def stack(views: int = 8, size: int = 16, slices: int = 3):

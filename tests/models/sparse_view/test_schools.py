@@ -1,8 +1,13 @@
 """The schools and the unrolled methods on a fan's slice and on a stack of slices."""
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 import torch
 
+from mvrecon.engine.module import ReconstructionModule
+from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.sparse_view.itnet import ItNet, growth
 from mvrecon.models.sparse_view.primal_dual import PrimalDual, _norm_bound
 from mvrecon.parts import MODELS
@@ -11,7 +16,7 @@ from mvrecon.reconstruct.filtered.fdk import fbp
 from mvrecon.reconstruct.power import power_norm
 from mvrecon.testing import check_model
 from mvrecon.testing.projector import close
-from tests.models.sparse_view.conftest import fan, stack, stirred
+from tests.models.sparse_view.conftest import fan, rig, stack, stirred
 
 NET = {"network": {"name": "unet2d", "width": 4, "levels": 3}}
 SMALL = {
@@ -103,6 +108,60 @@ def test_a_sinogram_of_a_whole_turn_has_no_first_view(sample, A):
     with torch.no_grad():
         turned = model(views.roll(4, dims=2))
         assert close(turned, model(views).roll(8, dims=2), 1e-5)
+
+
+def dense_batch(A, sample) -> dict[str, torch.Tensor]:
+    """A case with its true views from twice as many angles."""
+    truth = sample.volume[None]
+    return {"volume": truth, "views": sample.views[None], "true_views": fan(views=16)(truth)}
+
+
+def test_the_sinogram_loss_is_zero_for_the_true_sinogram_of_all_angles_and_it_alone(A, sample):
+    model, batch = MODELS.build("sinogram_unet", A, factor=2), dense_batch(A, sample)
+    loss = ReconstructionLoss(0.026, corrected_views=1.0)
+    out = model(batch["views"])
+    assert loss(out, batch)["corrected_views"] > 0
+    true = replace(out, corrected_views=(batch["true_views"],))
+    assert float(loss(true, batch)["corrected_views"]) == 0
+    level = replace(out, corrected_views=(batch["true_views"] + 0.1 * 0.026 * 160,))
+    assert float(loss(level, batch)["corrected_views"]) == pytest.approx(0.01, rel=1e-4)
+
+
+def test_the_sinogram_loss_teaches_the_sinogram_network_alone(A, sample):
+    model, batch = stirred(MODELS.build("dual_domain", A, factor=2)), dense_batch(A, sample)
+    loss = ReconstructionLoss(0.026, corrected_views=1.0)
+    loss(model(batch["views"]), batch)["corrected_views"].backward()
+    assert all(p.grad is not None for p in model.completion.parameters())
+    assert all(p.grad is None for p in model.net.parameters())
+
+
+def test_a_few_steps_on_the_sinogram_s_error_pass_linear_interpolation(A, sample):
+    torch.manual_seed(0)
+    network = {**NET["network"], "levels": 2}
+    model = MODELS.build("sinogram_unet", A, factor=2, network=network)
+    loss, errors = ReconstructionLoss(0.026, volume=0.0, corrected_views=1.0), []
+    batch, optimizer = dense_batch(A, sample), torch.optim.Adam(model.parameters(), lr=3e-3)
+    for _ in range(41):
+        total = loss(model(batch["views"]), batch)["total"]
+        errors.append(float(total.detach()))
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+    assert errors[-1] < 0.6 * errors[0]
+
+
+def test_in_training_the_true_sinogram_is_of_the_rig_that_the_model_completes(A, sample):
+    geometry = {
+        "grid": {"size": [16, 16, 1], "spacing": 10.0},
+        "camera": {"name": "circular", **rig()},
+        "projector": {"name": "drr"},
+    }
+    make = partial(ReconstructionModule, geometry, loss={"corrected_views": 1.0})
+    module = make({"name": "sinogram_unet", "factor": 2}, optimizer={}, data_range=0.026)
+    truth = sample.volume[None]
+    assert close(module.corrected_projector(truth), fan(views=16)(truth), 1e-6)
+    plain = make({"name": "fbp_unet"}, optimizer={}, data_range=0.026)
+    assert plain.corrected_projector is plain.projector
 
 
 @pytest.mark.door

@@ -49,7 +49,7 @@ class HeadSubject(Subject):
     @cached_property
     def given(self) -> tuple[Tensor, Tensor, Tensor]:
         """Logits and prior [2 m 1 D v u], and views [2 1 m v u] of nothing where a ray misses."""
-        m, (depth, v, u) = len(self.frusta.step), self.frusta.shape
+        m, (depth, v, u) = len(self.frusta.slant), self.frusta.shape
         shape = (2, m, 1, depth, v, u)
         hits = self.frusta.chord.reshape(m, v, u) > 0
         return (

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -101,8 +102,8 @@ def bad_logits(subject: HeadSubject) -> float:
 def no_ray_hits(subject: HeadSubject) -> float:
     """Frusta of which no bin may hold anything."""
     frusta = Frusta.of(GRID, small_rig(), depth=10).to(subject.device, subject.dtype)
-    frusta.occupied.zero_()
-    density = subject.head(*subject.given, frusta)
+    none = replace(frusta, touching=torch.zeros_like(frusta.occupied[None]))
+    density = subject.head(*subject.given, none)
     return float((density != 0).sum())  # true of NaN, too
 
 

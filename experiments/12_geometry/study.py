@@ -1,0 +1,248 @@
+"""Where does geometry inside a network pay? One protocol for all arms and regimes.
+
+    python experiments/12_geometry/study.py pace  # seconds of a step of each arm
+    python experiments/12_geometry/study.py train --seconds 400  # every run that is not there yet
+    python experiments/12_geometry/study.py table  # results.csv, paired.csv, curves.png
+
+A run is a folder of `mvrecon-train`; one that broke off goes on, one that ended is skipped. Every
+arm trains for the same processor time of one thread: steps = seconds / pace.
+"""
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from itertools import product
+from pathlib import Path
+
+import torch
+
+from mvrecon.config import compose
+from mvrecon.engine.fit import build_module
+
+HERE = Path(__file__).parent
+BASE = (
+    "experiment=open_kbp_rounds",
+    "~compare.rounds_world",
+    "~compare.world_unet",
+    "scene.vary=exact",
+    "data.sizes.train=648",
+    "callbacks=quiet",
+    "logger=csv",
+)
+NARROW = "rounds=[{resolution: full, widths: [16,32,64], cameras: null}]"
+
+#: What differs between the models; "none" stands for the support where cameras err.
+ARMS = {
+    "cross_view": ("model=rounds",),
+    "world_rounds": ("model=rounds_world",),
+    "world_unet": ("model=world_unet", f"model.{NARROW}"),
+}
+ALIGNED = {
+    "cross_view_aligned": ("model=corrected", "model@model.model=rounds"),
+    "world_unet_aligned": (
+        "model=corrected",
+        "model@model.model=world_unet",
+        f"model.model.{NARROW}",
+    ),
+}
+CLASSICAL = {
+    "sirt": ("model=sirt", "model.iterations=25"),
+    "sirt_aligned": ("model=corrected", "model@model.model=sirt", "model.model.iterations=25"),
+    "tv": (
+        "model=classical",
+        "reconstructor@model.reconstructor=fista_tv",
+        "model.reconstructor.weight=1e-4",
+    ),
+    "tv_aligned": (
+        "model=corrected",
+        "model@model.model=classical",
+        "reconstructor@model.model.reconstructor=fista_tv",
+        "model.model.reconstructor.weight=1e-4",
+    ),
+}
+#: Views of each regime, and the support that its networks work in.
+REGIMES = {
+    "clean": ((), "hull"),
+    "rig": (("acquisition={disturbed: {views: 3, shift_px: 1.0, gain: 0.05}}",), "none"),
+    "photons": (("acquisition=photons", "acquisition.photons=1e4"), "none"),
+}
+
+
+def settings(regime: str, arm: str) -> list[str]:
+    """The overrides of an arm in a regime."""
+    views, support = REGIMES[regime]
+    options = [*BASE, *(ARMS | ALIGNED | CLASSICAL)[arm], *views]
+    if arm not in ARMS:  # options of the experiment's own model, which these have not
+        options += ["~model.support", "~model.precision"]
+    if arm in CLASSICAL:
+        return options
+    inside = "model.model" if arm in ALIGNED else "model"
+    return [*options, f"{inside}.support={support}", f"{inside}.precision=auto"]
+
+
+def paths(data: Path) -> list[str]:
+    """The overrides that say where the patients lie."""
+    files = ("scene.path", "openkbp_train.h5"), ("test_scene.path", "openkbp_val.h5")
+    return [f"{key}={data / name}" for key, name in files]
+
+
+def pace(data: Path) -> None:
+    """Measure the processor seconds of a training step of each arm; alignment is not in it, since
+    it is computed once a case.
+    """
+    torch.set_num_threads(1)
+    rows = {}
+    for arm, support in product(ARMS, ("none", "hull")):
+        given = compose(*settings("clean", arm), *paths(data), f"model.support={support}")
+        module = build_module(given, given["model"], 0.04)
+        volume = torch.zeros(4, 1, 32, 32, 32)
+        volume[:, :, 6:26, 8:24, 6:26] = 0.02
+        views = module.projector(volume)
+        batch = {"views": views, "volume": volume, "true_views": views}
+        optimizer = torch.optim.AdamW(module.parameters(), 1e-4)
+        times = []
+        for _ in range(6):
+            start = time.process_time()
+            module._terms(module.model(views), batch)["total"].backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            times.append(time.process_time() - start)
+        rows[arm, support] = min(times[1:])
+    with open(HERE / "pace.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("arm", "support", "seconds_per_step"))
+        writer.writerows((*key, f"{value:.3f}") for key, value in rows.items())
+
+
+def steps(regime: str, arm: str, seconds: int) -> int:
+    """Training steps of an arm in so many processor seconds."""
+    with open(HERE / "pace.csv", newline="") as file:
+        rows = {
+            (r["arm"], r["support"]): float(r["seconds_per_step"]) for r in csv.DictReader(file)
+        }
+    return round(seconds / rows[arm.removesuffix("_aligned"), REGIMES[regime][1]])
+
+
+def train(options: argparse.Namespace) -> None:
+    """Train every arm that was asked for and is not trained yet, one after the other."""
+    for regime, arm, seed in product(options.regimes, options.arms, options.seeds):
+        if regime != "rig" and arm.endswith("_aligned"):
+            continue
+        seconds = 0 if arm in CLASSICAL else options.seconds
+        folder = options.runs / regime / arm / f"{seconds}s_{seed}"
+        if (folder / "results.json").exists():
+            continue
+        count = max(1, steps(regime, arm, seconds)) if seconds else 1
+        command = [sys.executable, "-m", "mvrecon.train", *settings(regime, arm)]
+        command += [*paths(options.data), f"data.cache={options.runs / 'cases'}", f"seed={seed}"]
+        command += [f"trainer.max_steps={count}", f"trainer.val_check_interval={min(count, 400)}"]
+        command += [f"hydra.run.dir={folder}"]
+        subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def collected(runs: Path) -> list[dict]:
+    """One row a run, with the PSNR of every patient."""
+    rows = []
+    for path in sorted(runs.glob("*/*/*/results.json")):
+        regime, arm, run = path.relative_to(runs).parts[:3]
+        seconds, seed = run.removesuffix("").split("s_")
+        result = next(iter(json.loads(path.read_text())["methods"].values()))
+        rows.append(
+            {
+                "regime": regime,
+                "arm": arm,
+                "seconds": int(seconds),
+                "seed": int(seed),
+                "steps": result["train_steps"],
+                "parameters": result["parameters"],
+                **{
+                    name: round(result[name]["mean"], 4)
+                    for name in ("psnr", "psnr_inside", "ssim", "nrmse", "view_nrmse")
+                },
+                "ms_per_volume": round(result["ms_per_volume"]),
+                "patients": " ".join(f"{value:.3f}" for value in result["psnr"]["values"]),
+            }
+        )
+    return rows
+
+
+def paired(rows: list[dict]) -> list[dict]:
+    """Each arm less each world arm of the same regime, length and seed, patient by patient."""
+    pairs = []
+    for one, other in product(rows, rows):
+        same = all(one[key] == other[key] for key in ("regime", "seconds", "seed"))
+        if not same or one["arm"] == other["arm"] or not other["arm"].startswith("world"):
+            continue
+        a, b = (torch.tensor([float(v) for v in r["patients"].split()]) for r in (one, other))
+        difference = a - b
+        error = difference.std() / len(difference) ** 0.5
+        pairs.append(
+            {
+                **{key: one[key] for key in ("regime", "seconds", "seed", "arm")},
+                "over": other["arm"],
+                "db": round(difference.mean().item(), 3),
+                "half_95": round(1.96 * error.item(), 3),
+                "ahead": int((difference > 0).sum()),
+                "of": len(difference),
+            }
+        )
+    return pairs
+
+
+def curves(rows: list[dict], path: Path) -> None:
+    """Mean PSNR against training time, a panel for each regime."""
+    import matplotlib.pyplot as plt
+
+    regimes = [name for name in REGIMES if any(r["regime"] == name for r in rows)]
+    figure, panels = plt.subplots(1, len(regimes), figsize=(4.5 * len(regimes), 3.6), squeeze=False)
+    for panel, regime in zip(panels[0], regimes, strict=True):
+        own = [row for row in rows if row["regime"] == regime]
+        for arm in ARMS | ALIGNED:
+            line = sorted((r["seconds"], r["psnr"]) for r in own if r["arm"] == arm)
+            panel.plot(*zip(*line, strict=True), "o-", label=arm) if line else None
+        for arm, style in zip(CLASSICAL, (":", "--", "-.", (0, (1, 4))), strict=True):
+            level = [row["psnr"] for row in own if row["arm"] == arm]
+            panel.axhline(level[0], color="grey", linestyle=style, label=arm) if level else None
+        panel.set(title=regime, xlabel="processor seconds of training", ylabel="PSNR in dB")
+        panel.set_xscale("log")
+        panel.legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+def table(options: argparse.Namespace) -> None:
+    """Write the rows of all runs, their paired differences, and the curves."""
+    rows = collected(options.runs)
+    for name, lines in (("results.csv", rows), ("paired.csv", paired(rows))):
+        with open(HERE / name, "w", newline="") as file:
+            writer = csv.DictWriter(file, list(lines[0]))
+            writer.writeheader()
+            writer.writerows(lines)
+    curves(rows, HERE / "curves.png")
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("task", choices=("pace", "train", "table"))
+    parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the patients")
+    parser.add_argument("--runs", type=Path, default=Path("outputs/12_geometry"))
+    parser.add_argument("--regimes", nargs="+", choices=REGIMES, default=["clean", "rig"])
+    every = [*ARMS, *ALIGNED, *CLASSICAL]
+    parser.add_argument("--arms", nargs="+", choices=every, default=every)
+    parser.add_argument("--seconds", type=int, default=400, help="of one thread, training")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    options = parser.parse_args()
+    options.data, options.runs = options.data.resolve(), options.runs.resolve()
+    if options.task == "pace":
+        pace(options.data)
+    else:
+        {"train": train, "table": table}[options.task](options)
+
+
+if __name__ == "__main__":
+    main()

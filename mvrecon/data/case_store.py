@@ -1,0 +1,101 @@
+"""Cases kept in a folder, so that a run does not make what an earlier one has made."""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import torch
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.data.digests import of_grid, of_rig
+from mvrecon.data.storage import dataset_in
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import Refused, blaming
+from mvrecon.geometry.grid import Grid
+from mvrecon.scenes.sample import Sample, Scene
+
+#: Raised where what a scene, a projector or a file of this store is has changed: older files are
+#: not read.
+VERSION = 1
+
+
+class CaseStore:
+    """A folder of cases as a perfect detector measures them, in a file each.
+
+    A file is known by a SHA-256 digest of all that its case depends on: what `made_of` says, index,
+    seed, grid and rig. What a detector adds, and gains that drifted, are not in it. Files are
+    written whole or not at all, so several runs may share a folder; a file that is damaged is made
+    anew.
+
+    Args:
+        folder: of the files; it is made.
+        made_of: settings of scene and projector and digests of their files, as JSON has them.
+        scene: its `seed_of(index, seed)`, where it has one, says on which seed a case depends.
+    """
+
+    def __init__(self, folder: str | Path, made_of: Mapping[str, Any], scene: Scene):
+        self.folder, self.made_of = Path(folder), json.dumps(made_of, sort_keys=True)
+        self.scene = scene
+
+    def __call__(
+        self, index: int, seed: int, grid: Grid, cameras: Any, make: Callable[[], Sample]
+    ) -> Sample:
+        """The case that is kept, or else the one that `make` makes, kept from now on.
+
+        Explicit rays have no digest: their cases are not kept.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        if not isinstance(cameras, Cameras):
+            return make()
+        path = self.path(index, seed, grid, cameras)
+        if path.exists():
+            try:
+                return _read(path, grid, cameras)
+            except Refused:  # cut short or damaged: the case can be made again
+                pass
+        sample = make()
+        _write(path, sample)
+        return sample
+
+    def path(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Path:
+        """The file of a case."""
+        seed = getattr(self.scene, "seed_of", lambda index, seed: seed)(index, seed)
+        case = [VERSION, self.made_of, index, seed, of_grid(grid), of_rig(cameras)]
+        return self.folder / f"{hashlib.sha256(json.dumps(case).encode()).hexdigest()}.h5"
+
+
+def _write(path: Path, sample: Sample) -> None:
+    with written_whole(path) as part, h5py.File(part, "w") as file:
+        for name in ("views", "volume", "inside"):
+            values = getattr(sample, name).cpu().numpy()
+            file.create_dataset(name, data=values, fletcher32=True, chunks=(1, *values.shape[1:]))
+        file.attrs["name"] = sample.name
+
+
+def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
+    """The case in a file.
+
+    Raises:
+        Refused: it is damaged, or has another size or type than this case.
+    """
+    volume = (1, *grid.shape)
+    expected = {
+        "views": ((1, len(cameras), *cameras.shape), "float32"),
+        "volume": (volume, "float32"),
+        "inside": (volume, "bool"),
+    }
+    values = {}
+    with blaming(path, "is not a case that can be read"), h5py.File(path, "r") as file:
+        for name, kind in expected.items():
+            dataset = dataset_in(path, file, name, "a case")
+            if (dataset.shape, str(dataset.dtype)) != kind:
+                raise Refused(
+                    f"{path}: expected {name} as {kind}, got {dataset.shape}, {dataset.dtype}"
+                )
+            values[name] = torch.from_numpy(dataset[()])
+        return Sample(**values, name=str(file.attrs["name"]))

@@ -1,0 +1,103 @@
+"""Which wells of a Derenzo phantom are resolved, by the valley between neighbours."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import euler_rotation
+from mvrecon.geometry.sample import normalised, sample
+from mvrecon.scenes.derenzo import sector_wells
+
+#: Two wells are resolved up to this ratio, as two points are by Rayleigh's criterion.
+RESOLVED = 0.735
+#: Heights along the wells over which profiles are averaged.
+HEIGHTS = 16
+
+
+class Sector(NamedTuple):
+    """Wells of one diameter.
+
+    Args:
+        diameter: in mm.
+        ratios: valley to peak of each pair of neighbours; infinite without a peak. A single well
+            has none.
+    """
+
+    diameter: float
+    ratios: Float[Tensor, " p"]
+
+    @property
+    def resolved(self) -> float:
+        """Share of the pairs that are resolved; nan without a pair."""
+        return (self.ratios <= RESOLVED).double().mean().item()
+
+
+def valley_to_peak(
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    well_diameters: Sequence[float] = (8, 6, 5, 4, 3, 2),
+    radius: float = 40.0,
+    height: float = 80.0,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    euler_degrees: Sequence[float] = (0.0, 0.0, 0.0),
+) -> list[Sector]:
+    """Valley-to-peak ratio of all neighbouring wells of each sector, without unit: the value midway
+    by the mean of the values at both centres.
+
+    Values are trilinear, and means over the middle half of the wells' height. A pair is resolved up
+    to 0.735 (Hallen, Schug, Weissler, Gebhardt, Salomon, Kiessling, Schulz, EJNMMI Phys. 7 (2020)
+    12).
+
+    Args:
+        volume: of activity.
+        grid: where it lies.
+        well_diameters, radius, height, centre, euler_degrees: of the phantom, as for `derenzo`.
+
+    Raises:
+        ValueError: a volume of another shape than the grid, or wells that are not inside it.
+    """
+    if tuple(volume.shape) != grid.shape:
+        raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")
+    turns = euler_rotation([(60.0 * k, 0.0, 0.0) for k in range(len(well_diameters))])
+    to_world, origin = euler_rotation(euler_degrees), torch.tensor(list(centre)).double()
+    sectors = []
+    for diameter, turn in zip(well_diameters, turns, strict=True):
+        wells = sector_wells(diameter, radius)
+        one, other = _neighbours(wells, diameter)
+        places = torch.stack([one, (one + other) / 2, other], dim=1) @ turn[:2, :2].T
+        along = torch.linspace(-height / 4, height / 4, HEIGHTS, dtype=torch.float64)
+        points = torch.cat(
+            [
+                places[:, :, None].expand(-1, -1, HEIGHTS, -1),
+                along[:, None].expand(len(places), 3, HEIGHTS, 1),
+            ],
+            dim=-1,
+        )
+        left, valley, right = _means(volume, grid, points @ to_world.T + origin).unbind(dim=1)
+        peak = (left + right) / 2
+        ratios = torch.where(peak > 0, valley / torch.where(peak > 0, peak, 1), torch.inf)
+        sectors.append(Sector(float(diameter), ratios))
+    return sectors
+
+
+def _neighbours(
+    wells: Float[Tensor, "n 2"], diameter: float
+) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
+    """Both wells of all pairs that are twice the diameter apart."""
+    near = (torch.cdist(wells, wells) < 2.01 * diameter).triu(diagonal=1)
+    one, other = near.nonzero().unbind(dim=1)
+    return wells[one], wells[other]
+
+
+def _means(
+    volume: Float[Tensor, "d h w"], grid: Grid, points: Float[Tensor, "p k n 3"]
+) -> Float[Tensor, "p k"]:
+    index = grid.to_index(points)
+    if not ((index > -0.5) & (index < torch.tensor(grid.size) - 0.5)).all():
+        raise ValueError("Expected a Derenzo phantom inside the grid, got wells outside")
+    values = sample(volume.double()[None, None], normalised(index, grid.shape)[None])
+    return values[0, 0].mean(dim=-1)

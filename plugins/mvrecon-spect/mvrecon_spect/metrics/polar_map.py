@@ -1,0 +1,144 @@
+"""The polar map of the left ventricle, and its 17 segments.
+
+Convention: seen from the apex, the anterior wall is on top and the septum on the left, so angles
+run from anterior towards the septum, counter-clockwise; for world axes that are right-handed. The
+ventricle is a cylinder over two thirds of its length (basal and mid rings) and a cap over the rest
+(Germano et al., J. Nucl. Med. 36 (1995) 2107, sample it so); segments are those of Cerqueira et
+al., Circulation 105 (2002) 539.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.sample import normalised, sample
+
+#: The share of the long axis from the base along which rays are perpendicular to it.
+CYLINDER = 2 / 3
+#: The elevation in degrees at which the apical ring ends and the apex begins.
+APEX = 60.0
+#: Segments of the rings from base to apex.
+SEGMENTS = (6, 6, 4, 1)
+
+
+class LongAxis(NamedTuple):
+    """Where a left ventricle lies.
+
+    Args:
+        base: the axis' end in the plane of the valves, (x, y, z) in mm.
+        apex: its end at the tip of the muscle, (x, y, z) in mm.
+        septum: direction (x, y, z) from the axis towards the middle of the septum.
+    """
+
+    base: Sequence[float]
+    apex: Sequence[float]
+    septum: Sequence[float]
+
+
+def polar_map(
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    axis: LongAxis,
+    reach_mm: float,
+    rows: int = 4,
+    angles: int = 72,
+) -> Float[Tensor, "4r a"]:
+    """The polar map of a ventricle: the greatest value along each ray from its axis outward, in the
+    unit of the volume.
+
+    Rows run from base to apex, the same number for the basal, mid and apical rings and the apex;
+    columns from the anterior wall's middle towards the septum.
+
+    Args:
+        volume: of activity.
+        grid: where it lies.
+        axis: of the ventricle.
+        reach_mm: length of the rays, from the axis beyond the wall, short of other organs.
+        rows: of each ring.
+        angles: of a turn; a multiple of 12, so that every segment has the same number.
+
+    Raises:
+        ValueError: a volume of another shape than the grid, an axis without length or along the
+            septum, a reach that is not positive, rows below one, angles no multiple of 12.
+    """
+    if tuple(volume.shape) != grid.shape:
+        raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")
+    if not reach_mm > 0 or rows < 1 or angles < 12 or angles % 12:
+        raise ValueError(
+            f"Expected a positive reach, a row or more and a multiple of 12 angles, got "
+            f"{reach_mm}, {rows} and {angles}"
+        )
+    origins, directions = _rays(axis, rows, angles)
+    count = 1 + math.ceil(reach_mm / (min(grid.spacing) / 2))
+    depth = torch.linspace(0, reach_mm, count, dtype=torch.float64)
+    points = origins[..., None, :] + directions[..., None, :] * depth[:, None]
+    index = normalised(grid.to_index(points), grid.shape)
+    return sample(volume.double()[None, None], index[None])[0, 0].amax(dim=-1)
+
+
+def segments(values: Float[Tensor, "4r a"]) -> Float[Tensor, "17"]:
+    """Means of the 17 segments of a polar map, in its unit: basal 1 to 6 from anterior over the
+    septum, mid 7 to 12, apical 13 to 16, apex 17.
+
+    The apex counts each elevation by the cosine that its solid angle goes with.
+
+    Args:
+        values: as `polar_map` gives it.
+
+    Raises:
+        ValueError: rows that are no multiple of 4, or angles no multiple of 12.
+    """
+    rows, angles = values.shape
+    if rows % 4 or angles % 12 or not values.numel():
+        raise ValueError(
+            f"Expected a map of a multiple of 4 rows and of 12 angles, got {rows} and {angles}"
+        )
+    means = []
+    elevation = torch.deg2rad(_elevations(rows // 4)[rows // 4 :])
+    for ring, count in zip(values.chunk(4), SEGMENTS, strict=True):
+        if count == 1:
+            share = elevation.cos().to(values)
+            means.append((ring.mean(dim=1) * share).sum()[None] / share.sum())
+            continue
+        width = angles // count
+        # the first segment lies about the first column
+        parts = ring.roll(width // 2, dims=1).unflatten(1, (count, width))
+        means.append(parts.mean(dim=(0, 2)))
+    return torch.cat(means)
+
+
+def _elevations(rows: int) -> Float[Tensor, " 2r"]:
+    """Angle of the apical rows and of the apex' above the plane across the axis, in degrees."""
+    middle = (torch.arange(rows, dtype=torch.float64) + 0.5) / rows
+    return torch.cat([APEX * middle, APEX + (90 - APEX) * middle])
+
+
+def _rays(
+    axis: LongAxis, rows: int, angles: int
+) -> tuple[Float[Tensor, "4r a 3"], Float[Tensor, "4r a 3"]]:
+    """Where the rays begin, in mm, and their directions."""
+    base, apex, septum = (torch.tensor(list(v), dtype=torch.float64) for v in axis)
+    along = apex - base
+    length = along.norm()
+    tip = along / torch.where(length > 0, length, 1)
+    across = septum - (septum @ tip) * tip
+    if not length > 0 or not across.norm() > 1e-6 * septum.norm():
+        raise ValueError(
+            f"Expected an axis with a length and a septum beside it, got base {list(axis.base)}, "
+            f"apex {list(axis.apex)} and septum {list(axis.septum)}"
+        )
+    across = across / across.norm()
+    front = torch.linalg.cross(across, tip)
+    turn = 2 * math.pi * torch.arange(angles, dtype=torch.float64) / angles
+    outward = turn.cos()[:, None] * front + turn.sin()[:, None] * across
+    steps = (torch.arange(2 * rows, dtype=torch.float64) + 0.5) / (2 * rows)
+    shares = torch.cat([CYLINDER * steps, torch.full((2 * rows,), CYLINDER).double()])
+    tilt = torch.deg2rad(torch.cat([torch.zeros(2 * rows).double(), _elevations(rows)]))
+    tilt = tilt[:, None, None]
+    origins = (base + shares[:, None] * along)[:, None].expand(-1, angles, -1)
+    return origins, tilt.cos() * outward + tilt.sin() * tip

@@ -1,0 +1,116 @@
+"""Cases that are kept in a folder: made once, whatever the detector adds, and never a wrong one."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mvrecon.acquisition.acquired import Acquired
+from mvrecon.acquisition.disturbances import Disturbance
+from mvrecon.acquisition.settings import Acquisition
+from mvrecon.data.case_store import CaseStore
+from mvrecon.data.module import SceneData
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, SCENES
+from tests.data.conftest import RIG
+
+GRID = Grid.centred((8, 8, 8), 6.0)
+
+
+@pytest.fixture
+def cameras():
+    return CAMERAS.from_config(RIG)
+
+
+def measured(folder, acquisition=None, made_of="ellipsoids"):
+    scene = SCENES.build("ellipsoids", value=0.02)
+    store = CaseStore(folder, {"scene": made_of}, scene)
+    return Acquired(scene, {"name": "drr"}, acquisition, store)
+
+
+def same(one, other):
+    names = ("views", "volume", "inside")
+    return one.name == other.name and all(
+        torch.equal(getattr(one, name), getattr(other, name)) for name in names
+    )
+
+
+def test_a_case_is_made_once_and_has_the_bits_of_one_that_is_made_anew(
+    tmp_path, cameras, monkeypatch
+):
+    plain = Acquired(SCENES.build("ellipsoids", value=0.02), {"name": "drr"})
+    expected = plain.sample(1, 5, GRID, cameras)
+    assert same(measured(tmp_path).sample(1, 5, GRID, cameras), expected)
+    again = measured(tmp_path)
+    monkeypatch.setattr(again, "_ideal", None)  # must not be called
+    assert same(again.sample(1, 5, GRID, cameras), expected)
+
+
+def test_noise_and_gains_are_not_kept_and_shifts_of_a_detector_have_a_file_of_their_own(
+    tmp_path, cameras
+):
+    for acquisition, files in (
+        (None, 1),
+        (Acquisition(photons=1e4), 1),
+        (Acquisition(disturbed=Disturbance(gain=0.1)), 1),
+        (Acquisition(disturbed=Disturbance(shift_px=1.0)), 2),
+    ):
+        scene = SCENES.build("ellipsoids", value=0.02)
+        expected = Acquired(scene, {"name": "drr"}, acquisition).sample(0, 0, GRID, cameras)
+        for _ in range(2):
+            assert same(measured(tmp_path, acquisition).sample(0, 0, GRID, cameras), expected)
+        assert len(list(tmp_path.iterdir())) == files
+
+
+def test_another_scene_case_series_grid_or_rig_has_another_file(tmp_path, cameras):
+    store, moved = measured(tmp_path).store, replace(cameras, source=cameras.source + 1e-6)
+    other = measured(tmp_path, made_of="another").store
+    paths = {
+        store.path(0, 0, GRID, cameras),
+        other.path(0, 0, GRID, cameras),
+        store.path(1, 0, GRID, cameras),
+        store.path(0, 1, GRID, cameras),
+        store.path(0, 0, GRID.refined(2), cameras),
+        store.path(0, 0, GRID, moved),
+    }
+    assert len(paths) == 6
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("how", ["cut short", "one bit", "other sizes", "text"])
+def test_a_kept_case_that_is_damaged_is_made_anew(tmp_path, cameras, how):
+    """A case kept from an earlier run that is damaged or of another size is made anew."""
+    expected = measured(tmp_path).sample(0, 0, GRID, cameras)
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    if how == "other sizes":
+        measured(tmp_path / "other").sample(0, 0, GRID.refined(2), cameras)
+        (other,) = (tmp_path / "other").iterdir()
+        path.write_bytes(other.read_bytes())
+    else:
+        at = whole.index(expected.views.numpy().tobytes()[:64])
+        flipped = whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :]
+        path.write_bytes(
+            {"cut short": whole[:-100], "one bit": flipped, "text": b"views"}.get(how, b"")
+        )
+    assert same(measured(tmp_path).sample(0, 0, GRID, cameras), expected)
+    assert len(path.read_bytes()) == len(whole)
+
+
+def test_a_run_takes_the_cases_of_an_earlier_one_and_worker_processes_make_the_same(
+    volume_file, tmp_path, monkeypatch
+):
+    scenes = dict.fromkeys(("train", "test"), {"name": "hdf5", "path": str(volume_file)})
+    measurement = {"grid": {"shape": [6, 6, 6], "spacing": 8.0}, "camera": RIG}
+    sizes = {"train": 3, "val": 1, "test": 1}
+
+    def views(**options):
+        data = SceneData(scenes, measurement, sizes, **options)
+        data.setup("fit")
+        return data.sets["train"].prepare()["views"]
+
+    expected, folder = views(), tmp_path / "cases"
+    assert torch.equal(views(cache=str(folder), workers=1), expected)
+    assert len(list(folder.iterdir())) == 4
+    monkeypatch.setattr(Acquired, "_ideal", None)  # must not be called
+    assert torch.equal(views(cache=str(folder), seed=7), expected), "no case depends on the seed"

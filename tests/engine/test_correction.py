@@ -1,0 +1,163 @@
+"""Corrections before a reconstruction: the same for an app, a model and a table."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+import mvrecon as mv
+import mvrecon.reconstruction
+from mvrecon.calibration.self_alignment import self_aligned
+from mvrecon.calibration.translation import translated
+from mvrecon.cameras import files
+from mvrecon.config import compose
+from mvrecon.data.volume_files import read_volume
+from mvrecon.engine import fit, run_folder
+from mvrecon.engine.export import save_views
+from mvrecon.engine.trained_correction import corrected_by
+from mvrecon.engine.wrong_cameras import camera_row, cameras_of, sentences
+from mvrecon.models.corrected import Corrected
+from mvrecon.parts import PROJECTORS, SCENES
+from mvrecon.reconstruct.iterative import sirt
+from tests.engine.runs import call
+from tests.models.rig import small_rig
+
+SHIFT, GAIN = torch.zeros(1, 8, 2), torch.ones(1, 8)
+SHIFT[0, 2], SHIFT[0, 5], GAIN[0, 5] = torch.tensor([0.9, -0.7]), torch.tensor([-0.6, 0.8]), 1.05
+
+
+@pytest.fixture(scope="module")
+def case():
+    """Operator, truth, and views of which two cameras are wrong."""
+    grid, cameras = small_rig(n_views=8, size=24, pixels=36)
+    sample = SCENES.build("ellipsoids").sample(0, 0, grid, cameras)
+    views = translated(sample.views[None], SHIFT) * GAIN[:, None, :, None, None]
+    return PROJECTORS.build("drr", grid=grid, cameras=cameras), sample.volume[None], views
+
+
+def reconstructed(case, folder, *options: str) -> tuple[float, dict]:
+    """Relative error of the volume of the app, and its results."""
+    A, truth, views = case
+    stored = save_views(folder, "scan", views[0, 0], "1")
+    files.save(A.cameras, folder / "rig.json")
+    fixed = (
+        f"views.path={stored}/views.h5",
+        f"camera.path={folder}/rig.json",
+        f"grid.size={list(A.grid.size)}",
+        f"grid.spacing={list(A.grid.spacing)}",
+        "reconstructor=sirt",
+        "reconstructor.momentum=true",
+        "reconstructor.iterations=20",
+        f"hydra.run.dir={folder}/run",
+        "device=cpu",
+    )
+    assert call(mvrecon.reconstruction, *fixed, *options) == 0
+    volume, _ = read_volume(folder / "run" / "volume.nii.gz")
+    table = json.loads((folder / "run" / "results.json").read_text())
+    return ((volume - truth[0, 0]).norm() / truth.norm()).item(), table
+
+
+def test_the_app_tells_wrong_cameras_and_moves_views_or_cameras(case, tmp_path, capsys):
+    for name in ("plain", "align", "calibrate"):
+        (tmp_path / name).mkdir()
+    plain, results = reconstructed(case, tmp_path / "plain", "left_out=true")
+    assert "cameras" not in results
+    disagreement = torch.tensor(results["left_out"])
+    moved, results = reconstructed(case, tmp_path / "align", "correct=align", "left_out=true")
+    assert "camera 2: shifted by +0." in capsys.readouterr().out
+    assert (torch.tensor(results["left_out"])[[2, 5]] < disagreement[[2, 5]]).all()
+    shift = torch.tensor(results["cameras"]["shift_px"])
+    assert (shift - SHIFT).abs().max() < 0.15
+    calibrated, _ = reconstructed(
+        case, tmp_path / "calibrate", "correct=align", "self_calibrate=true"
+    )
+    rigs = [files.from_file(tmp_path / "calibrate" / at) for at in ("rig.json", "run/rig.json")]
+    offset = (rigs[1].origin - rigs[0].origin)[2].float()
+    pixels = shift[0, 2, 0] * rigs[0].u[2].float() + shift[0, 2, 1] * rigs[0].v[2].float()
+    torch.testing.assert_close(offset, pixels, rtol=1e-3, atol=1e-3)
+    assert max(moved, calibrated) < 0.85 * plain and abs(moved - calibrated) < 0.1 * plain
+
+
+def test_a_model_on_corrected_views_is_the_model_of_these_views(case):
+    A, _, views = case
+    options = {"name": "sirt", "iterations": 5}
+    model = Corrected(A, options).eval()
+    corrected, by = self_aligned(A, views)
+    out = model(views)
+    torch.testing.assert_close(out.volume, sirt(A, corrected, 5))
+    assert out.alignment is not None and torch.equal(out.alignment.gain, by.gain)
+
+
+def test_in_training_a_view_is_aligned_once(case, monkeypatch):
+    A, _, views = case
+    batch = torch.cat([views, views.flip(-1)])
+    model = Corrected(A, {"name": "sirt", "iterations": 2}).train()
+    first = model(batch)
+    monkeypatch.setattr(model, "_corrected", None)  # a second computation would fail
+    again = model(batch.flip(0))
+    assert torch.equal(again.volume.flip(0), first.volume)
+    torch.testing.assert_close(
+        first.volume, model.eval().__class__(A, model_of(model))(batch).volume
+    )
+
+
+def model_of(model: Corrected) -> dict:
+    return {"name": "sirt", "iterations": model.model.iterations}
+
+
+def test_the_table_has_the_figures_where_the_truth_is_known(case):
+    A, _, views = case
+    _, by = self_aligned(A, views)
+    row = camera_row([cameras_of(by, {"shift_px": SHIFT, "gain": GAIN})])["cameras"]
+    assert row["auc"] == 1 and row["shift_rms_px"] < 0.2 * row["true_shift_rms_px"]
+    assert camera_row([cameras_of(by, {})])["cameras"].keys() == {
+        "deviation",
+        "shift_px",
+        "gain",
+        "shift_error",
+        "gain_error",
+    }
+    assert camera_row([cameras_of(None, {})]) == {} and sentences(None) == []
+    still = replace(by, shift_px=0 * by.shift_px, gain=0 * by.gain + 1)
+    assert sentences(camera_row([cameras_of(still, {})])["cameras"]) == []
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """One step of a model whose cameras correct views, and of one whose do not."""
+    settings = compose(
+        "experiment=smoke",
+        "+model@compare.rounds=rounds",
+        "+model@compare.geometry_free=geometry_free",
+        "trainer.max_steps=1",
+        "trainer.val_check_interval=1",
+    )
+    folder = tmp_path_factory.mktemp("run")
+    run_folder.start(folder, settings)
+    for label in ("rounds", "geometry_free"):
+        fit.fit(label, settings, fit.build_data(settings), folder)
+    return folder
+
+
+def test_views_are_corrected_by_the_cameras_of_a_trained_model(runs):
+    module = mv.load(runs, "rounds").module.eval()
+    views = module.projector(torch.rand(1, 1, *module.projector.grid.shape))
+    with torch.inference_mode():
+        expected = module(views).corrected_views[-1]
+    assert torch.equal(corrected_by(module.projector, views, str(runs), "rounds").views, expected)
+
+
+@pytest.mark.door
+def test_a_correction_that_does_not_fit_is_refused(case, runs, tmp_path, capsys):
+    """A model that corrects no view, a calibration without an alignment and an unknown option are
+    refused.
+    """
+    A = mv.load(runs, "rounds").module.projector
+    with pytest.raises(ValueError, match="whose cameras correct"):
+        corrected_by(A, torch.ones(1, 1, *A.range_shape), str(runs), "geometry_free")
+    with pytest.raises(TypeError, match="alternations"):
+        Corrected(case[0], correct={"name": "align", "alternation": 2})
+    with pytest.raises(AssertionError):
+        reconstructed(case, tmp_path, "self_calibrate=true")
+    assert "correct=align" in capsys.readouterr().err

@@ -1,0 +1,95 @@
+"""Consistency steps weighted for counts: stable, exact where they must be, and of no scale."""
+
+import pytest
+import torch
+
+from mvrecon.models.consistency import Consistency, weighted_for_counts
+from mvrecon.models.geometry import whole_geometry
+from mvrecon.parts import MODELS
+from mvrecon.testing import check_model
+from tests.models.rig import small_projector
+from tests.models.rounds.test_model import SMALL
+from tests.models.test_cross_view import OPTIONS
+
+COUNTED = {"steps": 3, "noise": "poisson"}
+
+
+@pytest.fixture(scope="module")
+def geometry():
+    return whole_geometry(small_projector())
+
+
+def volume(geometry, batch: int = 1) -> torch.Tensor:
+    random = torch.Generator().manual_seed(0)
+    return 0.2 + torch.rand(batch, 1, *geometry.A.grid.shape, generator=random)
+
+
+def test_for_a_uniform_volume_the_weights_are_those_of_sirt(geometry):
+    """It makes expect its value times each chord, so R is that of SIRT but for a factor."""
+    flat = torch.full((1, 1, *geometry.A.grid.shape), 2.5)
+    counted, views = weighted_for_counts(geometry, geometry.A(flat)), geometry.A(volume(geometry))
+    one, other = counted.residual(flat, views), geometry.residual(flat, views)
+    # rays that meet next to nothing are taken to expect more than that
+    assert (one - other).norm() < 0.02 * other.norm()
+
+
+def test_each_step_lowers_the_weighted_residual_and_the_truth_stays(geometry):
+    truth, start = volume(geometry), torch.ones(1, 1, *geometry.A.grid.shape)
+    views = geometry.A(truth)
+    weights = weighted_for_counts(geometry, geometry.A(start)).row
+    misfits = []
+    for steps in range(5):
+        x = Consistency({"steps": steps, "noise": "poisson"}).eval()(geometry, start, views)
+        misfits.append((weights * (views - geometry.A(x)).square()).sum().item())
+    assert all(b < a for a, b in zip(misfits, misfits[1:], strict=False))
+    kept = Consistency(COUNTED)(geometry, truth, views)
+    torch.testing.assert_close(kept, truth, rtol=1e-4, atol=1e-4)
+
+
+def test_it_has_no_scale_and_a_batch_is_its_cases(geometry):
+    steps = Consistency(COUNTED).eval()
+    x, truth = torch.ones(2, 1, *geometry.A.grid.shape), volume(geometry, 2)
+    x[1] *= 100
+    views = geometry.A(truth)
+    views[1] *= 100
+    whole = steps(geometry, x, views)
+    torch.testing.assert_close(steps(geometry, 1e-3 * x, 1e-3 * views), 1e-3 * whole)
+    torch.testing.assert_close(steps(geometry, x[1:], views[1:]), whole[1:])
+
+
+def test_bright_pixels_count_less_than_with_equal_noise(geometry):
+    """A wrong pixel changes the volume the less, the more counts it is expected to have."""
+    x = volume(geometry)
+    x[..., :4, :, :] *= 20
+    expected = geometry.A(x)
+    pixel = torch.zeros_like(expected)
+    bright = int(expected.argmax())
+    pixel.view(-1)[bright] = 1.0
+    counted = weighted_for_counts(geometry, expected)
+    plain, weighted = geometry.back(pixel).abs().sum(), counted.back(pixel).abs().sum()
+    assert weighted < plain
+
+
+@pytest.mark.parametrize("name", ["cross_view", "backprojection_unet", "rounds"])
+def test_a_model_of_counts_starts_from_osem_and_keeps_the_contract(name):
+    start = {"name": "osem", "iterations": 5, "subsets": 2}
+    own = {**OPTIONS, "rounds": {"rounds": SMALL["M3"]}}.get(name, {})
+    options = {**own, "start": start, "consistency": COUNTED}
+    check_model(name, small_projector(), **options)
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [
+        ({"steps": 2, "noise": "laplace"}, "gaussian or poisson"),
+        ({"stops": 2}, "did you mean 'steps'"),
+        (-1, "0 consistency steps or more"),
+    ],
+)
+def test_consistency_that_there_is_not_is_refused(steps, message):
+    """A model refuses consistency steps of another noise, of an unknown option, or fewer than
+    none.
+    """
+    with pytest.raises((TypeError, ValueError), match=message):
+        MODELS.build("backprojection_unet", small_projector(), consistency=steps)
