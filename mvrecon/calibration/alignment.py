@@ -140,15 +140,15 @@ def alignment(
     one = start or Alignment.none(views)
     smooth = blurred(expected, BLUR)
     peak = smooth.detach().abs().amax((1, 2, 3, 4), keepdim=True)
-    tiny = torch.finfo(views.dtype).tiny
+    unit = torch.where(peak > 0, peak, 1.0)  # no object is expected: then nothing is known
     counts = (smooth.detach().abs() > EMPTY * peak) * (1 if weight is None else weight)
     fit = _Fit(
-        _columns(smooth).div(peak.clamp_min(tiny)[:, 0]),
+        _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
         views.new_tensor([prior.shift_px, prior.shift_px, prior.gain]).pow(-2),
     )
     for _ in range(steps):
-        rest = (blurred(aligned(views, one), BLUR) - smooth) / peak.clamp_min(tiny)
+        rest = (blurred(aligned(views, one), BLUR) - smooth) / unit
         one = fit.step(rest[:, 0].flatten(2), one)
     return one
 

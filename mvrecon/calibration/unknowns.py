@@ -139,8 +139,12 @@ def _complement(columns: Float[Tensor, "rows n"]) -> Float[Tensor, "rows k"]:
 
 
 def motions(cameras: Cameras, centre: Float[Tensor, "3"]) -> Float[Tensor, "m 2 3"]:
-    """Pixels by which a point in world mm moves in each view (u, v), for a mm along x, y and z."""
-    centre = centre.to(cameras.origin)
-    points = torch.cat([centre[None], centre + torch.eye(3).to(centre)])
-    uv = cameras.project(points)[..., :2]
-    return (uv[:, 1:] - uv[:, :1]).mT
+    """Pixels by which a point in world mm moves in each view (u, v), for a mm along x, y and z: the
+    derivative of its image.
+    """
+    uvw = torch.linalg.inv(cameras.frame)
+    if cameras.parallel:
+        return uvw[:, :2]
+    at = uvw @ (centre.to(cameras.source) - cameras.source)[..., None]
+    u_v, w = at[:, :2], at[:, 2:]
+    return (uvw[:, :2] - u_v / w * uvw[:, 2:]) / w

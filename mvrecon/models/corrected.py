@@ -47,7 +47,8 @@ class Corrected(nn.Module):
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         check_views(views, self.projector.cameras)
-        with torch.no_grad():
+        # a fit of parts of a pixel is no work for half precision
+        with torch.no_grad(), torch.autocast(views.device.type, enabled=False):
             corrected = self._recalled(views) if self.training else self._corrected(views)
         return replace(self.model(corrected.views), alignment=corrected.alignment)
 

@@ -128,13 +128,13 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
 
 
 def test_no_case_is_simulated_twice_however_many_methods_see_it(settings, tmp_path, monkeypatch):
-    made, make = Counter(), SceneDataset._made
+    made, make = Counter(), SceneDataset.made
 
     def noted(self, item):
         made[self.seed, self.indices[item]] += 1
         return make(self, item)
 
-    monkeypatch.setattr(SceneDataset, "_made", noted)
+    monkeypatch.setattr(SceneDataset, "made", noted)
     trainer = {**settings["trainer"], "max_steps": 4}  # more than an epoch
     other = {"name": "backprojection_unet", "width": 4, "start": 2, "consistency": 0}
     train(
