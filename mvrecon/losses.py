@@ -191,6 +191,6 @@ class ReconstructionLoss(nn.Module):
         gain = relative(error, visible)
         if out.weights is None:
             return gain
-        seen = visible.any(dim=-5, keepdim=True)
+        anywhere = visible.any(dim=-5, keepdim=True)
         fused = (out.weights * out.opinions).sum(dim=1, keepdim=True) / self.data_range
-        return gain + relative((fused - truth[:, None]).square(), seen)
+        return gain + relative((fused - truth[:, None]).square(), anywhere)

@@ -56,7 +56,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     solve.check(settings)  # what does not fit is told before the folder is anybody's
     correction.check(settings)
     estimate, device = None, device_of(settings["device"])
-    with run_folder.taken(folder, settings, own=WRITTEN):
+    with run_folder.taken(folder, settings, products=WRITTEN):
         if free:
             case, estimate = calibrate.calibrate(case, free, device)
             files.save(case.cameras, beside(out))

@@ -20,9 +20,9 @@ def draw(table: list[Row], out: Path) -> None:
     for name, size in dict.fromkeys(
         (row["method"], row["size"]) for row in table if row["counted"] == "iterations"
     ):
-        own = [row for row in table if (row["method"], row["size"]) == (name, size)]
-        marker = "o" if len(own) == 1 else None
-        points = [(max(1, int(row["count"])), float(row["nrmse"])) for row in own]
+        lines = [row for row in table if (row["method"], row["size"]) == (name, size)]
+        marker = "o" if len(lines) == 1 else None
+        points = [(max(1, int(row["count"])), float(row["nrmse"])) for row in lines]
         left.plot(*zip(*points, strict=True), marker=marker, label=f"{name}, {size}$^2$")
     trained = [row for row in table if row["counted"] == "steps"]
     for name in dict.fromkeys(row["method"] for row in trained):

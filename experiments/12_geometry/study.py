@@ -97,8 +97,8 @@ def pace(data: Path) -> None:
     torch.set_num_threads(1)
     rows = {}
     for arm, support in product(ARMS, ("none", "hull")):
-        given = compose(*settings("clean", arm), *paths(data), f"model.support={support}")
-        module = build_module(given, given["model"], 0.04)
+        run = compose(*settings("clean", arm), *paths(data), f"model.support={support}")
+        module = build_module(run, run["model"], 0.04)
         volume = torch.zeros(4, 1, 32, 32, 32)
         volume[:, :, 6:26, 8:24, 6:26] = 0.02
         views = module.projector(volume)
@@ -149,7 +149,7 @@ def collected(runs: Path) -> list[dict]:
     rows = []
     for path in sorted(runs.glob("*/*/*/results.json")):
         regime, arm, run = path.relative_to(runs).parts[:3]
-        seconds, seed = run.removesuffix("").split("s_")
+        seconds, seed = run.split("s_")
         result = next(iter(json.loads(path.read_text())["methods"].values()))
         rows.append(
             {
@@ -200,13 +200,15 @@ def curves(rows: list[dict], path: Path) -> None:
     regimes = [name for name in REGIMES if any(r["regime"] == name for r in rows)]
     figure, panels = plt.subplots(1, len(regimes), figsize=(4.5 * len(regimes), 3.6), squeeze=False)
     for panel, regime in zip(panels[0], regimes, strict=True):
-        own = [row for row in rows if row["regime"] == regime]
+        lines = [row for row in rows if row["regime"] == regime]
         for arm in ARMS | ALIGNED:
-            line = sorted((r["seconds"], r["psnr"]) for r in own if r["arm"] == arm)
-            panel.plot(*zip(*line, strict=True), "o-", label=arm) if line else None
+            line = sorted((r["seconds"], r["psnr"]) for r in lines if r["arm"] == arm)
+            if line:
+                panel.plot(*zip(*line, strict=True), "o-", label=arm)
         for arm, style in zip(CLASSICAL, (":", "--", "-.", (0, (1, 4))), strict=True):
-            level = [row["psnr"] for row in own if row["arm"] == arm]
-            panel.axhline(level[0], color="grey", linestyle=style, label=arm) if level else None
+            level = [row["psnr"] for row in lines if row["arm"] == arm]
+            if level:
+                panel.axhline(level[0], color="grey", linestyle=style, label=arm)
         panel.set(title=regime, xlabel="processor seconds of training", ylabel="PSNR in dB")
         panel.set_xscale("log")
         panel.legend(fontsize=7)

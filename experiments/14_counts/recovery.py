@@ -142,14 +142,14 @@ def draw(rows: list[dict], file: Path) -> None:
 
     figure, axes = pyplot.subplots(1, 3, figsize=(13, 4), layout="constrained")
     for name in METHODS:
-        own = [r for r in rows if r["method"] == name]
+        lines = [r for r in rows if r["method"] == name]
         for axis, diameter in zip(axes, (13.0, 22.0), strict=False):
-            points = [r for r in own if r["sphere_mm"] == diameter]
+            points = [r for r in lines if r["sphere_mm"] == diameter]
             pairs = [(float(r["variability"]), float(r["recovery"])) for r in points]
             axis.plot(*zip(*pairs, strict=True), ".-", label=name)
             axis.set(xlabel="background variability", ylabel="contrast recovery")
             axis.set_title(f"sphere of {diameter:g} mm")
-        values = [float(r["objective"]) for r in own if r["sphere_mm"] == 10.0]
+        values = [float(r["objective"]) for r in lines if r["sphere_mm"] == 10.0]
         axes[2].plot(range(1, 1 + len(values)), [v - min(values) + 1 for v in values], label=name)
     axes[2].set(xlabel="iteration", ylabel="objective above its least, + 1", yscale="log")
     axes[2].legend()

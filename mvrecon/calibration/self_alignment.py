@@ -62,12 +62,13 @@ def self_alignment(
         raise ValueError(f"expected at least one alternation, got {alternations}")
     check_finite(views)
     by, volume, weights = Alignment.none(views), None, sirt_weights(A, views.dtype)
+    moves = motions(A.cameras, A.grid.centre)
     for _ in range(alternations):
         volume = sirt(
             A, aligned(views, by), iterations, weights=weights, momentum=True, start=volume
         )
         fitted = alignment(views, A(volume), start=by, steps=1)
-        by = standing_still(fitted, motions(A.cameras, A.grid.centre))
+        by = standing_still(fitted, moves)
     return by
 
 

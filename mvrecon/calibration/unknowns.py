@@ -65,7 +65,9 @@ class Unknowns(NamedTuple):
         for name, column in zip(self.kinds, values.unbind(dim=1), strict=True):
             if field := KINDS[name].field:
                 fields[field][KINDS[name].column] = column
-        return Misalignment(**{name: torch.stack(own, dim=1) for name, own in fields.items()})
+        return Misalignment(
+            **{name: torch.stack(columns, dim=1) for name, columns in fields.items()}
+        )
 
     def gains(self, values: Float[Tensor, "m k"]) -> Float[Tensor, " m"]:
         """The factor of each view, 1 where it is not free."""
@@ -93,9 +95,9 @@ def unknowns(cameras: Cameras, free: Sequence[str]) -> Unknowns:
     kinds = tuple(k for k in KINDS if any(k in SINGLE.get(name, (name,)) for name in free))
     blocks = []
     for name in free:
-        own = SINGLE.get(name, (name,))
+        parts = SINGLE.get(name, (name,))
         rows = torch.arange(views)[:, None] * len(kinds) + torch.tensor(
-            [kinds.index(kind) for kind in own]
+            [kinds.index(kind) for kind in parts]
         )
         columns = _columns(cameras, name)
         block = columns.new_zeros(views * len(kinds), columns.shape[1])

@@ -83,8 +83,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         index = self.indices[item]
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
-        wrong = [key for key in ERRORS if getattr(sample, key) is not None]
-        made = {key: getattr(sample, key) for key in (*TENSORS, *wrong)}
+        errors = [key for key in ERRORS if getattr(sample, key) is not None]
+        made = {key: getattr(sample, key) for key in (*TENSORS, *errors)}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
                 raise ValueError(

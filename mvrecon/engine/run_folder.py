@@ -33,7 +33,7 @@ WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 @contextmanager
 def taken(
-    folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, own: Sequence[str] = ()
+    folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
 ) -> Iterator[None]:
     """Context that locks a run folder, new or started with the same settings, and writes the
     settings into it.
@@ -42,7 +42,7 @@ def taken(
         folder: of the run.
         settings: plain.
         file: of the settings.
-        own: files that a run which fails takes away with it, if they were not there before.
+        products: files that a run which fails takes away with it, if they were not there before.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -50,7 +50,7 @@ def taken(
     """
     with claimed(folder):
         check(folder, settings, file)
-        with _cleared_on_failure(folder, own):
+        with _cleared_on_failure(folder, products):
             start(folder, dict(settings), file)
             yield
 

@@ -135,7 +135,7 @@ def _iterated(
         if rule:
             options["monitor"] = runs
             choice = held_out(RECONSTRUCTORS.get(name), A, views, options=options, **rule)
-            volume, chosen = choice.volume, _told(choice)
+            volume, chosen = choice.volume, _choice_row(choice)
         else:
             sigma = settings["stop"]["sigma"]
             monitor = runs if sigma is None else combined(runs, discrepancy(sigma))
@@ -145,7 +145,7 @@ def _iterated(
     return _Run(volume, lambda: _share(last, size), residuals, chosen)
 
 
-def _told(choice: Choice) -> dict[str, Any]:
+def _choice_row(choice: Choice) -> dict[str, Any]:
     """The choice of the one sample that a scan is."""
     trials = [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials]
     weight = choice.weights[0] if choice.weights else None

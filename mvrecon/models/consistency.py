@@ -97,7 +97,7 @@ def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]
     row = reached / expected.maximum(least)
     chords = torch.where(reached, 1 / torch.where(reached, geometry.row, 1), 0)
     sums = geometry.A.T(row * chords)
-    column = torch.cat([inverse_sums(own) for own in sums.split(1)]) * (geometry.column > 0)
+    column = torch.cat([inverse_sums(one) for one in sums.split(1)]) * (geometry.column > 0)
     return replace(geometry, row=row, column=column)
 
 

@@ -57,7 +57,7 @@ class Corrected(nn.Module):
 
     def _recalled(self, views: Float[Tensor, "b 1 m v u"]) -> CorrectedViews:
         """The corrected views, by their alignments where these are known."""
-        names = [hashlib.sha256(own.cpu().numpy().tobytes()).digest() for own in views.detach()]
+        names = [hashlib.sha256(case.cpu().numpy().tobytes()).digest() for case in views.detach()]
         new = [i for i, name in enumerate(names) if name not in self._known]
         if new:
             corrected = self._corrected(views[new])

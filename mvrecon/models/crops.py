@@ -144,8 +144,8 @@ def _part(
         frusta_from_world,
         world_from_frusta,
         edges,
-        seen=_within(whole.seen, index, box),
-        inside=window.spans(_of_cameras(whole.inside, index)),
+        voxels=_within(whole.voxels, index, box),
+        bins=window.spans(_of_cameras(whole.bins, index)),
         thickness=window.parts(whole.thickness[index], (0,)),
         slant=window.parts(whole.slant[index], (1, 2)),
         n_depths=whole.n_depths,
@@ -154,13 +154,13 @@ def _part(
     return part.to(whole.slant.device)
 
 
-def _within(seen: Spans, index: Int[Tensor, " k"], box: Box) -> Spans:
+def _within(voxels: Spans, index: Int[Tensor, " k"], box: Box) -> Spans:
     """Rows of voxels of a box, for some cameras."""
     rows, columns = box.slices[:2], box.slices[2]
     width = columns.stop - columns.start
     first, end = (
         (place[index][..., *rows] - columns.start).clamp(0, width)
-        for place in (seen.first, seen.end)
+        for place in (voxels.first, voxels.end)
     )
     return Spans(first, end, width)
 

@@ -37,8 +37,8 @@ class Frusta:
         frusta_from_world: where each voxel lies in each frustum, float64.
         world_from_frusta: where each bin lies in the grid, float64.
         edges: planes between the depth bins in mm, float64.
-        seen: voxels inside a frustum.
-        inside: bins inside the grid's box, ahead of the source.
+        voxels: those inside a frustum.
+        bins: bins inside the grid's box, ahead of the source.
         thickness: mm of depth of a bin.
         slant: mm of ray per mm of depth.
         n_depths: depth bins of the frusta over the whole grid.
@@ -50,8 +50,8 @@ class Frusta:
     frusta_from_world: Float[Tensor, "m 1 5 2 3"]
     world_from_frusta: Float[Tensor, "1 m 5 2 3"]
     edges: Float[Tensor, "m e"]
-    seen: Spans
-    inside: Spans
+    voxels: Spans
+    bins: Spans
     thickness: Float[Tensor, "m D"]
     slant: Float[Tensor, "m v u"]
     n_depths: int
@@ -71,15 +71,15 @@ class Frusta:
         frusta_from_world, world_from_frusta = maps_between(grid, cameras, edges)
         ahead = frusta_lattice(cameras, grid, edges).ahead[:, None, :, None]
         shape = depth, *cameras.shape
-        inside = enclosed(world_from_frusta[0, :, None], grid.shape, shape)
+        bins = enclosed(world_from_frusta[0, :, None], grid.shape, shape)
         start, end = cameras.rays()
         slant = (end - start).norm(dim=-1) / cameras.distance[:, None, None]
         return cls(
             frusta_from_world,
             world_from_frusta,
             edges,
-            seen=enclosed(frusta_from_world, shape, grid.shape),
-            inside=replace(inside, end=inside.end * ahead),
+            voxels=enclosed(frusta_from_world, shape, grid.shape),
+            bins=replace(bins, end=bins.end * ahead),
             thickness=(edges[:, 1:] - edges[:, :-1]).abs().float(),
             slant=slant.float(),
             n_depths=depth,
@@ -88,7 +88,7 @@ class Frusta:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Bins (depth, row, column)."""
-        return self.inside.shape
+        return self.bins.shape
 
     @property
     def step(self) -> Float[Tensor, "m 1 D v u"]:
@@ -98,14 +98,14 @@ class Frusta:
     @property
     def visible(self) -> Bool[Tensor, "m 1 d h w"]:
         """Voxels inside a frustum."""
-        return self.seen.mask
+        return self.voxels.mask
 
     @property
     def occupied(self) -> Bool[Tensor, "*b m 1 D v u"]:
         """Bins that may be other than zero: those inside the grid's box, ahead of the source, and
         with a mask those that touch it.
         """
-        inside = self.inside.mask
+        inside = self.bins.mask
         return inside if self.touching is None else inside & self.touching
 
     @property
@@ -117,7 +117,7 @@ class Frusta:
         """On another device, or with steps of another dtype; the maps keep their digits."""
         slant = self.slant.to(*where)
         device = slant.device
-        names = ("frusta_from_world", "world_from_frusta", "edges", "seen", "inside")
+        names = ("frusta_from_world", "world_from_frusta", "edges", "voxels", "bins")
         moved = {name: getattr(self, name).to(device) for name in names}
         touching = None if self.touching is None else self.touching.to(device)
         thickness = self.thickness.to(slant)
@@ -154,7 +154,7 @@ class Frusta:
 
     def to_world(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
         """Each frustum's density at the voxels of the grid; zero where the camera does not see."""
-        return warp(frusta, self.frusta_from_world, self.seen.shape)[:, :, 0]
+        return warp(frusta, self.frusta_from_world, self.voxels.shape)[:, :, 0]
 
     def to_frusta(self, volumes: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m c D v u"]:
         """World volumes at the bins of the frusta, one volume for each camera (or one for all, m =

@@ -100,8 +100,8 @@ class AttenuatedTransform(RayTransform):
         """The same for emission in a box and for some cameras; all of the attenuation stays."""
         if self.clear:
             return super().cropped(box, views)
-        some = self if views is None else self._of_views(list(views))
-        return LinearOperator.cropped(some, box)
+        part = self if views is None else self._of_views(list(views))
+        return LinearOperator.cropped(part, box)
 
     def mirror(self) -> Mirror | None:
         """A plane that mirrors the attenuation into itself, too."""
@@ -115,8 +115,8 @@ class AttenuatedTransform(RayTransform):
     def _of_views(self, views: list[int]) -> "AttenuatedTransform":
         rig = self.cameras
         options = {name: getattr(self, name) for name in OPTIONS}
-        some = rig[torch.tensor(views, device=rig.source.device)]
-        return AttenuatedTransform(self.grid, some, self.mu, **options).to(self.device)
+        cameras = rig[torch.tensor(views, device=rig.source.device)]
+        return AttenuatedTransform(self.grid, cameras, self.mu, **options).to(self.device)
 
     def _compiled(self, tensor: Tensor, lines: Tensor) -> bool:
         """Whether the CPU's kernels serve; they know no gradient in the rays."""

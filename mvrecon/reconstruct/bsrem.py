@@ -76,9 +76,9 @@ def bsrem(
     parts = subset_likelihoods(A, counts, background, subsets)
     sums = [part.sensitivity(parts[0].counts.dtype) for part in parts]
     whole = torch.stack(sums).sum(dim=0)
-    seen = whole > 0
-    penalty = RelativeDifference(voxel_steps(A), seen[0, 0], **(prior or {}))
-    strength = weight * whole[seen].mean().item() if seen.any() else 0.0
+    visible = whole > 0
+    penalty = RelativeDifference(voxel_steps(A), visible[0, 0], **(prior or {}))
+    strength = weight * whole[visible].mean().item() if visible.any() else 0.0
 
     def objective(volume: Tensor, residual: Tensor) -> Tensor:
         return likelihood_of_residual(counts, volume, residual) + strength * penalty(volume)
@@ -108,14 +108,14 @@ def _iterates(
     the first iteration is one of OSEM whose subsets share one sensitivity.
     """
     s, subsets = torch.stack(list(sums)).sum(dim=0), len(parts)
-    seen = s > 0
-    metric = seen / torch.where(seen, s + 2 * strength * penalty.weights(s), 1)
-    floor = FLOOR * uniform(parts, s) * seen
+    visible = s > 0
+    metric = visible / torch.where(visible, s + 2 * strength * penalty.weights(s), 1)
+    floor = FLOOR * uniform(parts, s) * visible
     x = x.maximum(floor)
     for number in count():
         length = subsets / (1 + RELAXATION * number)
-        for part, own in zip(parts, sums, strict=True):
-            slope = part.explained(x) - own
+        for part, sensitivity in zip(parts, sums, strict=True):
+            slope = part.explained(x) - sensitivity
             if strength:
                 slope = slope - strength / subsets * penalty.gradient(x)
             x = torch.addcmul(x, x * metric, slope, value=length).maximum(floor)

@@ -157,7 +157,7 @@ def _chosen(
     """All samples, those of the same choice in one run."""
     parts: dict[int, Tensor] = {}
     for pick in dict.fromkeys(picks):
-        samples = [sample for sample, own in enumerate(picks) if own == pick]
+        samples = [sample for sample, choice in enumerate(picks) if choice == pick]
         chosen = {**_with(options, pick.weight), "iterations": pick.iterations}
         if chosen.get("start") is not None:
             chosen["start"] = chosen["start"][samples]

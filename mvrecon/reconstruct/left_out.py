@@ -40,7 +40,7 @@ def left_out_residual(
     for m in range(count):
         others = [n for n in range(count) if n != m]
         volume = method(A.cropped(grid, others), views[:, :, others])
-        own = views[:, :, [m]]
-        rest = (own - A.cropped(grid, [m])(volume)).flatten(1).norm(dim=1)
-        errors.append(rest / own.flatten(1).norm(dim=1).clamp_min(torch.finfo(own.dtype).tiny))
+        view = views[:, :, [m]]
+        rest = (view - A.cropped(grid, [m])(volume)).flatten(1).norm(dim=1)
+        errors.append(rest / view.flatten(1).norm(dim=1).clamp_min(torch.finfo(view.dtype).tiny))
     return torch.stack(errors, dim=1)

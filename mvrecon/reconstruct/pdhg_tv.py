@@ -99,15 +99,15 @@ def _descend(
             break
         ahead = torch.lerp(x, volume, 2)
         beyond = views - A(ahead)
-        own = (beyond + residual) / 2  # of the volume, by linearity
+        rest = (beyond + residual) / 2  # of the volume, by linearity
         gap = None
         if monitor is not None and (number % EVERY == 0 or number == iterations):
-            gap = objective.gap(volume, own, Bound(multiplier, back, fresh))
-        if watch.ends(number, volume, lambda: own, gap=gap):  # noqa: B023
+            gap = objective.gap(volume, rest, Bound(multiplier, back, fresh))
+        if watch.ends(number, volume, lambda: rest, gap=gap):  # noqa: B023
             break
         target = (multiplier + balance * fit.weights.row * beyond) / (1 + balance)
         multiplier = multiplier.lerp(target, RELAXATION)
-        x, residual = x.lerp(volume, RELAXATION), residual.lerp(own, RELAXATION)
+        x, residual = x.lerp(volume, RELAXATION), residual.lerp(rest, RELAXATION)
         if field is not None:
             fresh = kernels.dual_step(ahead, field.clone(), rate, steps)
             field = field.lerp_(fresh, RELAXATION)

@@ -13,6 +13,8 @@ import pytest
 import torch
 
 from mvrecon.cameras import files
+from mvrecon.config import compose
+from mvrecon.engine import fit, run_folder
 from mvrecon.parts import CAMERAS
 
 RIG = {
@@ -39,6 +41,17 @@ def call(app, *options):
         except SystemExit as stop:
             return stop.code
     return 0
+
+
+def trained_for_a_step(folder, *methods):
+    """A run folder of so many methods of the smoke experiment, each trained for one step."""
+    others = [f"+model@compare.{name}={name}" for name in methods if name != "cross_view"]
+    length = ("trainer.max_steps=1", "trainer.val_check_interval=1")
+    settings = compose("experiment=smoke", *others, *length)
+    run_folder.start(folder, settings)
+    for label in methods:
+        fit.fit(label, settings, fit.build_data(settings), folder)
+    return folder
 
 
 def crowd(kind, folder):

@@ -11,16 +11,14 @@ import mvrecon.reconstruction
 from mvrecon.calibration.self_alignment import self_aligned
 from mvrecon.calibration.translation import translated
 from mvrecon.cameras import files
-from mvrecon.config import compose
 from mvrecon.data.volume_files import read_volume
-from mvrecon.engine import fit, run_folder
 from mvrecon.engine.export import save_views
 from mvrecon.engine.trained_correction import corrected_by
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of, sentences
 from mvrecon.models.corrected import Corrected
 from mvrecon.parts import PROJECTORS, SCENES
 from mvrecon.reconstruct.iterative import sirt
-from tests.engine.runs import call
+from tests.engine.runs import call, trained_for_a_step
 from tests.models.rig import small_rig
 
 SHIFT, GAIN = torch.zeros(1, 8, 2), torch.ones(1, 8)
@@ -126,18 +124,7 @@ def test_the_table_has_the_figures_where_the_truth_is_known(case):
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """One step of a model whose cameras correct views, and of one whose do not."""
-    settings = compose(
-        "experiment=smoke",
-        "+model@compare.rounds=rounds",
-        "+model@compare.geometry_free=geometry_free",
-        "trainer.max_steps=1",
-        "trainer.val_check_interval=1",
-    )
-    folder = tmp_path_factory.mktemp("run")
-    run_folder.start(folder, settings)
-    for label in ("rounds", "geometry_free"):
-        fit.fit(label, settings, fit.build_data(settings), folder)
-    return folder
+    return trained_for_a_step(tmp_path_factory.mktemp("run"), "rounds", "geometry_free")
 
 
 def test_views_are_corrected_by_the_cameras_of_a_trained_model(runs):

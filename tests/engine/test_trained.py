@@ -7,18 +7,14 @@ import torch
 import yaml
 
 import mvrecon as mv
-from mvrecon.config import compose
-from mvrecon.engine import checkpoints, fit, run_folder
+from mvrecon.engine import checkpoints, fit
+from tests.engine.runs import trained_for_a_step
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A run of one step; its other method, SIRT, learns nothing and has no checkpoint."""
-    settings = compose("experiment=smoke", "trainer.max_steps=1", "trainer.val_check_interval=1")
-    folder = tmp_path_factory.mktemp("run")
-    run_folder.start(folder, settings)
-    fit.fit("cross_view", settings, fit.build_data(settings), folder)
-    return folder
+    return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view")
 
 
 def test_a_run_folder_and_its_checkpoint_are_one_method(run: Path):

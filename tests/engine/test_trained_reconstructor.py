@@ -13,30 +13,18 @@ import torch
 import mvrecon as mv
 import mvrecon.reconstruction
 from mvrecon.cameras import files
-from mvrecon.config import compose
 from mvrecon.data.volume_files import read_volume
-from mvrecon.engine import fit, run_folder
 from mvrecon.engine.export import save_views
 from mvrecon.engine.trained_reconstructor import trained
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
-from tests.engine.runs import call
+from tests.engine.runs import call, trained_for_a_step
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """One step of two methods: one that takes any rig, and one that is made for its own."""
-    settings = compose(
-        "experiment=smoke",
-        "+model@compare.geometry_free=geometry_free",
-        "trainer.max_steps=1",
-        "trainer.val_check_interval=1",
-    )
-    folder = tmp_path_factory.mktemp("run")
-    run_folder.start(folder, settings)
-    for label in ("cross_view", "geometry_free"):
-        fit.fit(label, settings, fit.build_data(settings), folder)
-    return folder
+    return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view", "geometry_free")
 
 
 @pytest.fixture(scope="module")

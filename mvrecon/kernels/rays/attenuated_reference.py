@@ -62,8 +62,8 @@ def backproject(
     detector = views.shape[2:4]
     dealt = _dealt(lines, layers, detector, mu.shape, method)
     for index, weight in _attenuated(mu.to(views), lines, window, detector, method):
-        seen = (values * next(dealt).to(views)).sum(dim=-1)
-        flat = flat.index_add(1, index, weight * seen)
+        value = (values * next(dealt).to(views)).sum(dim=-1)
+        flat = flat.index_add(1, index, weight * value)
     return flat.reshape(len(views), d + 2, h + 2, w + 2)[:, 1:-1, 1:-1, 1:-1]
 
 
@@ -73,8 +73,8 @@ def _attenuated(
     """Every flat index and weight, in mm, with the transmission from there to the detector."""
     entries = list(weights(lines, window, detector, mu.shape, mu, method))
     flat, size = F.pad(mu, (1, 1) * 3).flatten(), CELLS[method]
-    each = torch.stack([weight * flat[index] for index, weight in entries])
-    depth = each.unflatten(0, (-1, size)).sum(dim=1)
+    depths = torch.stack([weight * flat[index] for index, weight in entries])
+    depth = depths.unflatten(0, (-1, size)).sum(dim=1)
     # counts run along the ray's direction, to its end on the detector's side
     upwards = directions(lines, detector) > 0
     before = torch.where(upwards, _above(depth), _above(depth.flip(0)).flip(0))

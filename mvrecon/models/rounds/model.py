@@ -147,5 +147,5 @@ def boxes_of(mask: Bool[Tensor, "b 1 d h w"]) -> list[Box]:
     none, the whole grid.
     """
     shape = mask.shape[2:]
-    boxes = [Box.around(own).grown(MARGIN, shape).aligned(ALIGNED, shape) for own in mask]
+    boxes = [Box.around(sample).grown(MARGIN, shape).aligned(ALIGNED, shape) for sample in mask]
     return [box if box.size else Box.whole(shape) for box in boxes]

@@ -129,8 +129,8 @@ class RoundOptions(Checked):
     @property
     def network(self) -> Mapping[str, Any]:
         """Name and own options of the cameras' network."""
-        own = dict(self.cameras or {})
-        return {name: value for name, value in own.items() if name not in ("correct", "shared")}
+        options = dict(self.cameras or {})
+        return {name: value for name, value in options.items() if name not in ("correct", "shared")}
 
     @property
     def task(self) -> Task:

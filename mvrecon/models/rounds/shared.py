@@ -21,8 +21,8 @@ class OneEach(nn.Module):
         self.networks = nn.ModuleList(make() for _ in range(count))
 
     def forward(self, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
-        own = x.unflatten(0, (-1, len(self.networks))).unbind(1)
-        pairs = zip(self.networks, own, strict=True)
+        parts = x.unflatten(0, (-1, len(self.networks))).unbind(1)
+        pairs = zip(self.networks, parts, strict=True)
         return torch.stack([network(part) for network, part in pairs], dim=1).flatten(0, 1)
 
 

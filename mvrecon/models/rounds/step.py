@@ -168,8 +168,8 @@ class Round(nn.Module):
         volumes = []
         for i, box in enumerate(measured.boxes):
             cells = [slice(s.start // self.edge, -(-s.stop // self.edge)) for s in box.slices]
-            own = [one[i : i + 1, :, *cells] for one in extra]
-            answer = self._answer(evidence[i : i + 1, :, *box.slices], own)
+            part = [one[i : i + 1, :, *cells] for one in extra]
+            answer = self._answer(evidence[i : i + 1, :, *box.slices], part)
             volumes.append(placed(torch.cat(answer, dim=1), box, x.shape[2:]))
         learned, memory = torch.cat(volumes).split(1, dim=1)
         return learned, memory

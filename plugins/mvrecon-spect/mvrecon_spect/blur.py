@@ -146,11 +146,11 @@ class BlurredPinholes(Projector):
         ops, (window, _) = self._ops(y), self._extent
         for part in self._parts(views):
             count = len(part.lines)
-            some = views[:, first : first + count]
+            block = views[:, first : first + count]
             rows, columns = (n - 1 for n in part.kernels.shape[-2:])
             turned = part.kernels.flip(-2, -1).flatten(0, 1)[:, None]
             # the transpose, as a plain convolution: torch's own is much slower
-            every = F.pad(some, (columns, columns, rows, rows)).repeat_interleave(LAYERS, dim=1)
+            every = F.pad(block, (columns, columns, rows, rows)).repeat_interleave(LAYERS, dim=1)
             planes = F.conv2d(every, turned, groups=every.shape[1])
             layers = planes.unflatten(1, (count, -1)).movedim(2, -1) * part.weight[..., None]
             rays = part.lines, part.layers, window, self.method
@@ -167,12 +167,12 @@ class BlurredPinholes(Projector):
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
         """The same for activity in a box and for some cameras; all of the attenuation stays."""
-        some = self if views is None else self._of_views(views)
-        return LinearOperator.cropped(some, box)
+        part = self if views is None else self._of_views(views)
+        return LinearOperator.cropped(part, box)
 
     def _of_views(self, views: Sequence[int]) -> "BlurredPinholes":
-        some = self.cameras[torch.tensor(list(views), device=self.cameras.source.device)]
-        return BlurredPinholes(self.grid, some, self.mu, self.optics, self.method, self.backend)
+        cameras = self.cameras[torch.tensor(list(views), device=self.cameras.source.device)]
+        return BlurredPinholes(self.grid, cameras, self.mu, self.optics, self.method, self.backend)
 
     @property
     def _extent(self) -> tuple[list[float], list[int]]:
@@ -190,8 +190,8 @@ class BlurredPinholes(Projector):
         layers = -self.magnification().to(like.device)
         kernels = self.kernels.to(like)
         for first in range(0, len(lines), TOGETHER):
-            some = slice(first, first + TOGETHER)
-            yield Part(lines[some], layers[some], weight[some], kernels[some])
+            part = slice(first, first + TOGETHER)
+            yield Part(lines[part], layers[part], weight[part], kernels[part])
 
 
 class Part(NamedTuple):
@@ -238,10 +238,10 @@ def kernels_of(
         return image
     sigma = optics.intrinsic_mm / FWHM / pitch
     across, down = _gaussian(sigma[:, 0]), _gaussian(sigma[:, 1])
-    own = (down[:, :, None] * across[:, None, :])[:, None]
-    rows, columns = own.shape[-2:]
+    kernels = (down[:, :, None] * across[:, None, :])[:, None]
+    rows, columns = kernels.shape[-2:]
     padded = F.pad(image, (columns - 1, columns - 1, rows - 1, rows - 1))
-    return F.conv2d(padded.transpose(0, 1), own, groups=len(own)).transpose(0, 1)
+    return F.conv2d(padded.transpose(0, 1), kernels, groups=len(kernels)).transpose(0, 1)
 
 
 def _places(reach: int) -> Float[Tensor, " n"]:

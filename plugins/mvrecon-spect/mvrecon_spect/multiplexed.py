@@ -47,5 +47,5 @@ class Multiplexed(Composed):
         """The views of some detectors by their own pinholes; some pixels by all of their views."""
         if not isinstance(selection, ViewSelection):
             return super().subset(selection)
-        own = [view * self.holes + hole for view in selection.views for hole in range(self.holes)]
-        return Multiplexed(self.B.subset(ViewSelection(self.B.range_shape, own)), self.holes)
+        views = [view * self.holes + hole for view in selection.views for hole in range(self.holes)]
+        return Multiplexed(self.B.subset(ViewSelection(self.B.range_shape, views)), self.holes)

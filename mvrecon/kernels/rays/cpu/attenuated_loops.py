@@ -53,7 +53,7 @@ def _attenuate(matter, rig, ray, part, ascending, steps, desk):
 
 @scalar
 def _spread(volume, rig, ray, span, made, steps, desk):
-    """Add to a volume, along a span of a ray, every segment's length times its number in `own`.
+    """Add to a volume, along a span of a ray, every segment's length times its number in `value`.
 
     `made` are the slabs whose segments are known, and whose cells are in the room unless it ends
     before it begins.
@@ -63,7 +63,7 @@ def _spread(volume, rig, ray, span, made, steps, desk):
     if made[0] != span[0] or made[1] != span[1]:
         count = visit(rig, ray, span, desk.room)[0]
         cells(rig, ray, count, steps, desk.room)
-    weigh(rig, desk.room, desk.path.own, span[0] - made[0], count)
+    weigh(rig, desk.room, desk.path.value, span[0] - made[0], count)
     if rig.method == SIDDON:
         siddon.spread(store, n, count, desk.room, real(ray.length))
     else:
@@ -131,7 +131,7 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
             for n in range(len(views)):
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
-                    path.own[i] *= path.share[i]
+                    path.value[i] *= path.share[i]
                 made = part if n == 0 else (part[0], part[0] - 1)
                 _spread(Matter(store, n), rig, ray, span, made, steps, desk)
 
@@ -167,6 +167,6 @@ def bend_slabs(store, matter, rig, desk, reads, views, slabs):
                 )
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
-                    path.source[i] += path.own[i] * path.emission[i]
+                    path.source[i] += path.value[i] * path.emission[i]
             bend(path, count, ascending)
             _spread(Matter(store, 0), rig, ray, span, part, steps, desk)

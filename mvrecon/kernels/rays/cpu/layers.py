@@ -43,12 +43,14 @@ def deal(path, count, values):
 
 @scalar
 def gather(path, count, values):
-    """Into `own`: the value of a pixel's layers at its segments, the transpose of `deal`."""
+    """Into `value`: the value of a pixel's layers at its segments, the transpose of `deal`."""
     last = len(values) - 2
     for i in range(count):
         k = min(int(path.layer[i]), last) if last >= 0 else 0
         part = path.layer[i] - k if last >= 0 else path.layer.dtype.type(0)
-        path.own[i] = values[k] if last < 0 else values[k] - part * values[k] + part * values[k + 1]
+        path.value[i] = (
+            values[k] if last < 0 else values[k] - part * values[k] + part * values[k + 1]
+        )
 
 
 @scalar

@@ -23,7 +23,7 @@ from mvrecon.kernels.rays.trace import SIDDON
 #: Per segment: optical depth, mean transmission within the segment and then from all of it to the
 #: end, transmission from its near end, what it emits, that of one volume, what is
 #: spread into it, and its place among the layers.
-Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "own", "layer"])
+Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "value", "layer"])
 #: Up to this optical depth (1 - exp(-m)) / m and its slope are series; the terms that are left out
 #: are below the last digit of double precision.
 SERIES = 0.5
@@ -140,25 +140,25 @@ def weigh(rig, room, share, first, count):
 
 @scalar
 def bend(path, number, ascending):
-    """Into `own`: the derivative of the sum of what all segments send out by their optical
+    """Into `value`: the derivative of the sum of what all segments send out by their optical
     depths.
 
     A segment weakens itself and all those beyond it.
     """
     depth, share, passed, source = path.depth, path.share, path.passed, path.source
-    own, real = path.own, depth.dtype.type
+    value, real = path.value, depth.dtype.type
     for i in range(np.uint32(number)):
-        own[i] = slope_of_mean(depth[i])
+        value[i] = slope_of_mean(depth[i])
     if deepest(depth, number) > real(SERIES):
         for i in range(np.uint32(number)):
             m = np.float64(depth[i])
             if m > SERIES:
-                own[i] = real((exp(-m) * (1 + m) - 1) / (m * m))
+                value[i] = real((exp(-m) * (1 + m) - 1) / (m * m))
     for i in range(np.uint32(number)):
-        own[i] *= passed[i] * source[i]
+        value[i] *= passed[i] * source[i]
         source[i] *= share[i]
     beyond = 0.0
     for j in range(np.uint32(number)):
         i = np.uint32(number) - np.uint32(1) - j if ascending else j
-        own[i] = real(own[i] - beyond)
+        value[i] = real(value[i] - beyond)
         beyond += source[i]
