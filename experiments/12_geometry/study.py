@@ -1,6 +1,6 @@
 """Where does geometry inside a network pay? One protocol for all arms and regimes.
 
-    python experiments/12_geometry/study.py pace  # seconds of a step of each arm
+    python experiments/12_geometry/study.py pace  # seconds of a step of each arm in each regime
     python experiments/12_geometry/study.py train --seconds 400  # every run that is not there yet
     python experiments/12_geometry/study.py table  # results.csv, paired.csv, curves.png
 
@@ -17,6 +17,7 @@ import sys
 import time
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
@@ -24,6 +25,7 @@ from mvrecon.config import compose
 from mvrecon.engine.fit import build_module
 
 HERE = Path(__file__).parent
+PACE = HERE / "pace.csv"
 BASE = (
     "experiment=open_kbp_rounds",
     "~compare.rounds_world",
@@ -64,11 +66,41 @@ CLASSICAL = {
         "model.model.reconstructor.weight=1e-4",
     ),
 }
-#: Views of each regime, and the support that its networks work in.
+
+
+class Regime(NamedTuple):
+    """What differs between the views of the regimes.
+
+    Args:
+        views: overrides of rig and acquisition.
+        support: that the networks work in; a hull of views that err can cut into the object.
+    """
+
+    views: tuple[str, ...] = ()
+    support: str = "hull"
+
+
+def _disturbed(options: str) -> Regime:
+    return Regime((f"acquisition={{disturbed: {{{options}}}}}",), "none")
+
+
 REGIMES = {
-    "clean": ((), "hull"),
-    "rig": (("acquisition={disturbed: {views: 3, shift_px: 1.0, gain: 0.05}}",), "none"),
-    "photons": (("acquisition=photons", "acquisition.photons=1e4"), "none"),
+    "clean": Regime(),
+    "photons_1e4": Regime(("acquisition=photons", "acquisition.photons=1e4")),
+    "photons_1e3": Regime(("acquisition=photons", "acquisition.photons=1e3"), "none"),
+    "rig": _disturbed("views: 3, shift_px: 1.0, gain: 0.05"),
+    "rig_one": _disturbed("views: 1, shift_px: 1.0, gain: 0.05"),
+    "rig_all": _disturbed("views: 8, shift_px: 1.0, gain: 0.05"),
+    "views_2": Regime(("camera.n_views=2",)),
+    "views_3": Regime(("camera.n_views=3",)),
+    "views_4": Regime(("camera.n_views=4",)),
+    "views_16": Regime(("camera.n_views=16",)),
+    "pixels_half": Regime(
+        ("camera.detector.pixels=[96,96]", "camera.detector.pixel_mm=[9.0,10.0]")
+    ),
+    "pixels_third": Regime(
+        ("camera.detector.pixels=[144,144]", "camera.detector.pixel_mm=[6.0,6.6667]")
+    ),
 }
 
 
@@ -90,14 +122,14 @@ def paths(data: Path) -> list[str]:
     return [f"{key}={data / name}" for key, name in files]
 
 
-def pace(data: Path) -> None:
-    """Measure the processor seconds of a training step of each arm; alignment is not in it, since
-    it is computed once a case.
+def pace(options: argparse.Namespace) -> None:
+    """Measure the processor seconds of a training step of each arm in each regime that was asked
+    for; alignment is not in it, since it is computed once a case.
     """
     torch.set_num_threads(1)
-    rows = {}
-    for arm, support in product(ARMS, ("none", "hull")):
-        run = compose(*settings("clean", arm), *paths(data), f"model.support={support}")
+    rows = _paces()
+    for regime, arm in product(options.regimes, ARMS):
+        run = compose(*settings(regime, arm), *paths(options.data))
         module = build_module(run, run["model"], 0.04)
         volume = torch.zeros(4, 1, 32, 32, 32)
         volume[:, :, 6:26, 8:24, 6:26] = 0.02
@@ -111,26 +143,29 @@ def pace(data: Path) -> None:
             optimizer.step()
             optimizer.zero_grad()
             times.append(time.process_time() - start)
-        rows[arm, support] = min(times[1:])
-    with open(HERE / "pace.csv", "w", newline="") as file:
+        rows[regime, arm] = min(times[1:])
+    with open(PACE, "w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(("arm", "support", "seconds_per_step"))
+        writer.writerow(("regime", "arm", "seconds_per_step"))
         writer.writerows((*key, f"{value:.3f}") for key, value in rows.items())
+
+
+def _paces() -> dict[tuple[str, str], float]:
+    if not PACE.exists():
+        return {}
+    with open(PACE, newline="") as file:
+        return {(r["regime"], r["arm"]): float(r["seconds_per_step"]) for r in csv.DictReader(file)}
 
 
 def steps(regime: str, arm: str, seconds: int) -> int:
     """Training steps of an arm in so many processor seconds."""
-    with open(HERE / "pace.csv", newline="") as file:
-        rows = {
-            (r["arm"], r["support"]): float(r["seconds_per_step"]) for r in csv.DictReader(file)
-        }
-    return round(seconds / rows[arm.removesuffix("_aligned"), REGIMES[regime][1]])
+    return round(seconds / _paces()[regime, arm.removesuffix("_aligned")])
 
 
 def train(options: argparse.Namespace) -> None:
     """Train every arm that was asked for and is not trained yet, one after the other."""
     for regime, arm, seed in product(options.regimes, options.arms, options.seeds):
-        if regime != "rig" and arm.endswith("_aligned"):
+        if "disturbed" not in "".join(REGIMES[regime].views) and arm.endswith("_aligned"):
             continue
         seconds = 0 if arm in CLASSICAL else options.seconds
         folder = options.runs / regime / arm / f"{seconds}s_{seed}"
@@ -240,10 +275,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     options = parser.parse_args()
     options.data, options.runs = options.data.resolve(), options.runs.resolve()
-    if options.task == "pace":
-        pace(options.data)
-    else:
-        {"train": train, "table": table}[options.task](options)
+    {"pace": pace, "train": train, "table": table}[options.task](options)
 
 
 if __name__ == "__main__":
