@@ -124,15 +124,15 @@ def test_the_table_has_the_figures_where_the_truth_is_known(case):
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """One step of a model whose cameras correct views, and of one whose do not."""
-    return trained_for_a_step(tmp_path_factory.mktemp("run"), "rounds", "geometry_free")
+    return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view", "geometry_free")
 
 
 def test_views_are_corrected_by_the_cameras_of_a_trained_model(runs):
-    module = mv.load(runs, "rounds").module.eval()
+    module = mv.load(runs, "cross_view").module.eval()
     views = module.projector(torch.rand(1, 1, *module.projector.grid.shape))
     with torch.inference_mode():
         expected = module(views).corrected_views[-1]
-    assert torch.equal(corrected_by(module.projector, views, str(runs), "rounds").views, expected)
+    assert torch.equal(corrected_by(module.projector, views, str(runs), "cross_view").views, expected)
 
 
 @pytest.mark.door
@@ -140,7 +140,7 @@ def test_a_correction_that_does_not_fit_is_refused(case, runs, tmp_path, capsys)
     """A model that corrects no view, a calibration without an alignment and an unknown option are
     refused.
     """
-    A = mv.load(runs, "rounds").module.projector
+    A = mv.load(runs, "cross_view").module.projector
     with pytest.raises(ValueError, match="whose cameras correct"):
         corrected_by(A, torch.ones(1, 1, *A.range_shape), str(runs), "geometry_free")
     with pytest.raises(TypeError, match="alternations"):
