@@ -31,7 +31,7 @@ class Acquisition:
             projector's unit. None: no counts.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
-        disturbed: errors of some views of each case that nobody knows, before all that the detector does.
+        disturbed: errors of some views that nobody knows, before all that the detector does.
 
     Raises:
         TypeError: an option that is no number.
