@@ -100,18 +100,21 @@ def view_metrics(
 
 
 def camera_metrics(
-    by: Alignment, shift_px: Float[Tensor, "b m 2"], gain: Float[Tensor, "b m"]
+    by: Alignment,
+    shift_px: Float[Tensor, "b m 2"],
+    gain: Float[Tensor, "b m"],
+    wrong: Bool[Tensor, "b m"],
 ) -> dict[str, float]:
     """Root-mean-square errors of estimated shifts (pixels) and gains over all cameras, beside those
-    of estimating nothing, and the AUC of telling which cameras are disturbed.
+    of estimating nothing, and the AUC of telling which cameras are wrong.
 
     Args:
         by: the estimates of b cases.
         shift_px, gain: the truth.
+        wrong: the cameras with any error, these or others.
     """
-    disturbed = (shift_px != 0).any(dim=-1) | (gain != 1)
     return {
-        "auc": auc(by.deviation(), disturbed),
+        "auc": auc(by.deviation(), wrong),
         "shift_rms_px": _rms(by.shift_px - shift_px),
         "gain_rms": _rms(by.gain - gain),
         "true_shift_rms_px": _rms(shift_px),

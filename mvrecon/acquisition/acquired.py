@@ -131,9 +131,7 @@ class Acquired:
 
         sample = self.store(index, seed, grid, rig, ideal) if self.store else ideal()
         if errors is not None:
-            gain = errors.gain.to(sample.views)
-            shift = errors.offset_px.to(sample.views)
-            sample = replace(sample, views=sample.views * gain, shift_px=shift, gain=gain[:, 0, 0])
+            sample = replace(sample, views=errors.views(sample.views), errors=errors.record())
         return replace(sample, views=detected(sample.views, self.acquisition, cameras, rng))
 
     def _ideal(self, index: int, seed: int, grid: Grid, rig: Any) -> Sample:

@@ -31,11 +31,12 @@ class Acquisition:
             projector's unit. None: no counts.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
-        disturbed: rig errors of each case that nobody knows, before all that the detector does.
+        disturbed: errors of some views that nobody knows, before all that the detector does.
 
     Raises:
         TypeError: an option that is no number.
-        ValueError: numbers that are too small or not finite; photons and counts at once.
+        ValueError: numbers that are too small or not finite; photons and counts at once; counts of
+            overexposed views.
     """
 
     fine: int = 2
@@ -60,6 +61,12 @@ class Acquisition:
             raise ValueError(
                 f"Electronic noise is in photons, so photons must be finite, got photons inf and "
                 f"noise {self.noise}"
+            )
+
+        if self.counts is not None and self.disturbed is not None and self.disturbed.saturated:
+            raise ValueError(
+                f"disturbed.saturated is of overexposed line integrals; expected no counts, got "
+                f"{self.counts}"
             )
 
     @classmethod

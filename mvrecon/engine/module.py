@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.engine.schedule import build_optimizer, build_schedule
+from mvrecon.engine.wrong_cameras import TRUTH
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.metrics import camera_metrics, view_metrics, volume_metrics
@@ -116,7 +117,7 @@ class ReconstructionModule(L.LightningModule):
         ]
         means = {name: torch.tensor([f[name] for f in figures]).nanmean() for name in figures[0]}
         if out.alignment is not None and "gain" in batch:
-            known = camera_metrics(out.alignment, batch["shift_px"], batch["gain"])
+            known = camera_metrics(out.alignment, *(batch[key] for key in TRUTH))
             means |= {f"cameras_{name}": torch.tensor(value) for name, value in known.items()}
         for name, value in (terms | means).items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr", batch_size=len(predicted))

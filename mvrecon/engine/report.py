@@ -80,7 +80,8 @@ def _spoilt(acquisition: Mapping[str, Any]) -> str:
     """The options of a detector that are not zero, without those that do nothing."""
     silent = {"fine"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
     errors = acquisition.get("disturbed") or {}
-    disturbed = {f"disturbed.{name}": value for name, value in errors.items()}
+    usual = {"probability": 1, **({"views": 1} if errors.get("lost") else {})}
+    disturbed = {f"disturbed.{k}": v for k, v in errors.items() if v != usual.get(k)}
     shown = {**acquisition, "disturbed": 0, **disturbed}
     return ", ".join(f"{k} {v:g}" for k, v in shown.items() if v and k not in silent)
 

@@ -11,8 +11,8 @@ from mvrecon.metrics import camera_metrics
 
 #: Standard errors from which a camera counts as wrong.
 CLEAR = 3.0
-#: The true shifts and gains of a batch, by their names in it.
-TRUTH = ("shift_px", "gain")
+#: The true shifts and gains of a batch, and which cameras are wrong, by their names in it.
+TRUTH = ("shift_px", "gain", "wrong")
 
 
 def cameras_of(alignment: Alignment | None, scene: Mapping[str, Any]) -> dict[str, Any]:
@@ -34,8 +34,8 @@ def camera_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     row = {"deviation": by.deviation().tolist()}
     row |= {field.name: getattr(by, field.name).tolist() for field in fields(Alignment)}
     if all("true_gain" in score for score in known):
-        shift, gain = (torch.cat([score[f"true_{key}"] for score in known]) for key in TRUTH)
-        row |= camera_metrics(by, shift, gain)
+        truth = (torch.cat([score[f"true_{key}"] for score in known]) for key in TRUTH)
+        row |= camera_metrics(by, *truth)
     return {"cameras": row}
 
 

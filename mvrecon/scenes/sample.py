@@ -1,9 +1,10 @@
 """Scenes, and the samples that they make: the measured views of a case and the true volume."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
@@ -32,16 +33,14 @@ class Sample:
         volume: truth on the grid, float32.
         inside: the voxels that the object touches.
         name: of the case, the same for the same (seed, index).
-        shift_px: of each detector along (u, v), which nobody knows; none where there is none.
-        gain: of each view, likewise.
+        errors: what is wrong with each view and nobody knows, by name; empty where nothing is.
     """
 
     views: Float[Tensor, "1 m v u"]
     volume: Float[Tensor, "1 d h w"]
     inside: Bool[Tensor, "1 d h w"]
     name: str
-    shift_px: Float[Tensor, "m 2"] | None = None
-    gain: Float[Tensor, " m"] | None = None
+    errors: Mapping[str, Shaped[Tensor, "m *n"]] = field(default_factory=dict)
 
 
 class Scene(Protocol):

@@ -1,13 +1,14 @@
 """Rig errors that nobody knows: which views, by how much, and that they are those of a moved
 detector."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
 from mvrecon.acquisition.acquired import Acquired
-from mvrecon.acquisition.disturbances import Disturbance, RigErrors, rig_errors
+from mvrecon.acquisition.disturbances import Disturbance, rig_errors
+from mvrecon.acquisition.rig_errors import RigErrors
 from mvrecon.acquisition.settings import Acquisition
 from mvrecon.engine.report import remarks
 from mvrecon.geometry.grid import Grid
@@ -34,7 +35,7 @@ def measured(rig="cone", index=0, projector="drr", **options):
 def test_a_detector_moved_by_one_column_and_two_rows_sees_what_its_neighbours_saw(rig):
     scene = SCENES.build("ellipsoids")
     offset = torch.tensor([[1.0, 2.0]]).expand(5, 2)
-    moved = RigErrors(offset, torch.ones(5, 1, 1)).rig(RIGS[rig])
+    moved = replace(RigErrors.none(5), shift_px=offset).rig(RIGS[rig])
     views = scene.sample(0, 0, GRID, RIGS[rig]).views
     seen = scene.sample(0, 0, GRID, moved).views
     assert torch.allclose(seen[..., :-2, :-1], views[..., 2:, 1:], atol=1e-4 * float(views.max()))
@@ -59,7 +60,7 @@ def test_a_gain_is_a_factor_of_a_view_within_its_bounds():
 def test_shifts_are_drawn_anew_for_each_case_and_again_for_the_same():
     options = {"views": 5, "shift_px": 0.7}
     errors = [rig_errors(Disturbance(**options), RIGS["cone"], generator(0, i)) for i in range(40)]
-    offsets = torch.stack([one.offset_px for one in errors])
+    offsets = torch.stack([one.shift_px for one in errors])
     assert float(offsets.abs().max()) <= 0.7
     # of a uniform number: 200 draws along each axis, within 4 standard errors
     assert float(offsets.square().mean()) == pytest.approx(0.7**2 / 3, rel=0.18)
@@ -82,6 +83,55 @@ def test_a_projector_on_a_finer_grid_is_disturbed_as_line_integrals_are(monkeypa
     assert (views - line).norm() < 0.15 * line.norm() < 0.5 * (views - still).norm()
 
 
+def test_a_motion_of_the_object_is_seen_as_the_moved_object_is():
+    """A scene that stands one voxel further along x, y and z, against one that moved there."""
+    motion = torch.tensor([[10.0, -10.0, 20.0]]).expand(5, 3)
+    volume = torch.zeros(1, 1, 12, 12, 12)
+    volume[..., 4:7, 5:8, 3:7] = 1.0
+    moved = volume.roll((2, -1, 1), dims=(2, 3, 4))
+    still = Drr(GRID, RIGS["cone"], method="siddon")
+    rig = replace(RigErrors.none(5), motion_mm=motion).rig(RIGS["cone"])
+    seen = Drr(GRID, rig, method="siddon")(volume)
+    assert torch.allclose(seen, still(moved), rtol=1e-4, atol=1e-3)
+
+
+def test_a_detector_turned_about_its_normal_sees_the_turned_view():
+    """By 180 degrees: columns and rows are reversed; the middle of the detector stays."""
+    turn = torch.tensor([[0.0, 0.0, 180.0]]).expand(5, 3)
+    turned = replace(RigErrors.none(5), tilt_deg=turn).rig(RIGS["cone"])
+    scene = SCENES.build("ellipsoids")
+    views = scene.sample(0, 0, GRID, RIGS["cone"]).views
+    seen = scene.sample(0, 0, GRID, turned).views
+    assert torch.allclose(seen.flip(2, 3), views, atol=1e-4 * float(views.max()))
+
+
+def test_lost_overexposed_and_truncated_views_are_cut_versions_of_the_right_ones():
+    plain, index = measured().views, torch.arange(16)
+    for options in ({"lost": 1}, {"saturated": 0.25}, {"truncated": 0.25}):
+        wrong, known = measured(**options), measured(**options).errors["wrong"]
+        assert int(known.sum()) == 1
+        view, right = wrong.views[0, known][0], plain[0, known][0]
+        assert torch.equal(wrong.views[:, ~known], plain[:, ~known])
+        if "lost" in options:
+            assert not view.any() and float(wrong.errors["gain"][known]) == 0
+        elif "saturated" in options:
+            assert torch.equal(view, right.clamp_min(0.25 * float(right.max())))
+        else:
+            ends = right * (index < 12), right * (index >= 4)
+            assert any(torch.equal(view, end) for end in ends)
+
+
+def test_views_are_wrong_with_their_probability_and_only_so_many():
+    options = {"views": 3, "shift_px": 1.0, "lost": 5, "probability": 0.3}
+    errors = [rig_errors(Disturbance(**options), RIGS["cone"], generator(1, i)) for i in range(60)]
+    lost = torch.stack([one.gain == 0 for one in errors]).double()
+    moved = torch.stack([one.shift_px.any(dim=1) for one in errors])
+    # 300 and 180 draws, within 4 standard errors
+    assert float(lost.mean()) == pytest.approx(0.3, abs=0.106)
+    assert float(moved.sum()) / 180 == pytest.approx(0.3, abs=0.137)
+    assert int(moved.sum(dim=1).max()) <= 3
+
+
 def test_a_table_says_that_views_were_disturbed():
     """By each option's name and value."""
     acquisition = asdict(Acquisition(disturbed=Disturbance(views=3, shift_px=1.0, gain=0.05)))
@@ -95,11 +145,13 @@ def test_a_table_says_that_views_were_disturbed():
     [
         ({"views": 0}, ValueError, "disturbed.views as a whole number of at least 1, got 0"),
         ({"views": 6}, ValueError, "at most the rig's 5 cameras, got 6"),
-        ({"shift_px": -1.0}, ValueError, "disturbed.shift_px of at least 0"),
-        ({"gain": float("nan")}, ValueError, "disturbed.gain from 0 to below 1"),
+        ({"shift_px": -1.0}, ValueError, "disturbed.shift_px as a number of at least 0"),
+        ({"gain": float("nan")}, ValueError, "disturbed.gain as a number from 0 to below 1"),
+        ({"lost": 1.5}, ValueError, "disturbed.lost as a whole number of at least 0, got 1.5"),
+        ({"truncated": 1.0}, ValueError, "disturbed.truncated as a number from 0 to below 1"),
         ({"gain": "5 %"}, TypeError, "disturbed.gain as a number, got '5 %'"),
         ({"shift": 1.0}, TypeError, "no option 'shift'; did you mean 'shift_px'"),
-        (3, TypeError, "disturbed is a mapping of views, shift_px, gain, got 3"),
+        (3, TypeError, "disturbed is a mapping of views, shift_px, .*, got 3"),
     ],
 )
 def test_disturbances_that_make_no_sense_are_refused(options, error, message):

@@ -32,8 +32,8 @@ def disturbed(measurement):
     rng = torch.Generator().manual_seed(1)
     disturbance = Disturbance(views=3, shift_px=1.0, gain=0.05)
     errors = [rig_errors(disturbance, A.cameras, rng) for _ in views]
-    shift = torch.stack([one.offset_px for one in errors]).float()
-    gain = torch.stack([one.gain[:, 0, 0] for one in errors]).float()
+    shift = torch.stack([one.shift_px for one in errors]).float()
+    gain = torch.stack([one.gain for one in errors]).float()
     return translated(views, shift) * gain[:, None, :, None, None], shift, gain
 
 

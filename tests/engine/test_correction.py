@@ -23,6 +23,7 @@ from tests.models.rig import small_rig
 
 SHIFT, GAIN = torch.zeros(1, 8, 2), torch.ones(1, 8)
 SHIFT[0, 2], SHIFT[0, 5], GAIN[0, 5] = torch.tensor([0.9, -0.7]), torch.tensor([-0.6, 0.8]), 1.05
+WRONG = (SHIFT != 0).any(dim=-1) | (GAIN != 1)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +108,7 @@ def model_of(model: Corrected) -> dict:
 def test_the_table_has_the_figures_where_the_truth_is_known(case):
     A, _, views = case
     _, by = self_aligned(A, views)
-    row = camera_row([cameras_of(by, {"shift_px": SHIFT, "gain": GAIN})])["cameras"]
+    row = camera_row([cameras_of(by, {"shift_px": SHIFT, "gain": GAIN, "wrong": WRONG})])["cameras"]
     assert row["auc"] == 1 and row["shift_rms_px"] < 0.2 * row["true_shift_rms_px"]
     assert camera_row([cameras_of(by, {})])["cameras"].keys() == {
         "deviation",
