@@ -20,12 +20,12 @@ from mvrecon.models.consistency import (
     typical_chord,
 )
 from mvrecon.models.cropping import Cropping
-from mvrecon.models.single_pass import SinglePass
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.network import network_by_name
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
+from mvrecon.models.single_pass import SinglePass
 from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import SirtWeights, correction, sirt, sirt_weights

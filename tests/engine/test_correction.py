@@ -133,7 +133,9 @@ def test_views_are_corrected_by_the_cameras_of_a_trained_model(runs):
     views = module.projector(torch.rand(1, 1, *module.projector.grid.shape))
     with torch.inference_mode():
         expected = module(views).corrected_views[-1]
-    assert torch.equal(corrected_by(module.projector, views, str(runs), "cross_view").views, expected)
+    assert torch.equal(
+        corrected_by(module.projector, views, str(runs), "cross_view").views, expected
+    )
 
 
 @pytest.mark.door

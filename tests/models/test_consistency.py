@@ -7,8 +7,8 @@ from mvrecon.models.consistency import Consistency, weighted_for_counts
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.parts import MODELS
 from mvrecon.testing import check_model
-from tests.models.rig import small_projector
 from tests.models.cross_view.test_model import SMALL
+from tests.models.rig import small_projector
 from tests.models.test_single_pass import OPTIONS
 
 COUNTED = {"steps": 3, "noise": "poisson"}

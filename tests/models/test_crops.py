@@ -14,9 +14,9 @@ from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import cropping, crops
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.crops import cropped_geometry
-from mvrecon.models.single_pass import SinglePass
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.models.options import Options
+from mvrecon.models.single_pass import SinglePass
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.ray_transform import RayTransform
 from tests.models.rig import small_rig

@@ -11,8 +11,8 @@ from mvrecon.models.networks import UNet3d
 from mvrecon.parts import MODELS, NETWORKS
 from mvrecon.testing import check_model, check_network
 from tests.models.rig import small_projector
-from tests.models.test_single_pass import OPTIONS
 from tests.models.test_published import SMALL
+from tests.models.test_single_pass import OPTIONS
 
 BUILT_IN = {"unet": {"width": 4, "levels": 2}, **SMALL}
 

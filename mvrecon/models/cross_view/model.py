@@ -11,12 +11,12 @@ from torch import Tensor, nn
 from mvrecon.geometry.box import Box
 from mvrecon.models.consistency import Consistency, Start, Steps, checked_start, normalised
 from mvrecon.models.cropping import Cropping
+from mvrecon.models.cross_view.settings import ROUNDS, Computing, RoundOptions
+from mvrecon.models.cross_view.step import Measured, Round, State
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.cross_view.settings import ROUNDS, Computing, RoundOptions
-from mvrecon.models.cross_view.step import Measured, Round, State
 from mvrecon.projectors.operator import Projector
 
 #: Of the longest chord of a support: as long counts each ray that meets it, at least.

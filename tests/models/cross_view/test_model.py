@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+import yaml
 
+from mvrecon.config import conf_dir
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import EARLIER, ReconstructionLoss
-from mvrecon.models.frusta import Frusta
-from mvrecon.models.output import Reconstruction
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.cross_view.sampling import RaySamples
+from mvrecon.models.frusta import Frusta
+from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.reconstruct.iterative import sirt
 from mvrecon.testing import check_model
@@ -54,13 +56,13 @@ def test_every_choice_of_rounds_keeps_the_contract(rounds, support):
 
 
 def test_the_presets_have_as_many_weights_as_in_the_docs():
-    projector = small_projector()
-    world = [{"widths": [32, 48, 64]}, {"widths": [32, 48, 64]}]
-    world.append({"widths": [16, 32, 64], "resolution": "full"})
-    one = [{"widths": [18, 36, 72], "resolution": "full"}]
-    models = [CrossView(projector), CrossView(projector, world), CrossView(projector, one, consistency=3)]
-    counts = [sum(p.numel() for p in model.parameters()) for model in models]
-    assert [round(count / 1e6, 2) for count in counts] == [1.88, 1.77, 0.51]
+    projector, counts = small_projector(), []
+    for name in ("cross_view", "cross_view_frustum3d", "world_rounds", "world_unet"):
+        options = yaml.safe_load((conf_dir() / "model" / f"{name}.yaml").read_text())
+        kept = {key: value for key, value in options.items() if key not in ("name", "defaults")}
+        model = CrossView(projector, **kept)
+        counts.append(round(sum(p.numel() for p in model.parameters()) / 1e6, 2))
+    assert counts == [0.66, 0.65, 1.77, 0.51]
 
 
 def test_before_training_a_round_is_a_step_of_sirt():

@@ -10,15 +10,16 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mvrecon.config import conf_dir
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.output import Reconstruction
 from mvrecon.models.cross_view.evidence import Evidence
 from mvrecon.models.cross_view.model import CrossView
-from mvrecon.models.cross_view.settings import OpinionOptions
+from mvrecon.models.cross_view.rays2d import Rays2d
+from mvrecon.models.cross_view.settings import ROUNDS, OpinionOptions, RoundOptions
 from mvrecon.models.cross_view.views import means
+from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.testing import check_model
-from tests.models.rig import small_projector, small_rig
 from tests.models.cross_view.test_model import blob
+from tests.models.rig import small_projector, small_rig
 
 WORLD = {"widths": [4], "resolution": "full"}
 RAYS = {"name": "rays2d", "widths": [4, 6], "depths": 4}
@@ -67,20 +68,17 @@ def test_a_hull_of_odd_sizes_and_a_grid_of_one_slice_keep_the_contract():
     check_model("cross_view", projector, rounds=CHOICES["frustum3d"])
 
 
-def test_the_presets_are_the_defaults_and_have_as_many_weights_as_in_the_docs():
-    projector, counts = small_projector(), []
-    for name in ("cross_view_opinions", "cross_view_frustum3d"):
-        options = yaml.safe_load((conf_dir() / "model" / f"{name}.yaml").read_text())
-        first = options["rounds"][0]
-        if first["opinions"] is not None:
-            assert OpinionOptions.of(first["opinions"]) == OpinionOptions()
-        model = CrossView(projector, **{key: value for key, value in options.items() if key != "name"})
-        counts.append(round(sum(p.numel() for p in model.parameters()) / 1e6, 2))
-        part = inspect.signature(type(model.rounds[0].cameras)).parameters
+def test_the_preset_is_the_default():
+    options = yaml.safe_load((conf_dir() / "model" / "cross_view.yaml").read_text())
+    plain = inspect.signature(Rays2d).parameters
+    for said, default in zip(options["rounds"], ROUNDS, strict=True):
+        one, other = RoundOptions.of(said), RoundOptions.of(default)
+        assert (one.resolution, tuple(one.widths)) == (other.resolution, tuple(other.widths))
+        assert one.task == other.task
         for option in ("widths", "depths", "binning", "memory"):
-            own = first["cameras"][option]
-            assert (tuple(own) if isinstance(own, list) else own) == part[option].default
-    assert counts == [1.91, 1.87]
+            own = one.network[option]
+            assert (tuple(own) if isinstance(own, list) else own) == plain[option].default
+    assert OpinionOptions.of(options["rounds"][0]["opinions"]) == OpinionOptions()
 
 
 def test_before_training_a_round_with_opinions_is_the_round_without():
