@@ -4,6 +4,7 @@ import ast
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = sorted((ROOT / "mvrecon").rglob("*.py"))
@@ -13,15 +14,33 @@ FILES = sorted(
 SHELL = sorted((ROOT / "scripts").glob("*.sh"))
 
 
+class Function(NamedTuple):
+    """A function or method: its name, its length, and what it takes."""
+
+    name: str
+    lines: int
+    parameters: set[str]
+
+
+class Source(NamedTuple):
+    """What the rules ask of a file: its functions, and the lines that print."""
+
+    functions: list[Function]
+    prints: list[int]
+
+
 @cache
-def nodes(file: Path) -> list[ast.AST]:
-    """The syntax of a file, read once for all rules."""
-    return list(ast.walk(ast.parse(file.read_text())))
-
-
-def functions(file: Path) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
-    kinds = ast.FunctionDef | ast.AsyncFunctionDef
-    return [node for node in nodes(file) if isinstance(node, kinds)]
+def source(file: Path) -> Source:
+    """A file, read once for several rules; its syntax itself would fill the memory."""
+    functions, prints = [], []
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            parameters = {a.arg for a in node.args.args + node.args.kwonlyargs} - {"self", "cls"}
+            lines = (node.end_lineno or 0) - node.lineno + 1
+            functions.append(Function(node.name, lines, parameters))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            prints += [node.lineno] * (node.func.id == "print")
+    return Source(functions, prints)
 
 
 def broken(files: list[Path], rule: Callable[[Path], object]) -> dict[str, object]:
@@ -37,35 +56,16 @@ def test_no_file_is_too_long():
     assert broken([*FILES, *SHELL], lambda f: max(0, length(f) - 300)) == {}
 
 
-def long_functions(file: Path) -> dict[str, int]:
-    return {
-        f.name: lines for f in functions(file) if (lines := (f.end_lineno or 0) - f.lineno + 1) > 60
-    }
-
-
 def test_no_function_is_too_long():
-    assert broken(FILES, long_functions) == {}
-
-
-def many_parameters(file: Path) -> dict[str, set[str]]:
-    taken = {
-        f.name: {a.arg for a in f.args.args + f.args.kwonlyargs} - {"self", "cls"}
-        for f in functions(file)
-    }
-    return {name: names for name, names in taken.items() if len(names) > 7}
+    assert broken(FILES, lambda f: [x for x in source(f).functions if x.lines > 60]) == {}
 
 
 def test_no_function_has_too_many_parameters():
-    assert broken(FILES, many_parameters) == {}
-
-
-def prints(file: Path) -> list[int]:
-    calls = (n for n in nodes(file) if isinstance(n, ast.Call))
-    return [c.lineno for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
+    assert broken(FILES, lambda f: [x for x in source(f).functions if len(x.parameters) > 7]) == {}
 
 
 def test_the_package_does_not_print():
-    assert broken(PACKAGE, prints) == {}
+    assert broken(PACKAGE, lambda f: source(f).prints) == {}
 
 
 def test_the_median_file_is_short():
