@@ -128,9 +128,9 @@ class Opinions(nn.Module):
         self, volume: Float[Tensor, "b 1 d h w"], largest: bool = False
     ) -> Float[Tensor, "b 1 e i x"]:
         """The mean, or the largest, value of each cell."""
-        if self.edge == 1:
-            return volume
-        return max_pool3d(volume, 2, ceil_mode=True) if largest else halved(volume)
+        for _ in range(self.edge.bit_length() - 1):
+            volume = max_pool3d(volume, 2, ceil_mode=True) if largest else halved(volume)
+        return volume
 
     def _density(
         self,

@@ -9,7 +9,7 @@ from mvrecon.models.cross_view.unet import Precision
 from mvrecon.registry import check_options
 
 #: Voxels of a cell along each axis, by the resolution of a round.
-EDGES = {"half": 2, "full": 1}
+EDGES = {"quarter": 4, "half": 2, "full": 1}
 
 
 class Checked:
@@ -79,8 +79,8 @@ class RoundOptions(Checked):
     """One round's resolution, widths, cameras and opinions.
 
     Args:
-        resolution: of the network in the world: "half", cells of 8 voxels as its channels, or
-            "full".
+        resolution: of the network in the world and of opinions: "quarter", "half", cells of 64 or
+            of 8 voxels as its channels, or "full".
         widths: channels of each of its scales, the finest first.
         cameras: the cameras' network: `{name: ..., correct: true, shared: true, **options}`:
             whether it corrects the views, and is one for all cameras or one each; none for a
@@ -94,7 +94,7 @@ class RoundOptions(Checked):
 
     what: ClassVar[str] = "A round"
 
-    resolution: Literal["half", "full"] = "half"
+    resolution: Literal["quarter", "half", "full"] = "half"
     widths: Sequence[int] = (32, 48, 64)
     cameras: Mapping[str, Any] | None = None
     opinions: Mapping[str, Any] | None = None
@@ -102,7 +102,7 @@ class RoundOptions(Checked):
     def __post_init__(self) -> None:
         if self.resolution not in EDGES:
             raise ValueError(
-                f"Expected the resolution of a round as half or full, got {self.resolution!r}"
+                f"Expected the resolution of a round as {', '.join(EDGES)}, got {self.resolution!r}"
             )
         if not self.widths or min(self.widths) < 1:
             raise ValueError(
@@ -167,9 +167,9 @@ class Computing(Checked):
             raise ValueError(f"Expected the precision float32 or auto, got {self.precision!r}")
 
 
-#: Cameras correct, place and weigh at half resolution; a network in the world at full resolution,
+#: Cameras correct, place and weigh at a quarter of the resolution; a network in the world at full resolution,
 #: with a second correction of the views.
 ROUNDS: tuple[Mapping[str, Any], ...] = (
-    {"resolution": "half", "widths": (8,), "cameras": {"name": "rays2d"}, "opinions": {}},
+    {"resolution": "quarter", "widths": (8,), "cameras": {"name": "rays2d"}, "opinions": {}},
     {"resolution": "full", "widths": (16, 32, 64), "cameras": {"name": "rays2d"}},
 )

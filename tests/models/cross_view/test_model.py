@@ -62,7 +62,7 @@ def test_the_presets_have_as_many_weights_as_in_the_docs():
         kept = {key: value for key, value in options.items() if key not in ("name", "defaults")}
         model = CrossView(projector, **kept)
         counts.append(round(sum(p.numel() for p in model.parameters()) / 1e6, 2))
-    assert counts == [0.66, 0.65, 1.77, 0.51]
+    assert counts == [0.71, 0.7, 1.77, 0.51]
 
 
 def test_before_training_a_round_is_a_step_of_sirt():
@@ -239,7 +239,7 @@ def test_parallel_beams_have_rays_too():
     ("options", "error", "message"),
     [
         ({"rounds": []}, ValueError, "at least one round"),
-        ({"rounds": [{"resolution": "double"}]}, ValueError, "half or full, got 'double'"),
+        ({"rounds": [{"resolution": "double"}]}, ValueError, "quarter, half, full, got 'double'"),
         ({"rounds": [{"widths": []}]}, ValueError, "widths of a round"),
         ({"rounds": [{"width": 3}]}, TypeError, "no option 'width'; did you mean 'widths'"),
         ({"rounds": [{"cameras": {"name": "ray2d"}}]}, LookupError, "did you mean 'rays2d'"),

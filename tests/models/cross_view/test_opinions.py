@@ -36,6 +36,7 @@ CHOICES = {
     "uniform": rounds(opinions={"prior": "uniform"}),
     "density": rounds(opinions={"head": {"name": "density"}}),
     "full": rounds(opinions={}, resolution="full"),
+    "quarter": rounds(opinions={}, resolution="quarter"),
     "placed alone": rounds({**RAYS, "correct": False}, opinions={}),
     "one each": rounds({**RAYS, "shared": False}, opinions={}),
     "frustum3d": rounds(FRUSTA),
