@@ -34,7 +34,8 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     import_plugins(settings["plugins"])
     from mvrecon.engine import evaluation, fit, hparams, processes, run_folder
 
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for part in ("pytorch", "fabric"):
+        logging.getLogger(f"lightning.{part}").setLevel(logging.WARNING)
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
     if rank() > 0:

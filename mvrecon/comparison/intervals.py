@@ -31,8 +31,8 @@ def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
 
 
 def t_quantile(level: float, freedom: int) -> float:
-    """The t for which |T| < t has a probability of `level`, T of Student's distribution with so many
-    degrees of freedom.
+    """The t for which |T| < t has a probability of `level`, T of Student's distribution with
+    `freedom` degrees of freedom.
 
     Raises:
         ValueError: a level that is not between 0 and 1, or no degree of freedom.

@@ -110,6 +110,20 @@ class _Making(Dataset[dict[str, Any]]):
         return self.cases.made(item)
 
 
+def shared(count: int, rank: int, world: int) -> range:
+    """The items of one of several processes, none of which another one has.
+
+    Raises:
+        ValueError: fewer items than processes, but for none at all.
+    """
+    if 0 < count < world:
+        raise ValueError(
+            f"Expected no validation case or at least one for each of {world} processes "
+            f"(data.sizes.val), got {count}"
+        )
+    return range(rank, count, world)
+
+
 class EpochOrder(Sampler[int]):
     """A random order of `count` items that depends only on (seed, epoch), so that a resumed run
     continues with the items it has not used.

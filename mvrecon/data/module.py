@@ -15,7 +15,7 @@ from mvrecon.acquisition.acquired import Acquired
 from mvrecon.acquisition.settings import Acquisition
 from mvrecon.data import digests as sha256
 from mvrecon.data.case_store import CaseStore
-from mvrecon.data.dataset import EpochOrder, SceneDataset
+from mvrecon.data.dataset import EpochOrder, SceneDataset, shared
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 from mvrecon.registry import check_options
@@ -204,19 +204,8 @@ class SceneData(L.LightningDataModule):
         return self._loader("train", self._order)
 
     def val_dataloader(self) -> DataLoader[dict[str, Any]]:
-        """Validation batches; with several processes, this one's share, each case once.
-
-        Raises:
-            ValueError: fewer cases than processes.
-        """
-        rank, world = self._share
-        count = len(self.sets["val"])
-        if 0 < count < world:
-            raise ValueError(
-                f"Expected data.sizes.val of 0 or at least the number of processes, {world}, got "
-                f"{count}"
-            )
-        return self._loader("val", range(rank, count, world))
+        """Validation batches; with several processes, this one's share, see `shared`."""
+        return self._loader("val", shared(len(self.sets["val"]), *self._share))
 
     def test_dataloader(self) -> DataLoader[dict[str, Any]]:
         """Test batches."""

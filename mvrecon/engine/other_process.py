@@ -13,7 +13,8 @@ from mvrecon.engine import fit, run_folder
 def main(folder: Path) -> None:
     """Train every method of a run beside its first process, and end when that one does."""
     threading.Thread(target=_end_with_the_first, daemon=True).start()
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for part in ("pytorch", "fabric"):
+        logging.getLogger(f"lightning.{part}").setLevel(logging.WARNING)
     settings = run_folder.read_settings(folder)
     import_plugins(settings["plugins"])
     fit.fit_all(settings, fit.build_data(settings), folder)

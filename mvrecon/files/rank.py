@@ -5,7 +5,7 @@ it.
 import os
 
 #: Variables with the number of this process and with the number of all, by precedence.
-RANKS, WORLDS = ("RANK", "SLURM_PROCID"), ("WORLD_SIZE", "SLURM_NTASKS")
+RANKS, WORLDS = ("RANK", "SLURM_PROCID"), ("WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
 
 
 def rank() -> int:
