@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.engine.export import save_png
 from mvrecon.engine.run_folder import versions
-from mvrecon.files.memory import peak
+from mvrecon.files.memory import peak, restarted_peak
 from mvrecon.files.places import check_places
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
@@ -55,8 +55,9 @@ class Clock(L.Callback):
 
     def on_train_start(self, *_: Any) -> None:
         """Start."""
+        restarted_peak()  # one process trains several methods
         if torch.cuda.is_available():
-            torch.cuda.reset_peak_memory_stats()  # one process trains several methods
+            torch.cuda.reset_peak_memory_stats()
         self._mark = time.perf_counter()
 
     def on_validation_end(self, *_: Any) -> None:

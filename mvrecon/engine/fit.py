@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
-from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 
@@ -15,10 +14,11 @@ from mvrecon.engine.callbacks import Clock, Confined
 from mvrecon.engine.checkpoints import finished, unfinished
 from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
+from mvrecon.engine.processes import Environment
 from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
 from mvrecon.files.checks import plain_name
-from mvrecon.files.rank import rank
+from mvrecon.files.rank import rank, world
 from mvrecon.kernels.threads import in_one_order
 
 #: The logger whose files are read by TensorBoard.
@@ -158,7 +158,9 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     }
     fixed = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
     plugins: list[Any] = [DurableCheckpoints(folder)]
-    if "LOCAL_RANK" in os.environ:  # as `processes` and torchrun say it; SLURM may be around both
-        plugins.append(LightningEnvironment())
+    if world() > 1 and options.get("strategy", "auto") == "auto":
+        options["strategy"] = "ddp"
+    if "LOCAL_RANK" in os.environ and "TORCHELASTIC_RUN_ID" not in os.environ:
+        plugins.append(Environment())  # or SLURM's, in whose job the processes may be
     # `SceneData` shares the cases among the processes: each exactly once
     return L.Trainer(**options, **fixed, plugins=plugins, use_distributed_sampler=False)

@@ -132,7 +132,7 @@ class ReconstructionModule(L.LightningModule):
     def on_validation_epoch_end(self) -> None:
         """Log the means over the cases of all processes."""
         for name, value in (self._losses.compute() | self._figures.compute()).items():
-            self.log(f"val/{name}", value, prog_bar=name == "psnr")
+            self.log(f"val/{name}", value, prog_bar=name == "psnr", sync_dist=True)  # equal already
 
     def configure_optimizers(self) -> Any:
         """The optimiser, and its schedule over the whole number of steps, moved on at every

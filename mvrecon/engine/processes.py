@@ -12,12 +12,13 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
 import torch
+from lightning.fabric.plugins.environments import LightningEnvironment
 from torch import distributed
 
 from mvrecon.files.rank import world
@@ -57,15 +58,22 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
     try:
         with _environment(environments[0]):
             yield
-            if failed := [r for r, p in enumerate(others, 1) if p.wait(GRACE)]:
-                raise RuntimeError(f"Processes {failed} of {count} have failed; see their errors")
+        _leave()
+        if failed := [r for r, other in enumerate(others, 1) if _exit_of(other)]:
+            raise RuntimeError(f"Processes {failed} of {count} have failed; see their errors")
     finally:
         ended.set()
         for other in others:
             other.kill()
             other.wait()
-        if distributed.is_initialized():
-            distributed.destroy_process_group()
+        _leave()
+
+
+class Environment(LightningEnvironment):
+    """What Lightning knows of the processes, which train several methods one after the other."""
+
+    def teardown(self) -> None:
+        """Keep the environment for the next method, which Lightning's own would clear."""
 
 
 def devices(trainer: Mapping[str, Any]) -> int:
@@ -94,6 +102,20 @@ def _start(folder: Path, environment: Mapping[str, str]) -> subprocess.Popen[byt
         env={**os.environ, **environment, **paths},
         stdin=subprocess.PIPE,
     )
+
+
+def _exit_of(other: subprocess.Popen[bytes]) -> int:
+    """The exit status of a process that has nothing left to do; 0 where it does not come to its
+    end.
+    """
+    with suppress(subprocess.TimeoutExpired):
+        return other.wait(GRACE)
+    return 0
+
+
+def _leave() -> None:
+    if distributed.is_initialized():
+        distributed.destroy_process_group()
 
 
 def _watch(other: subprocess.Popen[bytes], ended: threading.Event) -> None:

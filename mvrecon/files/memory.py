@@ -13,8 +13,8 @@ STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def peak() -> int | None:
-    """The most memory that this process has had so far, in bytes; None on Windows, where Python
-    cannot ask for it.
+    """The most memory that this process has had so far, in bytes, on Linux since the last
+    `restarted_peak`; None on Windows, where Python cannot ask for it.
     """
     if resource is None:
         return None
