@@ -59,7 +59,9 @@ def test_two_processes_train_as_one_does_with_their_batches_together(pair):
     assert tables[0]["scenes"] == tables[1]["scenes"]
     assert rows[0]["train_steps"] == rows[1]["train_steps"] > 10
     for figure in ("psnr", "ssim", "nrmse", "view_nrmse"):
-        assert rows[0][figure]["values"] == pytest.approx(rows[1][figure]["values"], abs=1e-6)
+        assert rows[0][figure]["values"] == pytest.approx(
+            rows[1][figure]["values"], rel=1e-6, abs=1e-6
+        )
     for name in ("loss/total", "val/loss_total", "val/psnr", "val/ssim"):
         assert log(two, name) == pytest.approx(log(one, name), rel=1e-5), name
     assert tables[0]["validation_psnr"] == pytest.approx(log(one, "val/psnr")[-1], abs=0.5)
