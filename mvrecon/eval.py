@@ -75,15 +75,14 @@ def merged(run: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def task(config: DictConfig) -> float:
-    """One run of the app; returns the main method's mean PSNR in dB."""
+def task(config: DictConfig) -> None:
+    """One run of the app; returns nothing that a sweeper could choose by: these are test scenes."""
     from mvrecon.engine.report import show
     from mvrecon.engine.run_folder import anchored
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     table = evaluate(anchored(to_plain(config)), folder)
     show(table, folder)
-    return next(iter(table["methods"].values()))["psnr"]["mean"]
 
 
 def main() -> None:

@@ -5,21 +5,25 @@ Torch is imported inside the task, so that `--help` and typing mistakes are answ
 """
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
+from mvrecon.files.rank import rank
 
 
 def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
 
-    The folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
+    On several devices the first process alone writes and judges; the others return nothing. The
+    folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
     `checkpoints/`, `review/` and `results.json`.
 
     Raises:
@@ -28,16 +32,22 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             other data.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.engine import evaluation, fit, run_folder
+    from mvrecon.engine import evaluation, fit, hparams, processes, run_folder
 
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for part in ("pytorch", "fabric"):
+        logging.getLogger(f"lightning.{part}").setLevel(logging.WARNING)
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
+    if rank() > 0:
+        fit.fit_all(settings, data, folder)
+        return {}
     with run_folder.taken(folder, settings):
         run_folder.keep_measurement(folder, data)
-        for method in fit.methods(settings):
-            fit.fit(method, settings, data, folder)
+        with processes.started(folder, settings["trainer"]):
+            fit.fit_all(settings, data, folder)
         table = evaluation.results(settings, folder, data, device)
+        table["validation_psnr"] = evaluation.validation_psnr(settings, folder, data, device)
+        hparams.write(folder, settings, table)
         run_folder.write_results(folder, table)
     return table
 
@@ -60,7 +70,9 @@ def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
 
 
 def task(config: DictConfig) -> float:
-    """One run of the app; returns the main method's mean PSNR in dB, for sweepers."""
+    """One run of the app; returns the main method's PSNR on the validation's scenes in dB, for
+    sweepers: to choose by the test's scenes would spoil the test.
+    """
     from mvrecon.engine import run_folder
     from mvrecon.engine.report import show
 
@@ -70,9 +82,17 @@ def task(config: DictConfig) -> float:
         others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
         settings, folder = resumed(settings["resume"], others)
     run_folder.check(folder, settings)
-    table = train(settings, folder)
-    show(table, folder)
-    return next(iter(table["methods"].values()))["psnr"]["mean"]
+    finished = (folder / run_folder.RESULTS).is_file()
+    if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
+        return _score(run_folder.read_results(folder))
+    if table := train(settings, folder):
+        show(table, folder)
+    return _score(table)
+
+
+def _score(table: dict[str, Any]) -> float:
+    score = table.get("validation_psnr")
+    return math.nan if score is None else float(score)
 
 
 def main() -> None:

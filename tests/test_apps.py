@@ -52,7 +52,8 @@ def test_a_run_folder_holds_what_it_should(run):
         "checkpoints",
         "review",
     } <= names
-    assert any(name.startswith("events.") for name in names) and "hparams.yaml" not in names
+    boards = {path.parent.name for path in folder.rglob("events.*")}
+    assert boards == {"cross_view", "sirt"} and not list(folder.rglob("hparams.yaml"))
     settings = yaml.safe_load((folder / "config.yaml").read_text())
     assert settings["name"] == "smoke" and settings["seed"] == 3 and "hydra" not in settings
     assert {"planes.png", "mip.png", "views.png", "opinions.png", "weights.png"} <= {
@@ -72,14 +73,13 @@ def test_the_log_tells_losses_figures_and_times(run):
 def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    board = EventAccumulator(str(run[0])).Reload()
+    board = EventAccumulator(str(run[0] / "cross_view")).Reload()
     tags = board.Tags()
     assert {f"review/{name}" for name in ("planes", "mip", "views", "opinions", "weights")} <= set(
         tags["images"]
     )
-    assert {"loss/total", "val/psnr", "time/step_ms", "hp/psnr", "hp/seconds", "hp/peak_mb"} <= set(
-        tags["scalars"]
-    )
+    curves = {"loss/total", "val/psnr", "time/step_ms"}
+    assert curves | {"test/psnr", "test/ssim", "test/view_nrmse", "test/ms"} <= set(tags["scalars"])
     assert any("text/run" in tag for tag in tags["tensors"])
     assert "hp_metric" not in tags["scalars"]
 

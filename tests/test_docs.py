@@ -11,7 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 
+from mvrecon import compare
 from mvrecon.config import compose
 from mvrecon.parts import REGISTRIES
 
@@ -77,7 +80,18 @@ def test_a_command_of_a_page_composes(page: str, command: str):
     if app == "list":
         assert set(options) <= {*REGISTRIES, "--check"}, command
         return
-    compose(*(word for word in options if not word.startswith("-")), config_name=app)
+    if app == "compare":
+        compare.parser().parse_args(options)
+        return
+    given = OverridesParser.create().parse_overrides([w for w in options if not w.startswith("-")])
+    compose(*map(first_value, given), config_name=app)
+
+
+def first_value(given: Override) -> str:
+    """A setting of a command line; of a sweep, its first value."""
+    if not given.is_sweep_override():
+        return str(given.input_line)
+    return f"{given.get_key_element()}={next(given.sweep_string_iterator())}"
 
 
 def test_pages_show_commands_of_every_app():

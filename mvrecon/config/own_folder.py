@@ -1,12 +1,22 @@
 """A new folder for every run and every sweep, made before Hydra writes."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
+from mvrecon.config import conf_dir, plugin_conf_dirs
 from mvrecon.files.atomic import check_plain, new_folder
+from mvrecon.files.checks import shown
+from mvrecon.files.rank import world
+
+#: Hydra's own way to run the jobs of a sweep: one after the other, in this process.
+IN_TURN = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+#: Where Hydra keeps the names of settings that the names of a sweep's runs leave out.
+UNNAMED = "hydra.job.config.override_dirname.exclude_keys"
 
 
 class OwnFolder(Callback):
@@ -14,24 +24,39 @@ class OwnFolder(Callback):
     same.
 
     A folder that the command line names is taken as it is, and a resumed run has its folder
-    already. Hydra's log file is made by the first message in it, so that a run that is refused
-    leaves none.
+    already. The runs of a sweep are named by the settings that it varies. Hydra's log file is made
+    by the first message in it, so that a run that is refused leaves none.
     """
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """A run's folder."""
-        self._prepare(config, "hydra.run.dir")
+        """A run's folder.
+
+        Raises:
+            ValueError: a launcher has started several processes, which would each make its own.
+        """
+        lines = (*config.hydra.overrides.hydra, *config.hydra.overrides.task)
+        if world() > 1 and not any(
+            line.startswith(("hydra.run.dir=", "resume=")) for line in lines
+        ):
+            raise ValueError(
+                f"Expected hydra.run.dir=... for the {world()} processes of one run, which share it"
+            )
+        self._prepare(config, "hydra.run.dir", {})
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """A sweep's folder."""
-        self._prepare(config, "hydra.sweep.dir")
+        """A sweep's folder.
 
-    def _prepare(self, config: DictConfig, key: str) -> None:
-        overrides, log, changes = (
-            config.hydra.overrides.hydra,
-            "hydra.job_logging.handlers.file",
-            {},
-        )
+        Raises:
+            PermissionError: the sweep's jobs would compose configs from elsewhere in processes of
+                their own, which do not check them.
+        """
+        check_launcher(config)
+        tasks = OverridesParser.create().parse_overrides(list(config.hydra.overrides.task))
+        fixed = [task.key_or_group for task in tasks if not task.is_sweep_override()]
+        self._prepare(config, "hydra.sweep.dir", {UNNAMED: fixed})
+
+    def _prepare(self, config: DictConfig, key: str, changes: dict[str, str | list[str]]) -> None:
+        overrides, log = config.hydra.overrides.hydra, "hydra.job_logging.handlers.file"
         if OmegaConf.select(config, log):
             changes[f"{log}.delay"] = "true"
         if not any(line.lstrip("+").startswith(f"{key}=") for line in overrides):
@@ -39,8 +64,7 @@ class OwnFolder(Callback):
         with read_write(config), open_dict(config):
             for name, value in changes.items():
                 OmegaConf.update(config, name, value)
-                quoted = value.replace("'", r"\'")
-                overrides.append(f"++{name}='{quoted}'")  # a sweep's jobs are composed anew
+                overrides.append(f"++{name}={_quoted(value)}")  # a sweep's jobs are composed anew
 
     def _folder(self, config: DictConfig, key: str) -> Path:
         if not config.get("resume"):
@@ -49,3 +73,30 @@ class OwnFolder(Callback):
         folder = path if path.is_dir() else path.parent
         check_plain(folder)  # before Hydra opens a log in it
         return folder
+
+
+def check_launcher(config: DictConfig) -> None:
+    """Check that a sweep whose jobs run in other processes takes no config from elsewhere: what
+    `guarded` replaces is replaced in this process alone.
+
+    Raises:
+        PermissionError: it does; the message names the folders.
+    """
+    trusted = {str(folder) for folder in (conf_dir(), *plugin_conf_dirs())}
+    foreign = [
+        source.path
+        for source in config.hydra.runtime.config_sources
+        if source.schema == "file" and source.path not in trusted
+    ]
+    if foreign and config.hydra.launcher._target_ != IN_TURN:
+        raise PermissionError(
+            f"A sweep by {config.hydra.launcher._target_} composes its jobs in other processes, "
+            f"where configs are not checked; expected no --config-dir, got {shown(foreign)}"
+        )
+
+
+def _quoted(value: str | Sequence[str]) -> str:
+    """A value in the grammar of Hydra's command line."""
+    if not isinstance(value, str):
+        return f"[{','.join(map(_quoted, value))}]"
+    return "'" + value.replace("'", r"\'") + "'"

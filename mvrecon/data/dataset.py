@@ -9,6 +9,7 @@ from rich.progress import track
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.files.rank import rank
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import case_numbers, generator, mixed
 from mvrecon.scenes.sample import Sample, Scene, Thin
@@ -70,7 +71,10 @@ class SceneDataset(Dataset[dict[str, Any]]):
         if self._ready is None:
             console = Console(stderr=True)
             made = DataLoader(_Making(self), batch_size=None, num_workers=workers)
-            items = list(track(made, f"Preparing {what}", transient=True, console=console))
+            quiet = rank() > 0
+            items = list(
+                track(made, f"Preparing {what}", transient=True, console=console, disable=quiet)
+            )
             columns = {key: [item[key] for item in items] for key in (items[0] if items else ())}
             names = {"name": columns.pop("name", [])}
             self._ready = {key: torch.stack(column) for key, column in columns.items()} | names
@@ -103,31 +107,57 @@ class _Making(Dataset[dict[str, Any]]):
         return self.cases.made(item)
 
 
+def shared(count: int, rank: int, world: int) -> range:
+    """The items of one of several processes, none of which another one has.
+
+    Raises:
+        ValueError: fewer items than processes, but for none at all.
+    """
+    if 0 < count < world:
+        raise ValueError(
+            f"Expected no validation case or at least one for each of {world} processes "
+            f"(data.sizes.val), got {count}"
+        )
+    return range(rank, count, world)
+
+
 class EpochOrder(Sampler[int]):
     """A random order of `count` items that depends only on (seed, epoch), so that a resumed run
     continues with the items it has not used.
 
+    Several processes go through one order together, each with every `world`-th item of it; where
+    these do not come out even, the order ends with its beginning.
+
     Args:
         count: of items.
         seed: of the orders.
+        rank: number of this process.
+        world: number of processes.
 
     Attributes:
         generator: for the loader, which seeds its worker processes from it; (seed, epoch) alone
             decide that, too.
+
+    Raises:
+        ValueError: fewer items than processes.
     """
 
-    def __init__(self, count: int, seed: int):
-        self.count, self.seed = count, seed
+    def __init__(self, count: int, seed: int, rank: int = 0, world: int = 1):
+        if 0 < count < world:
+            raise ValueError(f"Expected a training case for each of {world} processes, got {count}")
+        self.count, self.seed, self.rank, self.world = count, seed, rank, world
         self.resumed, self.generator = (0, 0), torch.Generator()
         self.set_epoch(0)
 
     def __len__(self) -> int:
-        return self.count
+        return -(-self.count // self.world)
 
     def __iter__(self) -> Iterator[int]:
         epoch, n_done = self.resumed
         order = torch.randperm(self.count, generator=generator(self.seed, self.epoch)).tolist()
-        return iter(order[n_done:] if self.epoch == epoch else order)
+        order += order[: -self.count % self.world]
+        rest = order[n_done:] if self.epoch == epoch else order
+        return iter(rest[self.rank :: self.world])
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next order; Lightning calls this."""

@@ -15,7 +15,7 @@ from mvrecon.acquisition.acquired import Acquired
 from mvrecon.acquisition.settings import Acquisition
 from mvrecon.data import digests as sha256
 from mvrecon.data.case_store import CaseStore
-from mvrecon.data.dataset import EpochOrder, SceneDataset
+from mvrecon.data.dataset import EpochOrder, SceneDataset, shared
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 from mvrecon.registry import check_options
@@ -177,7 +177,12 @@ class SceneData(L.LightningDataModule):
                 made.prepare(f"{part} cases", self.loading.workers)
                 self.sets[part] = made
         if "train" in self.sets:
-            self._order = EpochOrder(len(self.sets["train"]), self.seed)
+            self._order = EpochOrder(len(self.sets["train"]), self.seed, *self._share)
+
+    @property
+    def _share(self) -> tuple[int, int]:
+        """This process's number in training, and the number of all."""
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def _measured(self, key: str) -> Acquired:
         """The scene "train" or "test" behind its detector, with the cases that are kept of it."""
@@ -199,8 +204,8 @@ class SceneData(L.LightningDataModule):
         return self._loader("train", self._order)
 
     def val_dataloader(self) -> DataLoader[dict[str, Any]]:
-        """Validation batches."""
-        return self._loader("val")
+        """Validation batches; with several processes, this one's share, see `shared`."""
+        return self._loader("val", shared(len(self.sets["val"]), *self._share))
 
     def test_dataloader(self) -> DataLoader[dict[str, Any]]:
         """Test batches."""
@@ -208,7 +213,9 @@ class SceneData(L.LightningDataModule):
 
     predict_dataloader = test_dataloader
 
-    def _loader(self, part: str, order: EpochOrder | None = None) -> DataLoader[dict[str, Any]]:
+    def _loader(
+        self, part: str, order: EpochOrder | range | None = None
+    ) -> DataLoader[dict[str, Any]]:
         return DataLoader(
             self.sets[part],
             self.loading.batch_size,
@@ -217,7 +224,7 @@ class SceneData(L.LightningDataModule):
             persistent_workers=self.loading.workers > 0,
             pin_memory=torch.cuda.is_available(),
             generator=order.generator
-            if order
+            if isinstance(order, EpochOrder)
             else torch.Generator(),  # or each epoch draws from the global one
         )
 
@@ -242,8 +249,8 @@ class SceneData(L.LightningDataModule):
         if loop is None or self._order is None:
             return {}
         n_batches = int(loop.epoch_loop.batch_progress.current.processed)  # pyright: ignore[reportAttributeAccessIssue]
-        n_done = n_batches * self.loading.batch_size
-        whole = n_done >= len(self._order)  # the epoch: then the next one goes on
+        n_done = n_batches * self.loading.batch_size * self._order.world
+        whole = n_done >= self._order.count  # the epoch: then the next one goes on
         place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}
         cases = self.sets["train"].prepare()
         if self._volumes is None:

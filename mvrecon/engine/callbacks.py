@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.engine.export import save_png
 from mvrecon.engine.run_folder import versions
-from mvrecon.files.memory import peak
+from mvrecon.files.memory import peak, restarted_peak
 from mvrecon.files.places import check_places
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
@@ -55,8 +55,9 @@ class Clock(L.Callback):
 
     def on_train_start(self, *_: Any) -> None:
         """Start."""
+        restarted_peak()  # one process trains several methods
         if torch.cuda.is_available():
-            torch.cuda.reset_peak_memory_stats()  # one process trains several methods
+            torch.cuda.reset_peak_memory_stats()
         self._mark = time.perf_counter()
 
     def on_validation_end(self, *_: Any) -> None:
@@ -71,7 +72,8 @@ class Clock(L.Callback):
         step, self._mark = now - self._mark, now
         self.seconds += step
         count = len(batch["views"])
-        figures = {"step_ms": 1e3 * step, "volumes_per_s": count / step, "seconds": self.seconds}
+        speed = count * trainer.world_size / step
+        figures = {"step_ms": 1e3 * step, "volumes_per_s": speed, "seconds": self.seconds}
         figures |= peak_megabytes()
         pl_module.log_dict(
             {f"time/{name}": value for name, value in figures.items()}, batch_size=count
@@ -150,13 +152,9 @@ class BoardReview(L.Callback):
         batch_idx: int,
         *_: Any,
     ) -> None:
-        """Log the support's share of the grid; keep the first batch and its reconstruction."""
-        out = outputs["out"]
-        if out.support is not None:
-            share = out.support.float().mean()
-            pl_module.log("val/support_fraction", share, on_epoch=True, batch_size=len(out.volume))
-        if batch_idx == 0 and not trainer.sanity_checking:
-            self._shown = batch, out
+        """Keep the first batch and its reconstruction."""
+        if batch_idx == 0 and trainer.is_global_zero and not trainer.sanity_checking:
+            self._shown = batch, outputs["out"]
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Write the pictures at every `every`-th validation."""
@@ -175,17 +173,6 @@ class BoardReview(L.Callback):
             save_png(Path(trainer.default_root_dir) / "review" / f"{name}.png", image)
             for board in _boards(trainer):
                 board.add_image(f"review/{name}", image, trainer.global_step, dataformats="HWC")
-
-    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log PSNR, run time and peak memory once, for the HParams tab of TensorBoard."""
-        names = {"psnr": "val/psnr", "seconds": "time/seconds", "peak_mb": "time/peak_mb"}
-        metrics = trainer.callback_metrics
-        figures = {
-            f"hp/{name}": float(metrics[key]) for name, key in names.items() if key in metrics
-        }
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                logger.log_hyperparams(dict(pl_module.hparams), figures)
 
     def _pictures(
         self, module: Any, batch: Any, out: Reconstruction, case: int

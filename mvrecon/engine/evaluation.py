@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
@@ -19,6 +20,7 @@ from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
 from mvrecon.engine.module import Settings
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of
+from mvrecon.files.memory import peak_since, restarted_peak
 from mvrecon.metrics import UNITS, view_metrics, volume_metrics
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
@@ -27,6 +29,9 @@ from mvrecon.registry import hint
 Scores = dict[str, list[dict[str, Any]]]
 #: Where evaluation can run, by Lightning's names.
 ACCELERATORS = ("auto", "cpu", "gpu", "cuda")
+
+#: Units of what a method costs.
+COSTS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
 
 See = Callable[[dict[str, Any], dict[str, Tensor]], None]
 
@@ -40,8 +45,9 @@ def evaluate(
     device: str = "cpu",
     see: See | None = None,
 ) -> Scores:
-    """Figures of merit, milliseconds of one reconstruction ("ms"), and what was wrong with the
-    cameras ("cameras", where a model tells), of each model on each scene.
+    """Figures of merit, milliseconds and memory of one reconstruction ("ms"; "bytes", None where it
+    is not known), and what was wrong with the cameras ("cameras", where a model tells), of each
+    model on each scene.
 
     Args:
         models: by label, all for the grid and the rig of `A`.
@@ -59,13 +65,12 @@ def evaluate(
         for label, model in ready.items():
             if not scores[label]:
                 model(scene["views"])  # the first call compiles and fills caches
-            milliseconds, out = _timed(model, scene["views"])
+            milliseconds, needed, out = _measured(model, scene["views"])
             volume = out.volume
             figures = volume_metrics(volume[0], scene["volume"][0], scene["inside"][0], data_range)
             figures |= view_metrics(A(volume), scene["views"])
-            scores[label].append(
-                {**figures, "ms": milliseconds, **cameras_of(out.alignment, scene)}
-            )
+            costs = {"ms": milliseconds, "bytes": needed}
+            scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
             volumes[label] = volume
         if see is not None:
             see(scene, volumes)
@@ -133,17 +138,35 @@ def results(
         "data_range": data.data_range,
         "device": device,
         "threads": torch.get_num_threads(),
-        "units": {**UNITS, "ms_per_volume": "ms", "train_seconds": "s", "data_range": data.unit},
+        "units": {**UNITS, **COSTS, "data_range": data.unit},
         "methods": {label: _row(method, scores[label]) for label, method in trained.items()},
     }
 
 
+def validation_psnr(
+    settings: Settings, folder: Path, data: SceneData, device: str = "cpu"
+) -> float:
+    """Mean PSNR of a run's main method on the validation scenes in dB, nan without any: what
+    settings may be chosen by.
+    """
+    data.setup("validate")
+    label, model = next(iter(methods(settings).items()))
+    path = finished(folder, label)
+    module = load(path).module if path.exists() else build_module(settings, model, data.data_range)
+    batches = DataLoader(data.sets["val"])
+    models = {label: module.model}
+    scores = evaluate(models, batches, module.projector, data.data_range, device)
+    return mean_and_spread([score["psnr"] for score in scores[label]])["mean"]
+
+
 def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
+    needed = [score["bytes"] for score in scores if score["bytes"] is not None]
     return {
         "parameters": sum(p.numel() for p in method.module.model.parameters() if p.requires_grad),
         "train_steps": method.steps,
         "train_seconds": method.seconds,
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
+        "peak_mb": max(needed) / 2**20 if needed else None,
         **{name: mean_and_spread([score[name] for score in scores]) for name in UNITS},
         **camera_row(scores),
     }
@@ -193,9 +216,18 @@ def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:
         }
 
 
-def _timed(model: nn.Module, views: Tensor) -> tuple[float, Reconstruction]:
+def _measured(model: nn.Module, views: Tensor) -> tuple[float, int | None, Reconstruction]:
+    """Milliseconds and bytes of one reconstruction, above what was in use before, and what came
+    out.
+    """
+    before = torch.cuda.memory_allocated() if views.is_cuda else restarted_peak()
+    if views.is_cuda:
+        torch.cuda.reset_peak_memory_stats()
     start = time.perf_counter()
     out = model(views)
-    if out.volume.is_cuda:
+    if views.is_cuda:
         torch.cuda.synchronize()
-    return 1e3 * (time.perf_counter() - start), out
+    milliseconds = 1e3 * (time.perf_counter() - start)
+    if views.is_cuda:
+        return milliseconds, torch.cuda.max_memory_allocated() - (before or 0), out
+    return milliseconds, peak_since(before), out

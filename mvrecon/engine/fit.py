@@ -1,5 +1,6 @@
 """One run: its data, its methods, and the training of every method that has weights to learn."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,15 @@ from mvrecon.engine.callbacks import Clock, Confined
 from mvrecon.engine.checkpoints import finished, unfinished
 from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
+from mvrecon.engine.processes import Environment
 from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
 from mvrecon.files.checks import plain_name
+from mvrecon.files.rank import rank, world
 from mvrecon.kernels.threads import in_one_order
+
+#: The logger whose files are read by TensorBoard.
+BOARD = f"{Board.__module__}.{Board.__qualname__}"
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
@@ -72,6 +78,12 @@ def trainable(module: L.LightningModule) -> bool:
     return any(p.requires_grad and p.numel() for p in module.parameters())
 
 
+def fit_all(settings: Settings, data: SceneData, folder: Path) -> None:
+    """Train every method of a run, one after the other; see `fit`."""
+    for method in methods(settings):
+        fit(method, settings, data, folder)
+
+
 def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     """Train one method of a run and write `checkpoints/<method>.ckpt`; do nothing if that file
     exists or the method has no weights to learn.
@@ -96,8 +108,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     L.seed_everything(
         settings["seed"], workers=True, verbose=False
     )  # initial weights have used up random numbers
-    board = folder if method == next(iter(models)) else folder / method
-    trainer = build_trainer(settings, folder, board, last)
+    trainer = build_trainer(settings, folder, method)
     begun = last.exists() or previous(last).exists()
     step = read_newest(last)["global_step"] if begun else 0
     if begun:
@@ -110,27 +121,34 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
             module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True
         )
         trainer.save_checkpoint(done)
-    remove(last)
+    if trainer.is_global_zero:
+        remove(last)
 
 
 def _tell(line: str) -> None:
-    Console(stderr=True, markup=False, highlight=False).print(line, soft_wrap=True)
+    Console(quiet=rank() > 0, stderr=True, markup=False, highlight=False).print(
+        line, soft_wrap=True
+    )
 
 
-def build_trainer(settings: Settings, folder: Path, board: Path, last: Path) -> L.Trainer:
-    """Lightning's trainer, its logs and pictures flat in `board`, its last checkpoint at every
-    validation in `last`.
+def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
+    """Lightning's trainer of a method: logs and pictures of the main one flat in the run folder,
+    those of the others in `<folder>/<method>`, the board's events of all there; its last checkpoint
+    at every validation.
 
     Raises:
-        PermissionError: a callback or a logger that would write outside `board`.
+        PermissionError: a callback or a logger that would write outside that folder.
     """
+    main = method == next(iter(methods(settings)))
+    board, last = folder if main else folder / method, unfinished(folder, method)
     board.mkdir(parents=True, exist_ok=True)
     callbacks: list[Any] = [
         instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
     ]
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
+    events = folder / method  # TensorBoard calls a run by its folder
     loggers = [
-        instantiate(node, board, save_dir=str(board))
+        instantiate(node, board, save_dir=str(events if node["_target_"] == BOARD else board))
         for node in (settings["logger"] or {}).values()
         if node
     ]
@@ -139,4 +157,10 @@ def build_trainer(settings: Settings, folder: Path, board: Path, last: Path) -> 
         **settings["trainer"],
     }
     fixed = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
-    return L.Trainer(**options, **fixed, plugins=[DurableCheckpoints(folder)])
+    plugins: list[Any] = [DurableCheckpoints(folder)]
+    if world() > 1 and options.get("strategy", "auto") == "auto":
+        options["strategy"] = "ddp"
+    if "LOCAL_RANK" in os.environ and "TORCHELASTIC_RUN_ID" not in os.environ:
+        plugins.append(Environment())  # or SLURM's, in whose job the processes may be
+    # `SceneData` shares the cases among the processes: each exactly once
+    return L.Trainer(**options, **fixed, plugins=plugins, use_distributed_sampler=False)

@@ -5,9 +5,9 @@ from functools import cached_property
 from typing import Any
 
 import lightning.pytorch as L
-import torch
 from torch import Tensor
 
+from mvrecon.engine.means import Means
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.engine.wrong_cameras import TRUTH
 from mvrecon.geometry.grid import Grid
@@ -56,6 +56,7 @@ class ReconstructionModule(L.LightningModule):
         self.projector = build_projector(**geometry)
         self.model = MODELS.from_config(model, projector=self.projector)
         self.loss = ReconstructionLoss(data_range, **loss)
+        self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
 
     def forward(self, views: Tensor) -> Reconstruction:
         """Reconstruct; see the model."""
@@ -82,6 +83,7 @@ class ReconstructionModule(L.LightningModule):
                 value.detach(),
                 prog_bar=name == "total",
                 batch_size=len(batch["views"]),
+                sync_dist=True,
             )
         return terms["total"]
 
@@ -104,7 +106,9 @@ class ReconstructionModule(L.LightningModule):
         return PROJECTORS.from_config(options, grid=self.projector.grid, cameras=cameras)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
-        """Log the loss and the figures of merit; hand the reconstruction on to the board."""
+        """Judge a batch by the loss and the figures of merit; hand the reconstruction on to the
+        board.
+        """
         out = self.model(batch["views"])
         terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
         predicted = self.projector(out.volume)
@@ -115,13 +119,21 @@ class ReconstructionModule(L.LightningModule):
                 out.volume, batch["volume"], batch["inside"], predicted, batch["views"], strict=True
             )
         ]
-        means = {name: torch.tensor([f[name] for f in figures]).nanmean() for name in figures[0]}
+        means = {name: predicted.new_tensor([f[name] for f in figures]) for name in figures[0]}
         if out.alignment is not None and "gain" in batch:
             known = camera_metrics(out.alignment, *(batch[key] for key in TRUTH))
-            means |= {f"cameras_{name}": torch.tensor(value) for name, value in known.items()}
-        for name, value in (terms | means).items():
-            self.log(f"val/{name}", value, prog_bar=name == "psnr", batch_size=len(predicted))
+            values = {name: predicted.new_tensor(value) for name, value in known.items()}
+            means |= {f"cameras_{name}": v.expand(len(predicted)) for name, v in values.items()}
+        if out.support is not None:
+            means["support_fraction"] = out.support.flatten(1).float().mean(dim=1)
+        self._losses.update(terms, len(predicted))
+        self._figures.update(means)
         return {"out": out}
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the means over the cases of all processes."""
+        for name, value in (self._losses.compute() | self._figures.compute()).items():
+            self.log(f"val/{name}", value, prog_bar=name == "psnr", sync_dist=True)  # equal already
 
     def configure_optimizers(self) -> Any:
         """The optimiser, and its schedule over the whole number of steps, moved on at every

@@ -181,6 +181,20 @@ def write_results(folder: Path, results: dict[str, Any]) -> None:
     write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
 
 
+def read_results(folder: Path) -> dict[str, Any]:
+    """The results that a run has written.
+
+    Raises:
+        Refused: it has none, or the file is none of a run's.
+    """
+    path = folder / RESULTS
+    with blaming(path, "is no table of results"):
+        table = json.loads(text_of(path))
+    if not isinstance(table, dict) or "methods" not in table:
+        raise Refused(f"{path}: expected a table of results, got {shown(table)}")
+    return table
+
+
 def write(path: Path, text: str) -> None:
     """Write a text file; one of that name is replaced whole or not at all."""
     with written_whole(path) as part:

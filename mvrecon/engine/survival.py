@@ -3,6 +3,8 @@ names its last checkpoint.
 """
 
 import random
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +21,8 @@ from mvrecon.engine.storage import previous
 
 class KeepLast(Checkpoint):
     """Writes the checkpoint for resuming: after every validation, after every epoch if there is no
-    validation, and at SIGTERM.
+    validation, and at SIGTERM (not with several processes, of which each gets its own SIGTERM at
+    another step: there the training stops at once).
 
     Args:
         path: of the checkpoint; the one before stays beside it.
@@ -29,6 +32,13 @@ class KeepLast(Checkpoint):
 
     def __init__(self, path: Path):
         self.path = path
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Replace Lightning's handler of SIGTERM, whose broadcast would wait for processes that are
+        in another one.
+        """
+        if trainer.world_size > 1 and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, _stop)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Save."""
@@ -137,6 +147,10 @@ def remembered(last: Path) -> Iterator[None]:
     except Exception as error:
         error.add_note(_kept(last))
         raise
+
+
+def _stop(*_: Any) -> None:
+    raise SIGTERMException
 
 
 def _kept(last: Path) -> str:

@@ -1,6 +1,7 @@
 """What is logged beside the training: a support on the board, time and memory."""
 
 import copy
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -42,6 +43,7 @@ def test_where_the_system_tells_no_memory_the_clock_logs_the_rest(monkeypatch):
 
     for known in ({"time/peak_mb"}, set()):
         logged.clear()
-        Clock().on_train_batch_end(None, Module(), None, {"views": torch.zeros(2, 1)}, 0)
+        batch = {"views": torch.zeros(2, 1)}
+        Clock().on_train_batch_end(SimpleNamespace(world_size=1), Module(), None, batch, 0)
         assert set(logged) == {"time/step_ms", "time/volumes_per_s", "time/seconds"} | known
         monkeypatch.setattr("mvrecon.files.memory.resource", None)

@@ -265,7 +265,7 @@ def test_a_checkpoint_gives_a_callback_no_place_outside(home: Path, tmp_path: Pa
         "spikes": {"_target_": "lightning.pytorch.callbacks.spike.SpikeDetection"}
     }
     folder = tmp_path / "run"
-    trainer = fit.build_trainer(settings, folder, folder, folder / "last.ckpt")
+    trainer = fit.build_trainer(settings, folder, settings["model"]["name"])
     spikes = next(
         callback for callback in trainer.callbacks if type(callback).__name__ == "SpikeDetection"
     )

@@ -1,0 +1,125 @@
+"""The methods of finished runs, read from their folders."""
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mvrecon.files.checks import Refused, blaming, shown, text_of, yaml_of
+
+RESULTS, SETTINGS = "results.json", ("eval.yaml", "config.yaml")
+#: Figures of merit that are compared; larger is better for those of `RISING`.
+FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
+#: Settings that say nothing of what is compared, and the most that make up a run's name.
+SILENT, NAMED = ("name", "resume", "plugins", "checkpoint", "save"), 4
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method of one run, judged on its test scenes.
+
+    Args:
+        run: what differs from the other runs.
+        method: its label in the run.
+        scenes: names of the test scenes, a patient each.
+        figures: of merit by name, a value for each scene.
+        ms: milliseconds of one reconstruction.
+        train_seconds: of training.
+        parameters: number of weights.
+        peak_mb: memory that a reconstruction needs, in units of 2^20 bytes; nan: not known.
+        folder: of the run.
+    """
+
+    run: str
+    method: str
+    scenes: tuple[str, ...]
+    figures: Mapping[str, tuple[float, ...]]
+    ms: float
+    train_seconds: float
+    parameters: int
+    peak_mb: float
+    folder: Path
+
+    def mean(self, figure: str) -> float:
+        """Mean of a figure over the scenes where it is a number."""
+        values = [value for value in self.figures[figure] if math.isfinite(value)]
+        return sum(values) / len(values) if values else math.nan
+
+
+def read(places: Iterable[str | Path]) -> list[Row]:
+    """The methods of all finished runs at some places: run folders, or folders with runs in them.
+
+    Raises:
+        FileNotFoundError: a place without a finished run.
+        Refused: a file that is none of a run's.
+    """
+    folders = list(dict.fromkeys(run for place in places for run in _runs(Path(place))))
+    names = _names(folders)
+    return [row for folder, name in zip(folders, names, strict=True) for row in _rows(folder, name)]
+
+
+def _runs(place: Path) -> list[Path]:
+    found = [path.parent for path in sorted(place.expanduser().rglob(RESULTS))]
+    if not found:
+        raise FileNotFoundError(f"Expected a finished run (with {RESULTS}) in {place}, got none")
+    return found
+
+
+def _rows(folder: Path, name: str) -> Iterator[Row]:
+    path = folder / RESULTS
+    with blaming(path, "is no table of results"):
+        table = json.loads(text_of(path))
+        for label, row in table["methods"].items():
+            yield Row(
+                run=name,
+                method=str(label),
+                scenes=tuple(map(str, table["scenes"])),
+                figures={key: tuple(map(_number, row[key]["values"])) for key in FIGURES},
+                ms=_number(row["ms_per_volume"]),
+                train_seconds=_number(row["train_seconds"]),
+                parameters=int(row["parameters"]),
+                peak_mb=_number(row.get("peak_mb")),
+                folder=folder,
+            )
+
+
+def _number(value: float | None) -> float:
+    """A number of a table, in which those that are not finite are null."""
+    return math.nan if value is None else float(value)
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Each run by the settings that differ, or by its folder where none does."""
+    settings = [dict(_leaves(_settings(folder))) for folder in folders]
+    keys = [key for key in dict.fromkeys(key for s in settings for key in s)]
+    differing = [key for key in keys if len({repr(s.get(key)) for s in settings}) > 1]
+    parts = {key.removesuffix(".name") for key in differing if key.endswith(".name")}
+    telling = [key for key in differing if key.endswith(".name") or not _below(key, parts)]
+    return [
+        ", ".join(f"{key.removesuffix('.name')}={s[key]}" for key in telling[:NAMED] if key in s)
+        or folder.name
+        for s, folder in zip(settings, folders, strict=True)
+    ]
+
+
+def _below(key: str, parts: Iterable[str]) -> bool:
+    """Whether a setting is an option of a part that differs itself."""
+    return any(key.startswith(f"{part}.") for part in parts)
+
+
+def _settings(folder: Path) -> Mapping[str, Any]:
+    path = next((folder / name for name in SETTINGS if (folder / name).is_file()), None)
+    settings = yaml_of(path) if path else {}
+    if not isinstance(settings, Mapping):
+        raise Refused(f"{path}: expected settings by name, got {shown(settings)}")
+    return {key: value for key, value in settings.items() if key not in SILENT}
+
+
+def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        for key, item in value.items():
+            yield from _leaves(item, f"{prefix}.{key}".lstrip("."))
+    else:
+        yield prefix, value

@@ -1,0 +1,42 @@
+"""The board's table of runs: the settings of every method beside its figures on the test scenes."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mvrecon.engine.fit import BOARD, methods
+from mvrecon.engine.loggers import Board
+
+#: Settings of a run that make no difference to what comes out, or whose place is taken by `model`.
+SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "model")
+#: Figures of the table, and what they are called in the results.
+FIGURES = {"psnr": "psnr", "ssim": "ssim", "view_nrmse": "view_nrmse"}
+COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
+
+
+def write(folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any]) -> None:
+    """Log settings and test figures of every method, where the run has a board.
+
+    A setting has a name of its own, such as camera.n_views: TensorBoard puts those that differ
+    between runs first.
+    """
+    loggers = (settings["logger"] or {}).values()
+    if not any(node and node["_target_"] == BOARD for node in loggers):
+        return
+    shared = {key: value for key, value in settings.items() if key not in SILENT}
+    for label, model in methods(dict(settings)).items():
+        row, board = table["methods"][label], Board(str(folder / label))
+        figures = {f"test/{name}": row[key]["mean"] for name, key in FIGURES.items()}
+        costs = {f"test/{name}": row[key] for name, key in COSTS.items() if row[key] is not None}
+        options = {key: value for key, value in model.items() if key != "name"}
+        named = {"method": label, "model": {"": model["name"], **options}}
+        board.log_hyperparams(dict(_leaves(named | shared)), figures | costs)
+        board.finalize("success")
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        for key, item in value.items():
+            yield from _leaves(item, f"{name}.{key}".strip("."))
+    else:
+        yield name, value if isinstance(value, bool | int | float | str) else str(value)

@@ -1,0 +1,32 @@
+"""Means over the cases of a validation, whichever process has judged them."""
+
+from collections.abc import Mapping
+
+from torch import Tensor
+from torchmetrics import MeanMetric
+
+
+class Means:
+    """Weighted means by name, over all cases and all processes of a run (torchmetrics' MeanMetric,
+    which sums over them).
+
+    Args:
+        ignore_nan: cases whose figure is nan count in no mean; otherwise they make it nan.
+    """
+
+    def __init__(self, ignore_nan: bool):
+        self._strategy = "ignore" if ignore_nan else "disable"
+        self._means: dict[str, MeanMetric] = {}
+
+    def update(self, values: Mapping[str, Tensor], weight: float = 1.0) -> None:
+        """Add the figures of some cases, one or several for each name."""
+        for name, value in values.items():
+            if name not in self._means:
+                self._means[name] = MeanMetric(nan_strategy=self._strategy).to(value.device)  # pyright: ignore[reportArgumentType]
+            self._means[name].update(value.detach(), weight)
+
+    def compute(self) -> dict[str, Tensor]:
+        """The means by name, and begin anew; all processes call this together."""
+        means = {name: self._means[name].compute() for name in sorted(self._means)}
+        self._means.clear()
+        return means

@@ -1,0 +1,110 @@
+"""Runs beside each other: paired intervals, tables that other programs read, and a Pareto front."""
+
+import csv
+import io
+import json
+import math
+import xml.etree.ElementTree as ET
+
+import pytest
+import yaml
+
+from mvrecon import compare
+from mvrecon.comparison import pareto, tables
+from mvrecon.comparison.intervals import mean_interval, t_quantile
+from mvrecon.comparison.rows import FIGURES, read
+from mvrecon.files.checks import Refused
+
+#: PSNR of two methods on four patients of very different difficulty.
+EASY, BETTER = [20.0, 25.0, 30.0, 35.0], [20.9, 26.1, 31.0, 36.0]
+
+
+def run(folder, settings, **methods):
+    """A finished run's folder: method -> (PSNR of each scene, ms)."""
+    rows = {
+        label: {
+            "parameters": 7,
+            "train_seconds": 2.0,
+            "ms_per_volume": ms,
+            "peak_mb": None,
+            **{figure: {"values": values} for figure in FIGURES},
+        }
+        for label, (values, ms) in methods.items()
+    }
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(settings, sort_keys=False))
+    table = {"scenes": [f"pt_{k}" for k in range(4)], "methods": rows}
+    (folder / "results.json").write_text(json.dumps(table))
+    return folder
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    """A sweep of two runs that differ in their model and the number of views."""
+    for name, views, values, ms in (("ours", 8, BETTER, 9.0), ("unet", 4, EASY, 3.0)):
+        settings = {
+            "name": "sweep",
+            "model": {"name": name, "width": views},
+            "camera": {"n_views": views, "sid": 400.0},
+        }
+        run(tmp_path / name, settings, **{name: (values, ms), "sirt": (EASY, 100.0)})
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("freedom", "value"), [(1, 12.7062), (2, 4.3027), (7, 2.3646), (32, 2.0369), (200, 1.9719)]
+)
+def test_students_quantiles_are_those_of_the_tables(freedom, value):
+    assert t_quantile(0.95, freedom) == pytest.approx(value, abs=5e-5)
+
+
+def test_an_interval_of_pairs_does_not_care_how_different_patients_are(sweep):
+    rows = {row.method: row for row in read([sweep])}
+    paired = tables.difference(rows["ours"], rows["unet"], "psnr")
+    assert paired.mean == pytest.approx(1.0) and paired.low > 0.8 and paired.high < 1.2
+    alone = mean_interval(BETTER)
+    assert alone.high - alone.low > 20 * (paired.high - paired.low)
+    assert all(math.isnan(v) for v in mean_interval([1.0, math.nan])[1:]), "one patient"
+
+
+def test_runs_are_named_by_what_differs(sweep):
+    names = {row.run for row in read([sweep])}
+    assert names == {"model=ours, camera.n_views=8", "model=unet, camera.n_views=4"}
+    assert {row.run for row in read([sweep / "ours"])} == {"ours"}
+
+
+def test_every_form_of_the_table_holds_every_method(sweep, tmp_path):
+    out = tmp_path / "table"
+    compare.compare([sweep], reference="unet", out=out)
+    lines = list(csv.DictReader(io.StringIO((out / "compare.csv").read_text())))
+    assert [line["method"] for line in lines] == ["ours", "sirt", "unet", "sirt"]
+    assert float(lines[0]["psnr mean"]) == pytest.approx(sum(BETTER) / 4)
+    assert float(lines[0]["psnr difference"]) == pytest.approx(1.0)
+    page, paper = ((out / f"compare.{end}").read_text() for end in ("md", "tex"))
+    assert page.count("\n") == 6 and "+1.00 (+0.87 to +1.13)" in page
+    assert r"camera.n\_views=8" in paper and paper.count(r"\\") == 5
+    points = ET.fromstring((out / "pareto.svg").read_text()).iter(
+        "{http://www.w3.org/2000/svg}circle"
+    )
+    assert len(list(points)) == 4
+
+
+def test_the_front_leaves_out_what_another_method_beats_in_both(sweep):
+    front = pareto.front(read([sweep]), "psnr")
+    assert [row.method for row in front] == ["unet", "ours"]
+
+
+@pytest.mark.door
+def test_a_table_from_elsewhere_is_refused_or_only_shown(tmp_path, capsys):
+    """A file of results that is damaged is refused by name, and one with markup in a label shows it
+    as text.
+    """
+    folder = run(tmp_path / "a", {}, **{"<b>[red]$x": (EASY, 1.0)})
+    compare.show(compare.compare([folder], out=tmp_path / "out"))
+    assert "<b>[red]$x" in capsys.readouterr().out
+    assert "<b>" not in (tmp_path / "out" / "pareto.svg").read_text()
+    (folder / "results.json").write_text('{"methods": {"a": 3}}')
+    with pytest.raises(Refused, match="results.json: is no table of results"):
+        read([folder])
+    with pytest.raises(FileNotFoundError, match="Expected a finished run"):
+        read([tmp_path / "out"])

@@ -1,0 +1,19 @@
+"""What a piece of work adds to the memory of this process, whatever was in use before."""
+
+import sys
+
+import pytest
+
+from mvrecon.files.memory import peak, peak_since, restarted_peak
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the other systems do not tell")
+def test_the_memory_of_a_piece_of_work_is_its_own():
+    size = 64 * 2**20
+    assert len(b"1" * (2 * size)) == 2 * size  # more than what is to be measured, and gone
+    start = restarted_peak()
+    work = b"2" * size
+    needed = peak_since(start)
+    assert needed is not None and size * 0.9 < needed < size * 1.1
+    assert len(work) == size and peak_since(None) is None
+    assert abs((peak() or 0) - (start or 0) - needed) < 2**20, "the count has begun anew"
