@@ -67,7 +67,12 @@ def task(config: DictConfig) -> float:
     settings = run_folder.anchored(to_plain(config))
     folder = Path(HydraConfig.get().runtime.output_dir)
     if settings["resume"]:
-        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        import_plugins(settings["plugins"])
+        others = [
+            override
+            for override in HydraConfig.get().overrides.task
+            if not override.lstrip("+").startswith(("resume=", "plugins="))
+        ]
         settings, folder = resumed(settings["resume"], others)
     run_folder.check(folder, settings)
     table = train(settings, folder)

@@ -7,9 +7,10 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from mvrecon import listing, registry
-from mvrecon.listing import describe, main
+from mvrecon import registry
+from mvrecon.listing import main
 from mvrecon.parts import REGISTRIES
+from mvrecon.signatures import GIVEN, describe
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.names()]
@@ -23,9 +24,9 @@ def test_what_is_read_is_what_an_import_gives(kind: str, name: str):
     parameters = {
         n: p for n, p in inspect.signature(imported).parameters.items() if p.kind not in CATCH_ALL
     }
-    assert set(part.options) == set(parameters) - listing.GIVEN
+    assert set(part.options) == set(parameters) - GIVEN
     needed = {n for n, p in parameters.items() if p.default is p.empty}
-    assert {n for n, default in part.options.items() if not default} == needed - listing.GIVEN
+    assert {n for n, option in part.options.items() if not option.default} == needed - GIVEN
     assert part.summary
     assert " ".join(inspect.getdoc(imported).split()).startswith(part.summary)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import Refused, shown, text_of
+from mvrecon.files.checks import Refused, check_file, shown, text_of
 
 FORMAT = "mvrecon.cameras"
 VERSION = 1
@@ -46,10 +46,7 @@ def from_file(path: str | Path) -> Cameras:
             that `Cameras` refuses.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"There is no camera file {path}; expected JSON as mvrecon.cameras.files.save writes it"
-        )
+    check_file(path, "JSON as mvrecon.cameras.files.save writes it")
     try:
         record = json.loads(text_of(path))
     except (

@@ -19,8 +19,11 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
+from mvrecon.config.errors import one_line
 from mvrecon.config.guard import guarded
+from mvrecon.config.plugins import check_plugins
 from mvrecon.config.schemas import SCHEMAS
+from mvrecon.config.typed import check_parts
 from mvrecon.files.checks import shown
 from mvrecon.registry import installed, locate
 
@@ -79,25 +82,48 @@ def prepare_hydra() -> None:
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once.
 
+    Names, options and types of all settings are checked before the task imports anything heavy. An
+    error ends the process with one line; with HYDRA_FULL_ERROR=1 with its traceback. Modules that
+    the command line itself names in `plugins=` may also lie in the current folder.
+
     Raises:
-        PermissionError: the flag of Hydra's that unpickles a file.
+        SystemExit: an error, or Ctrl-C.
     """
-    if {"-h", "--help"} & set(sys.argv[1:]):
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
         return
-    if any(argument.startswith("--e") for argument in sys.argv[1:]):
-        raise PermissionError(
-            "--experimental-rerun unpickles a file, which can run anything; use resume=<run folder>"
-        )
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(
             errors="backslashreplace"
         )  # as stderr: a path that it cannot write must not end a run
+    if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
+        sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     prepare_hydra()
-    with guarded(conf_dir(), plugin_conf_dirs()):
+    guard = guarded(conf_dir(), plugin_conf_dirs(), check_settings)
+    with one_line(f"mvrecon-{config_name}"), guard:
+        if any(argument.startswith("--e") for argument in arguments):
+            raise PermissionError(
+                "--experimental-rerun unpickles a file, which can run anything; use resume=<run "
+                "folder>"
+            )
         hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(
             task
         )()
+
+
+def check_settings(config: DictConfig) -> None:
+    """Check plugins and parts of a composed config, whose missing settings may come later.
+
+    Raises:
+        ImportError, PermissionError: a module of `plugins` that is none.
+        LookupError, TypeError: a part's name, option or value.
+    """
+    plain: Any = OmegaConf.to_container(config, resolve=False)
+    settings = {key: value for key, value in plain.items() if key != "hydra"}
+    if settings.get("plugins") != "???":
+        check_plugins(settings.get("plugins"))
+    check_parts(settings)
 
 
 def help_text(config_name: str) -> str:

@@ -11,6 +11,8 @@ from typing import Any
 
 from mvrecon.engine.old_names import current
 from mvrecon.files.checks import TEXT, Refused, blaming, shown
+from mvrecon.parts import REGISTRIES
+from mvrecon.signatures import parts_in
 
 #: The files that `torch.save` puts into an archive, below one folder.
 MEMBERS = re.compile(
@@ -73,6 +75,21 @@ def check_settings(path: Path, settings: Any) -> dict[str, Any]:
             f"{sorted(KEYS)}"
         )
     return {**settings, "geometry": current(settings["geometry"])}
+
+
+def check_known(path: Path, settings: Mapping[str, Any]) -> None:
+    """Check that every part which a checkpoint names is there.
+
+    Raises:
+        ModuleNotFoundError: one is not; the message says which kind and name a plugin must bring.
+    """
+    for _, kind, node in parts_in(settings):
+        if node["name"] not in REGISTRIES[kind].names():
+            raise ModuleNotFoundError(
+                f"{path}: needs the {kind} {node['name']!r}, which neither mvrecon nor an installed "
+                f"plugin has; install its plugin, or import the module that registers it "
+                f"(plugins=[...] on a command line)"
+            )
 
 
 def _plain(value: Any, depth: int = 0) -> bool:

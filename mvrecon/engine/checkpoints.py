@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mvrecon.data.module import SceneData
-from mvrecon.engine.checkpoint_check import check_archive, check_settings
+from mvrecon.engine.checkpoint_check import check_archive, check_known, check_settings
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.run_folder import SETTINGS
 from mvrecon.engine.storage import read
@@ -71,6 +71,7 @@ def load(path: Path) -> Trained:
     Raises:
         FileNotFoundError: the method's training has not ended.
         DamagedCheckpoint: the file is not what was written.
+        ModuleNotFoundError: a part of the method is of a plugin that is not installed.
         Refused: more than tensors and plain values, or not the weights of the method that it
             describes.
     """
@@ -82,7 +83,10 @@ def load(path: Path) -> Trained:
     with blaming(path, "cannot be read"):
         state = read(path)
     with blaming(path, "does not fit this version's method", "was it written by another version?"):
-        module = ReconstructionModule(**check_settings(path, state["hyper_parameters"]))
+        settings = check_settings(path, state["hyper_parameters"])
+    check_known(path, settings)
+    with blaming(path, "does not fit this version's method", "was it written by another version?"):
+        module = ReconstructionModule(**settings)
         module.load_state_dict(state["state_dict"])
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
         data = state.get(SceneData.__qualname__, {})
