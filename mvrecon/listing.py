@@ -6,7 +6,9 @@ Sources are read, not imported, so the answer comes at once and a broken plugin 
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
+from mvrecon.new_plugin import new_plugin
 from mvrecon.parts import REGISTRIES
 from mvrecon.signatures import Option, Part, describe
 
@@ -38,6 +40,20 @@ def _line(name: str, option: Option) -> str:
     return f"  {name}{value}  {option.text}".rstrip()
 
 
+def start_project(name: str, parser: argparse.ArgumentParser) -> int:
+    """Write the project of a new plugin into the current folder, and say what comes next."""
+    from rich.console import Console
+
+    try:
+        files = new_plugin(name, Path.cwd())
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    Console(markup=False, highlight=False).print(
+        f"{len(files)} files in {name}; next: pip install -e {name}; pytest {name}", soft_wrap=True
+    )
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The console script; its exit status is 1 if a part that was checked is broken."""
     parser = argparse.ArgumentParser(
@@ -49,7 +65,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--check", action="store_true", help="import every part, and say which are broken and why"
     )
+    parser.add_argument(
+        "--new-plugin",
+        metavar="NAME",
+        help="write a project with a part of every kind into the new folder NAME",
+    )
     options = parser.parse_args(arguments)
+    if options.new_plugin:
+        return start_project(options.new_plugin, parser)
     kinds = [options.kind] if options.kind else REGISTRIES
     parts = [
         describe(kind, name, options.check) for kind in kinds for name in REGISTRIES[kind].names()

@@ -81,14 +81,14 @@ def check_known(path: Path, settings: Mapping[str, Any]) -> None:
     """Check that every part which a checkpoint names is there.
 
     Raises:
-        ModuleNotFoundError: one is not; the message says which kind and name a plugin must bring.
+        Refused: one is not; the message says which kind and name a plugin must bring.
     """
     for _, kind, node in parts_in(settings):
         if node["name"] not in REGISTRIES[kind].names():
-            raise ModuleNotFoundError(
-                f"{path}: needs the {kind} {node['name']!r}, which neither mvrecon nor an installed "
-                f"plugin has; install its plugin, or import the module that registers it "
-                f"(plugins=[...] on a command line)"
+            raise Refused(
+                f"{path}: No {kind} is named {shown(node['name'])} here; if a plugin brings it, "
+                f"install that plugin, or import the module that registers it (plugins=[...] on a "
+                f"command line)"
             )
 
 

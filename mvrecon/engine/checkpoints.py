@@ -71,9 +71,8 @@ def load(path: Path) -> Trained:
     Raises:
         FileNotFoundError: the method's training has not ended.
         DamagedCheckpoint: the file is not what was written.
-        ModuleNotFoundError: a part of the method is of a plugin that is not installed.
-        Refused: more than tensors and plain values, or not the weights of the method that it
-            describes.
+        Refused: more than tensors and plain values, a part of a plugin that is not installed, or
+            not the weights of the method that it describes.
     """
     if not path.is_file():
         raise FileNotFoundError(
