@@ -6,6 +6,7 @@ Torch is imported inside the task, so that `--help` and typing mistakes are answ
 
 import logging
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,8 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     for part in ("pytorch", "fabric"):
         logging.getLogger(f"lightning.{part}").setLevel(logging.WARNING)
+    # Lightning's own use of torch, of which no user can be rid
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
     if rank() > 0:
@@ -79,7 +82,12 @@ def task(config: DictConfig) -> float:
     settings = run_folder.anchored(to_plain(config))
     folder = Path(HydraConfig.get().runtime.output_dir)
     if settings["resume"]:
-        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        import_plugins(settings["plugins"])
+        others = [
+            override
+            for override in HydraConfig.get().overrides.task
+            if not override.lstrip("+").startswith(("resume=", "plugins="))
+        ]
         settings, folder = resumed(settings["resume"], others)
     run_folder.check(folder, settings)
     finished = (folder / run_folder.RESULTS).is_file()

@@ -76,6 +76,7 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
         "mvrecon-reconstruct": "mvrecon.reconstruction:main",
         "mvrecon-list": "mvrecon.listing:main",
         "mvrecon-compare": "mvrecon.compare:main",
+        "mvrecon-warmup": "mvrecon.warmup:main",
     }
 
 

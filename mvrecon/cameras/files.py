@@ -7,7 +7,7 @@ from typing import Any
 
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import Refused, shown, text_of
+from mvrecon.files.checks import Refused, check_file, shown, text_of
 
 FORMAT = "mvrecon.cameras"
 VERSION = 1
@@ -40,16 +40,16 @@ def from_file(path: str | Path) -> Cameras:
     "parallel": false, "extent": "segment", "cameras": [{"source": [x, y, z], "origin": [..], "u":
     [..], "v": [..]}, ..]}; the meanings are those of `Cameras`.
 
+    Args:
+        path: of the file.
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: truncated, too large or not such a file, entries missing or not finite, or a rig
             that `Cameras` refuses.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"There is no camera file {path}; expected JSON as mvrecon.cameras.files.save writes it"
-        )
+    check_file(path, "JSON as mvrecon.cameras.files.save writes it")
     try:
         record = json.loads(text_of(path))
     except (

@@ -5,6 +5,7 @@ torch's defaults and no loop pays for a config object. Importing this file impor
 Lightning.
 """
 
+import re
 import sys
 from collections.abc import Callable
 from io import TextIOWrapper
@@ -19,12 +20,17 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
+from mvrecon.config.errors import one_line
 from mvrecon.config.guard import guarded
+from mvrecon.config.plugins import check_plugins
 from mvrecon.config.schemas import SCHEMAS
-from mvrecon.files.checks import shown
+from mvrecon.config.typed import check_parts
+from mvrecon.files.checks import shown, yaml_of
 from mvrecon.registry import installed, locate
 
 VERSION_BASE = "1.3"
+#: Groups whose part is an option of a model.
+OF_MODELS = {"head", "network", "reconstructor"}
 
 
 class PluginConf(SearchPathPlugin):
@@ -79,35 +85,63 @@ def prepare_hydra() -> None:
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once.
 
+    Names, options and types of all settings are checked before the task imports anything heavy. An
+    error ends the process with one line; with HYDRA_FULL_ERROR=1 with its traceback. Modules that
+    the command line itself names in `plugins=` may also lie in the current folder.
+
     Raises:
-        PermissionError: the flag of Hydra's that unpickles a file.
+        SystemExit: an error, or Ctrl-C.
     """
-    if {"-h", "--help"} & set(sys.argv[1:]):
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
         return
-    if any(argument.startswith("--e") for argument in sys.argv[1:]):
-        raise PermissionError(
-            "--experimental-rerun unpickles a file, which can run anything; use resume=<run folder>"
-        )
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(
             errors="backslashreplace"
         )  # as stderr: a path that it cannot write must not end a run
+    if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
+        sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     prepare_hydra()
-    with guarded(conf_dir(), plugin_conf_dirs()):
+    guard = guarded(conf_dir(), plugin_conf_dirs(), check_settings)
+    with one_line(f"mvrecon-{config_name}"), guard:
+        if any(argument.startswith("--e") for argument in arguments):
+            raise PermissionError(
+                "--experimental-rerun unpickles a file, which can run anything; use resume=<run "
+                "folder>"
+            )
         hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(
             task
         )()
 
 
+def check_settings(config: DictConfig) -> None:
+    """Check plugins and parts of a composed config, whose missing settings may come later.
+
+    Raises:
+        ImportError, PermissionError: a module of `plugins` that is none.
+        LookupError, TypeError: a part's name, option or value.
+    """
+    plain: Any = OmegaConf.to_container(config, resolve=False)
+    settings = {key: value for key, value in plain.items() if key != "hydra"}
+    if settings.get("plugins") != "???":
+        check_plugins(settings.get("plugins"))
+    check_parts(settings)
+
+
 def help_text(config_name: str) -> str:
-    """The text of `--help`: every config group with its choices, and all settings with comments."""
+    """The text of `--help`: the config groups that the app takes, with their choices, and all
+    settings with comments.
+    """
     choices: dict[str, set[str]] = {}
     for folder in (conf_dir(), *plugin_conf_dirs()):
         for file in folder.glob("*/*.yaml"):
             choices.setdefault(file.parent.name, set()).add(file.stem)
+    taken = groups_of(app_file(config_name))
     groups = "\n".join(
-        f"  {group:<12}{', '.join(sorted(names))}" for group, names in sorted(choices.items())
+        f"  {group:<12}{', '.join(sorted(names))}"
+        for group, names in sorted(choices.items())
+        if group in taken
     )
     settings = app_file(config_name).read_text(encoding="utf-8")
     return (
@@ -119,6 +153,14 @@ def help_text(config_name: str) -> str:
         "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's "
         "options.\n"
     )
+
+
+def groups_of(app: Path) -> set[str]:
+    """The config groups in an app's list of defaults, and those that its models choose from."""
+    entries = yaml_of(app).get("defaults", ())
+    keys = (next(iter(entry)) for entry in entries if isinstance(entry, dict))
+    groups = {re.sub("^override ", "", key).partition("@")[0].strip("/") for key in keys}
+    return groups | (OF_MODELS if "model" in groups else set())
 
 
 def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:

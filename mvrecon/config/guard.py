@@ -24,12 +24,15 @@ OPEN = {"mode", "verbose", "help", "sweeper.params", "runtime", "overrides", "jo
 
 
 @contextmanager
-def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
+def guarded(
+    main: Path, others: Sequence[Path], check: Callable[[DictConfig], None] | None = None
+) -> Iterator[None]:
     """Context in which every config that Hydra composes is checked before Hydra acts on it.
 
     Args:
         main: the folder of mvrecon's own configs.
         others: further folders that are trusted: those of installed plugins.
+        check: a further check of each composed config, which raises what it likes.
 
     Raises:
         PermissionError: a file from elsewhere sets what only the command line may, or reads
@@ -59,7 +62,10 @@ def guarded(main: Path, others: Sequence[Path]) -> Iterator[None]:
                     f"--config-name={config_name} is no app of mvrecon's; choose an experiment=..."
                 )
             check_foreign(config, foreign, overrides, composed)
-        return _named(used(config, composed([]) if overrides else config))
+        config = _named(used(config, composed([]) if overrides else config))
+        if check is not None:
+            check(config)
+        return config
 
     def bounded(source: Any, config_path: str) -> Any:
         path = Path(source.path) / source._normalize_file_name(config_path)

@@ -67,12 +67,18 @@ class OwnFolder(Callback):
                 overrides.append(f"++{name}={_quoted(value)}")  # a sweep's jobs are composed anew
 
     def _folder(self, config: DictConfig, key: str) -> Path:
-        if not config.get("resume"):
+        run = run_of(Path(config.resume)) if config.get("resume") else None
+        if run is None:
             return new_folder(OmegaConf.select(config, key))
-        path = Path(config.resume).expanduser()
-        folder = path if path.is_dir() else path.parent
-        check_plain(folder)  # before Hydra opens a log in it
-        return folder
+        check_plain(run)  # before Hydra opens a log in it
+        return run
+
+
+def run_of(path: Path) -> Path | None:
+    """The run folder that a path names or lies in; None: there is none, as the app will say."""
+    path = path.expanduser().absolute()
+    folders = (path, *path.parents[:3])
+    return next((folder for folder in folders if (folder / "config.yaml").is_file()), None)
 
 
 def check_launcher(config: DictConfig) -> None:

@@ -32,7 +32,7 @@ from mvrecon.data.slabs import Slab, Slabs, planes
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.data.texts import texts_of, variable
 from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import NAME, SPACING, Refused, blaming, plain_name, shown
+from mvrecon.files.checks import NAME, SPACING, Refused, blaming, check_file, plain_name, shown
 
 #: Bytes of a chunk that is written, unless one plane has more.
 CHUNK = 2**25
@@ -216,8 +216,7 @@ class VolumeFile:
 
 
 def _opened(path: Path) -> tuple[h5py.File, Texts]:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
+    check_file(path, EXPECTED)
     if not h5py.is_hdf5(path):
         raise Refused(f"{path}: not an HDF5 file; expected {EXPECTED}")
     with blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"):

@@ -17,7 +17,16 @@ from torch import Tensor
 from mvrecon.data.orientation import oriented, right_angled
 from mvrecon.data.slabs import Slabs, planes
 from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import DEFLATE, EDGE, VOLUME, Refused, blaming, plain_name, shown
+from mvrecon.files.checks import (
+    DEFLATE,
+    EDGE,
+    VOLUME,
+    Refused,
+    blaming,
+    check_file,
+    plain_name,
+    shown,
+)
 from mvrecon.geometry.grid import Grid
 
 IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}
@@ -61,8 +70,7 @@ def itk_image(path: Path) -> ItkImage:
         Refused: damaged, cut short, not three axes, several values a pixel, or data in a file that
             does not lie beside it.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {', '.join(IO)}")
+    check_file(path, ", ".join(IO))
     data, packed = _data_file(path)
     reader = _reader(path)
     with blaming(path, "cannot be read"):

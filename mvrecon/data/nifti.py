@@ -16,7 +16,7 @@ from torch import Tensor
 from mvrecon.data.orientation import Planes, oriented, right_angled
 from mvrecon.data.slabs import Slabs, planes
 from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, blaming
+from mvrecon.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, blaming, check_file
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
@@ -55,8 +55,7 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
     """
     nibabel = _nibabel(path)
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
+    check_file(path, EXPECTED)
     with blaming(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"):
         header = _header(path, nibabel)
         shape = _shape(path, header)

@@ -12,7 +12,7 @@ import numpy as np
 
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import VOLUME, Refused, blaming
+from mvrecon.files.checks import VOLUME, Refused, blaming, check_file
 
 EXPECTED = "a file of pytorch-3dunet: HDF5 with raw [z y x] or [c z y x], and optionally label"
 #: Axes of one volume, and of several channels.
@@ -39,8 +39,7 @@ def read_example(path: str | Path) -> Example:
         Refused: not HDF5, another layout, damaged, or values and labels of different voxels.
     """
     path = Path(path).expanduser()
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
+    check_file(path, EXPECTED)
     with (
         blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
         h5py.File(path, "r", locking="best-effort") as file,

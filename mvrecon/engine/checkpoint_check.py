@@ -11,6 +11,8 @@ from typing import Any
 
 from mvrecon.engine.old_names import current, current_model
 from mvrecon.files.checks import TEXT, Refused, blaming, shown
+from mvrecon.parts import REGISTRIES
+from mvrecon.signatures import parts_in
 
 #: The files that `torch.save` puts into an archive, below one folder.
 MEMBERS = re.compile(
@@ -74,6 +76,21 @@ def check_settings(path: Path, settings: Any) -> dict[str, Any]:
         )
     geometry, model = current(settings["geometry"]), current_model(settings["model"])
     return {**settings, "geometry": geometry, "model": model}
+
+
+def check_known(path: Path, settings: Mapping[str, Any]) -> None:
+    """Check that every part which a checkpoint names is there.
+
+    Raises:
+        Refused: one is not; the message says which kind and name a plugin must bring.
+    """
+    for _, kind, node in parts_in(settings):
+        if node["name"] not in REGISTRIES[kind].names():
+            raise Refused(
+                f"{path}: No {kind} is named {shown(node['name'])} here; if a plugin brings it, "
+                f"install that plugin, or import the module that registers it (plugins=[...] on a "
+                f"command line)"
+            )
 
 
 def _plain(value: Any, depth: int = 0) -> bool:

@@ -135,15 +135,20 @@ class RandomNumbers(L.Callback):
 @contextmanager
 def remembered(last: Path) -> Iterator[None]:
     """Context that adds the path of the last good checkpoint to the error of an interrupted
-    training; SIGTERM becomes an error too.
+    training; SIGTERM and Ctrl-C become errors too.
 
     Raises:
-        SystemExit: SIGTERM came. Lightning's own would end the process as if all had gone well.
+        SystemExit: SIGTERM or Ctrl-C came. Lightning's own would end the process as if all had gone
+            well, or without a word.
     """
     try:
         yield
     except SIGTERMException as stop:
         raise SystemExit(f"Stopped by SIGTERM. {_kept(last)}") from stop
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning ends the process itself
+            raise SystemExit(f"Stopped by Ctrl-C. {_kept(last)}") from stop
+        raise
     except Exception as error:
         error.add_note(_kept(last))
         raise
@@ -154,7 +159,8 @@ def _stop(*_: Any) -> None:
 
 
 def _kept(last: Path) -> str:
+    run = last.parents[2]
     checkpoint = next((path for path in (last, previous(last)) if path.exists()), None)
     if checkpoint is None:
-        return "There is no checkpoint yet: resume=<run folder> begins again"
-    return f"The last good checkpoint is {checkpoint}: resume=<run folder> goes on from it"
+        return f"There is no checkpoint yet: mvrecon-train resume={run} begins again"
+    return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} goes on from it"

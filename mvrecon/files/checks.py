@@ -116,6 +116,19 @@ def plain_name(name: Any, where: str | Path) -> str:
     )
 
 
+def check_file(path: Path, expected: str) -> None:
+    """Check that a path is a file's.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        IsADirectoryError: a folder is.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder; expected {expected}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected {expected}")
+
+
 def shown(value: Any) -> str:
     """A value from a file, short enough for a message."""
     return reprlib.repr(value)

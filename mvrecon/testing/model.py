@@ -1,5 +1,6 @@
 """Checks that every model must pass."""
 
+from collections.abc import Callable, Collection
 from typing import Any
 
 import torch
@@ -40,7 +41,7 @@ def check_model(name: str, projector: Projector, seed: int = 0, **options: Any) 
         _check_volume(model, views, projector.grid.shape)
         _check_scale(model, views)
         _check_batch(model, views)
-        _check_refusals(model, views)
+        check_refusals(model, views)
     check_gradients(model, model(views).volume)
 
 
@@ -97,7 +98,19 @@ def check_gradients(network: nn.Module, answer: Tensor) -> None:
     assert not bad, f"gradients are not finite: {', '.join(bad)}"
 
 
-def _check_refusals(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
+def check_refusals(
+    method: Callable[[Tensor], Any],
+    views: Float[Tensor, "2 1 m v u"],
+    only: Collection[str] | None = None,
+) -> None:
+    """Raise AssertionError unless a method refuses spoiled views by a ValueError that speaks of
+    views.
+
+    Args:
+        method: called with the views.
+        views: good ones.
+        only: the kinds of spoiled views that are tried; None: all.
+    """
     spoiled = {"NaN": views.clone(), "inf": views.clone()}
     for value, copy in spoiled.items():
         copy[0, 0, 1, 0, 0] = float(value)
@@ -110,8 +123,10 @@ def _check_refusals(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None
         "a column less": views[..., 1:],
     }
     for what, bad in {**spoiled, **shapes}.items():
+        if only is not None and what not in only:
+            continue
         try:
-            model(bad)
+            method(bad)
         except ValueError as error:
             assert "views" in str(error).lower(), (
                 f"views with {what}: the error does not speak of views: {error}"

@@ -44,7 +44,7 @@ def test_writing_is_all_or_nothing(rig, monkeypatch):
 @pytest.mark.door
 def test_a_missing_file_is_named(tmp_path):
     """A camera file that is not there is an error with its name and what was expected."""
-    with pytest.raises(FileNotFoundError, match="no camera file .*none.json; expected JSON"):
+    with pytest.raises(FileNotFoundError, match="none.json: no such file; expected JSON"):
         from_file(tmp_path / "none.json")
 
 

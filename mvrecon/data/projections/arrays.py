@@ -10,7 +10,7 @@ import numpy as np
 from mvrecon.data.itk import itk_image
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.data.storage import check_chunks, dataset_in
-from mvrecon.files.checks import EDGE, Refused, blaming
+from mvrecon.files.checks import EDGE, Refused, blaming, check_file
 
 EXPECTED = "the views.h5 of mvrecon-simulate: a dataset views [m v u] of floats"
 
@@ -27,8 +27,7 @@ class NpyViews(ProjectionStack):
     """
 
     def __init__(self, path: Path):
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file; expected a NumPy array [m v u]")
+        check_file(path, "a NumPy array [m v u]")
         with blaming(path, "cannot be read as a NumPy array"):
             self._array = np.lib.format.open_memmap(path, mode="r")
         if self._array.ndim == 2:
@@ -75,8 +74,7 @@ class Hdf5Views(ProjectionStack):
     """
 
     def __init__(self, path: Path):
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
+        check_file(path, EXPECTED)
         self._sound: set[int] = set()
         with self._opened(path) as file:
             views = dataset_in(path, file, "views", EXPECTED)

@@ -12,7 +12,7 @@ import numpy as np
 from mvrecon.data.dicom import dicom_file, frames_of, header_of, pixels_of
 from mvrecon.data.projections.order import by_number, ordered
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
-from mvrecon.files.checks import EDGE, Refused, blaming
+from mvrecon.files.checks import EDGE, Refused, blaming, check_file
 
 #: Formats of Pillow by a file's ending.
 PILLOW = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
@@ -138,8 +138,7 @@ def header(file: Path) -> Header:
         FileNotFoundError: nothing is there.
         Refused: not such an image, in colour, or with pages of several sizes.
     """
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: no such file; expected an image (TIFF, PNG or DICOM)")
+    check_file(file, "an image (TIFF, PNG or DICOM)")
     with blaming(file, "cannot be read as an image"):
         if file.suffix.lower() not in PILLOW:
             dataset = header_of(file)

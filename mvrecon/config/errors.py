@@ -1,0 +1,94 @@
+"""Errors of the apps as one line; the environment variable HYDRA_FULL_ERROR=1 shows them whole."""
+
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import PurePosixPath
+from typing import Any
+
+from hydra._internal import utils
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from mvrecon.registry import hint
+
+#: What a user's settings, files and machine can cause; anything else is a fault of the program.
+EXPECTED = (
+    *(HydraException, OmegaConfBaseException),
+    *(ValueError, TypeError, LookupError, OSError, ImportError, RuntimeError, MemoryError),
+    FloatingPointError,
+)
+#: Kinds of these that only a fault of the program raises.
+FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
+
+#: What OmegaConf adds to its messages for programmers.
+TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
+
+
+@contextmanager
+def one_line(app: str) -> Iterator[None]:
+    """Context in which an error that a user can mend ends the process with one line and status 1.
+
+    Args:
+        app: begins the line.
+
+    Raises:
+        SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
+    """
+    report, value = utils.run_and_report, JobReturn.return_value
+    # Hydra's own print tracebacks, and a line more
+    utils.run_and_report = lambda function: function()
+    JobReturn.return_value = value.getter(_result)  # type: ignore[method-assign]
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        sys.stderr.write(f"{app}: stopped by Ctrl-C\n")
+        raise SystemExit(130) from stop
+    except EXPECTED as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1" or _is_fault(error):
+            raise
+        sys.stderr.write(f"{app}: {sentence(error)}\n")
+        raise SystemExit(1) from error
+    finally:
+        utils.run_and_report, JobReturn.return_value = report, value  # type: ignore[method-assign]
+
+
+def _result(job: JobReturn) -> Any:
+    """What a job of Hydra's returned, or its error, which in a sweep tells the job."""
+    if job.status == JobStatus.COMPLETED:
+        return job._return_value
+    if job.hydra_cfg is not None and job.hydra_cfg.hydra.mode == RunMode.MULTIRUN:
+        job._return_value.add_note(f"in the job {' '.join(job.overrides or ())}")
+    raise job._return_value
+
+
+def _is_fault(error: BaseException) -> bool:
+    return isinstance(error, FAULTS) and not isinstance(error, OmegaConfBaseException)
+
+
+def sentence(error: BaseException) -> str:
+    """An error's kind and message on one line, with the nearest known name for a mistyped one."""
+    cause = error.__cause__ or error
+    if isinstance(error, MissingConfigException) and error.options is not None:
+        choice = PurePosixPath(str(error.missing_cfg_file))
+        known = [PurePosixPath(option).name for option in error.options]
+        return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
+    if isinstance(cause, ConfigKeyError | ConfigAttributeError):
+        parent = cause.parent_node
+        known = {str(key) for key in parent or ()} - {"hydra"}
+        return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
+    if isinstance(error, HydraException):
+        texts = [str(error), str(cause) if cause is not error else ""]
+        return _joined(
+            [re.sub(r"\s*(full_key|object_type|reference_type)\b.*", "", t) for t in texts]
+        )
+    return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
+
+
+def _joined(texts: list[str]) -> str:
+    lines = (" ".join(text.split()) for text in texts)
+    return "; ".join(line.rstrip(".") for line in lines if line)

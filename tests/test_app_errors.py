@@ -1,0 +1,133 @@
+"""A mistyped setting is answered in one line, with the nearest name, before torch is imported."""
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mvrecon.config import conf_dir, launch
+from mvrecon.config.plugins import check_plugins, import_plugins, names
+from mvrecon.config.typed import check_parts, fits
+from mvrecon.parts import PROJECTORS
+
+MISTAKES = {
+    "camera.view=4": r"There is no setting 'camera.view'; did you mean 'n_views'\?",
+    "model=crossview": r"model has no choice 'crossview'; did you mean 'cross_view'\?",
+    "camera.n_views=abc": r"camera.n_views: expected int, got 'abc' \(number of cameras",
+    "projector.name=dr": r"projector.name: no projector is 'dr'; did you mean 'drr'\?",
+    "+projector.metod=joseph": r"'metod'; did you mean 'method'\?",
+    "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
+    "modle=sirt": r"There is no setting 'modle'; did you mean 'model'\?",
+    "seed=x": r"Value 'x' of type 'str' could not be converted to Integer$",
+    "+foo=1": r"does not use the setting 'foo'",
+}
+
+
+def reached(config: object) -> None:
+    raise AssertionError("the task was called")
+
+
+@pytest.fixture
+def answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """What `mvrecon-train` writes to the error stream for a command line, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+    def run(*overrides: str, task=reached) -> str:
+        monkeypatch.setattr(sys, "argv", ["mvrecon-train", *overrides])
+        with pytest.raises(SystemExit) as stop:
+            launch(task, "train")
+        assert stop.value.code
+        return capsys.readouterr().err
+
+    return run
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("override", MISTAKES)
+def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
+    override: str, answer, tmp_path: Path
+):
+    """A mistyped setting, choice, value or plugin is answered in one line, with the nearest
+    name, before a folder is made.
+    """
+    text = answer(override)
+    assert text.startswith("mvrecon-train: ") and text.count("\n") == 1, text
+    assert re.search(MISTAKES[override], text.strip()), text
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_traceback_is_there_where_it_is_asked_for(answer, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(sys, "argv", ["mvrecon-train", "model=crossview"])
+    with pytest.raises(Exception, match="Could not find 'model/crossview'"):
+        launch(reached, "train")
+
+
+def test_an_error_of_the_task_is_one_line_and_a_fault_of_the_program_is_not(answer):
+    def refuse(config: object) -> None:
+        raise ValueError("expected a,\n got b")
+
+    def stop(config: object) -> None:
+        raise KeyboardInterrupt
+
+    assert answer(task=refuse) == "mvrecon-train: ValueError: expected a, got b\n"
+    assert answer(task=stop) == "mvrecon-train: stopped by Ctrl-C\n"
+    with pytest.raises(AssertionError, match="the task was called"):
+        answer()
+
+
+@pytest.mark.parametrize(
+    ("type", "good", "bad"),
+    [
+        ("int", [3], ["3", 3.5, True, None, [3]]),
+        ("float | None", [3, 3.5, None], ["3", False]),
+        ("bool", [True], [1, "true"]),
+        ("Literal['a', 'b']", ["a"], ["c", None]),
+        ("Sequence[float] | None", [[1, 2.5], None], [["a"], 3]),
+        ("Whatever | int", ["anything"], []),
+    ],
+)
+def test_plain_types_are_told_apart(type: str, good: list, bad: list):
+    tree = ast.parse(type, mode="eval").body
+    assert all(fits(value, tree) for value in good)
+    assert not any(fits(value, tree) for value in bad)
+
+
+def test_every_choice_of_ours_fits_the_types_of_its_part():
+    for group in ("scene", "camera", "projector", "model"):
+        for file in sorted((conf_dir() / group).glob("*.yaml")):
+            part = yaml.safe_load(file.read_text())
+            part.pop("defaults", None)
+            check_parts({group: part})
+
+
+@pytest.mark.parametrize("page", ["README.md", "plugins/README.md"])
+def test_the_plugin_of_a_page_works_by_its_own_command(
+    page: str, root: Path, answer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The page's own code in its own file, its own command, in a folder that is on no path."""
+    text = (root / page).read_text()
+    code = re.search(r"```python\n([^`]*register\(.doubled.\).*?)```", text, re.S)
+    command = re.search(r"mvrecon-train (experiment=quickstart plugins=[^`\n]*)", text)
+    assert code is not None and command is not None
+    monkeypatch.setattr(PROJECTORS, "_parts", dict(PROJECTORS._parts))
+    monkeypatch.delitem(sys.modules, "my_parts", raising=False)
+    (tmp_path / "my_parts.py").write_text(code[1])
+    with pytest.raises(ModuleNotFoundError, match="plugins=.my_parts. on the command line"):
+        check_plugins(["my_parts"])
+
+    def build(config) -> None:
+        import_plugins(config.plugins)
+        raise ValueError(PROJECTORS.origin(config.projector.name))
+
+    answered = answer(*command[1].split(), task=build)
+    assert answered == "mvrecon-train: ValueError: my_parts:doubled\n"
+
+
+def test_one_string_is_one_module():
+    assert names("my_parts") == names(["my_parts"]) == ["my_parts"] and names(None) == []

@@ -1,0 +1,88 @@
+"""The project that `mvrecon-list --new-plugin` writes keeps what mvrecon asks of every part."""
+
+import importlib.util
+import inspect
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from mvrecon.config import compose
+from mvrecon.listing import main
+from mvrecon.new_plugin import new_plugin
+from mvrecon.parts import REGISTRIES
+from mvrecon.registry import GROUP
+from tests.faults.plugins import plugin
+
+NAME = "seven_kinds"
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory):
+    """The project on Python's path, declared as pip would."""
+    folder = tmp_path_factory.mktemp("projects")
+    new_plugin(NAME, folder)
+    about = tomllib.loads((folder / NAME / "pyproject.toml").read_text())["project"]
+    with plugin(folder / NAME, about["entry-points"][GROUP], name=NAME):
+        spec = importlib.util.spec_from_file_location(
+            "seven_kinds_tests", folder / NAME / "tests" / "test_parts.py"
+        )
+        assert spec is not None and spec.loader is not None
+        tests = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(tests)
+        yield folder / NAME, tests
+    for module in [m for m in sys.modules if m.partition(".")[0] == NAME]:
+        del sys.modules[module]
+
+
+KINDS = ["scene", "camera", "projector", "head", "network", "model", "reconstructor"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_part_of_the_project_passes_its_own_test(kind: str, project):
+    _, tests = project
+    getattr(tests, f"test_{kind}")()
+
+
+def test_the_project_tests_every_part_and_option(project):
+    folder, tests = project
+    own = {n.removeprefix("test_") for n, _ in inspect.getmembers(tests) if n.startswith("test_")}
+    assert own == {*KINDS, "a_file_of_options_has_every_option"}
+    for kind in KINDS:
+        assert NAME in REGISTRIES[kind].names()
+    assert [file.parent.name for file in tests.CONF] == sorted(KINDS)
+    for file in tests.CONF:
+        tests.test_a_file_of_options_has_every_option(file)
+    chosen = compose(*(f"{kind}={NAME}" for kind in ("scene", "camera", "projector", "model")))
+    assert chosen["camera"]["rise_mm"] == 20.0 and chosen["model"] == {
+        "name": NAME,
+        "iterations": 5,
+    }
+
+
+def test_the_project_is_written_as_mvrecon_is(project, root: Path):
+    folder, _ = project
+    command = [sys.executable, "-m", "ruff"]
+    for act in (["check"], ["format", "--check"]):
+        options = [*act, "--no-cache", f"--config={root / 'pyproject.toml'}", str(folder)]
+        done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout
+    assert not [file for file in folder.rglob("*") if "my_plugin" in file.name]
+
+
+def test_a_name_that_is_none_or_taken_is_refused(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["--new-plugin", "mine"]) == 0
+    assert "pip install -e mine" in capsys.readouterr().out
+    before = sorted(tmp_path.rglob("*"))
+    for name, why in {
+        "mine": "exists",
+        "a-b": "a Python package",
+        "mvrecon_x": "not begin",
+    }.items():
+        with pytest.raises(SystemExit):
+            main(["--new-plugin", name])
+        assert why in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
