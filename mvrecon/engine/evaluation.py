@@ -2,7 +2,6 @@
 scenes were used in training.
 """
 
-import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,8 +17,9 @@ from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
 from mvrecon.engine.module import Settings
+from mvrecon.engine.quality import quality_of, quality_row
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of
-from mvrecon.metrics import UNITS, view_metrics, volume_metrics
+from mvrecon.metrics import UNITS, mean_and_spread, view_metrics, volume_metrics
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
 from mvrecon.registry import hint
@@ -40,8 +40,9 @@ def evaluate(
     device: str = "cpu",
     see: See | None = None,
 ) -> Scores:
-    """Figures of merit, milliseconds of one reconstruction ("ms"), and what was wrong with the
-    cameras ("cameras", where a model tells), of each model on each scene.
+    """Figures of merit, milliseconds of one reconstruction ("ms"), what a model tells of its own
+    error ("quality") and what of the cameras ("cameras", where it does), of each model on each
+    scene.
 
     Args:
         models: by label, all for the grid and the rig of `A`.
@@ -63,24 +64,12 @@ def evaluate(
             volume = out.volume
             figures = volume_metrics(volume[0], scene["volume"][0], scene["inside"][0], data_range)
             figures |= view_metrics(A(volume), scene["views"])
-            scores[label].append(
-                {**figures, "ms": milliseconds, **cameras_of(out.alignment, scene)}
-            )
+            figures |= {"ms": milliseconds, "quality": quality_of(out, scene)}
+            scores[label].append({**figures, **cameras_of(out.alignment, scene)})
             volumes[label] = volume
         if see is not None:
             see(scene, volumes)
     return scores
-
-
-def mean_and_spread(values: list[float]) -> dict[str, Any]:
-    """Mean, sample standard deviation (nan where there is none), and the values.
-
-    A nan among them, from a scene without an object, counts in neither.
-    """
-    numbers = [value for value in values if not math.isnan(value)]
-    mean = sum(numbers) / len(numbers) if numbers else math.nan
-    spread = statistics.stdev(numbers) if len(numbers) > 1 and math.isfinite(mean) else math.nan
-    return {"mean": mean, "std": spread, "values": values}
 
 
 def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[str, Trained]:
@@ -145,6 +134,7 @@ def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
         "train_seconds": method.seconds,
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
         **{name: mean_and_spread([score[name] for score in scores]) for name in UNITS},
+        **quality_row(scores),
         **camera_row(scores),
     }
 

@@ -8,6 +8,7 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
+from mvrecon.engine.quality import quality_of
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.engine.wrong_cameras import TRUTH
 from mvrecon.geometry.grid import Grid
@@ -116,6 +117,8 @@ class ReconstructionModule(L.LightningModule):
             )
         ]
         means = {name: torch.tensor([f[name] for f in figures]).nanmean() for name in figures[0]}
+        quality = quality_of(out, batch)
+        means |= {f"quality_{name}": torch.tensor(value) for name, value in quality.items()}
         if out.alignment is not None and "gain" in batch:
             known = camera_metrics(out.alignment, *(batch[key] for key in TRUTH))
             means |= {f"cameras_{name}": torch.tensor(value) for name, value in known.items()}
