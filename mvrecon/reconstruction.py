@@ -73,8 +73,9 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         in_hu = settings["unit"] == "HU"
         save_volume(out, hounsfield(volume) if in_hu else volume, case.grid)
         if (sigma := outcome.sigma) is not None:
-            width = hounsfield(sigma) - hounsfield(0 * sigma) if in_hu else sigma
-            save_volume(beside(out, ".sigma.nii.gz"), width, case.grid)
+            if in_hu:  # half of what lies between, as the scale bends at water
+                sigma = (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
+            save_volume(beside(out, ".sigma.nii.gz"), sigma, case.grid)
         table = {
             **_row(settings, case, out),
             **outcome.row(),
