@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, avg_pool3d
+from torch.nn.functional import avg_pool2d, avg_pool3d, gaussian_nll_loss
 
 from mvrecon.models.output import Reconstruction
 
@@ -16,6 +16,8 @@ from mvrecon.models.output import Reconstruction
 EARLIER = 0.4
 #: Of the truth's power: as much counts each start's error where opinions are compared with it.
 LEAST = 1e-6
+#: The least variance that a voxel may have, relative to the square of the value range.
+VARIANCE = 1e-12
 
 
 def edge_difference(
@@ -54,6 +56,14 @@ def at_cells(volume: Float[Tensor, "b c d h w"], like: Tensor) -> Float[Tensor, 
     return volume if max(edges) == 1 else avg_pool3d(volume, edges, ceil_mode=True)
 
 
+def binned_like(
+    views: Float[Tensor, "b 1 m v u"], like: Float[Tensor, "b k m r s"]
+) -> Float[Tensor, "b 1 m r s"]:
+    """Means of views over the cells of pixels that other views have, in the views' unit."""
+    edge = views.shape[-1] // like.shape[-1]
+    return avg_pool2d(views.flatten(0, 2), edge).unflatten(0, views.shape[:3])
+
+
 @dataclass(frozen=True)
 class Weights:
     """Weights of the terms of a training loss; 0 leaves a term out.
@@ -72,6 +82,9 @@ class Weights:
         corrected_views: of the mean squared error of the views as the cameras' networks have
             corrected them, or of the completed sinogram, against the truth's own views A x_true,
             as mean densities along rays.
+        uncertainty: of the mean negative log-likelihood of the volume's error under the standard
+            deviations that the model expects, Gaussian (Nix & Weigend, IEEE ICNN 1994); it is no
+            term where the model expects none, and has no gradient in the volume.
     """
 
     volume: float = 1.0
@@ -81,6 +94,7 @@ class Weights:
     cross_view: float = 0.0
     rounds: float = 0.0
     corrected_views: float = 0.0
+    uncertainty: float = 0.0
 
 
 class ReconstructionLoss(nn.Module):
@@ -122,12 +136,24 @@ class ReconstructionLoss(nn.Module):
             terms["rounds"] = self._rounds(out, truth)
         if self.compares_views(out):
             terms["corrected_views"] = self._corrected(out, batch["true_views"])
+        if out.sigma is not None and self.weights["uncertainty"]:
+            terms["uncertainty"] = self._uncertainty(out, volume, truth)
         total = sum(self.weights[name] * value for name, value in terms.items())
         return {**terms, "total": torch.as_tensor(total)}
 
     def compares_views(self, out: Reconstruction) -> bool:
         """Whether corrected views of this reconstruction are compared with the truth's own."""
         return bool(out.corrected_views and self.weights["corrected_views"])
+
+    def _uncertainty(self, out: Reconstruction, volume: Tensor, truth: Tensor) -> Float[Tensor, ""]:
+        assert out.sigma is not None
+        variance = (out.sigma / self.data_range).square()
+        if out.support is not None:  # outside it all is zero by definition, the error's size too
+            variance = torch.where(out.support, variance, 1.0)
+        surprise = gaussian_nll_loss(
+            volume.detach(), truth, variance, eps=VARIANCE, reduction="none"
+        )
+        return mean_where(surprise, out.support)
 
     def _rounds(self, out: Reconstruction, truth: Tensor) -> Float[Tensor, ""]:
         errors = [
@@ -160,9 +186,7 @@ class ReconstructionLoss(nn.Module):
             if self.weights["opinions_gain"]:
                 terms["opinions_gain"] = self._gain(out, error, truth, support)
         if out.cross_views is not None and self.weights["cross_view"]:
-            if out.cross_views.shape[-1] < views.shape[-1]:
-                edge = views.shape[-1] // out.cross_views.shape[-1]
-                views = avg_pool2d(views.flatten(0, 2), edge).unflatten(0, views.shape[:3])
+            views = binned_like(views, out.cross_views)
             power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
             terms["cross_view"] = (out.cross_views - views).square().mean() / power
         return terms

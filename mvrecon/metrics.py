@@ -7,6 +7,8 @@ never taken from the data, so that numbers of different volumes compare.
 """
 
 import math
+import statistics
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -128,6 +130,43 @@ def auc(score: Float[Tensor, "*n"], positive: Bool[Tensor, "*n"]) -> float:
     """
     higher = score[positive][:, None] - score[~positive]
     return ((higher.sign() + 1) / 2).double().mean().item()
+
+
+def coverage(error: Float[Tensor, "*n"], sigma: Float[Tensor, "*n"], share: float) -> float:
+    """Share of errors within the Gaussian interval about zero that should hold `share` of them,
+    without a unit; nan for no error.
+
+    Args:
+        error: of each value.
+        sigma: its standard deviation, in the same unit.
+        share: between 0 and 1; 0.68 means |error| <= 0.994 sigma, 0.95 means 1.96 sigma.
+    """
+    wide = statistics.NormalDist().inv_cdf((1 + share) / 2)
+    return (error.abs() <= wide * sigma).double().mean().item()
+
+
+def opinion_spread(
+    opinions: Float[Tensor, "b m 1 d h w"], weights: Float[Tensor, "b m 1 d h w"]
+) -> float:
+    """Weighted standard deviation of the cameras' opinions relative to their weighted mean, both as
+    root mean squares over voxels, without a unit.
+    """
+    opinions, weights = opinions.double(), weights.double()
+    mean = (weights * opinions).sum(dim=1, keepdim=True)
+    deviation = (weights * (opinions - mean).square()).sum(dim=1).sqrt()
+    size = mean.norm().item()
+    return deviation.norm().item() / size if size else 0.0
+
+
+def mean_and_spread(values: list[float]) -> dict[str, Any]:
+    """Mean, sample standard deviation (nan where there is none), and the values.
+
+    A nan among them, from a scene without an object, counts in neither.
+    """
+    numbers = [value for value in values if not math.isnan(value)]
+    mean = sum(numbers) / len(numbers) if numbers else math.nan
+    spread = statistics.stdev(numbers) if len(numbers) > 1 and math.isfinite(mean) else math.nan
+    return {"mean": mean, "std": spread, "values": values}
 
 
 def _rms(error: Tensor) -> float:

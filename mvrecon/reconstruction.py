@@ -30,9 +30,10 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
     `results.json` and, unless `out` names another file, the volume; with `correct=align` also
-    `cameras.png`. A rig that was calibrated (`calibrate`) lies beside the volume, too:
-    `<volume>.cameras.json`. A run that fails leaves none of them, so that the folder is free for a
-    second try.
+    `cameras.png`. Beside the volume lie a rig that was calibrated (`calibrate`), too, as
+    `<volume>.cameras.json`, and the standard deviation of the volume's error, where a network tells
+    it, as `<volume>.sigma.nii.gz` in the volume's unit. A run that fails leaves none of them, so
+    that the folder is free for a second try.
 
     Raises:
         RuntimeError: another process is at work in the folder.
@@ -69,7 +70,12 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         outcome = solve.solve(case, settings, device)
         volume = outcome.volume
         export.save_png(folder / "planes.png", montage.slices(volume, case.grid.spacing))
-        save_volume(out, hounsfield(volume) if settings["unit"] == "HU" else volume, case.grid)
+        in_hu = settings["unit"] == "HU"
+        save_volume(out, hounsfield(volume) if in_hu else volume, case.grid)
+        if (sigma := outcome.sigma) is not None:
+            if in_hu:  # half of what lies between, as the scale bends at water
+                sigma = (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
+            save_volume(beside(out, ".sigma.nii.gz"), sigma, case.grid)
         table = {
             **_row(settings, case, out),
             **outcome.row(),
@@ -94,9 +100,11 @@ def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
     }
 
 
-def beside(volume: Path) -> Path:
-    """The file of a calibrated rig beside its volume; a rig that is there by another name stays."""
-    return volume.with_name(volume.name.partition(".")[0] + ".cameras.json")
+def beside(volume: Path, ending: str = ".cameras.json") -> Path:
+    """The file beside a volume with its name and another ending, that of a calibrated rig; a rig
+    that is there by another name stays.
+    """
+    return volume.with_name(volume.name.partition(".")[0] + ending)
 
 
 def task(config: DictConfig) -> None:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.metrics import view_metrics, volume_metrics
+from mvrecon.metrics import coverage, opinion_spread, view_metrics, volume_metrics
 
 
 def case(shape=(1, 8, 9, 10)):
@@ -129,3 +129,22 @@ def test_small_volumes_and_unequal_views_are_refused():
         volume_metrics(small, small, small > 0, 1.0)
     with pytest.raises(ValueError, match="measured"):
         view_metrics(torch.rand(1, 2, 4, 4), torch.rand(1, 3, 4, 4))
+
+
+def test_intervals_of_a_gaussian_cover_their_share():
+    """68 and 95 % of errors whose sizes differ, if sigma is their standard deviation, within 4
+    standard errors; all with an infinite one."""
+    rng = torch.Generator().manual_seed(0)
+    sigma = torch.rand(40_000, generator=rng) + 0.1
+    error = sigma * torch.randn(40_000, generator=rng)
+    assert coverage(error, sigma, 0.68) == pytest.approx(0.68, abs=0.0094)
+    assert coverage(error, sigma, 0.95) == pytest.approx(0.95, abs=0.0044)
+    assert coverage(error, math.inf * sigma, 0.95) == 1
+    assert math.isnan(coverage(error[:0], sigma[:0], 0.68))
+
+
+def test_the_spread_of_opinions_is_their_standard_deviation_over_their_mean():
+    opinions = torch.tensor([1.0, 3.0, 9.0]).reshape(1, 3, 1, 1, 1, 1)
+    weights = torch.tensor([0.5, 0.5, 0.0]).reshape(1, 3, 1, 1, 1, 1)
+    assert opinion_spread(opinions, weights) == pytest.approx(0.5)
+    assert opinion_spread(0 * opinions, weights) == 0

@@ -197,6 +197,9 @@ class BoardReview(L.Callback):
             shown["opinions"] = montage.opinions(out.opinions[case, :, 0], top, spacing)
         if out.weights is not None:
             shown["weights"] = montage.weights(out.weights[case, :, 0], spacing)
+        if out.sigma is not None:
+            error, sigma = out.volume[case, 0] - truth, out.sigma[case, 0]
+            shown["uncertainty"] = montage.uncertainty(error, sigma, top, spacing)
         if (by := out.alignment) is not None:
             truth = batch["shift_px"][case] if "shift_px" in batch else None
             shown["cameras"] = cameras.alignments(by.shift_px[case], by.gain[case], truth)

@@ -2,7 +2,6 @@
 scenes were used in training.
 """
 
-import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,9 +18,10 @@ from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
 from mvrecon.engine.module import Settings
+from mvrecon.engine.quality import quality_of, quality_row
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of
 from mvrecon.files.memory import peak_since, restarted_peak
-from mvrecon.metrics import UNITS, view_metrics, volume_metrics
+from mvrecon.metrics import UNITS, mean_and_spread, view_metrics, volume_metrics
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
 from mvrecon.registry import hint
@@ -46,8 +46,8 @@ def evaluate(
     see: See | None = None,
 ) -> Scores:
     """Figures of merit, milliseconds and memory of one reconstruction ("ms"; "bytes", None where it
-    is not known), and what was wrong with the cameras ("cameras", where a model tells), of each
-    model on each scene.
+    is not known), what a model tells of its own error ("quality") and what of the cameras
+    ("cameras", where it does), of each model on each scene.
 
     Args:
         models: by label, all for the grid and the rig of `A`.
@@ -69,23 +69,12 @@ def evaluate(
             volume = out.volume
             figures = volume_metrics(volume[0], scene["volume"][0], scene["inside"][0], data_range)
             figures |= view_metrics(A(volume), scene["views"])
-            costs = {"ms": milliseconds, "bytes": needed}
+            costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
             scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
             volumes[label] = volume
         if see is not None:
             see(scene, volumes)
     return scores
-
-
-def mean_and_spread(values: list[float]) -> dict[str, Any]:
-    """Mean, sample standard deviation (nan where there is none), and the values.
-
-    A nan among them, from a scene without an object, counts in neither.
-    """
-    numbers = [value for value in values if not math.isnan(value)]
-    mean = sum(numbers) / len(numbers) if numbers else math.nan
-    spread = statistics.stdev(numbers) if len(numbers) > 1 and math.isfinite(mean) else math.nan
-    return {"mean": mean, "std": spread, "values": values}
 
 
 def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[str, Trained]:
@@ -168,6 +157,7 @@ def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
         "peak_mb": max(needed) / 2**20 if needed else None,
         **{name: mean_and_spread([score[name] for score in scores]) for name in UNITS},
+        **quality_row(scores),
         **camera_row(scores),
     }
 

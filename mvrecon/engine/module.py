@@ -8,6 +8,7 @@ import lightning.pytorch as L
 from torch import Tensor
 
 from mvrecon.engine.means import Means
+from mvrecon.engine.quality import quality_of
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.engine.wrong_cameras import TRUTH
 from mvrecon.geometry.grid import Grid
@@ -120,6 +121,8 @@ class ReconstructionModule(L.LightningModule):
             )
         ]
         means = {name: predicted.new_tensor([f[name] for f in figures]) for name in figures[0]}
+        values = {name: predicted.new_tensor(q) for name, q in quality_of(out, batch).items()}
+        means |= {f"quality_{name}": value.expand(len(predicted)) for name, value in values.items()}
         if out.alignment is not None and "gain" in batch:
             known = camera_metrics(out.alignment, *(batch[key] for key in TRUTH))
             values = {name: predicted.new_tensor(value) for name, value in known.items()}

@@ -9,7 +9,7 @@ from mvrecon.acquisition.settings import Acquisition
 RIGS = ("arc", "circular", "dome", "parallel")
 
 #: Terms of the loss that version 0.1.0 did not have.
-NEW_TERMS = {"opinions_gain": 0.0, "rounds": 0.0, "corrected_views": 0.0}
+NEW_TERMS = {"rounds": 0.0, "corrected_views": 0.0, "opinions_gain": 0.0, "uncertainty": 1e-3}
 
 
 def current_model(model: Any) -> Any:

@@ -9,6 +9,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from mvrecon.engine.quality import sentence
+
 WIDTH = 114
 COLUMNS = {
     "psnr": ("PSNR\ndB", "{:.2f}"),
@@ -61,6 +63,8 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
     if got and (run := results.get("acquisition_of_run", got)) != got:
         lines.append(f"The run's detector was another: {_spoilt(run) or 'perfect'}")
     for label, row in results.get("methods", {}).items():
+        if words := sentence(row.get("quality", {})):
+            lines.append(f"{label}: {words}")
         if "auc" in (cameras := row.get("cameras", {})):
             lines.append(f"{label} tells which cameras are disturbed: {_accuracy(cameras)}")
     if results.get("overlap"):

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mvrecon.engine.scan import Scan
 from mvrecon.files.memory import peak
+from mvrecon.models.output import Reconstruction
 from mvrecon.parts import RECONSTRUCTORS, STREAMED
 from mvrecon.reconstruct.held_out import Choice, held_out
 from mvrecon.reconstruct.left_out import left_out_residual
@@ -37,6 +38,7 @@ class Outcome:
             method does not iterate.
         chosen: iterations and weight that views which were left out have chosen.
         view_nrmse: |y - A x| / |y| over the measured pixels; NaN for views of zero.
+        sigma: standard deviation of each voxel's error, where the method expects one.
     """
 
     volume: Float[Tensor, "d h w"]
@@ -45,10 +47,12 @@ class Outcome:
     view_nrmse: float
     residuals: list[float] = field(default_factory=list)
     chosen: dict[str, Any] = field(default_factory=dict)
+    sigma: Float[Tensor, "d h w"] | None = None
 
     def row(self) -> dict[str, Any]:
-        """All but the volume, for `results.json`."""
-        return {name: value for name, value in vars(self).items() if name != "volume"}
+        """All but volumes, for `results.json`."""
+        volumes = ("volume", "sigma")
+        return {name: value for name, value in vars(self).items() if name not in volumes}
 
 
 def check(settings: Mapping[str, Any]) -> None:
@@ -83,7 +87,8 @@ def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outco
         run = _direct(scan, name, options, device)
     seconds = time.perf_counter() - start
     volume = run.volume[0, 0].cpu()
-    return Outcome(volume, seconds, peak(), run.misfit(), run.residuals, run.chosen)
+    sigma = None if run.sigma is None else run.sigma[0, 0].cpu()
+    return Outcome(volume, seconds, peak(), run.misfit(), run.residuals, run.chosen, sigma)
 
 
 class _Run(NamedTuple):
@@ -92,13 +97,14 @@ class _Run(NamedTuple):
     Args:
         volume: in the unit of the views per mm.
         misfit: |y - A x| / |y|, computed without the method's time.
-        residuals, chosen: as of `Outcome`.
+        residuals, chosen, sigma: as of `Outcome`.
     """
 
     volume: Float[Tensor, "1 1 d h w"]
     misfit: Callable[[], float]
     residuals: list[float] = []
     chosen: dict[str, Any] = {}
+    sigma: Float[Tensor, "1 1 d h w"] | None = None
 
 
 class _Runs:
@@ -156,6 +162,9 @@ def _direct(scan: Scan, name: str, options: dict[str, Any], device: str) -> _Run
     """A method that does not iterate, with all views in memory."""
     whole = scan.measured.whole()
     A, views = scan.operator().to(device), whole.views[None, None].to(device)
+    outputs: list[Reconstruction] = []
+    if "watch" in signature(RECONSTRUCTORS.get(name)).parameters:
+        options["watch"] = outputs.append
     volume = RECONSTRUCTORS.build(name, A, views, **options)
     mask = whole.mask.to(device)
 
@@ -163,7 +172,7 @@ def _direct(scan: Scan, name: str, options: dict[str, Any], device: str) -> _Run
         rest = (views - A(volume))[0, 0]
         return _share(rest[mask].norm().item(), views[0, 0][mask].norm().item())
 
-    return _Run(volume, misfit)
+    return _Run(volume, misfit, sigma=outputs[0].sigma if outputs else None)
 
 
 def _share(rest: float, whole: float) -> float:

@@ -1,12 +1,14 @@
 """A trained network as a reconstructor; the engine is imported at its first use."""
 
 import warnings
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.data import digests
+from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
 from mvrecon.projectors.operator import Projector
 
@@ -15,7 +17,11 @@ USUAL = (0.05, 2.0)
 
 
 def trained(
-    A: Projector, views: Float[Tensor, "b 1 m v u"], checkpoint: str, method: str | None = None
+    A: Projector,
+    views: Float[Tensor, "b 1 m v u"],
+    checkpoint: str,
+    method: str | None = None,
+    watch: Callable[[Reconstruction], None] | None = None,
 ) -> Float[Tensor, "b 1 d h w"]:
     """Reconstruct by a trained network, in the unit of its training.
 
@@ -24,6 +30,7 @@ def trained(
         views: in the operator's unit.
         checkpoint: path of a checkpoint or of a run folder.
         method: its label in the run's table; see `load`.
+        watch: called with all that the network tells, before the volume is returned.
 
     Warns:
         UserWarning: another rig, grid, projector or range of values than in training.
@@ -34,9 +41,11 @@ def trained(
     """
     model, data_range = model_for(A, checkpoint, method)
     with torch.inference_mode():
-        volume = model(views).volume
-    _warn_of_values(volume, data_range, checkpoint)
-    return volume.clone()
+        out = model(views)
+    _warn_of_values(out.volume, data_range, checkpoint)
+    if watch is not None:
+        watch(out)
+    return out.volume.clone()
 
 
 def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple[nn.Module, float]:

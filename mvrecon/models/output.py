@@ -22,6 +22,7 @@ class Reconstruction:
         cross_views: opinion m projected into camera n, in the unit of the views; of a model in
             rounds what the opinions of all others together predict for camera n, m = 1, in cells of
             pixels.
+        sigma: standard deviation of the error that the model expects of each voxel of the volume.
         support: where the volume may differ from zero; none for everywhere.
         start: the classical reconstruction that the network began with.
         start_views: the start projected into every camera, in the unit of the views.
@@ -39,6 +40,7 @@ class Reconstruction:
     visible: Bool[Tensor, "m 1 d h w"] | None = None
     weights: Float[Tensor, "b m 1 d h w"] | None = None
     cross_views: Float[Tensor, "b m n v u"] | None = None
+    sigma: Float[Tensor, "b 1 d h w"] | None = None
     support: Bool[Tensor, "b 1 d h w"] | None = None
     start: Float[Tensor, "b 1 d h w"] | None = None
     start_views: Float[Tensor, "b 1 m v u"] | None = None

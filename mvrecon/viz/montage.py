@@ -162,6 +162,22 @@ def opinions(
     return _captioned(columns, PLANES)
 
 
+def uncertainty(
+    error: Float[Tensor, "d h w"],
+    sigma: Float[Tensor, "d h w"],
+    data_range: float,
+    spacing: Spacing = CUBES,
+) -> Image:
+    """Three middle planes (rows) of the size of a volume's error and of its expected standard
+    deviation (columns), to scale, both from 0 to data_range / 8.
+    """
+    columns = {
+        name: [grey(p, (0, data_range / 8)) for p in middle_planes(v, spacing)]
+        for name, v in (("|error|", error.abs()), ("sigma", sigma))
+    }
+    return _captioned(columns, PLANES)
+
+
 def weights(volumes: Float[Tensor, "m d h w"], spacing: Spacing = CUBES) -> Image:
     """Three middle planes (rows) of every camera's weight (columns), to scale.
 

@@ -18,10 +18,11 @@ from measuring import Results, on_device, wait
 
 from mvrecon.config import compose
 from mvrecon.data.module import SceneData
-from mvrecon.engine.evaluation import evaluate, mean_and_spread
+from mvrecon.engine.evaluation import evaluate
 from mvrecon.engine.fit import build_data, build_module
 from mvrecon.engine.module import ReconstructionModule, Settings
 from mvrecon.engine.schedule import build_schedule
+from mvrecon.metrics import mean_and_spread
 
 #: mm along (x, y, z), and of the detector along (v, u).
 FIELD, DETECTOR = (512, 320, 384), (864, 960)

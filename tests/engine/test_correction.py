@@ -11,6 +11,7 @@ import mvrecon.reconstruction
 from mvrecon.calibration.self_alignment import self_aligned
 from mvrecon.calibration.translation import translated
 from mvrecon.cameras import files
+from mvrecon.data.attenuation import WATER
 from mvrecon.data.volume_files import read_volume
 from mvrecon.engine.export import save_views
 from mvrecon.engine.trained_correction import corrected_by
@@ -23,6 +24,7 @@ from tests.models.rig import small_rig
 
 SHIFT, GAIN = torch.zeros(1, 8, 2), torch.ones(1, 8)
 SHIFT[0, 2], SHIFT[0, 5], GAIN[0, 5] = torch.tensor([0.9, -0.7]), torch.tensor([-0.6, 0.8]), 1.05
+SIRT = "reconstructor=sirt", "reconstructor.momentum=true", "reconstructor.iterations=20"
 WRONG = (SHIFT != 0).any(dim=-1) | (GAIN != 1)
 
 
@@ -35,7 +37,7 @@ def case():
     return PROJECTORS.build("drr", grid=grid, cameras=cameras), sample.volume[None], views
 
 
-def reconstructed(case, folder, *options: str) -> tuple[float, dict]:
+def reconstructed(case, folder, *options: str, method=SIRT) -> tuple[float, dict]:
     """Relative error of the volume of the app, and its results."""
     A, truth, views = case
     stored = save_views(folder, "scan", views[0, 0], "1")
@@ -45,13 +47,10 @@ def reconstructed(case, folder, *options: str) -> tuple[float, dict]:
         f"camera.path={folder}/rig.json",
         f"grid.size={list(A.grid.size)}",
         f"grid.spacing={list(A.grid.spacing)}",
-        "reconstructor=sirt",
-        "reconstructor.momentum=true",
-        "reconstructor.iterations=20",
         f"hydra.run.dir={folder}/run",
         "device=cpu",
     )
-    assert call(mvrecon.reconstruction, *fixed, *options) == 0
+    assert call(mvrecon.reconstruction, *fixed, *method, *options) == 0
     volume, _ = read_volume(folder / "run" / "volume.nii.gz")
     table = json.loads((folder / "run" / "results.json").read_text())
     return ((volume - truth[0, 0]).norm() / truth.norm()).item(), table
@@ -124,8 +123,11 @@ def test_the_table_has_the_figures_where_the_truth_is_known(case):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """One step of a model whose cameras correct views, and of one whose do not."""
-    return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view", "geometry_free")
+    """One step of a model whose cameras correct views and which tells its uncertainty, and of one
+    that does neither.
+    """
+    folder, tells = tmp_path_factory.mktemp("run"), "model.uncertainty=true"
+    return trained_for_a_step(folder, "cross_view", "geometry_free", options=(tells,))
 
 
 def test_views_are_corrected_by_the_cameras_of_a_trained_model(runs):
@@ -136,6 +138,22 @@ def test_views_are_corrected_by_the_cameras_of_a_trained_model(runs):
     assert torch.equal(
         corrected_by(module.projector, views, str(runs), "cross_view").views, expected
     )
+
+
+def test_the_app_writes_the_standard_deviation_beside_the_volume(runs, tmp_path):
+    """In the volume's unit: 1000 HU are 0.0192/mm where all that may be is less than water."""
+    A = mv.load(runs, "cross_view").module.projector
+    truth = torch.full((1, 1, *A.grid.shape), 0.01)
+    of_run = f"reconstructor.checkpoint={runs}", "reconstructor.method=cross_view"
+    method = "reconstructor=trained", *of_run
+    reconstructed((A, truth, A(truth)), tmp_path, "unit=HU", method=method)
+    saved, grid = read_volume(tmp_path / "run" / "volume.sigma.nii.gz")
+    with torch.inference_mode():
+        out = mv.load(runs, "cross_view").module.eval()(A(truth))
+    light = (out.volume + out.sigma < WATER)[0, 0]
+    assert light.any() and torch.allclose(grid.affine, A.grid.affine)
+    expected = out.sigma[0, 0][light] * 1000 / WATER
+    assert expected.min() > 0 and torch.allclose(saved[light], expected, rtol=1e-3, atol=0.1)
 
 
 @pytest.mark.door

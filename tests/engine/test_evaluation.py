@@ -12,11 +12,11 @@ from rich.console import Console
 from torch import nn
 
 from mvrecon.acquisition.settings import Acquisition
-from mvrecon.engine.evaluation import device_of, evaluate, mean_and_spread
+from mvrecon.engine.evaluation import device_of, evaluate
 from mvrecon.engine.export import save_case, save_png
 from mvrecon.engine.report import WIDTH, remarks, table
 from mvrecon.geometry.grid import Grid
-from mvrecon.metrics import UNITS
+from mvrecon.metrics import UNITS, mean_and_spread
 from mvrecon.models.output import Reconstruction
 
 SHAPE = (8, 8, 8)

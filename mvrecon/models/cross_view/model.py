@@ -13,6 +13,7 @@ from mvrecon.models.consistency import Consistency, Start, Steps, checked_start,
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.cross_view.settings import ROUNDS, Computing, RoundOptions
 from mvrecon.models.cross_view.step import Measured, Round, State
+from mvrecon.models.cross_view.uncertainty import Uncertainty
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
@@ -45,7 +46,7 @@ class CrossView(nn.Module):
         support: where the density may differ from zero, from the views: the visual "hull", its
             "box", "auto", or "none" for the whole grid.
         noise: of the views, as `support_from_views` wants it; none for exact views.
-        computing: of `Computing`: precision and crop of the networks.
+        computing: of `Computing`: precision and crop of the networks, and uncertainty.
 
     Raises:
         TypeError: an option that a round or the model does not have.
@@ -78,6 +79,7 @@ class CrossView(nn.Module):
         )
         self.trust = nn.Parameter(torch.ones(())) if first < len(options) else None
         self.consistency = Consistency(consistency)
+        self.uncertainty = Uncertainty(how.precision) if how.uncertainty else None
         self._check_memories()
 
     def _check_memories(self) -> None:
@@ -96,17 +98,21 @@ class CrossView(nn.Module):
         chord = torch.where(geometry.row > 0, 1 / geometry.row, 0)
         boxes = boxes_of(geometry.mask) if self.crop and geometry.mask is not None else None
         measured, state = Measured(geometry, y, chord, boxes), State(x0, torch.zeros_like(x0))
-        volumes, corrected = [], []
+        volumes, corrected, before = [], [], x0
         for one in self.rounds:
-            state = one(measured, state)
+            before, state = state.volume, one(measured, state)
             volumes.append(state.volume * scale)
             if one.corrects:
                 corrected.append((y + chord * state.correction) * scale)
         if state.correction is not None and self.trust is not None:
             y = y + self.trust * chord * state.correction
         volume = self.consistency(geometry, state.volume, y).clamp_min(0)
+        sigma = None
+        if self.uncertainty is not None:
+            sigma = self.uncertainty(geometry, y, volume, (x0, before)) * scale
         return Reconstruction(
             volume * scale,
+            sigma=sigma,
             support=geometry.mask,
             start=x0 * scale,
             earlier=tuple(volumes[:-1]),

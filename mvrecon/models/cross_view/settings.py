@@ -145,13 +145,15 @@ class RoundOptions(Checked):
 
 @dataclass(frozen=True)
 class Computing(Checked):
-    """How the networks of the rounds compute, and on which part of the grid.
+    """How the networks of the rounds compute, on which part of the grid, and whether one more tells
+    how far the volume may be off.
 
     Args:
         precision: of the convolutions, "float32", or "auto": bfloat16 where the processor has
             instructions for it.
         crop: whether the networks in the world see no more of the grid than the box around a
             sample's support, with a margin of 4 voxels.
+        uncertainty: whether a network estimates the standard deviation of each voxel's error.
 
     Raises:
         ValueError: an unknown precision.
@@ -161,6 +163,7 @@ class Computing(Checked):
 
     precision: Precision = "float32"
     crop: bool = False
+    uncertainty: bool = False
 
     def __post_init__(self) -> None:
         if self.precision not in get_args(Precision):

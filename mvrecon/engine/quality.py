@@ -1,0 +1,79 @@
+"""What a method tells of its own error, without the truth, for `results.json`."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from mvrecon.losses import binned_like
+from mvrecon.metrics import coverage, mean_and_spread, nrmse, opinion_spread
+from mvrecon.models.output import Reconstruction
+
+#: Percent of the voxels that intervals should cover.
+SHARES = (68, 95)
+#: Figures that a method has without the truth, and how a line of words calls them.
+WITHOUT_TRUTH = {
+    "predicted_nrmse": "sigma",
+    "opinion_spread": "spread of opinions",
+    "cross_view_nrmse": "views predicted by the other cameras",
+    "view_nrmse": "view NRMSE",
+}
+
+
+def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float]:
+    """What a reconstruction tells of its own error, without a unit: the NRMSE that its standard
+    deviation predicts, the spread of its opinions, and how well these predict the other cameras'
+    views; and how many of the voxels inside the object its intervals cover.
+    """
+    figures = {}
+    if out.sigma is not None:
+        figures["predicted_nrmse"] = nrmse(out.volume + out.sigma, out.volume)
+        inside = scene["inside"]
+        off = (out.volume - scene["volume"])[inside], out.sigma[inside]
+        figures |= {f"coverage_{share}": coverage(*off, share / 100) for share in SHARES}
+    if out.opinions is not None and out.weights is not None:
+        figures["opinion_spread"] = opinion_spread(out.opinions, out.weights)
+    if out.cross_views is not None:
+        views = binned_like(scene["views"], out.cross_views).expand_as(out.cross_views)
+        figures["cross_view_nrmse"] = nrmse(out.cross_views, views)
+    return figures
+
+
+def quality_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Every figure over the scenes; of those without the truth also "rank", Spearman's correlation
+    with the true NRMSE (nan for fewer than three scenes).
+    """
+    figures = [{**score.get("quality", {}), "view_nrmse": score["view_nrmse"]} for score in scores]
+    errors, row = [score["nrmse"] for score in scores], {}
+    for name in figures[0]:
+        values = [figure[name] for figure in figures]
+        row[name] = {} if name == "view_nrmse" else mean_and_spread(values)
+        if name in WITHOUT_TRUTH:
+            row[name]["rank"] = rank_correlation(values, errors)
+    return {"quality": row}
+
+
+def rank_correlation(values: Sequence[float], others: Sequence[float]) -> float:
+    """Spearman's rank correlation, without a unit; nan for fewer than three pairs, or where one is
+    no number.
+    """
+    from torchmetrics.functional.regression import spearman_corrcoef  # slow to import
+
+    pair = torch.tensor([values, others], dtype=torch.float64)
+    if pair.shape[1] < 3 or not pair.isfinite().all():
+        return math.nan
+    return spearman_corrcoef(pair[0], pair[1]).item()
+
+
+def sentence(quality: Mapping[str, Any]) -> str:
+    """A line of words: the coverage of the intervals where there are any, and the ranks."""
+    parts = []
+    if "coverage_68" in quality:
+        covered = " and ".join(f"{quality[f'coverage_{share}']['mean']:.1%}" for share in SHARES)
+        parts.append(f"intervals of 68 % and 95 % cover {covered} of the voxels inside")
+    ranks = {WITHOUT_TRUTH[k]: q["rank"] for k, q in quality.items() if "rank" in q}
+    known = [f"{name} {rank:.2f}" for name, rank in ranks.items() if not math.isnan(rank)]
+    if known:
+        parts.append(f"rank correlation with the true NRMSE: {', '.join(known)}")
+    return "; ".join(parts)

@@ -1,0 +1,56 @@
+"""What a method tells of its own error: figures of a scene, ranks over scenes, words."""
+
+import math
+
+import pytest
+import torch
+
+from mvrecon.engine.quality import quality_of, quality_row, rank_correlation, sentence
+from mvrecon.models.output import Reconstruction
+
+
+def scene(error: float) -> tuple[Reconstruction, dict]:
+    """A volume that is wrong by 1 and 3 of `error`, half of it each, and says so of the first."""
+    truth = torch.ones(1, 1, 4, 4, 4)
+    wrong = torch.full_like(truth, error)
+    wrong[..., :2] *= 3
+    views = torch.ones(1, 1, 2, 4, 4)
+    opinions = torch.stack([truth + error, truth - error], dim=1)
+    out = Reconstruction(
+        truth + wrong,
+        sigma=torch.full_like(truth, 1.5 * error),
+        opinions=opinions,
+        weights=torch.full_like(opinions, 0.5),
+        cross_views=views[..., :2, :2] * (1 + error),
+    )
+    return out, {"volume": truth, "inside": truth > 0, "views": views}
+
+
+def test_figures_of_a_scene():
+    out, case = scene(0.1)
+    figures = quality_of(out, case)
+    assert figures["coverage_68"] == figures["coverage_95"] == 0.5
+    assert figures["predicted_nrmse"] == pytest.approx(float(0.15 * 8 / out.volume.norm()))
+    assert figures["opinion_spread"] == pytest.approx(0.1, rel=1e-4)
+    assert figures["cross_view_nrmse"] == pytest.approx(0.1, rel=1e-4)
+    assert quality_of(Reconstruction(out.volume), case) == {}
+
+
+def test_ranks_over_the_scenes_and_words():
+    errors = (0.1, 0.3, 0.2, 0.4)
+    scores = [{"nrmse": e, "view_nrmse": 1 - e, "quality": quality_of(*scene(e))} for e in errors]
+    row = quality_row(scores)["quality"]
+    assert row["predicted_nrmse"]["rank"] == pytest.approx(1, abs=1e-4)
+    assert row["view_nrmse"] == {"rank": pytest.approx(-1, abs=1e-4)}
+    assert "rank" not in row["coverage_68"] and len(row["coverage_68"]["values"]) == 4
+    words = sentence(row)
+    assert words.startswith("intervals of 68 % and 95 % cover 50.0% and 50.0% of the voxels inside")
+    assert "sigma 1.00, spread of opinions 1.00" in words and words.endswith("view NRMSE -1.00")
+    plain = [{"nrmse": e, "view_nrmse": e} for e in errors[:2]]
+    assert sentence(quality_row(plain)["quality"]) == ""
+
+
+def test_two_scenes_or_a_number_that_is_none_have_no_rank():
+    assert rank_correlation([1.0, 3.0, 2.0], [1.0, 3.0, 2.0]) == pytest.approx(1, abs=1e-4)
+    assert math.isnan(rank_correlation([1.0, 2.0], [1.0, 2.0]))
+    assert math.isnan(rank_correlation([1.0, 2.0, math.inf], [1.0, 2.0, 3.0]))
