@@ -161,8 +161,9 @@ class ReconstructionLoss(nn.Module):
                 terms["opinions_gain"] = self._gain(out, error, truth, support)
         if out.cross_views is not None and self.weights["cross_view"]:
             if out.cross_views.shape[-1] < views.shape[-1]:
-                edge = views.shape[-1] // out.cross_views.shape[-1]
-                views = avg_pool2d(views.flatten(0, 2), edge).unflatten(0, views.shape[:3])
+                edge = -(-views.shape[-1] // out.cross_views.shape[-1])
+                pooled = avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
+                views = pooled.unflatten(0, views.shape[:3])
             power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
             terms["cross_view"] = (out.cross_views - views).square().mean() / power
         return terms

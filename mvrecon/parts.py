@@ -19,6 +19,7 @@ CAMERAS = Registry(
     circular="mvrecon.cameras.rigs:circular",
     arc="mvrecon.cameras.rigs:arc",
     dome="mvrecon.cameras.rigs:dome",
+    random="mvrecon.cameras.random_rigs:random",
     parallel="mvrecon.cameras.rigs:parallel",
     from_file="mvrecon.cameras.files:from_file",
     dcspect80="mvrecon.cameras.dcspect80:dcspect80",

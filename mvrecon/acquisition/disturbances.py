@@ -22,16 +22,18 @@ class Disturbance:
         views: so many of a case's views, drawn for each case.
         shift_px: of the detector along columns and along rows, uniform between minus and plus this.
         gain: of the views' values, 1 + a number uniform between minus and plus this.
+        share: of the cases that have such errors, 0 to 1; the others have none.
 
     Raises:
         TypeError: an option that is no number.
-        ValueError: numbers below 0 or not finite, a gain of 1 or more, views that are no whole
-            number of at least 1.
+        ValueError: numbers below 0 or not finite, a gain of 1 or more, a share above 1, views that
+            are no whole number of at least 1.
     """
 
     views: int = 1
     shift_px: float = 0.0
     gain: float = 0.0
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -41,6 +43,8 @@ class Disturbance:
             raise ValueError(
                 f"Expected disturbed.views as a whole number of at least 1, got {self.views}"
             )
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"Expected disturbed.share from 0 to 1, got {self.share}")
         if not (0 <= self.shift_px < math.inf and 0 <= self.gain < 1):
             raise ValueError(
                 f"Expected disturbed.shift_px of at least 0 and disturbed.gain from 0 to below 1, "
@@ -91,6 +95,8 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
         raise ValueError(f"Expected disturbed.views of at most the rig's {m} cameras, got {k}")
     chosen = torch.zeros(m, 1, dtype=torch.float64)
     chosen[torch.randperm(m, generator=rng)[:k]] = 1.0
+    if disturbance.share < 1:
+        chosen *= torch.rand((), generator=rng) < disturbance.share
     drawn = chosen * (2 * torch.rand(m, 3, generator=rng, dtype=torch.float64) - 1)
     offset, gain = drawn.split((2, 1), dim=1)
     return RigErrors(disturbance.shift_px * offset, 1 + disturbance.gain * gain[..., None])
