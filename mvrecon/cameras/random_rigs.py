@@ -20,7 +20,7 @@ ARC, APERTURE, ELEVATION = (90.0, 200.0), (90.0, 180.0), 45.0
 UNEVEN = 0.2
 
 
-def random(
+def random_rig(
     n_views: Sequence[int],
     sid: Sequence[float],
     magnification: Sequence[float],

@@ -197,18 +197,16 @@ class SceneData(L.LightningDataModule):
             else torch.Generator(),  # or each epoch draws from the global one
         )
 
-    def digests(self, *parts: str) -> dict[str, str]:
-        """SHA-256 of the rig, and of every file by its path that the scenes of `parts` ("train",
-        "test") read.
+    def digests(self, *parts: str, rig: bool = True) -> dict[str, str]:
+        """SHA-256 of the rig, unless it may be another, and of every file by its path that the
+        scenes of `parts` ("train", "test") read.
 
         Each is read once.
         """
         paths = sorted({path for part in parts for path in self._files[part]})
         self._digests |= {path: sha256.of_file(path) for path in paths if path not in self._digests}
-        return {
-            sha256.RIG: sha256.of_rig(self.cameras),
-            **{path: self._digests[path] for path in paths},
-        }
+        own = {sha256.RIG: sha256.of_rig(self.cameras)} if rig else {}
+        return own | {path: self._digests[path] for path in paths}
 
     def state_dict(self) -> dict[str, Any]:
         """State for a checkpoint: epoch and position in it, names of the training cases, digests of

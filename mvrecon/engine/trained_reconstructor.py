@@ -22,11 +22,12 @@ def trained(
     Args:
         A: the operator that made the views, on the grid that is reconstructed.
         views: in the operator's unit.
-        checkpoint: path of a checkpoint or of a run folder.
-        method: its label in the run's table; see `load`.
+        checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
+        method: its label in the run's table.
 
     Warns:
-        UserWarning: another rig, grid, projector or range of values than in training.
+        UserWarning: another grid, projector or range of values than in training, or another rig
+            where it was trained on one.
 
     Raises:
         ValueError: a network that was trained for another number of cameras or voxels.
@@ -47,7 +48,8 @@ def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple
     from mvrecon.engine.trained import load  # Lightning's import takes seconds
 
     module = load(checkpoint, method).module
-    for difference in _differences(A, module.projector):
+    many = module.hparams["geometry"].get("rigs", 0) > 0
+    for difference in _differences(A, module.projector, many):
         warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=3)
     model = MODELS.from_config(module.hparams["model"], projector=A)
     try:
@@ -60,10 +62,12 @@ def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple
     return model.to(A.device).eval(), module.hparams["data_range"]
 
 
-def _differences(A: Projector, other: Projector) -> list[str]:
-    """What differs from the operator of the training, in words."""
+def _differences(A: Projector, other: Projector, many: bool) -> list[str]:
+    """What differs from the operator of the training, in words; no rig where it was trained on
+    many.
+    """
     grid, trained_grid, lines = A.grid, other.grid, []
-    if digests.of_rig(A.cameras) != digests.of_rig(other.cameras):
+    if not many and digests.of_rig(A.cameras) != digests.of_rig(other.cameras):
         counts = f"{len(other.cameras)} cameras of {other.cameras.shape} pixels"
         lines.append(f"rig ({counts}); got {len(A.cameras)} of {A.cameras.shape}")
     if grid.shape != trained_grid.shape or not torch.allclose(grid.affine, trained_grid.affine):

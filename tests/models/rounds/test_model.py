@@ -86,6 +86,17 @@ def test_nothing_depends_on_the_order_of_the_cameras():
     assert (permuted - volume).abs().max() < 1e-5 * volume.abs().max()
 
 
+@pytest.mark.parametrize("name", ["rays2d", "frustum3d"])
+def test_weights_fit_a_rig_and_a_detector_of_any_size(name):
+    """Cells may stand beyond the detector; pixels there are none, and change nothing."""
+    cameras = {"name": name, "widths": [4, 6], "depths": 4}
+    rounds = [{"widths": [4, 6], "cameras": cameras}]
+    other = small_projector(3, pixels=11)
+    check_model("rounds", other, rounds=rounds)
+    model = Rounds(other, rounds)
+    model.load_state_dict(Rounds(small_projector(4, size=10), rounds).state_dict())
+
+
 @pytest.mark.filterwarnings("ignore:Rays are up to")
 @torch.no_grad()
 def test_outside_the_hull_all_rounds_are_zero_and_inside_not():
