@@ -84,8 +84,7 @@ class ReconstructionModule(L.LightningModule):
         Raises:
             FloatingPointError: a loss that is not finite.
         """
-        own = self._on_rig(batch)
-        terms = self._terms(own, own.model(batch["views"]), batch)
+        terms = self._terms(self._on_rig(batch).model(batch["views"]), batch)
         if not terms["total"].isfinite():
             shown = ", ".join(f"{name} {value.item():.4g}" for name, value in terms.items())
             raise FloatingPointError(
@@ -103,10 +102,10 @@ class ReconstructionModule(L.LightningModule):
             )
         return terms["total"]
 
-    def _terms(self, own: OnRig, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def _terms(self, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
         """The loss, with the truth's own views where views are corrected towards them."""
         if self.loss.compares_views(out):
-            A = own.corrected.to(batch["volume"].device)
+            A = self._on_rig(batch).corrected.to(batch["volume"].device)
             batch = {**batch, "true_views": A(batch["volume"])}
         return self.loss(out, batch)
 
@@ -114,7 +113,7 @@ class ReconstructionModule(L.LightningModule):
         """Log the loss and the figures of merit; hand the reconstruction on to the board."""
         own = self._on_rig(batch)
         out = own.model(batch["views"])
-        terms = {f"loss_{name}": value for name, value in self._terms(own, out, batch).items()}
+        terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
         predicted = own.A(out.volume)
         figures = [
             volume_metrics(volume, truth, inside, self.hparams["data_range"])

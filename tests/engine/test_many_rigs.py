@@ -19,15 +19,17 @@ from tests.models.rig import small_projector
 
 CAMERAS = "{name: rays2d, widths: [4], depths: 4}"
 SETTINGS = (
-    "experiment=smoke",
-    "~compare.sirt",
     "camera=random",
+    "callbacks=quiet",
+    "logger=csv",
+    "optimizer.lr=1e-3",
+    "trainer={max_steps: 3, val_check_interval: 3, accelerator: cpu}",
     "camera.n_views=[3,4]",
     "camera.pixels=[13,17]",
     "model=rounds",
     f"model.rounds=[{{resolution: half, widths: [4], cameras: {CAMERAS}}}]",
     "model.start=2",
-    "loss={rounds: 1.0, corrected_views: 10.0}",
+    "loss.corrected_views=10.0",
     "grid.size=[8,8,8]",
     "grid.spacing=16.0",
     "data={rigs: 3, sizes: {train: 6, val: 1, test: 1}}",
@@ -97,7 +99,7 @@ def test_weights_in_a_file_are_the_trained_ones_and_fit_a_rig_never_seen(
     assert len(words) == 1 and "another grid" in words[0], "any rig is as in training"
     settings = run_folder.anchored({"checkpoint": "ours"})
     assert settings == {"checkpoint": str(path)}
-    with pytest.raises(FileNotFoundError, match="is at .*theirs; .*Known: ours|did you mean"):
+    with pytest.raises(FileNotFoundError, match="is at .*theirs.*Known: ours"):
         mv.load("theirs")
 
 

@@ -12,6 +12,7 @@ from mvrecon.models.frusta import Frusta
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.rounds.model import Rounds
 from mvrecon.models.rounds.sampling import RaySamples
+from mvrecon.models.rounds.views import Binned, means
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.reconstruct.iterative import sirt
 from mvrecon.testing import check_model
@@ -214,12 +215,23 @@ def test_samples_along_rays_are_those_of_the_frusta():
     assert samples.double().maps.dtype == samples.half().maps.dtype == torch.float64
 
 
-@pytest.mark.parametrize(("pixels", "edge"), [(12, 3), (8, 2), (7, 1)])
-def test_pixels_are_joined_where_the_detector_divides(pixels, edge):
+@pytest.mark.parametrize(("pixels", "edge"), [(12, 3), (8, 3), (2, 2)])
+def test_pixels_are_joined_on_a_detector_that_has_as_many(pixels, edge):
     projector = small_projector(pixels=pixels)
     model = stirred(projector)
     assert model.rounds[0].cameras.binning == edge
     assert model(projector(blob(projector))).volume.isfinite().all()
+
+
+def test_a_cell_beyond_the_detector_is_where_its_pixels_would_be():
+    """So a cell is in the same place as that of a detector which the cells fill."""
+    whole = Binned.of(small_projector(pixels=12), 3).cameras
+    grid, cameras = small_rig(pixels=12)
+    less = PROJECTORS.build("drr", grid=grid, cameras=cameras.cropped((0, 11), (0, 10)))
+    assert torch.equal(Binned.of(less, 3).cameras.rays()[1], whole.rays()[1])
+    views = torch.rand(1, 1, 4, 11, 10)
+    expected = views[..., 9:11, 9:].mean(dim=(-2, -1))
+    assert torch.allclose(means(views, 3)[..., -1, -1], expected)
 
 
 def test_weights_come_back_from_a_file():
