@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mvrecon.cameras.epipolar import epipolar_line as epipolar_line
     from mvrecon.cameras.explicit import ExplicitRays as ExplicitRays
     from mvrecon.cameras.files import from_file as from_file
+    from mvrecon.cameras.random_rigs import random_rig as random_rig
     from mvrecon.cameras.rigs import arc as arc
     from mvrecon.cameras.rigs import circular as circular
     from mvrecon.cameras.rigs import dome as dome
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from mvrecon.data.volume_files import read_volume as read_volume
     from mvrecon.data.volume_files import save_volume as save_volume
     from mvrecon.engine.trained import load as load
+    from mvrecon.engine.trained import save_weights as save_weights
     from mvrecon.geometry.grid import Grid as Grid
     from mvrecon.projectors.drr import Drr as Drr
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
@@ -77,9 +79,11 @@ _DOOR = {
     "osem": "mvrecon.reconstruct.mlem:osem",
     "parallel": "mvrecon.cameras.rigs:parallel",
     "pdhg_tv": "mvrecon.reconstruct.pdhg_tv:pdhg_tv",
+    "random_rig": "mvrecon.cameras.random_rigs:random_rig",
     "read_volume": "mvrecon.data.volume_files:read_volume",
     "reconstructed": "mvrecon.reconstruct.by_name:reconstructed",
     "save_volume": "mvrecon.data.volume_files:save_volume",
+    "save_weights": "mvrecon.engine.trained:save_weights",
     "sirt": "mvrecon.reconstruct.iterative:sirt",
     "tikhonov": "mvrecon.reconstruct.tikhonov:tikhonov",
     "tv_map": "mvrecon.reconstruct.tv_map:tv_map",

@@ -17,15 +17,16 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     Args:
         options: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the
-            run: `test_scene`, `acquisition`, `data`, further `compare`; `device` and `save`.
+            run: `test_scene`, `acquisition`, `camera`, `grid`, `data`, further `compare`; `device`
+            and `save`.
         folder: where the results go, with `eval.yaml`, which is `options`, and `versions.txt`.
 
     Raises:
         FileNotFoundError: no checkpoint or no run is there.
         RuntimeError: another process is at work in the folder.
-        ValueError: an unknown device; the run was made with another rig or other data; the folder
-            is another evaluation's; settings for a method that the run has trained, which its
-            checkpoint decides.
+        ValueError: an unknown device; the run's rig or data have changed since; weights that do not
+            fit the camera or the grid; the folder is another evaluation's; settings for a method
+            that the run has trained, which its checkpoint decides.
         FileExistsError: the folder is a run's own.
     """
     import_plugins(options["plugins"])
@@ -47,32 +48,50 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
         export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
 
     see = save if options["save"] else None
-    run_folder.compare_measurement(run, data.digests("test"))
+    elsewhere = bool(options["camera"] or options["grid"])
+    run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
     with run_folder.taken(folder, options, run_folder.EVALUATION):
-        table = evaluation.results(settings, run, data, device, see)
+        table = evaluation.results(settings, run, data, device, see, elsewhere)
         table["checkpoint"] = str(run)
         table["acquisition_of_run"] = trained["acquisition"]
+        table["geometry"] = {key: settings[key] for key in ("camera", "grid")}
+        table["geometry_of_run"] = {key: trained[key] for key in ("camera", "grid")}
         run_folder.write_results(folder, table)
     return table
 
 
 def merged(run: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """A run's settings with the test scene, the acquisition, the data options and the compared
-    methods that an evaluation gives.
+    """A run's settings with the test scene, the acquisition, the camera, the grid, the data options
+    and the compared methods that an evaluation gives.
+
+    A camera with a name takes the place of the run's; without, its options change those of the
+    run's. Cases are of one rig.
     """
-    data = {**run["data"], **(options["data"] or {})}
-    data["sizes"] = {**run["data"]["sizes"], **(data["sizes"] or {})}
+    data = over(run["data"], options["data"] or {})
     scene = options["test_scene"] or run["test_scene"]
-    acquisition = {**run["acquisition"], **(options["acquisition"] or {})}
-    compare = {**run["compare"], **options["compare"]}
+    camera, grid = options["camera"] or {}, options["grid"] or {}
+    sizes = {"size", "shape"} if {"size", "shape"} & set(grid) else set()
+    kept = {key: value for key, value in run["grid"].items() if key not in sizes}
     return {
         **run,
         "name": f"{run['name']} ({options['name']})",
         "test_scene": scene,
-        "acquisition": acquisition,
-        "data": data,
-        "compare": compare,
+        "acquisition": {**run["acquisition"], **(options["acquisition"] or {})},
+        "camera": camera if "name" in camera else over(run["camera"], camera),
+        "grid": {**kept, **grid},
+        "data": {**data, "rigs": 0},
+        "compare": {**run["compare"], **options["compare"]},
     }
+
+
+def over(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Settings with changes, mapping by mapping."""
+    inner = {
+        key: over(settings[key], value)
+        for key, value in changes.items()
+        if isinstance(value, dict) and isinstance(settings.get(key), dict)
+    }
+    return {**settings, **changes, **inner}
 
 
 def task(config: DictConfig) -> None:

@@ -60,8 +60,9 @@ def binned_like(
     views: Float[Tensor, "b 1 m v u"], like: Float[Tensor, "b k m r s"]
 ) -> Float[Tensor, "b 1 m r s"]:
     """Means of views over the cells of pixels that other views have, in the views' unit."""
-    edge = views.shape[-1] // like.shape[-1]
-    return avg_pool2d(views.flatten(0, 2), edge).unflatten(0, views.shape[:3])
+    edge = -(-views.shape[-1] // like.shape[-1])
+    pooled = avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
+    return pooled.unflatten(0, views.shape[:3])
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ class ScanSettings:
 
 @dataclass
 class Evaluation:
-    """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the camera, are
+    """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the model, are
     not keys.
     """
 
@@ -81,6 +81,8 @@ class Evaluation:
     checkpoint: str = MISSING
     test_scene: Any = None
     acquisition: Any = None
+    camera: Any = None
+    grid: Any = field(default_factory=dict)
     data: Any = None
     compare: Any = field(default_factory=dict)
     device: str = "auto"

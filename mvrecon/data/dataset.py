@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.progress import track
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from mvrecon.cameras.camera import Cameras
@@ -154,10 +155,14 @@ class EpochOrder(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         epoch, n_done = self.resumed
-        order = torch.randperm(self.count, generator=generator(self.seed, self.epoch)).tolist()
+        order = self.order(generator(self.seed, self.epoch)).tolist()
         order += order[: -self.count % self.world]
         rest = order[n_done:] if self.epoch == epoch else order
         return iter(rest[self.rank :: self.world])
+
+    def order(self, rng: torch.Generator) -> Tensor:
+        """The items of one epoch."""
+        return torch.randperm(self.count, generator=rng)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next order; Lightning calls this."""

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,14 @@ from torch.utils.data import DataLoader
 from mvrecon import __version__
 from mvrecon.acquisition.acquired import Acquired
 from mvrecon.acquisition.settings import Acquisition
+from mvrecon.cameras.camera import Cameras
 from mvrecon.data import digests as sha256
 from mvrecon.data.case_store import CaseStore
 from mvrecon.data.dataset import EpochOrder, SceneDataset, shared
+from mvrecon.data.loading import Loading
+from mvrecon.data.rigs import ManyRigs, RigOrder, training_rigs
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.registry import check_options
 from mvrecon.scenes.sample import Scene
 
 #: Series of random cases. Every run is judged on the same ones; its own seed makes the cases that
@@ -26,42 +27,6 @@ from mvrecon.scenes.sample import Scene
 TEST, VAL, TRAIN = 0, 1, 2
 #: Which parts of the data each stage of Lightning needs.
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
-
-
-@dataclass(frozen=True)
-class Loading:
-    """How cases are made and put into batches.
-
-    Args:
-        batch_size: cases in a batch.
-        workers: processes that make the cases before training, and load batches.
-        cache: folder in which cases are kept from run to run, without their noise; None: they are
-            made anew by every run. All cases of a run are kept in memory either way.
-
-    Raises:
-        ValueError: a number that is too small.
-    """
-
-    batch_size: int = 1
-    workers: int = 0
-    cache: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.batch_size < 1 or self.workers < 0:
-            raise ValueError(
-                f"Expected a batch_size of at least 1 and workers of at least 0, got "
-                f"{self.batch_size} and {self.workers}"
-            )
-
-    @classmethod
-    def of(cls, options: Mapping[str, Any]) -> "Loading":
-        """The options of a mapping.
-
-        Raises:
-            TypeError: an unknown option; the message gives the nearest and all.
-        """
-        check_options("data", options, (field.name for field in fields(cls)))
-        return cls(**options)
 
 
 class SceneData(L.LightningDataModule):
@@ -81,7 +46,8 @@ class SceneData(L.LightningDataModule):
         overlap: training, validation and test take the first cases of a file, the same ones: for a
             file with one volume.
         seed: of the training cases and their order.
-        loading: of `Loading`: cases in a batch, processes, and where cases are kept.
+        loading: of `Loading`: cases in a batch, processes, where cases are kept, and by how many
+            rigs they are measured.
 
     Raises:
         TypeError: an unknown option of the acquisition or of loading.
@@ -109,11 +75,12 @@ class SceneData(L.LightningDataModule):
                 f"Expected sizes and seed of at least 0, got sizes {dict(sizes)}, seed {seed}"
             )
         self.grid = Grid.centred(**measurement["grid"])
-        self.cameras = CAMERAS.from_config(measurement["camera"])
+        self.cameras: Cameras = CAMERAS.from_config(measurement["camera"])
         self.projector = measurement.get("projector")
         self.acquisition = Acquisition.of(measurement.get("acquisition"))
         self.sizes, self.loading = dict(sizes), Loading.of(loading)
         self.overlap, self.seed = overlap, seed
+        self.rigs = training_rigs(measurement["camera"], self.loading.rigs)
         self._settings = {key: dict(scenes[key]) for key in ("train", "test")}
         self.scenes: dict[str, Scene] = {
             key: SCENES.from_config(scenes[key]) for key in ("train", "test")
@@ -126,7 +93,7 @@ class SceneData(L.LightningDataModule):
         self.shared = same_cases(scenes["train"], scenes["test"])
         self._files = {key: list(sha256.files_in(scenes[key])) for key in ("train", "test")}
         self._digests: dict[str, str] = {}
-        self.sets: dict[str, SceneDataset] = {}
+        self.sets: dict[str, SceneDataset | ManyRigs] = {}
         self._order: EpochOrder | None = None
         self._volumes: list[str] | None = None
 
@@ -170,19 +137,28 @@ class SceneData(L.LightningDataModule):
         series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}
         for part in STAGES[stage] if stage else ("train", "val", "test"):
             if part not in self.sets:
-                measured = self._measured("test" if part == "test" else "train")
-                made = SceneDataset(
-                    measured, self.grid, self.cameras, self.indices(part), series[part]
-                )
+                made = self._cases(part, series[part])
                 made.prepare(f"{part} cases", self.loading.workers)
                 self.sets[part] = made
-        if "train" in self.sets:
-            self._order = EpochOrder(len(self.sets["train"]), self.seed, *self._share)
+        if (cases := self.sets.get("train")) is not None:
+            if isinstance(cases, ManyRigs):
+                self._order = RigOrder(cases, self.seed, *self._share)
+            else:
+                self._order = EpochOrder(len(cases), self.seed, *self._share)
 
     @property
     def _share(self) -> tuple[int, int]:
         """This process's number in training, and the number of all."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def _cases(self, part: str, series: int) -> SceneDataset | ManyRigs:
+        """The cases of "train", "val" or "test"."""
+        measured = self._measured("test" if part == "test" else "train")
+        indices = self.indices(part)
+        if part == "train" and self.rigs:
+            together = self.loading.batch_size * self._share[1]
+            return ManyRigs(measured, self.grid, self.rigs, indices, series, together)
+        return SceneDataset(measured, self.grid, self.cameras, indices, series)
 
     def _measured(self, key: str) -> Acquired:
         """The scene "train" or "test" behind its detector, with the cases that are kept of it."""
@@ -228,18 +204,16 @@ class SceneData(L.LightningDataModule):
             else torch.Generator(),  # or each epoch draws from the global one
         )
 
-    def digests(self, *parts: str) -> dict[str, str]:
-        """SHA-256 of the rig, and of every file by its path that the scenes of `parts` ("train",
-        "test") read.
+    def digests(self, *parts: str, rig: bool = True) -> dict[str, str]:
+        """SHA-256 of the rig, unless it may be another, and of every file by its path that the
+        scenes of `parts` ("train", "test") read.
 
         Each is read once.
         """
         paths = sorted({path for part in parts for path in self._files[part]})
         self._digests |= {path: sha256.of_file(path) for path in paths if path not in self._digests}
-        return {
-            sha256.RIG: sha256.of_rig(self.cameras),
-            **{path: self._digests[path] for path in paths},
-        }
+        own = {sha256.RIG: sha256.of_rig(self.cameras)} if rig else {}
+        return own | {path: self._digests[path] for path in paths}
 
     def state_dict(self) -> dict[str, Any]:
         """State for a checkpoint: epoch and position in it, names of the training cases, digests of

@@ -17,7 +17,8 @@ from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
-from mvrecon.engine.module import Settings
+from mvrecon.engine.module import Settings, build_projector
+from mvrecon.engine.on_rig import with_weights_of
 from mvrecon.engine.quality import quality_of, quality_row
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of
 from mvrecon.files.memory import peak_since, restarted_peak
@@ -92,19 +93,40 @@ def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[st
 
 
 def results(
-    settings: Settings, folder: Path, data: SceneData, device: str = "cpu", see: See | None = None
+    settings: Settings,
+    folder: Path,
+    data: SceneData,
+    device: str = "cpu",
+    see: See | None = None,
+    elsewhere: bool = False,
 ) -> dict[str, Any]:
     """The result table of a run: its checkpoints evaluated on the test scenes of `data`.
 
+    Args:
+        settings: of the run, or of an evaluation.
+        folder: of the run.
+        data: with the test scenes.
+        device: where the models run.
+        see: called with every scene and its reconstructions by label.
+        elsewhere: on the rig and the grid of `settings`, which may be others than in training.
+
     Raises:
         FileNotFoundError: a method whose training has not ended.
-        Refused: a method that was trained with another rig, or with other contents of a file.
+        ValueError: weights that do not fit the rig or the grid.
+        Refused: a method that was trained with another rig, which is no `elsewhere`, or with other
+            contents of a file.
     """
     trained = load_methods(settings, folder, data.data_range)
     for label, method in trained.items():
-        digests.compare(data.digests("test"), method.digests, finished(folder, label))
-    models: dict[str, nn.Module] = {label: method.module.model for label, method in trained.items()}
+        known = data.digests("test", rig=not elsewhere)
+        digests.compare(known, method.digests, finished(folder, label))
     A = next(iter(trained.values())).module.projector
+    if elsewhere:
+        A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    models = {
+        label: _on(A, method) if elsewhere else method.module.model
+        for label, method in trained.items()
+    }
     names: list[str] = []
     truths: list[str] = []
 
@@ -146,6 +168,12 @@ def validation_psnr(
     models = {label: module.model}
     scores = evaluate(models, batches, module.projector, data.data_range, device)
     return mean_and_spread([score["psnr"] for score in scores[label]])["mean"]
+
+
+def _on(A: Projector, method: Trained) -> nn.Module:
+    """A method's model on another operator; one without training is made for it already."""
+    model = method.module.model
+    return with_weights_of(model, method.module.hparams["model"], A) if method.steps else model
 
 
 def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:

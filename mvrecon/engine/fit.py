@@ -69,6 +69,8 @@ def build_data(settings: Settings) -> SceneData:
 def build_module(settings: Settings, model: Settings, data_range: float) -> ReconstructionModule:
     """A method of a run, with fresh weights."""
     geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
+    if rigs := settings["data"].get("rigs", 0):
+        geometry["rigs"] = rigs
     return ReconstructionModule(
         geometry, model, settings["loss"], settings["optimizer"], data_range
     )

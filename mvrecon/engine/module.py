@@ -1,13 +1,14 @@
 """One model in training, as a LightningModule: its loss, figures of merit and optimiser."""
 
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import lightning.pytorch as L
 from torch import Tensor
 
+from mvrecon.data.rigs import camera_of
 from mvrecon.engine.means import Means
+from mvrecon.engine.on_rig import OnRig, with_weights_of
 from mvrecon.engine.quality import quality_of
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.engine.wrong_cameras import TRUTH
@@ -37,7 +38,8 @@ class ReconstructionModule(L.LightningModule):
     Lightning's own way of loading does not (SECURITY.md).
 
     Args:
-        geometry: `grid`, `camera` and `projector`.
+        geometry: `grid`, `camera` and `projector`; where the training cases are of many rigs, their
+            number as `rigs`.
         model: name and options of the model.
         loss: weights of `ReconstructionLoss`.
         optimizer: name and options, and `schedule` with its `warmup`.
@@ -54,8 +56,10 @@ class ReconstructionModule(L.LightningModule):
     ):
         super().__init__()
         self.save_hyperparameters(logger=False)
-        self.projector = build_projector(**geometry)
+        self.projector = self._projector(0)
         self.model = MODELS.from_config(model, projector=self.projector)
+        own = OnRig(self.projector, self.model, geometry["projector"])
+        self._rigs = {0: own}  # no module: a checkpoint has the weights once
         self.loss = ReconstructionLoss(data_range, **loss)
         self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
 
@@ -63,13 +67,27 @@ class ReconstructionModule(L.LightningModule):
         """Reconstruct; see the model."""
         return self.model(views)
 
+    def _projector(self, rig: int) -> Projector:
+        geometry = self.hparams["geometry"]
+        camera = camera_of(geometry["camera"], rig)
+        return build_projector(geometry["grid"], camera, geometry["projector"])
+
+    def _on_rig(self, batch: dict[str, Any]) -> OnRig:
+        """The model on the rig of a batch: its own, or a training rig by its number."""
+        rig = int(batch["rig"][0]) if "rig" in batch else 0
+        if rig not in self._rigs:
+            A, options = self._projector(rig), self.hparams["model"]
+            model = with_weights_of(self.model, options, A)
+            self._rigs[rig] = OnRig(A, model, self.hparams["geometry"]["projector"])
+        return self._rigs[rig].ready(self.device, self.training)
+
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """The loss of one batch.
 
         Raises:
             FloatingPointError: a loss that is not finite.
         """
-        terms = self._terms(self.model(batch["views"]), batch)
+        terms = self._terms(self._on_rig(batch).model(batch["views"]), batch)
         if not terms["total"].isfinite():
             shown = ", ".join(f"{name} {value.item():.4g}" for name, value in terms.items())
             raise FloatingPointError(
@@ -91,28 +109,18 @@ class ReconstructionModule(L.LightningModule):
     def _terms(self, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
         """The loss, with the truth's own views where views are corrected towards them."""
         if self.loss.compares_views(out):
-            A = self.corrected_projector.to(batch["volume"].device)
+            A = self._on_rig(batch).corrected.to(batch["volume"].device)
             batch = {**batch, "true_views": A(batch["volume"])}
         return self.loss(out, batch)
-
-    @cached_property
-    def corrected_projector(self) -> Projector:
-        """The operator of the views that the model corrects: its own, or one of the same kind for
-        the model's `corrected_cameras`.
-        """
-        cameras = getattr(self.model, "corrected_cameras", None)
-        if cameras is None:
-            return self.projector
-        options = self.hparams["geometry"]["projector"]
-        return PROJECTORS.from_config(options, grid=self.projector.grid, cameras=cameras)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
         """Judge a batch by the loss and the figures of merit; hand the reconstruction on to the
         board.
         """
-        out = self.model(batch["views"])
+        own = self._on_rig(batch)
+        out = own.model(batch["views"])
         terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
-        predicted = self.projector(out.volume)
+        predicted = own.A(out.volume)
         figures = [
             volume_metrics(volume, truth, inside, self.hparams["data_range"])
             | view_metrics(view, measured)

@@ -21,6 +21,7 @@ from mvrecon.data.module import SceneData
 from mvrecon.engine.old_names import current
 from mvrecon.files.atomic import claimed, written_whole
 from mvrecon.files.checks import Refused, blaming, shown, text_of, yaml_of
+from mvrecon.files.places import of_weights
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
@@ -168,7 +169,8 @@ def anchored(value: Any) -> Any:
     """
     if isinstance(value, dict):
         return {
-            key: _absolute(item) if key in PLACES else anchored(item) for key, item in value.items()
+            key: _absolute(key, item) if key in PLACES else anchored(item)
+            for key, item in value.items()
         }
     return [anchored(item) for item in value] if isinstance(value, list) else value
 
@@ -212,10 +214,12 @@ def _cleared_on_failure(folder: Path, names: Sequence[str]) -> Iterator[None]:
         raise
 
 
-def _absolute(path: Any) -> Any:
+def _absolute(key: str, path: Any) -> Any:
     if isinstance(path, dict | list):
         return anchored(path)
-    return str(Path(path).expanduser().absolute()) if isinstance(path, str) else path
+    if not isinstance(path, str):
+        return path
+    return str(of_weights(path) if key == "checkpoint" else Path(path).expanduser().absolute())
 
 
 def _finite(value: Any) -> Any:

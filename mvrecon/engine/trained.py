@@ -1,12 +1,15 @@
-"""A trained method, from the path of its checkpoint or of its run."""
+"""A trained method, from the path of its checkpoint, of its weights or of its run."""
 
 from pathlib import Path
 
 from mvrecon.config.plugins import import_plugins
-from mvrecon.engine import checkpoints
+from mvrecon.engine import checkpoints, weights_file
 from mvrecon.engine.checkpoints import Trained
 from mvrecon.engine.fit import methods
 from mvrecon.engine.run_folder import read_settings
+from mvrecon.engine.weights_file import ENDING
+from mvrecon.files.places import of_weights, shipped_weights
+from mvrecon.registry import hint
 
 
 def load(path: str | Path, method: str | None = None) -> Trained:
@@ -14,8 +17,8 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     `load(path)(views, cameras, grid)` that of another rig and grid.
 
     Args:
-        path: of a checkpoint, or of a run folder; the modules that the run's setting `plugins`
-            names are imported.
+        path: of a checkpoint, of weights (.safetensors) or of a run folder, whose modules in the
+            setting `plugins` are imported; or the name of weights that are part of mvrecon.
         method: its label in the run's table; None: the run's main method. A checkpoint holds one
             method, and needs no label.
 
@@ -26,9 +29,13 @@ def load(path: str | Path, method: str | None = None) -> Trained:
         Refused: more than tensors and plain values, or not the weights of the method that it
             describes.
     """
-    path = Path(path).expanduser()
+    path = of_weights(path)
     if path.is_file():
-        return checkpoints.load(path)
+        return weights_file.read(path) if path.suffix == ENDING else checkpoints.load(path)
+    if not path.exists():
+        raise FileNotFoundError(
+            f"No checkpoint or run folder is at {path}{hint(path.name, shipped_weights())}"
+        )
     folder = checkpoints.run_folder(path)
     settings = read_settings(folder)
     labels = list(methods(settings))
@@ -36,3 +43,18 @@ def load(path: str | Path, method: str | None = None) -> Trained:
         raise LookupError(f"The run {folder} has no method {method!r}. It has {', '.join(labels)}")
     import_plugins(settings["plugins"])
     return checkpoints.load(checkpoints.finished(folder, method or labels[0]))
+
+
+def save_weights(run: str | Path, path: str | Path, method: str | None = None) -> Path:
+    """Write a trained method's weights and settings into one file, for others and for other rigs;
+    returns its path.
+
+    Args:
+        run: as the `path` of `load`.
+        path: of the file, which ends with .safetensors.
+        method: its label in the run's table; None: the run's main method.
+
+    Raises:
+        ValueError: another ending; what `load` raises.
+    """
+    return weights_file.write(path, load(run, method))

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.data import digests
+from mvrecon.engine.on_rig import with_weights_of
 from mvrecon.models.output import Reconstruction
-from mvrecon.parts import MODELS
 from mvrecon.projectors.operator import Projector
 
 #: Of the training's value range: a volume whose greatest value is not between these is told.
@@ -28,12 +28,13 @@ def trained(
     Args:
         A: the operator that made the views, on the grid that is reconstructed.
         views: in the operator's unit.
-        checkpoint: path of a checkpoint or of a run folder.
-        method: its label in the run's table; see `load`.
+        checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
+        method: its label in the run's table.
         watch: called with all that the network tells, before the volume is returned.
 
     Warns:
-        UserWarning: another rig, grid, projector or range of values than in training.
+        UserWarning: another grid, projector or range of values than in training, or another rig
+            where it was trained on one.
 
     Raises:
         ValueError: a network that was trained for another number of cameras or voxels.
@@ -56,7 +57,8 @@ def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple
     from mvrecon.engine.trained import load  # Lightning's import takes seconds
 
     module = load(checkpoint, method).module
-    for difference in _differences(A, module.projector):
+    many = module.hparams["geometry"].get("rigs", 0) > 0
+    for difference in _differences(A, module.projector, many):
         warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=3)
     return model_on(A, module, checkpoint), module.hparams["data_range"]
 
@@ -72,21 +74,19 @@ def model_on(A: Projector, module: nn.Module, checkpoint: str) -> nn.Module:
     Raises:
         ValueError: weights that fit the rig and the grid of the training alone.
     """
-    model = MODELS.from_config(module.hparams["model"], projector=A)  # type: ignore[index]
     try:
-        model.load_state_dict(module.model.state_dict())  # type: ignore[union-attr]
-    except RuntimeError as error:
-        raise ValueError(
-            f"{checkpoint}: expected the rig and the grid of its training, got "
-            f"{len(A.cameras)} cameras and {A.grid.shape} voxels: {error}"
-        ) from error
+        model = with_weights_of(module.model, module.hparams["model"], A)  # type: ignore[arg-type, index]
+    except ValueError as error:
+        raise ValueError(f"{checkpoint}: {error}") from error
     return model.to(A.device).eval()
 
 
-def _differences(A: Projector, other: Projector) -> list[str]:
-    """What differs from the operator of the training, in words."""
+def _differences(A: Projector, other: Projector, many: bool) -> list[str]:
+    """What differs from the operator of the training, in words; no rig where it was trained on
+    many.
+    """
     grid, trained_grid, lines = A.grid, other.grid, []
-    if digests.of_rig(A.cameras) != digests.of_rig(other.cameras):
+    if not many and digests.of_rig(A.cameras) != digests.of_rig(other.cameras):
         counts = f"{len(other.cameras)} cameras of {other.cameras.shape} pixels"
         lines.append(f"rig ({counts}); got {len(A.cameras)} of {A.cameras.shape}")
     if grid.shape != trained_grid.shape or not torch.allclose(grid.affine, trained_grid.affine):

@@ -18,6 +18,8 @@ LOGS = ("save_dir", "root_dir", "log_dir")
 #: Addresses of files that are no paths: file:x, memory://x, simplecache::x; those of a web service
 #: write no file here.
 ADDRESS = re.compile(r"(?!https?://)(file:|.*(:/|::))")
+#: Trained weights that are part of mvrecon.
+WEIGHTS = Path(__file__).parents[1] / "weights"
 
 
 def inside(path: str | os.PathLike[str], folder: Path, what: str) -> Path:
@@ -77,3 +79,18 @@ def check_places(thing: Any, folder: Path) -> None:
         place = getattr(thing, name, None)
         if isinstance(place, str | os.PathLike) and str(place):
             inside(place, folder, f"{name} of {type(thing).__name__}")
+
+
+def shipped_weights() -> dict[str, Path]:
+    """The files of trained weights that are part of mvrecon, by name."""
+    return {path.stem: path for path in sorted(WEIGHTS.glob("*.safetensors"))}
+
+
+def of_weights(path: str | os.PathLike[str]) -> Path:
+    """The absolute path of a checkpoint; a name at which nothing is may be that of weights that are
+    part of mvrecon.
+    """
+    local = Path(path).expanduser()
+    return (
+        local.absolute() if local.exists() else shipped_weights().get(str(path), local.absolute())
+    )

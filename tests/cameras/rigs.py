@@ -23,6 +23,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "detector": OFFSET,
     },
     "parallel": {"n_views": 5, "detector": OFFSET, "depth_mm": 300.0},
+    "random": {
+        "n_views": (4, 6),
+        "sid": (300.0, 500.0),
+        "magnification": (1.3, 2.0),
+        "pixels": (5, 9),
+        "field_mm": (60.0, 90.0),
+    },
     "dcspect80": {"pixels": [6, 9]},
 }
 

@@ -19,9 +19,9 @@ APPS = {
     "stress": "mvrecon_bench.stress",
 }
 UNUSED = [
-    ("eval", "+camera.n_views=12"),
-    ("eval", "+camera=circular"),
-    ("eval", "+grid.spacing=2.0"),
+    ("eval", "+camra.n_views=12"),
+    ("eval", "+gird.spacing=2.0"),
+    ("eval", "+loss.volume=1"),
     ("eval", "+projector.name=drr"),
     ("eval", "+model.name=sirt"),
     ("eval", "+seed=5"),
@@ -54,11 +54,9 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
 
 
 @pytest.mark.door
-@pytest.mark.parametrize(
-    "option", ["seed=5", "camera.n_views=12", "grid.spacing=2.0", "projector=drr"]
-)
+@pytest.mark.parametrize("option", ["seed=5", "model=sirt", "loss.volume=2.0", "projector=drr"])
 def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
-    """The seed, the rig, the grid and the projector of an evaluation are those of the run, and
+    """The seed, the model, the loss and the projector of an evaluation are those of the run, and
     cannot be typed.
     """
     with pytest.raises(Exception, match=f"Could not override '{option.partition('=')[0]}'"):

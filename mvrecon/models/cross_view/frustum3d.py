@@ -33,8 +33,8 @@ class Frustum3d(nn.Module):
         task: what the round asks for.
         widths: channels of each scale, the finest first.
         depths: bins along a ray.
-        binning: detector pixels joined into a cell along each axis, at most; the largest number
-            that divides rows and columns is taken.
+        binning: detector pixels joined into a cell along each axis; fewer on a detector of fewer
+            rows or columns.
         memory: channels handed on to the cameras' network of a later round.
         precision: of the convolutions in 3-D.
 
@@ -88,7 +88,7 @@ class Frustum3d(nn.Module):
         correction = None
         if self.last is not None:
             cells = self.last(torch.cat([along.flatten(0, 1), images], dim=1))
-            correction = correction_of(cells, self.binning, b)
+            correction = correction_of(cells, self.binning, evidence.measured)
         return Answer(memory, correction, placed if self.task.logits else None)
 
     def _volumes(

@@ -27,8 +27,8 @@ class Rays2d(nn.Module):
         task: what the round asks for.
         widths: channels of each scale, the finest first.
         depths: samples along a ray.
-        binning: detector pixels joined into a cell along each axis, at most; the largest number
-            that divides rows and columns is taken.
+        binning: detector pixels joined into a cell along each axis; fewer on a detector of fewer
+            rows or columns.
         memory: channels handed on to the cameras' network of a later round.
         precision: of the convolutions.
 
@@ -70,7 +70,9 @@ class Rays2d(nn.Module):
         along = self.samples(volumes).flatten(2, 3).flatten(0, 1)
         answer = self.unet(torch.cat([images, along, evidence.memory.flatten(0, 1)], dim=1))
         cells, logits, features, memory = answer.split(self.sizes, dim=1)
-        correction = correction_of(cells, self.binning, b) if self.task.correct else None
+        correction = None
+        if self.task.correct:
+            correction = correction_of(cells, self.binning, evidence.measured)
         placed = None
         if self.task.logits:
             placed = torch.cat([logits, features], dim=1)

@@ -1,5 +1,6 @@
 """The views of a rig as a cameras' network sees them: cells of pixels as channels."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -8,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.models.cross_view.cells import from_cells, to_cells
+from mvrecon.models.cross_view.cells import from_cells, padded, to_cells, trimmed
 from mvrecon.models.cross_view.evidence import MAGNIFIED, SMALL, Evidence
 from mvrecon.projectors.operator import Projector
 
@@ -17,7 +18,7 @@ IMAGES = 3
 
 
 class Binned(NamedTuple):
-    """A rig whose detector pixels are joined into cells.
+    """A rig whose detector pixels are joined into cells, the last ones partly beyond the detector.
 
     Args:
         cameras: with cells as pixels.
@@ -29,8 +30,8 @@ class Binned(NamedTuple):
 
     @classmethod
     def of(cls, projector: Projector, binning: int) -> "Binned":
-        """The rig of a projector in cells of at most `binning` pixels along each axis: the largest
-        number that divides rows and columns.
+        """The rig of a projector in cells of `binning` pixels along each axis, of fewer where the
+        detector has fewer rows or columns: so weights fit a detector of any other size.
 
         Raises:
             ValueError: explicit rays, which have no image.
@@ -41,8 +42,9 @@ class Binned(NamedTuple):
                 f"Expected a rig of cameras for a cameras' network, got {type(cameras).__name__}"
             )
         rows, columns = cameras.shape
-        edge = max(k for k in range(1, binning + 1) if rows % k == 0 and columns % k == 0)
-        return cls(cameras.binned(edge), edge)
+        edge = min(binning, rows, columns)
+        whole = rows + -rows % edge, columns + -columns % edge
+        return cls(replace(cameras, shape=whole).binned(edge), edge)
 
 
 def image_cells(evidence: Evidence, edge: int) -> Float[Tensor, "b m k r s"]:
@@ -51,19 +53,20 @@ def image_cells(evidence: Evidence, edge: int) -> Float[Tensor, "b m k r s"]:
     mean = F.avg_pool2d(measured, 3, stride=1, padding=1, count_include_pad=False)
     residual = MAGNIFIED * evidence.residual.squeeze(1)
     views = torch.stack([residual, measured, MAGNIFIED * (measured - mean)], dim=2)
-    return to_cells(views.flatten(0, 1), edge).unflatten(0, measured.shape[:2])
+    return to_cells(padded(views.flatten(0, 1), edge), edge).unflatten(0, measured.shape[:2])
 
 
 def correction_of(
-    cells: Float[Tensor, "n k r s"], edge: int, samples: int
+    cells: Float[Tensor, "n k r s"], edge: int, like: Float[Tensor, "b 1 m v u"]
 ) -> Float[Tensor, "b 1 m v u"]:
-    """The correction of every view, from the cells of all cameras of so many samples."""
-    views = from_cells(cells, edge).unflatten(0, (samples, -1)).transpose(1, 2)
-    return SMALL * views
+    """The correction of every view, from the cells of all cameras, in the size of `like`."""
+    views = trimmed(from_cells(cells, edge), like.shape[-2:])
+    return SMALL * views.unflatten(0, (len(like), -1)).transpose(1, 2)
 
 
 def means(views: Float[Tensor, "b 1 m v u"], edge: int) -> Float[Tensor, "b 1 m r s"]:
     """The views at a detector of cells: the mean of each cell's pixels."""
     if edge == 1:
         return views
-    return F.avg_pool2d(views.flatten(0, 2), edge).unflatten(0, views.shape[:3])
+    pooled = F.avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
+    return pooled.unflatten(0, views.shape[:3])

@@ -12,6 +12,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.losses import EARLIER, ReconstructionLoss
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.cross_view.sampling import RaySamples
+from mvrecon.models.cross_view.views import Binned, means
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
@@ -86,6 +87,17 @@ def test_nothing_depends_on_the_order_of_the_cameras():
     volume = stirred(projector)(views).volume
     permuted = stirred(turned)(views[:, :, order]).volume
     assert (permuted - volume).abs().max() < 1e-5 * volume.abs().max()
+
+
+@pytest.mark.parametrize("name", ["rays2d", "frustum3d"])
+def test_weights_fit_a_rig_and_a_detector_of_any_size(name):
+    """Cells may stand beyond the detector; pixels there are none, and change nothing."""
+    cameras = {"name": name, "widths": [4, 6], "depths": 4}
+    rounds = [{"widths": [4, 6], "cameras": cameras}]
+    other = small_projector(3, pixels=11)
+    check_model("cross_view", other, rounds=rounds)
+    model = CrossView(other, rounds)
+    model.load_state_dict(CrossView(small_projector(4, size=10), rounds).state_dict())
 
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
@@ -205,12 +217,23 @@ def test_samples_along_rays_are_those_of_the_frusta():
     assert samples.double().maps.dtype == samples.half().maps.dtype == torch.float64
 
 
-@pytest.mark.parametrize(("pixels", "edge"), [(12, 3), (8, 2), (7, 1)])
-def test_pixels_are_joined_where_the_detector_divides(pixels, edge):
+@pytest.mark.parametrize(("pixels", "edge"), [(12, 3), (8, 3), (2, 2)])
+def test_pixels_are_joined_on_a_detector_that_has_as_many(pixels, edge):
     projector = small_projector(pixels=pixels)
     model = stirred(projector)
     assert model.rounds[0].cameras.binning == edge
     assert model(projector(blob(projector))).volume.isfinite().all()
+
+
+def test_a_cell_beyond_the_detector_is_where_its_pixels_would_be():
+    """So a cell is in the same place as that of a detector which the cells fill."""
+    whole = Binned.of(small_projector(pixels=12), 3).cameras
+    grid, cameras = small_rig(pixels=12)
+    less = PROJECTORS.build("drr", grid=grid, cameras=cameras.cropped((0, 11), (0, 10)))
+    assert torch.equal(Binned.of(less, 3).cameras.rays()[1], whole.rays()[1])
+    views = torch.rand(1, 1, 4, 11, 10)
+    expected = views[..., 9:11, 9:].mean(dim=(-2, -1))
+    assert torch.allclose(means(views, 3)[..., -1, -1], expected)
 
 
 def test_weights_come_back_from_a_file():

@@ -159,9 +159,9 @@ def test_in_training_the_true_sinogram_is_of_the_rig_that_the_model_completes(A,
     make = partial(ReconstructionModule, geometry, loss={"corrected_views": 1.0})
     module = make({"name": "sinogram_unet", "factor": 2}, optimizer={}, data_range=0.026)
     truth = sample.volume[None]
-    assert close(module.corrected_projector(truth), fan(views=16)(truth), 1e-6)
+    assert close(module._on_rig({}).corrected(truth), fan(views=16)(truth), 1e-6)
     plain = make({"name": "fbp_unet"}, optimizer={}, data_range=0.026)
-    assert plain.corrected_projector is plain.projector
+    assert plain._on_rig({}).corrected is plain.projector
 
 
 @pytest.mark.door

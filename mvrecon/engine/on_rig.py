@@ -1,0 +1,74 @@
+"""One model on several rigs: the same weights, another geometry."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import nn
+
+from mvrecon.parts import MODELS, PROJECTORS
+from mvrecon.projectors.operator import Projector
+
+
+@dataclass(eq=False)
+class OnRig:
+    """A model on one rig.
+
+    Args:
+        A: operator of the rig.
+        model: for it.
+        projector: name and options of the operator.
+    """
+
+    A: Projector
+    model: nn.Module
+    projector: dict[str, Any]
+
+    @cached_property
+    def corrected(self) -> Projector:
+        """The operator of the views that the model corrects: its own, or one of the same kind for
+        the model's `corrected_cameras`.
+        """
+        cameras = getattr(self.model, "corrected_cameras", None)
+        if cameras is None:
+            return self.A
+        return PROJECTORS.from_config(self.projector, grid=self.A.grid, cameras=cameras)
+
+    def ready(self, device: torch.device, training: bool) -> "OnRig":
+        """The same on a device, for training or not."""
+        self.A.to(device)
+        self.model.to(device).train(training)
+        return self
+
+
+def with_weights_of(model: nn.Module, options: dict[str, Any], A: Projector) -> nn.Module:
+    """A model of the same options for another operator, whose weights are the very tensors of the
+    first: what one learns, both have learned.
+
+    Args:
+        model: that has the weights.
+        options: its name and options.
+        A: the other operator.
+
+    Raises:
+        ValueError: weights that belong to a rig or a grid, such as a network for each camera.
+    """
+    with torch.random.fork_rng(devices=[]):  # initial weights that nobody uses
+        other = MODELS.from_config(options, projector=A)
+    weights, own = model.state_dict(keep_vars=True), other.state_dict()
+    if differing := [
+        name
+        for name in {**weights, **own}
+        if name not in own or name not in weights or own[name].shape != weights[name].shape
+    ]:
+        raise ValueError(
+            f"Expected weights that fit any rig, got {len(differing)} of {options['name']!r} that "
+            f"do not fit {len(A.cameras)} cameras of {tuple(A.cameras.shape)} pixels and "
+            f"{A.grid.shape} voxels, {differing[0]} among them; networks of cameras need shared: "
+            f"true"
+        )
+    for name, tensor in weights.items():
+        owner, _, last = name.rpartition(".")
+        setattr(other.get_submodule(owner), last, tensor)
+    return other

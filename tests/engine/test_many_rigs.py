@@ -1,0 +1,134 @@
+"""One set of weights on many rigs: trained, written into one file, and used on a rig never seen."""
+
+import warnings
+
+import pytest
+import torch
+
+import mvrecon as mv
+import mvrecon.eval
+from mvrecon.config import compose
+from mvrecon.engine import fit, run_folder
+from mvrecon.engine.on_rig import with_weights_of
+from mvrecon.engine.trained_reconstructor import trained
+from mvrecon.files import places
+from mvrecon.parts import MODELS, PROJECTORS
+from tests.cameras.rigs import OPTIONS
+from tests.engine.runs import call
+from tests.models.rig import small_projector
+
+CAMERAS = "{name: rays2d, widths: [4], depths: 4}"
+SETTINGS = (
+    "camera=random",
+    "callbacks=quiet",
+    "logger=csv",
+    "optimizer.lr=1e-3",
+    "trainer={max_steps: 3, val_check_interval: 3, accelerator: cpu}",
+    "camera.n_views=[3,4]",
+    "camera.pixels=[13,17]",
+    "model=cross_view",
+    f"model.rounds=[{{resolution: half, widths: [4], cameras: {CAMERAS}}}]",
+    "model.start=2",
+    "loss.corrected_views=10.0",
+    "grid.size=[8,8,8]",
+    "grid.spacing=16.0",
+    "data={rigs: 3, sizes: {train: 6, val: 1, test: 1}}",
+    "projector.backend=reference",
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Three steps, on a batch of each of three rigs."""
+    folder = tmp_path_factory.mktemp("run")
+    settings = compose(*SETTINGS)
+    run_folder.start(folder, settings)
+    fit.fit("cross_view", settings, fit.build_data(settings), folder)
+    return folder
+
+
+def a_rig(n_views):
+    options = {**OPTIONS["random"], "n_views": (n_views, n_views), "seed": 77}
+    grid = mv.Grid.centred(9, spacing=12.0)
+    return PROJECTORS.build("drr", grid=grid, cameras=mv.random_rig(**options))
+
+
+def test_a_step_on_one_rig_is_a_step_of_the_weights_on_all():
+    options = {"name": "cross_view", "rounds": [{"widths": [4], "cameras": {"name": "rays2d"}}]}
+    A, B = small_projector(4), small_projector(3, pixels=10)
+    state = torch.get_rng_state()
+    model = MODELS.from_config(options, projector=A)
+    torch.set_rng_state(state)
+    other = with_weights_of(model, options, B)
+    assert torch.equal(torch.get_rng_state(), state), "later random numbers stay"
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    truth = torch.rand(1, 1, *B.grid.shape)
+    other(B(truth)).volume.square().mean().backward()
+    optimizer.step()
+    copy = MODELS.from_config(options, projector=B)
+    copy.load_state_dict(model.state_dict())
+    assert torch.equal(copy(B(truth)).volume, other(B(truth)).volume)
+    assert model.rounds[0].step.item() == other.rounds[0].step.item() != 1
+
+
+def test_a_network_for_each_camera_is_no_network_for_any_rig():
+    cameras = {"name": "rays2d", "shared": False}
+    options = {"name": "cross_view", "rounds": [{"widths": [4], "cameras": cameras}]}
+    model = MODELS.from_config(options, projector=small_projector(4))
+    with pytest.raises(ValueError, match="do not fit 3 cameras .*need shared: true"):
+        with_weights_of(model, options, small_projector(3))
+
+
+def test_weights_in_a_file_are_the_trained_ones_and_fit_a_rig_never_seen(
+    run, tmp_path, monkeypatch
+):
+    path = mv.save_weights(run, tmp_path / "ours.safetensors")
+    ours, first = mv.load(path), mv.load(run)
+    assert ours.steps == first.steps == 3
+    weights = first.module.state_dict()
+    assert any(value.any() for name, value in weights.items() if name.endswith("trust"))
+    assert all(torch.equal(value, weights[k]) for k, value in ours.module.state_dict().items())
+    monkeypatch.setattr(places, "WEIGHTS", tmp_path)
+    A = a_rig(5)
+    views = A(torch.full((1, 1, *A.grid.shape), 0.5))
+    with warnings.catch_warnings(record=True) as messages:
+        warnings.simplefilter("always")
+        volume = trained(A, views, "ours")
+    assert volume.shape[2:] == A.grid.shape and volume.isfinite().all() and volume.any()
+    words = [str(w.message) for w in messages if "trained with" in str(w.message)]
+    assert len(words) == 1 and "another grid" in words[0], "any rig is as in training"
+    settings = run_folder.anchored({"checkpoint": "ours"})
+    assert settings == {"checkpoint": str(path)}
+    with pytest.raises(FileNotFoundError, match="is at .*theirs.*Known: ours"):
+        mv.load("theirs")
+
+
+@pytest.mark.door
+def test_a_flipped_bit_or_a_foreign_file_of_weights_is_refused(run, tmp_path):
+    """Weights with a flipped bit, without a description or cut short are refused."""
+    path = mv.save_weights(run, tmp_path / "ours.safetensors")
+    raw = path.read_bytes()
+    for bad, message in (
+        (raw[:-1] + bytes([raw[-1] ^ 1]), "do not fit their SHA-256"),
+        (raw[:-8], "is no .safetensors file"),
+        (raw.replace(b'"mvrecon"', b'"foreign"', 1), "expected a description"),
+    ):
+        path.write_bytes(bad)
+        with pytest.raises(ValueError, match=message):
+            mv.load(path)
+    with pytest.raises(ValueError, match=r"Expected a file \.safetensors"):
+        mv.save_weights(run, tmp_path / "ours.bin")
+
+
+def test_a_run_is_evaluated_on_another_rig_and_grid(run, tmp_path):
+    options = ("+camera.n_views=[5,5]", "+grid.size=[9,9,7]", "device=cpu")
+    where = f"hydra.run.dir={tmp_path}"
+    assert call(mvrecon.eval, f"checkpoint={run}", *options, where) == 0
+    merged = mvrecon.eval.merged(
+        run_folder.read_settings(run),
+        compose(f"checkpoint={run}", *options, config_name="eval"),
+    )
+    assert merged["camera"]["n_views"] == [5, 5] and merged["camera"]["pixels"] == [13, 17]
+    assert merged["grid"] == {"size": [9, 9, 7], "spacing": 16.0}
+    wrong = (f"checkpoint={run}", "+camera.n_view=[5,5]", where + "_2")
+    assert call(mvrecon.eval, *wrong) != 0
