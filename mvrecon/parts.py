@@ -47,8 +47,8 @@ NETWORKS = Registry(
 )
 CAMERA_NETWORKS = Registry(
     "camera_network",
-    rays2d="mvrecon.models.rounds.rays2d:Rays2d",
-    frustum3d="mvrecon.models.rounds.frustum3d:Frustum3d",
+    rays2d="mvrecon.models.cross_view.rays2d:Rays2d",
+    frustum3d="mvrecon.models.cross_view.frustum3d:Frustum3d",
 )
 RECONSTRUCTORS = Registry(
     "reconstructor",
@@ -79,8 +79,8 @@ CORRECTIONS = Registry(
 )
 MODELS = Registry(
     "model",
-    cross_view="mvrecon.models.cross_view:CrossView",
-    rounds="mvrecon.models.rounds.model:Rounds",
+    cross_view="mvrecon.models.cross_view.model:CrossView",
+    single_pass="mvrecon.models.single_pass:SinglePass",
     mean_fusion="mvrecon.models.baselines:MeanFusion",
     backprojection_unet="mvrecon.models.baselines:BackprojectionUNet",
     geometry_free="mvrecon.models.baselines:GeometryFree",

@@ -5,6 +5,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh dev
 
 export PATH="$PWD/.venv/bin:$PATH" OMP_NUM_THREADS=1
+# the many processes that tests start read each other's bytecode; some containers forbid to keep it
+unset PYTHONDONTWRITEBYTECODE
 ruff check .
 ruff format --check .
 python -m pytest -n 2 --dist=worksteal "$@"

@@ -72,7 +72,9 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
         key = NESTED.get(group, group)
         needed = needed_in(yaml.safe_load(file.read_text()))
         node = compose(
-            f"{key}={file.stem}", *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed)
+            *(["model=single_pass"] if group in NESTED else []),
+            f"{key}={file.stem}",
+            *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed),
         )
         part = node["model"][group] if group in NESTED else node[group]
         assert part["name"] in REGISTRIES[group].names()
@@ -90,8 +92,11 @@ def test_every_file_of_acquisitions_sets_every_option():
 
 
 def test_head_and_networks_are_chosen_on_the_command_line():
-    assert compose("head@model.head=density")["model"]["head"]["name"] == "density"
-    unchanged, model = compose()["model"], compose("network@model.opinion.network=unet")["model"]
+    plain = "model=single_pass"
+    assert compose(plain, "head@model.head=density")["model"]["head"]["name"] == "density"
+    unchanged, model = (
+        compose(plain, *more)["model"] for more in ((), ("network@model.opinion.network=unet",))
+    )
     assert "network" not in {*unchanged, *unchanged["opinion"], *model}
     assert model["opinion"] == {
         **unchanged["opinion"],

@@ -27,8 +27,8 @@ from mvrecon.engine.fit import build_module
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
 BASE = (
-    "experiment=open_kbp_rounds",
-    "~compare.rounds_world",
+    "experiment=open_kbp_cross_view",
+    "~compare.world_rounds",
     "~compare.world_unet",
     "scene.vary=exact",
     "data.sizes.train=648",
@@ -36,15 +36,26 @@ BASE = (
     "logger=csv",
 )
 NARROW = "rounds=[{resolution: full, widths: [16,32,64], cameras: null}]"
+HALF = "{resolution: half, widths: [32,48,64]"
+CAMERAS = "cameras: {name: rays2d}"
 
-#: What differs between the models; "none" stands for the support where cameras err.
+#: What differs between the models.
 ARMS = {
-    "cross_view": ("model=rounds",),
-    "world_rounds": ("model=rounds_world",),
+    "cross_view": ("model=cross_view",),
+    "no_opinions": ("model=cross_view", "model.rounds.0.opinions=null"),
+    "one_round": (
+        "model=cross_view",
+        f"model.rounds=[{{resolution: full, widths: [16,32,64], {CAMERAS}}}]",
+    ),
+    "three_rounds": (
+        "model=cross_view",
+        f"model.rounds=[{HALF}, {CAMERAS}}}, {HALF}}}, {{resolution: full, widths: [16,32,64]}}]",
+    ),
+    "world_rounds": ("model=world_rounds",),
     "world_unet": ("model=world_unet", f"model.{NARROW}"),
 }
 ALIGNED = {
-    "cross_view_aligned": ("model=corrected", "model@model.model=rounds"),
+    "cross_view_aligned": ("model=corrected", "model@model.model=cross_view"),
     "world_unet_aligned": (
         "model=corrected",
         "model@model.model=world_unet",
@@ -91,6 +102,11 @@ REGIMES = {
     "rig": _disturbed("views: 3, shift_px: 1.0, gain: 0.05"),
     "rig_one": _disturbed("views: 1, shift_px: 1.0, gain: 0.05"),
     "rig_all": _disturbed("views: 8, shift_px: 1.0, gain: 0.05"),
+    "tilt": _disturbed("views: 3, tilt_deg: 5.0"),
+    "motion": _disturbed("views: 3, motion_mm: 15.0"),
+    "lost": _disturbed("views: 1, lost: 1"),
+    "saturated": _disturbed("views: 3, saturated: 0.2"),
+    "truncated": _disturbed("views: 1, truncated: 0.25"),
     "views_2": Regime(("camera.n_views=2",)),
     "views_3": Regime(("camera.n_views=3",)),
     "views_4": Regime(("camera.n_views=4",)),

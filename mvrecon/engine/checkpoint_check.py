@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mvrecon.engine.old_names import current
+from mvrecon.engine.old_names import current, current_model
 from mvrecon.files.checks import TEXT, Refused, blaming, shown
 
 #: The files that `torch.save` puts into an archive, below one folder.
@@ -72,7 +72,8 @@ def check_settings(path: Path, settings: Any) -> dict[str, Any]:
             f"{path}: has the settings {shown(settings)}; expected names and numbers for "
             f"{sorted(KEYS)}"
         )
-    return {**settings, "geometry": current(settings["geometry"])}
+    geometry, model = current(settings["geometry"]), current_model(settings["model"])
+    return {**settings, "geometry": geometry, "model": model}
 
 
 def _plain(value: Any, depth: int = 0) -> bool:

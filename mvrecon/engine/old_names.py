@@ -9,7 +9,16 @@ from mvrecon.acquisition.settings import Acquisition
 RIGS = ("arc", "circular", "dome", "parallel")
 
 #: Terms of the loss that version 0.1.0 did not have.
-NEW_TERMS = {"rounds": 0.0, "corrected_views": 0.0, "opinions_gain": 0.0, "uncertainty": 1e-3}
+NEW_TERMS = {"opinions_gain": 0.0, "rounds": 0.0, "corrected_views": 0.0, "uncertainty": 1e-3}
+
+
+def current_model(model: Any) -> Any:
+    """The options of a model by the names of this version: up to 0.1.0 `cross_view` was the model
+    of one pass, which has a head of its own.
+    """
+    if isinstance(model, dict) and model.get("name") == "cross_view" and "head" in model:
+        return {**model, "name": "single_pass"}
+    return model
 
 
 def current(settings: Any) -> Any:
@@ -29,6 +38,11 @@ def current(settings: Any) -> Any:
         settings = {**settings, "acquisition": acquisition}
     if "scene" in settings and isinstance(settings.get("loss"), dict):
         settings = {**settings, "loss": {**NEW_TERMS, **settings["loss"]}}
+    if "model" in settings:
+        settings = {**settings, "model": current_model(settings["model"])}
+    if isinstance(settings.get("compare"), dict):
+        others = {name: current_model(model) for name, model in settings["compare"].items()}
+        settings = {**settings, "compare": others}
     if "scene" in settings and isinstance(data, dict):
         settings = {**settings, "data": {"overlap": False, **data}}
     return settings

@@ -33,7 +33,7 @@ def corrected_by(
         out = model(views)
     if not out.corrected_views:
         raise ValueError(
-            f"{checkpoint}: expected a model whose cameras correct their views, such as 'rounds', "
-            f"got a {type(model).__name__} without"
+            f"{checkpoint}: expected a model whose cameras correct their views, such as "
+            f"'cross_view', got a {type(model).__name__} without"
         )
     return CorrectedViews(out.corrected_views[-1].clone(), out.alignment)

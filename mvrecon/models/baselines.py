@@ -20,22 +20,22 @@ from mvrecon.models.consistency import (
     typical_chord,
 )
 from mvrecon.models.cropping import Cropping
-from mvrecon.models.cross_view import CrossView
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.network import network_by_name
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
+from mvrecon.models.single_pass import SinglePass
 from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import SirtWeights, correction, sirt, sirt_weights
 
 
-class MeanFusion(CrossView):
+class MeanFusion(SinglePass):
     """The mean of the M cameras' networks, as first proposed: no weighting, no refinement.
 
     Args:
-        projector, head, opinion, start, consistency, options: as in `CrossView`.
+        projector, head, opinion, start, consistency, options: as in `SinglePass`.
 
     Raises:
         ValueError: `refine_where`, since nothing is refined.
@@ -115,7 +115,7 @@ def _refuse_where(options: Options) -> None:
     if options.refine_where != "all":
         raise ValueError(
             f"refine_where={options.refine_where!r} needs opinions and their refinement, as in "
-            f"'cross_view'"
+            f"'single_pass'"
         )
 
 

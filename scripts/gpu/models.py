@@ -66,7 +66,7 @@ def learns(model: str, n: int, device: str) -> dict[str, Any]:
 
 def skips(extra: str, n: int, device: str) -> dict[str, Any]:
     """Milliseconds and waits of the cross-view model that leaves something out."""
-    module = built("cross_view", n, device, [extra]).eval()
+    module = built("single_pass", n, device, [extra]).eval()
     with torch.no_grad():
         views = module.projector(box(n, device))
         result: dict[str, Any] = {"ms": latency(lambda: module.model(views), device, 3)}
@@ -103,7 +103,7 @@ def main() -> None:
     for model in MODELS.names():
         results.attempt(model, lambda m=model: learns(m, n, device))
     for extra in VARIANTS:
-        results.attempt(f"cross_view {extra}", lambda e=extra: skips(e, n, device))
+        results.attempt(f"single_pass {extra}", lambda e=extra: skips(e, n, device))
     if device == "cuda":
         results.attempt("torch.compile of backprojection_unet", lambda: compiled(n, device))
 

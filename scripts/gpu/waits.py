@@ -33,11 +33,11 @@ from mvrecon.visual_hull.support import support_from_views
 N, PIXELS = 24, 36
 DETECTOR = {"pixels": [PIXELS, PIXELS], "pixel_mm": 6.0}
 MODELS = (
-    "cross_view",
-    "cross_view model.support=hull",
-    "cross_view model.support=auto model.masked=false",
-    "cross_view model.refine_where=disagreement",
-    "cross_view model.sigma=0.1",
+    "single_pass",
+    "single_pass model.support=hull",
+    "single_pass model.support=auto model.masked=false",
+    "single_pass model.refine_where=disagreement",
+    "single_pass model.sigma=0.1",
     "mean_fusion",
     "backprojection_unet",
     "backprojection_unet model.support=hull",

@@ -59,16 +59,21 @@ def nifti(folder: Path) -> None:
             file.write(bytes(2 * SHAPE[1] * SHAPE[2]))
 
 
+@pytest.fixture(scope="module", params=[(hdf5, ""), (nifti, ".nii.gz")], ids=["hdf5", "nifti"])
+def source(request, tmp_path_factory) -> list[str]:
+    """The name of a kind of scene, a large file of it and a small one, for every case."""
+    (make, suffix), folder = request.param, tmp_path_factory.mktemp("volumes")
+    make(folder)
+    return [make.__name__, *(str(folder / f"{size}{suffix}") for size in ("large", "small"))]
+
+
 @pytest.mark.slow
 @pytest.mark.door
 @pytest.mark.parametrize("case", [0, 1])
-@pytest.mark.parametrize(("make", "suffix"), [(hdf5, ""), (nifti, ".nii.gz")])
-def test_a_large_volume_takes_the_memory_of_slabs(make, suffix, case, tmp_path, run_python):
+def test_a_large_volume_takes_the_memory_of_slabs(source, case, run_python):
     """A packed volume of 768 MiB in float32 on a small grid takes less than a third of that,
     straight or varied.
     """
-    make(tmp_path)
-    names = [str(tmp_path / f"{size}{suffix}") for size in ("large", "small")]
-    done = run_python("-c", CODE, make.__name__, *names, str(case))
+    done = run_python("-c", CODE, *source, str(case))
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) < 256

@@ -122,12 +122,11 @@ def apps(folder: Path) -> list[tuple[int, str]]:
     """Two trainings, two evaluations of the first, and two simulations, each pair at once and in
     the same second.
     """
-    import torch
+    from tests.engine.lives import OPTIONS, warmed
 
-    from mvrecon.engine import evaluation, fit  # noqa: F401  (all imports once, for every process)
-    from tests.engine.lives import OPTIONS
-
-    torch.set_num_threads(1)
+    warmed(*OPTIONS)
+    for name in ("train", "eval", "simulate"):
+        import_module(f"mvrecon.{name}")
     os.chdir(folder)
     run = "checkpoint=outputs/train/2026-01-01_12-00-00"
     simulation = [*(o for o in OPTIONS if o.startswith(("grid", "camera"))), "cases=[0]"]

@@ -195,20 +195,28 @@ def live(
     raise SystemExit(0)
 
 
-def main(plan: dict[str, Any]) -> None:
-    """Live a plan."""
-    import lightning.pytorch.callbacks  # noqa: F401  (all imports once, for every life)
+def warmed(*options: str) -> dict[str, Any]:
+    """The settings of a training, after one look at all that it needs, so that processes forked
+    from this one import and compile nothing.
+    """
+    import lightning.pytorch.callbacks  # noqa: F401
     import torch
 
     from mvrecon.config import compose
     from mvrecon.engine import evaluation, fit
 
     torch.set_num_threads(1)
-    settings = compose(*plan["options"])
+    settings = compose(*options)
     data = fit.build_data(settings)
     module = fit.build_module(settings, settings["model"], data.data_range)
     data.scenes["train"].sample(0, 0, data.grid, data.cameras)
     torch.optim.AdamW(evaluation.trainable(module) * [*module.parameters()])
+    return settings
+
+
+def main(plan: dict[str, Any]) -> None:
+    """Live a plan."""
+    settings = warmed(*plan["options"])
     for name, fates in plan["runs"].items():
         for fate in [*fates, {}]:
             began, ended = time.perf_counter(), live(plan["options"], settings, Path(name), fate)

@@ -83,9 +83,9 @@ SMALL = (
     "data.sizes={train: 2, val: 1, test: 1}",
 )
 MODELS = {
-    "cross_view": (),
-    "cross_view in its hull": ("model.support=hull",),
-    "cross_view, unmasked in its box": ("model.support=box", "model.masked=false"),
+    "single_pass": (),
+    "single_pass in its hull": ("model.support=hull",),
+    "single_pass, unmasked in its box": ("model.support=box", "model.masked=false"),
     "backprojection_unet": (),
     "geometry_free": (),
     "mean_fusion": (),

@@ -27,6 +27,15 @@ def test_a_checkpoint_that_counts_its_views_by_the_old_name_is_read():
     assert check_settings(Path("a.ckpt"), method) == {**method, "geometry": NEW}
 
 
+def test_the_model_of_one_pass_has_another_name_now(tmp_path):
+    model, head = {"name": "cross_view", "rounds": []}, {"head": {"name": "density"}}
+    then, now = {"name": "cross_view", **head}, {"name": "single_pass", **head}
+    old = {"model": then, "compare": {"a": then, "b": model}}
+    assert current(old) == {"model": now, "compare": {"a": now, "b": model}}
+    method = {"geometry": {}, "model": then, "loss": {}, "optimizer": {}, "data_range": 1.0}
+    assert check_settings(tmp_path / "a.ckpt", method)["model"] == now
+
+
 @pytest.mark.parametrize(
     "settings",
     [NEW, {"camera": {"name": "helix", "views": 3}}, {"camera": None}, {"camera": "a"}, [], None],
@@ -43,7 +52,7 @@ def test_a_run_before_acquisitions_had_a_perfect_detector():
     """Settings without the key `acquisition` are those of today's default, which they are compared
     with; an evaluation's and a checkpoint's geometry stay as they are.
     """
-    settings = compose("experiment=smoke")
+    settings = compose("experiment=smoke", "loss.rounds=0", "loss.corrected_views=0")
     old = {key: value for key, value in settings.items() if key != "acquisition"}
     old["data"] = {key: value for key, value in settings["data"].items() if key != "overlap"}
     assert current(old) == settings == current(settings)

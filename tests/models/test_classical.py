@@ -7,7 +7,7 @@ import mvrecon as mv
 from mvrecon.parts import MODELS
 from mvrecon.testing import check_model
 from tests.models.rig import small_projector
-from tests.models.test_cross_view import OPTIONS
+from tests.models.test_single_pass import OPTIONS
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_the_model_sirt_is_the_classical_model_of_that_name():
     assert torch.equal(one(views).volume, other(views).volume)
 
 
-@pytest.mark.parametrize("name", ["cross_view", "backprojection_unet"])
+@pytest.mark.parametrize("name", ["single_pass", "backprojection_unet"])
 def test_sirt_with_momentum_by_name_is_the_start_by_number(name):
     A = small_projector()
     views = A(torch.rand(2, 1, *A.grid.shape))
@@ -48,8 +48,8 @@ def test_sirt_with_momentum_by_name_is_the_start_by_number(name):
 @pytest.mark.parametrize("support", ["none", "hull"])
 def test_a_model_that_starts_from_total_variation_keeps_the_contract(support):
     start = {"name": "fista_tv", "iterations": 3, "weight": 1e-2}
-    options = {**OPTIONS["cross_view"], "start": start, "support": support}
-    check_model("cross_view", small_projector(), **options)
+    options = {**OPTIONS["single_pass"], "start": start, "support": support}
+    check_model("single_pass", small_projector(), **options)
 
 
 @pytest.mark.door

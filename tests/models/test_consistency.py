@@ -7,9 +7,9 @@ from mvrecon.models.consistency import Consistency, weighted_for_counts
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.parts import MODELS
 from mvrecon.testing import check_model
+from tests.models.cross_view.test_model import SMALL
 from tests.models.rig import small_projector
-from tests.models.rounds.test_model import SMALL
-from tests.models.test_cross_view import OPTIONS
+from tests.models.test_single_pass import OPTIONS
 
 COUNTED = {"steps": 3, "noise": "poisson"}
 
@@ -70,10 +70,10 @@ def test_bright_pixels_count_less_than_with_equal_noise(geometry):
     assert weighted < plain
 
 
-@pytest.mark.parametrize("name", ["cross_view", "backprojection_unet", "rounds"])
+@pytest.mark.parametrize("name", ["single_pass", "backprojection_unet", "cross_view"])
 def test_a_model_of_counts_starts_from_osem_and_keeps_the_contract(name):
     start = {"name": "osem", "iterations": 5, "subsets": 2}
-    own = {**OPTIONS, "rounds": {"rounds": SMALL["M3"]}}.get(name, {})
+    own = {**OPTIONS, "cross_view": {"rounds": SMALL["M3"]}}.get(name, {})
     options = {**own, "start": start, "consistency": COUNTED}
     check_model(name, small_projector(), **options)
 

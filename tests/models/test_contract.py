@@ -8,7 +8,7 @@ from mvrecon.parts import MODELS
 from mvrecon.projectors.checks import check_views
 from mvrecon.testing import check_model
 from tests.models.rig import small_projector
-from tests.models.test_cross_view import OPTIONS
+from tests.models.test_single_pass import OPTIONS
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import cropping, crops
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.crops import cropped_geometry
-from mvrecon.models.cross_view import CrossView
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.models.options import Options
+from mvrecon.models.single_pass import SinglePass
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.ray_transform import RayTransform
 from tests.models.rig import small_rig
@@ -127,7 +127,7 @@ def helical_model(shared: bool = True):
     grid, cameras = helix()
     projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
     opinion = {"width": 4, "features": 2, "binning": 3, "shared": shared}
-    model = CrossView(
+    model = SinglePass(
         projector,
         {"name": "softmax_depth"},
         opinion,
@@ -182,7 +182,7 @@ def test_frusta_end_at_the_mask_and_nothing_changes(monkeypatch):
     A = PROJECTORS.build(
         "drr", grid=grid, cameras=circular(2, 90.0, 120.0, detector, angles=[40.0, 50.0])
     )
-    model = CrossView(
+    model = SinglePass(
         A, {"name": "softmax_depth"}, {"width": 4}, refine=4, start=3, consistency=1, support="hull"
     )
     for parameter in model.parameters():

@@ -11,8 +11,8 @@ from mvrecon.models.networks import UNet3d
 from mvrecon.parts import MODELS, NETWORKS
 from mvrecon.testing import check_model, check_network
 from tests.models.rig import small_projector
-from tests.models.test_cross_view import OPTIONS
 from tests.models.test_published import SMALL
+from tests.models.test_single_pass import OPTIONS
 
 BUILT_IN = {"unet": {"width": 4, "levels": 2}, **SMALL}
 
@@ -44,7 +44,7 @@ def test_networks_keep_the_contract(name):
 
 
 MODELS_WITH_NETWORKS = {
-    "cross_view": {"network": {"name": "tiny"}, "opinion": {"network": {"name": "tiny"}}},
+    "single_pass": {"network": {"name": "tiny"}, "opinion": {"network": {"name": "tiny"}}},
     "mean_fusion": {
         "opinion": {"network": {"name": "residual_unet3d", **SMALL["residual_unet3d"]}}
     },
@@ -70,7 +70,7 @@ def test_every_model_that_learns_from_volumes_is_here():
     assert learned == set(MODELS_WITH_NETWORKS)
 
 
-@pytest.mark.parametrize("name", ["cross_view", "backprojection_unet"])
+@pytest.mark.parametrize("name", ["single_pass", "backprojection_unet"])
 def test_before_training_any_network_leaves_the_model_s_start(name):
     """What corrects starts at zero, so the answer is the same with any network in the world."""
     projector = small_projector()
@@ -118,10 +118,10 @@ def test_mvrecon_s_own_network_by_name_is_the_same_as_without_one():
             TypeError,
             "did you mean 'width'",
         ),
-        ("cross_view", {"refine": 0, "network": {"name": "unet"}}, ValueError, "refine=0"),
+        ("single_pass", {"refine": 0, "network": {"name": "unet"}}, ValueError, "refine=0"),
         ("mean_fusion", {"network": {"name": "unet"}}, ValueError, "refine=0"),
         (
-            "cross_view",
+            "single_pass",
             {"opinion": {"prior": "uniform", "network": {"name": "unet"}}},
             ValueError,
             "prior='uniform' has no network",

@@ -10,7 +10,7 @@ from mvrecon.models.networks import halved
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from tests.models.rig import small_projector
-from tests.models.test_cross_view import HEAD
+from tests.models.test_single_pass import HEAD
 
 NAMES = tuple(MODELS.names())
 SKIPS = ({}, {"support": "hull"}, {"support": "hull", "masked": False})
@@ -19,9 +19,9 @@ WAYS = [
     (name, skip)
     for name in NAMES
     for skip in SKIPS
-    if not skip or name in ("cross_view", "backprojection_unet")
+    if not skip or name in ("single_pass", "backprojection_unet")
 ]
-NETWORKS = ("cross_view", "mean_fusion", "backprojection_unet", "geometry_free")
+NETWORKS = ("single_pass", "mean_fusion", "backprojection_unet", "geometry_free")
 
 
 def _projector(shape: tuple[int, int, int] = (12, 12, 12), pixels: int = 12) -> Projector:
@@ -33,7 +33,7 @@ def _projector(shape: tuple[int, int, int] = (12, 12, 12), pixels: int = 12) -> 
 
 def _stirred(name: str, projector: Projector, **options) -> torch.nn.Module:
     """With random weights everywhere."""
-    options |= {"head": HEAD} if name in ("cross_view", "mean_fusion") else {}
+    options |= {"head": HEAD} if name in ("single_pass", "mean_fusion") else {}
     model = MODELS.build(name, projector, **options)
     torch.manual_seed(2)
     for parameter in model.parameters():
@@ -65,7 +65,7 @@ def test_every_model_takes_any_grid(name, skip, shape):
 def test_every_model_takes_detectors_of_a_few_pixels(name, skip):
     for pixels in (1, 3):
         projector = _projector(pixels=pixels)
-        binned = {"opinion": {"binning": pixels}} if name in ("cross_view", "mean_fusion") else {}
+        binned = {"opinion": {"binning": pixels}} if name in ("single_pass", "mean_fusion") else {}
         _learns(
             _stirred(name, projector, **skip, **binned),
             projector(torch.rand(1, 1, 12, 12, 12)),

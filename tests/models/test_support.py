@@ -13,7 +13,7 @@ from mvrecon.visual_hull.support import Support
 
 HEAD = {"name": "softmax_depth"}
 MODEL_OPTIONS = {
-    "cross_view": {
+    "single_pass": {
         "head": HEAD,
         "opinion": {"width": 4},
         "refine": 4,
@@ -95,7 +95,7 @@ def test_everything_returned_has_the_grid_and_is_zero_outside(
 ):
     volume, views, mask = scenes
     _with_mask(monkeypatch, mask)
-    out = _build("cross_view", projector, support="hull", masked=masked)(views)
+    out = _build("single_pass", projector, support="hull", masked=masked)(views)
     assert torch.equal(out.support, mask) and out.visible.shape == (4, 1, 24, 24, 24)
     assert out.volume.shape == volume.shape and not (out.volume * ~mask).any() and out.volume.any()
     for field in (out.opinions, out.weights):
@@ -108,7 +108,7 @@ def test_everything_returned_has_the_grid_and_is_zero_outside(
 def test_cross_views_are_the_projected_opinions(projector, scenes, monkeypatch):
     _, views, mask = scenes
     _with_mask(monkeypatch, mask)
-    out = _build("cross_view", projector, support="hull")(views)
+    out = _build("single_pass", projector, support="hull")(views)
     assert _close(out.cross_views[:, 1], projector(out.opinions[:, 1])[:, 0], 1e-4)
 
 
@@ -116,7 +116,7 @@ def test_cross_views_are_the_projected_opinions(projector, scenes, monkeypatch):
 @torch.no_grad()
 def test_the_support_of_real_views_holds_the_object(kind, projector, scenes):
     volume, views, _ = scenes
-    out = _build("cross_view", projector, support=kind)(views)
+    out = _build("single_pass", projector, support=kind)(views)
     assert not (volume * ~out.support).any() and not out.support.all()
     if kind == "box":
         assert all(mask.sum() == Box.around(mask).size for mask in out.support)
@@ -132,7 +132,7 @@ def test_views_of_nothing_give_nothing(name, projector):
 @torch.no_grad()
 def test_an_empty_scene_in_a_batch_leaves_the_other_alone(projector, scenes):
     _, views, _ = scenes
-    model = _build("cross_view", projector, support="hull")
+    model = _build("single_pass", projector, support="hull")
     both = model(torch.cat([views[:1], torch.zeros_like(views[:1])])).volume
     assert not both[1].any() and _close(both[:1], model(views[:1]).volume, 1e-5)
 
@@ -173,7 +173,7 @@ def test_every_parameter_learns_on_a_support_met_first_in_evaluation(
 ):
     volume, views, mask = scenes
     _with_mask(monkeypatch, mask)
-    model = _build("cross_view", projector, support="hull")
+    model = _build("single_pass", projector, support="hull")
     with torch.inference_mode():
         model(views)
     out = model.train()(views)
@@ -203,11 +203,11 @@ def test_refinement_where_opinions_disagree(support, projector, scenes, monkeypa
     _, views, mask = scenes
     _with_mask(monkeypatch, mask)
     options = {"support": support, "consistency": 0}
-    plain = _build("cross_view", projector, refine=0, **options)
+    plain = _build("single_pass", projector, refine=0, **options)
     volumes = {}
     for tolerance in (1e-9, MIDDLE[support], 1e9):
         model = _build(
-            "cross_view", projector, refine_where="disagreement", tolerance=tolerance, **options
+            "single_pass", projector, refine_where="disagreement", tolerance=tolerance, **options
         )
         plain.load_state_dict(model.state_dict(), strict=False)
         volumes[tolerance] = model(views).volume
@@ -238,7 +238,7 @@ def test_losses_count_what_is_in_the_support(projector, scenes, monkeypatch):
     volume, views, mask = scenes
     _with_mask(monkeypatch, mask)
     with torch.no_grad():
-        out = _build("cross_view", projector, support="hull")(views)
+        out = _build("single_pass", projector, support="hull")(views)
     loss = ReconstructionLoss(1.0, edges=1.0, opinions=0.1, cross_view=0.01)
     terms = loss(out, {"volume": volume, "views": views})
     error = (out.volume - volume)[mask]
@@ -264,8 +264,8 @@ def test_unknown_choices_are_refused(options, said, projector):
 @pytest.mark.parametrize(
     ("name", "typed", "meant"),
     [
-        ("cross_view", "suport", "support"),
-        ("cross_view", "fusoin", "fusion"),
+        ("single_pass", "suport", "support"),
+        ("single_pass", "fusoin", "fusion"),
         ("mean_fusion", "consistancy", "consistency"),
         ("backprojection_unet", "widht", "width"),
     ],
@@ -275,9 +275,9 @@ def test_a_mistyped_option_is_named_with_the_nearest_of_all_that_the_model_has(
 ):
     with pytest.raises(TypeError, match=f"no option '{typed}'; did you mean '{meant}'") as error:
         _build(name, projector, **{typed: 1})
-    own = {"cross_view": "fusion", "mean_fusion": "opinion", "backprojection_unet": "width"}
+    own = {"single_pass": "fusion", "mean_fusion": "opinion", "backprojection_unet": "width"}
     assert all(option in str(error.value) for option in (own[name], "start", "support", "sigma"))
-    assert ("fusion" in str(error.value).split("Known:")[1]) == (name == "cross_view")
+    assert ("fusion" in str(error.value).split("Known:")[1]) == (name == "single_pass")
 
 
 def test_a_model_that_refines_nothing_refuses_to_choose_where(projector):

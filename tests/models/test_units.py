@@ -12,7 +12,7 @@ WAYS = [
     (name, skip)
     for name in MODELS.names()
     for skip in SKIPS[:2]
-    if not skip or name == "cross_view"
+    if not skip or name == "single_pass"
 ]
 
 

@@ -56,9 +56,8 @@ def offences(file: Path) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("file", CODE, ids=lambda f: str(f.relative_to(ROOT)))
-def test_no_code_runs_data(file: Path):
-    assert not offences(file)
+def test_no_code_runs_data():
+    assert {str(f.relative_to(ROOT)): found for f in CODE if (found := offences(f))} == {}
 
 
 @pytest.mark.parametrize(

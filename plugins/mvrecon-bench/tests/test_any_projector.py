@@ -111,7 +111,7 @@ def test_osem_is_ahead_of_mlem(A, volume):
 
 def test_a_model_is_trained_with_it(A, volume):
     torch.manual_seed(0)
-    model = MODELS.build("cross_view", projector=A, head={"name": "softmax_depth"})
+    model = MODELS.build("single_pass", projector=A, head={"name": "softmax_depth"})
     optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
     before = [weight.detach().clone() for weight in model.parameters()]
     loss = (model(A(volume)).volume - volume).square().mean()

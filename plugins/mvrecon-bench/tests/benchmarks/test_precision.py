@@ -13,7 +13,7 @@ MODEL = (
     "{n: 16, rig: {name: circular, n_views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, "
     "pixels: 12}, "
     "checkpoint: null,"
-    " model: {name: cross_view, head: {name: softmax_depth}, opinion: {width: 4}, refine: 4, "
+    " model: {name: single_pass, head: {name: softmax_depth}, opinion: {width: 4}, refine: 4, "
     "start: 2, consistency: 1}}"
 )
 TINY = (

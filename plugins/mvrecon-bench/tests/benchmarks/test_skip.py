@@ -17,7 +17,7 @@ MODEL = (
     "{n: 16, rig: {name: circular, n_views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, "
     "pixels: 12}, "
     "cases: 2,"
-    " modes: [auto, hull], checkpoints: {heart: null}, model: {name: cross_view, head: {name: "
+    " modes: [auto, hull], checkpoints: {heart: null}, model: {name: single_pass, head: {name: "
     "softmax_depth},"
     " opinion: {width: 4}, refine: 4, start: 2, consistency: 1}}"
 )
@@ -168,7 +168,7 @@ def trained(tmp_path):
         "projector": {"name": "drr"},
     }
     model = {
-        "name": "cross_view",
+        "name": "single_pass",
         "head": {"name": "softmax_depth"},
         "opinion": {"width": 4},
         "refine": 4,

@@ -10,15 +10,16 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mvrecon.config import conf_dir
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
+from mvrecon.models.cross_view.evidence import Evidence
+from mvrecon.models.cross_view.model import CrossView
+from mvrecon.models.cross_view.rays2d import Rays2d
+from mvrecon.models.cross_view.settings import ROUNDS, OpinionOptions, RoundOptions
+from mvrecon.models.cross_view.views import means
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.rounds.evidence import Evidence
-from mvrecon.models.rounds.model import Rounds
-from mvrecon.models.rounds.settings import OpinionOptions
-from mvrecon.models.rounds.views import means
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.testing import check_model
+from tests.models.cross_view.test_model import blob
 from tests.models.rig import small_projector, small_rig
-from tests.models.rounds.test_model import blob
 
 WORLD = {"widths": [4], "resolution": "full"}
 RAYS = {"name": "rays2d", "widths": [4, 6], "depths": 4}
@@ -43,10 +44,10 @@ CHOICES = {
 }
 
 
-def stirred(projector, choice="weighted") -> Rounds:
+def stirred(projector, choice="weighted") -> CrossView:
     """With random weights everywhere."""
     torch.manual_seed(2)
-    model = Rounds(projector, CHOICES[choice]).eval()
+    model = CrossView(projector, CHOICES[choice]).eval()
     for parameter in model.parameters():
         parameter.data += 0.1 * torch.randn_like(parameter)
     return model
@@ -54,7 +55,7 @@ def stirred(projector, choice="weighted") -> Rounds:
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_every_choice_of_cameras_keeps_the_contract(choice):
-    check_model("rounds", small_projector(), rounds=CHOICES[choice])
+    check_model("cross_view", small_projector(), rounds=CHOICES[choice])
 
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
@@ -63,34 +64,31 @@ def test_a_hull_of_odd_sizes_and_a_grid_of_one_slice_keep_the_contract():
     cameras = CAMERAS.build("circular", n_views=3, sid=100.0, sdd=200.0, detector=detector)
     grid = Grid.centred(size=(11, 9, 1), spacing=2.0)
     projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
-    check_model("rounds", projector, rounds=CHOICES["weighted"], support="hull")
-    check_model("rounds", projector, rounds=CHOICES["frustum3d"])
+    check_model("cross_view", projector, rounds=CHOICES["weighted"], support="hull")
+    check_model("cross_view", projector, rounds=CHOICES["frustum3d"])
 
 
-def test_the_presets_are_the_defaults_and_have_as_many_weights_as_in_the_docs():
-    projector, counts = small_projector(), []
-    for name in ("rounds_opinions", "rounds_frustum3d"):
-        options = yaml.safe_load((conf_dir() / "model" / f"{name}.yaml").read_text())
-        first = options["rounds"][0]
-        if first["opinions"] is not None:
-            assert OpinionOptions.of(first["opinions"]) == OpinionOptions()
-        model = Rounds(projector, **{key: value for key, value in options.items() if key != "name"})
-        counts.append(round(sum(p.numel() for p in model.parameters()) / 1e6, 2))
-        part = inspect.signature(type(model.rounds[0].cameras)).parameters
+def test_the_preset_is_the_default():
+    options = yaml.safe_load((conf_dir() / "model" / "cross_view.yaml").read_text())
+    plain = inspect.signature(Rays2d).parameters
+    for said, default in zip(options["rounds"], ROUNDS, strict=True):
+        one, other = RoundOptions.of(said), RoundOptions.of(default)
+        assert (one.resolution, tuple(one.widths)) == (other.resolution, tuple(other.widths))
+        assert one.task == other.task
         for option in ("widths", "depths", "binning", "memory"):
-            own = first["cameras"][option]
-            assert (tuple(own) if isinstance(own, list) else own) == part[option].default
-    assert counts == [1.91, 1.87]
+            own = one.network[option]
+            assert (tuple(own) if isinstance(own, list) else own) == plain[option].default
+    assert OpinionOptions.of(options["rounds"][0]["opinions"]) == OpinionOptions()
 
 
 def test_before_training_a_round_with_opinions_is_the_round_without():
     projector = small_projector()
     views = projector(blob(projector))
     torch.manual_seed(3)
-    plain = Rounds(projector, rounds())
+    plain = CrossView(projector, rounds())
     for parameter in plain.parameters():
         parameter.data += 0.1 * torch.randn_like(parameter)
-    model, n_inputs = Rounds(projector, CHOICES["mean"]), 32
+    model, n_inputs = CrossView(projector, CHOICES["mean"]), 32
     own, weights = plain.state_dict(), model.state_dict()
     for name, value in weights.items():
         if name == "rounds.0.world.first.weight":
@@ -111,7 +109,7 @@ def test_choices_at_their_defaults_change_no_bit_of_a_round_without_opinions():
     models = []
     for options in (rounds(), said):
         torch.manual_seed(0)
-        models.append(Rounds(projector, options))
+        models.append(CrossView(projector, options))
     assert list(models[0].state_dict()) == list(models[1].state_dict())
     assert not any("opinions" in name for name in models[0].state_dict())
     assert torch.equal(models[0](views).volume, models[1](views).volume)
@@ -233,7 +231,7 @@ def test_with_a_loss_of_their_own_opinions_leave_the_start_and_differ():
     views = projector(truth)
     views[:, :, 1] *= 1.2
     torch.manual_seed(0)
-    model = Rounds(projector, CHOICES["weighted"], start=6)
+    model = CrossView(projector, CHOICES["weighted"], start=6)
     loss = ReconstructionLoss(1.0, volume=0.0, opinions_gain=1.0)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     batch, errors = {"volume": truth, "views": views}, []
@@ -282,4 +280,4 @@ def test_with_a_loss_of_their_own_opinions_leave_the_start_and_differ():
 def test_opinions_that_make_no_sense_are_refused(options, error, message):
     """Opinions of cameras that there are not, and options that they do not have, are refused."""
     with pytest.raises(error, match=message):
-        Rounds(small_projector(), [options])
+        CrossView(small_projector(), [options])

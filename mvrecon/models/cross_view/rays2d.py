@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from mvrecon.models.rounds.evidence import MAGNIFIED, Answer, Evidence, Task
-from mvrecon.models.rounds.sampling import RaySamples
-from mvrecon.models.rounds.shared import for_cameras
-from mvrecon.models.rounds.unet import PlainUNet, Precision
-from mvrecon.models.rounds.views import IMAGES, Binned, correction_of, image_cells
+from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence, Task
+from mvrecon.models.cross_view.sampling import RaySamples
+from mvrecon.models.cross_view.shared import for_cameras
+from mvrecon.models.cross_view.unet import PlainUNet, Precision
+from mvrecon.models.cross_view.views import IMAGES, Binned, correction_of, image_cells
 from mvrecon.projectors.operator import Projector
 
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from mvrecon.losses import ReconstructionLoss
+from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.rounds.model import Rounds
+from tests.models.cross_view.test_model import SMALL, blob
 from tests.models.rig import small_projector
-from tests.models.rounds.test_model import SMALL, blob
 
 LOSS = ReconstructionLoss(1.0, rounds=1.0, uncertainty=1e-3)
 
@@ -25,9 +25,9 @@ def case():
     return projector, {"volume": truth, "views": views * (1 + 0.02 * torch.randn_like(views))}
 
 
-def model_of(projector, **options) -> Rounds:
+def model_of(projector, **options) -> CrossView:
     torch.manual_seed(0)
-    return Rounds(projector, SMALL["CM3"], **options)
+    return CrossView(projector, SMALL["CM3"], **options)
 
 
 def test_the_volume_and_its_training_are_those_of_the_model_without(case):

@@ -7,7 +7,7 @@ from mvrecon.parts import MODELS, PROJECTORS
 from tests.models.rig import small_projector, small_rig
 
 HEAD = {"name": "softmax_depth"}
-OPTIONS = {"cross_view": {"head": HEAD}, "mean_fusion": {"head": HEAD}}
+OPTIONS = {"single_pass": {"head": HEAD}, "mean_fusion": {"head": HEAD}}
 
 
 def _build(name: str, projector: torch.nn.Module, **options) -> torch.nn.Module:
@@ -36,7 +36,7 @@ def _stir(model: torch.nn.Module) -> None:
 
 def test_opinions_reproduce_their_own_views():
     projector = small_projector()
-    model = _build("cross_view", projector)
+    model = _build("single_pass", projector)
     _stir(model.opinions)
     _, views = _blob_views(projector)
     seen: list[torch.Tensor] = []
@@ -58,7 +58,7 @@ class _Unmoved(torch.nn.Module):
 
 def test_what_the_cameras_do_not_change_is_not_blurred_by_their_warps():
     projector = small_projector()
-    model = _build("cross_view", projector)
+    model = _build("single_pass", projector)
     model.opinions.head = _Unmoved()
     volume, views = _blob_views(projector)
     said, _ = model.opinions(model.cropping.whole, views, volume, torch.zeros_like(views))
@@ -71,7 +71,7 @@ def test_permuting_the_cameras_changes_nothing():
     volumes = []
     for rig, index in ((cameras, [0, 1, 2, 3]), (cameras[order], order)):
         projector = PROJECTORS.build("drr", grid=grid, cameras=rig)
-        model = _build("cross_view", projector)
+        model = _build("single_pass", projector)
         _stir(model)
         _, views = _blob_views(PROJECTORS.build("drr", grid=grid, cameras=cameras))
         volumes.append(model(views[:, :, index]).volume)
@@ -80,7 +80,7 @@ def test_permuting_the_cameras_changes_nothing():
 
 def test_cross_views_are_the_projected_opinions():
     projector = small_projector()
-    out = _build("cross_view", projector)(_blob_views(projector)[1])
+    out = _build("single_pass", projector)(_blob_views(projector)[1])
     expected = projector(out.opinions[:, 1])[:, 0, 3]
     assert _close(out.cross_views[:, 1, 3], expected, 1e-4)
 
@@ -97,8 +97,8 @@ def test_consistency_steps_bring_the_volume_towards_the_views():
 
 def test_separate_networks_for_every_camera():
     projector = small_projector()
-    shared = _build("cross_view", projector)
-    separate = _build("cross_view", projector, opinion={"shared": False})
+    shared = _build("single_pass", projector)
+    separate = _build("single_pass", projector, opinion={"shared": False})
     count = [sum(p.numel() for p in m.opinions.nets.parameters()) for m in (shared, separate)]
     assert count[1] == 4 * count[0]
     assert separate(_blob_views(projector)[1]).volume.isfinite().all()
@@ -106,7 +106,7 @@ def test_separate_networks_for_every_camera():
 
 def test_without_a_depth_network_every_depth_is_equally_likely():
     projector = small_projector()
-    model = _build("cross_view", projector, opinion={"prior": "uniform"})
+    model = _build("single_pass", projector, opinion={"prior": "uniform"})
     _, views = _blob_views(projector)
     frusta = model.cropping.whole.fine
     out = model(views)
@@ -114,9 +114,9 @@ def test_without_a_depth_network_every_depth_is_equally_likely():
     assert not list(model.opinions.parameters())
 
 
-def test_every_parameter_of_cross_view_learns():
+def test_every_parameter_of_single_pass_learns():
     projector = small_projector()
-    model = _build("cross_view", projector)
+    model = _build("single_pass", projector)
     _stir(model)
     volume, views = _blob_views(projector)
     loss = ReconstructionLoss(1.0, edges=0.1, opinions=0.1, cross_view=0.01)(
@@ -130,21 +130,21 @@ def test_every_parameter_of_cross_view_learns():
 @pytest.mark.parametrize("options", [{"fusion": "median"}, {"opinion": {"prior": "learnt"}}])
 def test_unknown_options_are_refused(options):
     with pytest.raises(ValueError, match="got"):
-        _build("cross_view", small_projector(), **options)
+        _build("single_pass", small_projector(), **options)
 
 
 def test_cameras_may_be_few():
     grid, cameras = small_rig()
     assert isinstance(cameras[[0]], Cameras)
     projector = PROJECTORS.build("drr", grid=grid, cameras=cameras[[0]])
-    model = _build("cross_view", projector)
+    model = _build("single_pass", projector)
     assert model(_blob_views(projector)[1]).volume.isfinite().all()
 
 
 #: Of models with random weights, from before they could skip anything: the sum and mean square of
 #: the volume, two of its voxels, and the loss.
 BEFORE = {
-    "cross_view": (127.037872, 0.022079, 0.491416, 0.457261, 0.013639),
+    "single_pass": (127.037872, 0.022079, 0.491416, 0.457261, 0.013639),
     "mean_fusion": (125.413834, 0.014192, 0.461284, 0.177629, 0.00994),
     "backprojection_unet": (129.599121, 0.043415, 0.589954, 0.254898, 0.031239),
 }

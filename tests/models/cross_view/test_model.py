@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+import yaml
 
+from mvrecon.config import conf_dir
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import EARLIER, ReconstructionLoss
+from mvrecon.models.cross_view.model import CrossView
+from mvrecon.models.cross_view.sampling import RaySamples
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.rounds.model import Rounds
-from mvrecon.models.rounds.sampling import RaySamples
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.reconstruct.iterative import sirt
 from mvrecon.testing import check_model
@@ -30,10 +32,10 @@ SMALL = {
 }
 
 
-def stirred(projector, rounds="CM3", **options) -> Rounds:
+def stirred(projector, rounds="CM3", **options) -> CrossView:
     """With random weights everywhere."""
     torch.manual_seed(2)
-    model = Rounds(projector, SMALL[rounds], **options).eval()
+    model = CrossView(projector, SMALL[rounds], **options).eval()
     for parameter in model.parameters():
         parameter.data += 0.1 * torch.randn_like(parameter)
     return model
@@ -50,24 +52,24 @@ def blob(projector, samples: int = 1) -> torch.Tensor:
 @pytest.mark.parametrize("support", ["none", "hull"])
 @pytest.mark.filterwarnings("ignore:Rays are up to")
 def test_every_choice_of_rounds_keeps_the_contract(rounds, support):
-    check_model("rounds", small_projector(), rounds=SMALL[rounds], support=support)
+    check_model("cross_view", small_projector(), rounds=SMALL[rounds], support=support)
 
 
 def test_the_presets_have_as_many_weights_as_in_the_docs():
-    projector = small_projector()
-    world = [{"widths": [32, 48, 64]}, {"widths": [32, 48, 64]}]
-    world.append({"widths": [16, 32, 64], "resolution": "full"})
-    one = [{"widths": [18, 36, 72], "resolution": "full"}]
-    models = [Rounds(projector), Rounds(projector, world), Rounds(projector, one, consistency=3)]
-    counts = [sum(p.numel() for p in model.parameters()) for model in models]
-    assert [round(count / 1e6, 2) for count in counts] == [1.88, 1.77, 0.51]
+    projector, counts = small_projector(), []
+    for name in ("cross_view", "cross_view_frustum3d", "world_rounds", "world_unet"):
+        options = yaml.safe_load((conf_dir() / "model" / f"{name}.yaml").read_text())
+        kept = {key: value for key, value in options.items() if key not in ("name", "defaults")}
+        model = CrossView(projector, **kept)
+        counts.append(round(sum(p.numel() for p in model.parameters()) / 1e6, 2))
+    assert counts == [0.66, 0.65, 1.77, 0.51]
 
 
 def test_before_training_a_round_is_a_step_of_sirt():
     """What networks change or correct starts at zero, and every step has length one."""
     projector = small_projector()
     views = projector(blob(projector))
-    model = Rounds(projector, SMALL["CM3"], start=3, consistency=2)
+    model = CrossView(projector, SMALL["CM3"], start=3, consistency=2)
     expected = sirt(projector, views, 3, momentum=True)
     expected = sirt(projector, views, 4, nonnegative=False, start=expected).clamp_min(0)
     volume = model(views).volume
@@ -100,7 +102,7 @@ def test_outside_the_hull_all_rounds_are_zero_and_inside_not():
 @torch.no_grad()
 def test_no_ray_is_weighted_by_less_than_a_tenth_of_the_longest_chord_of_the_hull():
     projector = small_projector()
-    model = Rounds(projector, SMALL["M3"], support="hull")
+    model = CrossView(projector, SMALL["M3"], support="hull")
     geometry = model._geometry(projector(blob(projector, 2)))
     chords = projector(geometry.mask.float())
     longest = chords.amax(dim=(1, 2, 3, 4), keepdim=True)
@@ -182,7 +184,7 @@ def test_a_few_steps_teach_the_cameras_what_the_grid_would_have_measured():
     true_views = projector(truth)
     views = 1.05 * true_views
     torch.manual_seed(0)
-    model = Rounds(projector, SMALL["CM3"])
+    model = CrossView(projector, SMALL["CM3"])
     loss = ReconstructionLoss(1.0, volume=0.0, corrected_views=10.0)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     batch, errors = {"volume": truth, "views": views, "true_views": true_views}, []
@@ -258,7 +260,7 @@ def test_parallel_beams_have_rays_too():
 def test_rounds_that_make_no_sense_are_refused(options, error, message):
     """Options of a model's rounds that do not exist, or do not fit one another, are refused."""
     with pytest.raises(error, match=message):
-        Rounds(small_projector(), **options)
+        CrossView(small_projector(), **options)
 
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
@@ -285,4 +287,4 @@ def test_a_crop_is_each_sample_s_own_and_of_the_whole_grid_it_changes_nothing():
 
 def test_a_crop_needs_a_support():
     with pytest.raises(ValueError, match="got crop=True and support='none'"):
-        Rounds(small_projector(), SMALL["M3"], crop=True)
+        CrossView(small_projector(), SMALL["M3"], crop=True)

@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 
+from mvrecon.models.cross_view.evidence import MAGNIFIED
+from mvrecon.models.cross_view.sampling import FixedFrusta
+from mvrecon.models.cross_view.settings import OpinionOptions
+from mvrecon.models.cross_view.unet import PlainUNet, Precision
+from mvrecon.models.cross_view.views import Binned, means
 from mvrecon.models.networks import halved
 from mvrecon.models.pooling import deviation, leave_one_out, pooled
-from mvrecon.models.rounds.evidence import MAGNIFIED
-from mvrecon.models.rounds.sampling import FixedFrusta
-from mvrecon.models.rounds.settings import OpinionOptions
-from mvrecon.models.rounds.unet import PlainUNet, Precision
-from mvrecon.models.rounds.views import Binned, means
 from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from mvrecon.models.cross_view import unet
+from mvrecon.models.cross_view.unet import Block, PlainUNet, arithmetic
 from mvrecon.models.networks import convolution
-from mvrecon.models.rounds import unet
-from mvrecon.models.rounds.unet import Block, PlainUNet, arithmetic
 
 
 @pytest.mark.parametrize("sizes", [(1, 1), (5, 7), (1, 1, 1), (3, 1, 6)])

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.models.rounds.cells import from_cells, to_cells
-from mvrecon.models.rounds.evidence import MAGNIFIED, SMALL, Evidence
+from mvrecon.models.cross_view.cells import from_cells, to_cells
+from mvrecon.models.cross_view.evidence import MAGNIFIED, SMALL, Evidence
 from mvrecon.projectors.operator import Projector
 
 #: Images of one camera: its residual, its view, and the sharp part of that.

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, Self, get_args
 
-from mvrecon.models.rounds.evidence import Task
-from mvrecon.models.rounds.unet import Precision
+from mvrecon.models.cross_view.evidence import Task
+from mvrecon.models.cross_view.unet import Precision
 from mvrecon.registry import check_options
 
 #: Voxels of a cell along each axis, by the resolution of a round.
@@ -170,9 +170,9 @@ class Computing(Checked):
             raise ValueError(f"Expected the precision float32 or auto, got {self.precision!r}")
 
 
-#: Two rounds at half resolution, the first with the cameras' network, and one at full resolution.
+#: Cameras correct, place and weigh at half resolution; a network in the world at full resolution,
+#: with a second correction of the views.
 ROUNDS: tuple[Mapping[str, Any], ...] = (
-    {"resolution": "half", "widths": (32, 48, 64), "cameras": {"name": "rays2d"}},
-    {"resolution": "half", "widths": (32, 48, 64)},
-    {"resolution": "full", "widths": (16, 32, 64)},
+    {"resolution": "half", "widths": (8,), "cameras": {"name": "rays2d"}, "opinions": {}},
+    {"resolution": "full", "widths": (16, 32, 64), "cameras": {"name": "rays2d"}},
 )

@@ -8,12 +8,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.geometry.box import Box, placed
+from mvrecon.models.cross_view.cells import from_cells, padded, to_cells, trimmed
+from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence
+from mvrecon.models.cross_view.opinions import Fused, Opinions
+from mvrecon.models.cross_view.settings import OpinionOptions, RoundOptions
+from mvrecon.models.cross_view.unet import PlainUNet, Precision
 from mvrecon.models.geometry import Geometry
-from mvrecon.models.rounds.cells import from_cells, padded, to_cells, trimmed
-from mvrecon.models.rounds.evidence import MAGNIFIED, Answer, Evidence
-from mvrecon.models.rounds.opinions import Fused, Opinions
-from mvrecon.models.rounds.settings import OpinionOptions, RoundOptions
-from mvrecon.models.rounds.unet import PlainUNet, Precision
 from mvrecon.parts import CAMERA_NETWORKS
 from mvrecon.projectors.operator import Projector
 

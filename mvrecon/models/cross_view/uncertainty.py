@@ -8,10 +8,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from mvrecon.models.cross_view.cells import from_cells, padded, to_cells, trimmed
+from mvrecon.models.cross_view.evidence import MAGNIFIED
+from mvrecon.models.cross_view.unet import PlainUNet, Precision
 from mvrecon.models.geometry import Geometry
-from mvrecon.models.rounds.cells import from_cells, padded, to_cells, trimmed
-from mvrecon.models.rounds.evidence import MAGNIFIED
-from mvrecon.models.rounds.unet import PlainUNet, Precision
 
 #: Volumes that the network looks at.
 EVIDENCE = 6

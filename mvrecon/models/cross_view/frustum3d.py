@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence, Task
+from mvrecon.models.cross_view.sampling import FixedFrusta
+from mvrecon.models.cross_view.shared import for_cameras
+from mvrecon.models.cross_view.unet import PlainUNet, Precision
+from mvrecon.models.cross_view.views import IMAGES, Binned, correction_of, image_cells, means
 from mvrecon.models.networks import halved
 from mvrecon.models.pooling import deviation, leave_one_out
-from mvrecon.models.rounds.evidence import MAGNIFIED, Answer, Evidence, Task
-from mvrecon.models.rounds.sampling import FixedFrusta
-from mvrecon.models.rounds.shared import for_cameras
-from mvrecon.models.rounds.unet import PlainUNet, Precision
-from mvrecon.models.rounds.views import IMAGES, Binned, correction_of, image_cells, means
 from mvrecon.projectors.operator import Projector
 
 #: Volumes in a frustum: two lifts, the volume and its change, mean and deviation of either lift of

@@ -26,7 +26,7 @@ from mvrecon.models.weighting import Weighting, comparison, fuse
 from mvrecon.projectors.operator import Projector
 
 
-class CrossView(nn.Module):
+class SinglePass(nn.Module):
     """Cross-view reconstruction.
 
     Args:

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.models.cross_view.cells import padded, trimmed
 from mvrecon.models.networks import convolution
-from mvrecon.models.rounds.cells import padded, trimmed
 
 #: Of what a block adds to its input.
 GAIN = 0.5

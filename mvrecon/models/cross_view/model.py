@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from mvrecon.geometry.box import Box
 from mvrecon.models.consistency import Consistency, Start, Steps, checked_start, normalised
 from mvrecon.models.cropping import Cropping
+from mvrecon.models.cross_view.settings import ROUNDS, Computing, RoundOptions
+from mvrecon.models.cross_view.step import Measured, Round, State
+from mvrecon.models.cross_view.uncertainty import Uncertainty
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.rounds.settings import ROUNDS, Computing, RoundOptions
-from mvrecon.models.rounds.step import Measured, Round, State
-from mvrecon.models.rounds.uncertainty import Uncertainty
 from mvrecon.projectors.operator import Projector
 
 #: Of the longest chord of a support: as long counts each ray that meets it, at least.
@@ -27,7 +27,7 @@ SHORTEST = 0.1
 MARGIN, ALIGNED = 4, 8
 
 
-class Rounds(nn.Module):
+class CrossView(nn.Module):
     """Reconstruction in rounds: cameras correct their views, a network in the world changes the
     volume, in the unit of (views / mm).
 
