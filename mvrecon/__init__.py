@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mvrecon.calibration.markers import from_markers as from_markers
     from mvrecon.cameras.camera import Cameras as Cameras
     from mvrecon.cameras.dcspect80 import dcspect80 as dcspect80
+    from mvrecon.cameras.epipolar import epipolar_line as epipolar_line
     from mvrecon.cameras.explicit import ExplicitRays as ExplicitRays
     from mvrecon.cameras.files import from_file as from_file
     from mvrecon.cameras.rigs import arc as arc
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
     from mvrecon.projectors.radon import Radon as Radon
     from mvrecon.reconstruct.bsrem import bsrem as bsrem
+    from mvrecon.reconstruct.by_name import reconstructed as reconstructed
     from mvrecon.reconstruct.cgls import cgls as cgls
     from mvrecon.reconstruct.filtered.fdk import fbp as fbp
     from mvrecon.reconstruct.filtered.fdk import fdk as fdk
@@ -61,6 +63,7 @@ _DOOR = {
     "circular": "mvrecon.cameras.rigs:circular",
     "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.cameras.rigs:dome",
+    "epipolar_line": "mvrecon.cameras.epipolar:epipolar_line",
     "fista_tv": "mvrecon.reconstruct.fista_tv:fista_tv",
     "fbp": "mvrecon.reconstruct.filtered.fdk:fbp",
     "fdk": "mvrecon.reconstruct.filtered.fdk:fdk",
@@ -75,6 +78,7 @@ _DOOR = {
     "parallel": "mvrecon.cameras.rigs:parallel",
     "pdhg_tv": "mvrecon.reconstruct.pdhg_tv:pdhg_tv",
     "read_volume": "mvrecon.data.volume_files:read_volume",
+    "reconstructed": "mvrecon.reconstruct.by_name:reconstructed",
     "save_volume": "mvrecon.data.volume_files:save_volume",
     "sirt": "mvrecon.reconstruct.iterative:sirt",
     "tikhonov": "mvrecon.reconstruct.tikhonov:tikhonov",

@@ -4,13 +4,21 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
 from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoint_check import check_archive, check_known, check_settings
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.run_folder import SETTINGS
 from mvrecon.engine.storage import read
+from mvrecon.engine.trained_reconstructor import model_on
 from mvrecon.files.atomic import check_plain
 from mvrecon.files.checks import blaming, plain_name
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import PROJECTORS
 
 
 @dataclass
@@ -33,6 +41,36 @@ class Trained:
     cases: list[str] | None = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
     volumes: list[str] = field(default_factory=list)
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        views: Float[Tensor, "b 1 m v u"],
+        cameras: Cameras | None = None,
+        grid: Grid | None = None,
+    ) -> Float[Tensor, "b 1 d h w"]:
+        """The volume that the method reconstructs from views, in the unit of (views / mm); `module`
+        has its gradient.
+
+        Args:
+            views: measured by the rig of the training, or by `cameras`.
+            cameras: another rig; None: that of the training.
+            grid: another grid of the volume; None: that of the training.
+
+        Raises:
+            ValueError: views that do not fit the rig, or weights that fit the rig and the grid of
+                the training alone.
+        """
+        if cameras is None and grid is None:
+            return self.module(views).volume
+        known = self.module.projector
+        A = PROJECTORS.from_config(
+            self.module.hparams["geometry"]["projector"],
+            grid=known.grid if grid is None else grid,
+            cameras=known.cameras if cameras is None else cameras,
+        )
+        name = f"The trained {self.module.hparams['model']['name']}"
+        return model_on(A.to(known.device), self.module, name)(views).volume
 
 
 def finished(folder: Path, method: str) -> Path:

@@ -10,7 +10,8 @@ from mvrecon.engine.run_folder import read_settings
 
 
 def load(path: str | Path, method: str | None = None) -> Trained:
-    """A trained method: `load(path).module(views).volume` is its reconstruction.
+    """A trained method: `load(path)(views)` is its reconstruction,
+    `load(path)(views, cameras, grid)` that of another rig and grid.
 
     Args:
         path: of a checkpoint, or of a run folder; the modules that the run's setting `plugins`

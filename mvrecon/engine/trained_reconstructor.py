@@ -49,15 +49,29 @@ def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple
     module = load(checkpoint, method).module
     for difference in _differences(A, module.projector):
         warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=3)
-    model = MODELS.from_config(module.hparams["model"], projector=A)
+    return model_on(A, module, checkpoint), module.hparams["data_range"]
+
+
+def model_on(A: Projector, module: nn.Module, checkpoint: str) -> nn.Module:
+    """The model of a trained module with its weights on another operator, ready to reconstruct.
+
+    Args:
+        A: the operator, of any rig and grid that the model's weights fit.
+        module: as `load` gives it.
+        checkpoint: where it came from, for the message.
+
+    Raises:
+        ValueError: weights that fit the rig and the grid of the training alone.
+    """
+    model = MODELS.from_config(module.hparams["model"], projector=A)  # type: ignore[index]
     try:
-        model.load_state_dict(module.model.state_dict())
+        model.load_state_dict(module.model.state_dict())  # type: ignore[union-attr]
     except RuntimeError as error:
         raise ValueError(
             f"{checkpoint}: expected the rig and the grid of its training, got "
             f"{len(A.cameras)} cameras and {A.grid.shape} voxels: {error}"
         ) from error
-    return model.to(A.device).eval(), module.hparams["data_range"]
+    return model.to(A.device).eval()
 
 
 def _differences(A: Projector, other: Projector) -> list[str]:

@@ -13,15 +13,30 @@ from mvrecon.cameras.views import check_finite
 def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device) -> None:
     """Raise ValueError unless a tensor [b c ...] has these last sizes and lies on the device."""
     if not isinstance(tensor, Tensor):
-        raise TypeError(f"Expected {what} as a tensor, got {type(tensor).__name__}")
+        raise TypeError(
+            f"Expected {what} as a tensor, got {type(tensor).__name__}; torch.as_tensor makes one "
+            f"of an array"
+        )
     if tensor.ndim != 5 or tuple(tensor.shape[2:]) != tuple(sizes):
         raise ValueError(
             f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}"
+            + _cure(tensor, sizes)
         )
     if tensor.device != device:
         raise ValueError(
             f"Expected {what} on {device}, where the projector is, got {tensor.device}"
         )
+
+
+def _cure(tensor: Tensor, sizes: Sequence[int]) -> str:
+    """What makes a tensor without batch or channel one of five axes; nothing for any other."""
+    if tuple(tensor.shape[-3:]) != tuple(sizes) or tensor.ndim not in (3, 4):
+        return ""
+    return "; for one sample of one channel take " + (
+        "x[None, None]"
+        if tensor.ndim == 3
+        else "x[:, None] where the first axis is the batch, x[None] where it is the channel"
+    )
 
 
 def check_floating(tensor: Tensor, what: str) -> None:

@@ -27,6 +27,22 @@ def test_a_run_folder_and_its_checkpoint_are_one_method(run: Path):
     assert first.module(torch.zeros(1, 1, *A.range_shape)).volume.shape[2:] == A.domain_shape
 
 
+def test_a_trained_method_is_called_with_views_and_with_another_rig_and_grid(run: Path):
+    """The training's own rig and grid, given by name, give the same bits; others their own shape."""
+    trained = mv.load(str(run))
+    A = trained.module.projector
+    views = A(torch.rand(1, 1, *A.domain_shape, generator=torch.Generator().manual_seed(0)))
+    expected = trained.module(views).volume
+    assert torch.equal(trained(views), expected) and not trained(views).requires_grad
+    assert torch.equal(trained(views, A.cameras, A.grid), expected)
+    fewer = trained(views[:, :, ::2], A.cameras[::2])
+    assert fewer.shape == expected.shape and fewer.isfinite().all()
+    grid = mv.Grid.centred(size=(12, 14, 16), spacing=9.0)
+    assert trained(views, grid=grid).shape[2:] == grid.shape
+    with pytest.raises(ValueError, match=r"take x\[None, None\]"):
+        trained(views[0, 0])
+
+
 def test_a_method_that_a_run_does_not_have_is_named(run: Path):
     with pytest.raises(LookupError, match="no method 'unet'. It has cross_view"):
         mv.load(run, "unet")

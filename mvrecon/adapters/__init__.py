@@ -1,0 +1,1 @@
+"""mvrecon's operators and volumes as other libraries take them."""
