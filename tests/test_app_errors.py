@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from mvrecon.config import conf_dir, launch
-from mvrecon.config.plugins import check_plugins, import_plugins
+from mvrecon.config.plugins import check_plugins, import_plugins, names
 from mvrecon.config.typed import check_parts, fits
 from mvrecon.parts import PROJECTORS
 
@@ -38,7 +38,7 @@ def answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Captu
     monkeypatch.setattr(sys, "path", [*sys.path])
 
     def run(*overrides: str, task=reached) -> str:
-        monkeypatch.setattr(sys, "argv", ["mvrecon-train", "experiment=smoke", *overrides])
+        monkeypatch.setattr(sys, "argv", ["mvrecon-train", *overrides])
         with pytest.raises(SystemExit) as stop:
             launch(task, "train")
         assert stop.value.code
@@ -116,24 +116,28 @@ def test_every_choice_of_ours_fits_the_types_of_its_part():
             check_parts({group: part})
 
 
-MODULE = """from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.drr import Drr
-PROJECTORS.register("errors_doubled")(Drr)
-"""
-
-
-def test_a_module_in_the_current_folder_is_a_plugin_where_the_command_line_names_it(
-    answer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("page", ["README.md", "plugins/README.md"])
+def test_the_plugin_of_a_page_works_by_its_own_command(
+    page: str, root: Path, answer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """One string is one module."""
+    """The page's own code in its own file, its own command, in a folder that is on no path."""
+    text = (root / page).read_text()
+    code = re.search(r"```python\n([^`]*register\(.doubled.\).*?)```", text, re.S)
+    command = re.search(r"mvrecon-train (experiment=quickstart plugins=[^`\n]*)", text)
+    assert code is not None and command is not None
     monkeypatch.setattr(PROJECTORS, "_parts", dict(PROJECTORS._parts))
-    (tmp_path / "errors_parts.py").write_text(MODULE)
-    with pytest.raises(ModuleNotFoundError, match="plugins=.errors_parts. on the command line"):
-        check_plugins(["errors_parts"])
+    monkeypatch.delitem(sys.modules, "my_parts", raising=False)
+    (tmp_path / "my_parts.py").write_text(code[1])
+    with pytest.raises(ModuleNotFoundError, match="plugins=.my_parts. on the command line"):
+        check_plugins(["my_parts"])
 
     def build(config) -> None:
         import_plugins(config.plugins)
         raise ValueError(PROJECTORS.origin(config.projector.name))
 
-    text = answer("plugins=errors_parts", "projector.name=errors_doubled", task=build)
-    assert text == "mvrecon-train: ValueError: mvrecon.projectors.drr:Drr\n"
+    answered = answer(*command[1].split(), task=build)
+    assert answered == "mvrecon-train: ValueError: my_parts:doubled\n"
+
+
+def test_one_string_is_one_module():
+    assert names("my_parts") == names(["my_parts"]) == ["my_parts"] and names(None) == []

@@ -75,6 +75,7 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
         "mvrecon-simulate": "mvrecon.simulate:main",
         "mvrecon-reconstruct": "mvrecon.reconstruction:main",
         "mvrecon-list": "mvrecon.listing:main",
+        "mvrecon-warmup": "mvrecon.warmup:main",
     }
 
 

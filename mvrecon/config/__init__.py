@@ -5,6 +5,7 @@ torch's defaults and no loop pays for a config object. Importing this file impor
 Lightning.
 """
 
+import re
 import sys
 from collections.abc import Callable
 from io import TextIOWrapper
@@ -24,10 +25,12 @@ from mvrecon.config.guard import guarded
 from mvrecon.config.plugins import check_plugins
 from mvrecon.config.schemas import SCHEMAS
 from mvrecon.config.typed import check_parts
-from mvrecon.files.checks import shown
+from mvrecon.files.checks import shown, yaml_of
 from mvrecon.registry import installed, locate
 
 VERSION_BASE = "1.3"
+#: Groups whose part is an option of a model.
+OF_MODELS = {"head", "network", "reconstructor"}
 
 
 class PluginConf(SearchPathPlugin):
@@ -127,13 +130,18 @@ def check_settings(config: DictConfig) -> None:
 
 
 def help_text(config_name: str) -> str:
-    """The text of `--help`: every config group with its choices, and all settings with comments."""
+    """The text of `--help`: the config groups that the app takes, with their choices, and all
+    settings with comments.
+    """
     choices: dict[str, set[str]] = {}
     for folder in (conf_dir(), *plugin_conf_dirs()):
         for file in folder.glob("*/*.yaml"):
             choices.setdefault(file.parent.name, set()).add(file.stem)
+    taken = groups_of(app_file(config_name))
     groups = "\n".join(
-        f"  {group:<12}{', '.join(sorted(names))}" for group, names in sorted(choices.items())
+        f"  {group:<12}{', '.join(sorted(names))}"
+        for group, names in sorted(choices.items())
+        if group in taken
     )
     settings = app_file(config_name).read_text(encoding="utf-8")
     return (
@@ -145,6 +153,14 @@ def help_text(config_name: str) -> str:
         "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's "
         "options.\n"
     )
+
+
+def groups_of(app: Path) -> set[str]:
+    """The config groups in an app's list of defaults, and those that its models choose from."""
+    entries = yaml_of(app).get("defaults", ())
+    keys = (next(iter(entry)) for entry in entries if isinstance(entry, dict))
+    groups = {re.sub("^override ", "", key).partition("@")[0].strip("/") for key in keys}
+    return groups | (OF_MODELS if "model" in groups else set())
 
 
 def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:

@@ -45,6 +45,7 @@ class Settings(Measurement):
     trainer: Any = None
     callbacks: Any = None
     logger: Any = None
+    device: str = "auto"
     resume: str | None = None
 
 

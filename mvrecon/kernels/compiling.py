@@ -3,13 +3,14 @@ the next process.
 """
 
 import logging
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+from numba import config, njit
 from numba.core.caching import FunctionCache
 
 logger = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ class Kept(FunctionCache):
     """
 
     warned = False
+    announced = False
 
     def __init__(self, loop: Callable[..., Any]):
         super().__init__(loop)
@@ -60,8 +62,12 @@ class Kept(FunctionCache):
         self._cache_file._source_stamp = SOURCES
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The machine code on disk, or None."""
-        return self._tried(super().load_overload, sig, target_context)
+        """The machine code on disk; None where it must be compiled, which is said once."""
+        code = self._tried(super().load_overload, sig, target_context)
+        if code is None and not Kept.announced:
+            Kept.announced = True
+            sys.stderr.write("mvrecon: compiling kernels, once, about 30 s (mvrecon-warmup)\n")
+        return code
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Machine code to disk, where there is room."""
@@ -94,3 +100,10 @@ def compiled(loop: Callable[..., Any]) -> Any:
     with suppress(RuntimeError):  # numba finds no folder to write to
         dispatcher._cache = Kept(loop)
     return dispatcher
+
+
+def kept_in() -> Path:
+    """The folder where numba keeps machine code: that of the environment variable NUMBA_CACHE_DIR,
+    else beside the code.
+    """
+    return Path(config.CACHE_DIR) if config.CACHE_DIR else Path(__file__).parent
