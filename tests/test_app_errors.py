@@ -81,16 +81,6 @@ def test_an_error_of_the_task_is_one_line_and_a_fault_of_the_program_is_not(answ
         answer()
 
 
-def test_the_checks_import_no_torch(run_python):
-    code = (
-        "import sys; sys.argv = ['mvrecon-train', 'camera.n_views=abc']\n"
-        "import mvrecon.train\n"
-        "try: mvrecon.train.main()\n"
-        "except SystemExit: print(sorted({'torch', 'lightning', 'numba'} & set(sys.modules)))"
-    )
-    assert run_python("-c", code).stdout == "[]\n"
-
-
 @pytest.mark.parametrize(
     ("type", "good", "bad"),
     [

@@ -17,6 +17,7 @@ COMMANDS = {
     "list --help": "listing",
     "train --cfg job": "train",
     "train projectr=drr": "train",
+    "train camera.n_views=abc": "train",
 }
 
 
@@ -29,7 +30,7 @@ def test_a_quick_answer_imports_nothing_heavy(run_python, command: str):
     )
     done = run_python("-c", code)
     assert "HEAVY []" in done.stdout, done.stdout + done.stderr
-    assert done.returncode == ("projectr" in command), done.stderr
+    assert done.returncode == ("=" in command), done.stderr
     if "--help" in command:  # Hydra's own help takes a second to compose
         assert done.stdout.lower().startswith(f"usage: {argv[0]}")
 

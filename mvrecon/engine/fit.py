@@ -15,6 +15,7 @@ from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
 from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
+from mvrecon.engine.training_memory import check_training
 from mvrecon.files.checks import plain_name
 from mvrecon.kernels.threads import in_one_order
 
@@ -82,6 +83,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
 
     Raises:
         FloatingPointError: a loss that is not finite.
+        ValueError: a step that does not fit into memory.
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
         SystemExit: SIGTERM came; the checkpoint of that step is written.
     """
@@ -93,6 +95,10 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
         return
+    accelerator = settings["trainer"].get("accelerator", "auto")
+    needed = check_training(module, data.loading.batch_size, accelerator)
+    if needed is not None:
+        _tell(f"{method}: a step keeps about {needed / 2**30:.2f} GiB")
     L.seed_everything(
         settings["seed"], workers=True, verbose=False
     )  # initial weights have used up random numbers

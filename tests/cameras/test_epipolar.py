@@ -7,7 +7,7 @@ import mvrecon as mv
 
 DETECTOR = {"pixels": [40, 48], "pixel_mm": 2.0, "offset_mm": [3.0, -5.0]}
 RIGS = {
-    "cone": mv.dome(6, 400.0, 800.0, DETECTOR),
+    "cone": mv.arc(6, 400.0, 800.0, DETECTOR),
     "parallel": mv.parallel(5, DETECTOR, start_degrees=11.0),
     "pinholes": mv.dcspect80(pixels=[16, 16])[[0, 17, 40]],
 }
