@@ -4,7 +4,7 @@ import ast
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -121,8 +121,13 @@ def _options(module: str, node: Definition) -> tuple[dict[str, Option], bool]:
                 inherited, others = _options(*definition(module, base.id))
                 options, catch_all = options | inherited, catch_all or others
     if any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list):
-        options |= _fields(node, texts)
-    return options, catch_all
+        for name, option in _fields(node, texts).items():
+            inherited_text = options.get(name, option).text
+            options[name] = replace(option, text=option.text or inherited_text)
+    return {
+        name: replace(option, text=option.text or texts.get(name, ""))
+        for name, option in options.items()
+    }, catch_all
 
 
 def _texts(docstring: str) -> dict[str, str]:

@@ -28,12 +28,17 @@ def test_what_is_read_is_what_an_import_gives(kind: str, name: str):
     needed = {n for n, p in parameters.items() if p.default is p.empty}
     assert {n for n, option in part.options.items() if not option.default} == needed - GIVEN
     assert part.summary
+    assert [option for option, what in part.options.items() if not what.text] == []
     assert " ".join(inspect.getdoc(imported).split()).startswith(part.summary)
 
 
-def test_every_part_and_origin_is_printed(capsys: pytest.CaptureFixture[str]):
+def test_every_part_and_origin_is_printed_and_options_with_their_units(
+    capsys: pytest.CaptureFixture[str],
+):
     assert main([]) == 0
     text = capsys.readouterr().out
+    assert "arc_degrees=180.0  the range of angles" in text
+    assert "sid (float)  mm from the source to the axis." in text
     for kind, name in PARTS:
         assert name in text
         assert REGISTRIES[kind].origin(name) in text

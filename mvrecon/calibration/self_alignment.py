@@ -34,7 +34,14 @@ def self_aligned(
     """Views as cameras without shift (pixels) and wrong gain would have measured them, both told by
     the views alone.
 
-    Arguments and errors as `self_alignment`.
+    Args:
+        A: the operator of the cameras as they should be; its grid must hold the whole object.
+        views: measured integrals.
+        alternations: of reconstruction and alignment.
+        iterations: of SIRT with momentum in each, from the volume of the one before.
+
+    Raises:
+        ValueError: as `self_alignment`.
     """
     by = self_alignment(A, views, alternations, iterations)
     return CorrectedViews(aligned(views, by), by)

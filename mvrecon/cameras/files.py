@@ -40,6 +40,9 @@ def from_file(path: str | Path) -> Cameras:
     "parallel": false, "extent": "segment", "cameras": [{"source": [x, y, z], "origin": [..], "u":
     [..], "v": [..]}, ..]}; the meanings are those of `Cameras`.
 
+    Args:
+        path: of the file.
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: truncated, too large or not such a file, entries missing or not finite, or a rig

@@ -55,6 +55,14 @@ def arc(
     """Cone beam on an arc about the z axis, as `circular`, but with a camera at both ends of the
     arc.
 
+    Args:
+        n_views: number of cameras; their angles are start + arc k / (n_views - 1).
+        sid: mm from the source to the axis.
+        sdd: mm from the source to the detector, which stands across the axis.
+        detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
+        arc_degrees: the range of angles, its end included; negative turns clockwise seen from +z.
+        start_degrees: the first angle.
+
     Raises:
         ValueError: as `circular`, or an arc that closes, so that its ends would be one camera.
     """
