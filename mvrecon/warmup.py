@@ -27,9 +27,8 @@ def warm_up() -> float:
                 z = x.clone().requires_grad_()
                 A.T(A(z)).sum().backward()
         views = mv.Drr(grid, cone)(x)
-        for method in (mv.fdk, mv.sirt, mv.fista_tv, mv.osem):
-            options = {} if method is mv.fdk else {"iterations": 1}
-            method(mv.Drr(grid, cone), views, **options)
+        for name in ("fdk", "sirt", "fista_tv", "osem"):
+            mv.reconstructed(views, cone, grid, name)
     return time.perf_counter() - begin
 
 

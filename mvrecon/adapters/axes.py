@@ -4,7 +4,7 @@ Convention: ours is [c d h w] = (z, y, x) with an affine from (x, y, z) to RAS i
 TorchIO hold [c x y z] with the same affine; SimpleITK's world is LPS, so x and y change signs.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,16 +14,11 @@ from torch import Tensor
 from mvrecon.adapters.missing import needs
 from mvrecon.geometry.grid import Grid
 
-if TYPE_CHECKING:
-    from monai.data import MetaTensor
-    from SimpleITK import Image
-    from torchio import ScalarImage
-
 #: From our world (RAS) to ITK's (LPS), and back.
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-def to_monai(volume: Float[Tensor, "c d h w"], grid: Grid) -> "MetaTensor":
+def to_monai(volume: Float[Tensor, "c d h w"], grid: Grid) -> Any:
     """A volume as MONAI's `MetaTensor` [c x y z], the affine in mm (RAS).
 
     Raises:
@@ -31,7 +26,7 @@ def to_monai(volume: Float[Tensor, "c d h w"], grid: Grid) -> "MetaTensor":
         ValueError: another shape than the grid's.
     """
     with needs("monai"):
-        from monai.data import MetaTensor
+        from monai.data import MetaTensor  # pyright: ignore[reportMissingImports]
 
     return MetaTensor(_turned(volume, grid), affine=grid.affine)
 
@@ -49,7 +44,7 @@ def from_monai(image: Float[Tensor, "c x y z"]) -> tuple[Float[Tensor, "c d h w"
     return _ours(image.as_subclass(Tensor), np.asarray(affine, np.float64))
 
 
-def to_torchio(volume: Float[Tensor, "c d h w"], grid: Grid) -> "ScalarImage":
+def to_torchio(volume: Float[Tensor, "c d h w"], grid: Grid) -> Any:
     """A volume as TorchIO's `ScalarImage` [c x y z], the affine in mm (RAS).
 
     Raises:
@@ -57,19 +52,19 @@ def to_torchio(volume: Float[Tensor, "c d h w"], grid: Grid) -> "ScalarImage":
         ValueError: another shape than the grid's.
     """
     with needs("torchio"):
-        from torchio import ScalarImage
+        from torchio import ScalarImage  # pyright: ignore[reportMissingImports]
 
     return ScalarImage(tensor=_turned(volume, grid), affine=grid.affine.numpy())
 
 
-def from_torchio(image: "ScalarImage") -> tuple[Float[Tensor, "c d h w"], Grid]:
+def from_torchio(image: Any) -> tuple[Float[Tensor, "c d h w"], Grid]:
     """The volume and the grid, in mm, of TorchIO's image; a left-handed one is flipped along its
     first axis.
     """
     return _ours(image.data, np.asarray(image.affine, np.float64))
 
 
-def to_simpleitk(volume: Float[Tensor, "d h w"], grid: Grid) -> "Image":
+def to_simpleitk(volume: Float[Tensor, "d h w"], grid: Grid) -> Any:
     """A volume as SimpleITK's `Image`, its origin, spacing and direction in mm (LPS).
 
     Raises:
@@ -139,4 +134,5 @@ def _ours(
         flip[0, 3] = values.shape[1] - 1
         values, affine = values.flip(1), affine @ flip
     volume = values.permute(0, 3, 2, 1).contiguous()
-    return volume, Grid(tuple(volume.shape[1:]), torch.from_numpy(affine))
+    d, h, w = volume.shape[1:]
+    return volume, Grid((d, h, w), torch.from_numpy(affine))

@@ -1,15 +1,12 @@
 """An operator for deepinv's algorithms, denoisers and training."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from mvrecon.adapters.missing import needs
 from mvrecon.projectors.operator import LinearOperator
 
-if TYPE_CHECKING:
-    from deepinv.physics import LinearPhysics
 
-
-def deepinv_physics(A: LinearOperator) -> "LinearPhysics":
+def deepinv_physics(A: LinearOperator) -> Any:
     """An operator as deepinv's `LinearPhysics`, in the unit of A (mm), differentiable as A is.
 
     Convention: deepinv's x are volumes [b c d h w] and its y are views [b c m v u], as here. Its
@@ -23,7 +20,7 @@ def deepinv_physics(A: LinearOperator) -> "LinearPhysics":
         ImportError: deepinv is not installed.
     """
     with needs("deepinv"):
-        from deepinv.physics import LinearPhysics
+        from deepinv.physics import LinearPhysics  # pyright: ignore[reportMissingImports]
 
     return LinearPhysics(
         A=lambda x, **_: A(x),

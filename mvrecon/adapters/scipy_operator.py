@@ -1,6 +1,6 @@
 """An operator for SciPy's solvers."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,11 +8,8 @@ import torch
 from mvrecon.adapters.missing import needs
 from mvrecon.projectors.operator import LinearOperator
 
-if TYPE_CHECKING:
-    from scipy.sparse.linalg import LinearOperator as ScipyOperator
 
-
-def scipy_operator(A: LinearOperator, dtype: Any = np.float64) -> "ScipyOperator":
+def scipy_operator(A: LinearOperator, dtype: Any = np.float64) -> Any:
     """An operator as `scipy.sparse.linalg.LinearOperator`, in the unit of A (mm), so that
     `lsqr`, `lsmr`, `svds` and others work on it.
 
@@ -28,11 +25,11 @@ def scipy_operator(A: LinearOperator, dtype: Any = np.float64) -> "ScipyOperator
         ValueError: another dtype.
     """
     with needs("scipy"):
-        from scipy.sparse.linalg import LinearOperator as ScipyOperator
+        from scipy.sparse import linalg  # pyright: ignore[reportMissingImports]
 
     if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise ValueError(f"Expected the dtype float32 or float64, got {np.dtype(dtype)}")
-    rows, columns = int(np.prod(A.range_shape)), int(np.prod(A.domain_shape))
+    shape = (int(np.prod(A.range_shape)), int(np.prod(A.domain_shape)))
 
     @torch.no_grad()
     def product(operator: LinearOperator, vectors: np.ndarray) -> np.ndarray:
@@ -42,9 +39,9 @@ def scipy_operator(A: LinearOperator, dtype: Any = np.float64) -> "ScipyOperator
         result = operator(batch.reshape(-1, 1, *operator.domain_shape))
         return result.reshape(len(batch), -1).T.cpu().numpy()
 
-    return ScipyOperator(
+    return linalg.LinearOperator(
         dtype=np.dtype(dtype),
-        shape=(rows, columns),
+        shape=shape,
         matvec=lambda x: product(A, x),
         rmatvec=lambda y: product(A.T, y),
         matmat=lambda x: product(A, x),

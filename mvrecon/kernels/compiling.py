@@ -3,6 +3,7 @@ the next process.
 """
 
 import logging
+import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,7 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from numba import config, njit
+from numba import njit
 from numba.core.caching import FunctionCache
 
 logger = logging.getLogger(__name__)
@@ -106,4 +107,4 @@ def kept_in() -> Path:
     """The folder where numba keeps machine code: that of the environment variable NUMBA_CACHE_DIR,
     else beside the code.
     """
-    return Path(config.CACHE_DIR) if config.CACHE_DIR else Path(__file__).parent
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent)
