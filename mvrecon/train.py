@@ -5,6 +5,7 @@ Torch is imported inside the task, so that `--help` and typing mistakes are answ
 """
 
 import logging
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.engine import evaluation, fit, run_folder
 
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    # Lightning's own use of torch, of which no user can be rid
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
     with run_folder.taken(folder, settings):

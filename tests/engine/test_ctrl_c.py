@@ -1,0 +1,31 @@
+"""Ctrl-C in a training says how to go on."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from mvrecon.engine.survival import remembered
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_ctrl_c_says_how_to_resume(kept: bool, tmp_path: Path):
+    """Lightning turns it into an exit without a word."""
+    run = tmp_path / "run"
+    last = run / "checkpoints" / "cross_view" / "last.ckpt"
+    last.parent.mkdir(parents=True)
+    if kept:
+        last.touch()
+    then = "goes on from it" if kept else "begins again"
+    message = f"Stopped by Ctrl-C. .*mvrecon-train resume={run} {then}"
+    with pytest.raises(SystemExit, match=message), remembered(last):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            sys.exit(1)
+
+
+def test_another_exit_stays_what_it_is(tmp_path: Path):
+    with pytest.raises(SystemExit) as stop, remembered(tmp_path / "a" / "b" / "c" / "last.ckpt"):
+        sys.exit(3)
+    assert stop.value.code == 3
