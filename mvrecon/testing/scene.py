@@ -10,7 +10,7 @@ from mvrecon.parts import SCENES
 from mvrecon.projectors.drr import Drr
 from mvrecon.scenes.sample import Sample, Scene
 
-GRID = Grid.centred(24, spacing=4.0)
+GRID = Grid.centred(24, spacing=5.0)
 RIG = circular(3, 400.0, 800.0, {"pixels": [32, 32], "pixel_mm": 8.0}, start_degrees=17.0)
 #: Views of the truth on a coarse grid miss the exact ones by this part of their norm at most.
 COARSE = 0.2

@@ -1,0 +1,25 @@
+"""Every endless scene of ours passes the check that a plugin's must."""
+
+from dataclasses import replace
+
+import pytest
+
+from mvrecon.parts import SCENES
+from mvrecon.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.testing import check_scene
+
+
+@pytest.mark.parametrize("name", ["ellipsoids", "shepp_logan", "ventricle"])
+def test_contract(name: str):
+    check_scene(name)
+
+
+def test_views_of_another_unit_are_told(monkeypatch: pytest.MonkeyPatch):
+    class InMetres(RandomEllipsoids):
+        def sample(self, *arguments):
+            case = super().sample(*arguments)
+            return replace(case, views=case.views / 1000)
+
+    monkeypatch.setattr(SCENES, "_parts", {"metres": InMetres})
+    with pytest.raises(AssertionError, match="differ from line integrals of the truth"):
+        check_scene("metres")
