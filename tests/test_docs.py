@@ -24,8 +24,8 @@ DOCS = sorted(
     + [*(ROOT / "plugins").glob("*.md"), *(ROOT / "plugins").glob("*/README.md")]
     + [*(ROOT / "experiments").rglob("README.md")]
 )
-#: Files that a reader makes, and other projects' files.
-ELSEWHERE = {"my_parts.py"}
+#: Files that a reader makes, that an app writes, and other projects' files.
+ELSEWHERE = {"my_parts.py", "compare.md"}
 #: Words of Lightning's that SECURITY.md forbids, and the pages that say so or that tell the past.
 UNSAFE, HISTORY = "load_from_checkpoint", {"SECURITY.md", "CHANGELOG.md"}
 

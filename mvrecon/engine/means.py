@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping
 
+from jaxtyping import Float
 from torch import Tensor
 from torchmetrics import MeanMetric
 
 
 class Means:
-    """Weighted means by name, over all cases and all processes of a run (torchmetrics' MeanMetric,
-    which sums over them).
+    """Means by name, over all cases and all processes of a run (torchmetrics' MeanMetric, which
+    sums over them).
 
     Args:
         ignore_nan: cases whose figure is nan count in no mean; otherwise they make it nan.
@@ -18,12 +19,14 @@ class Means:
         self._strategy = "ignore" if ignore_nan else "disable"
         self._means: dict[str, MeanMetric] = {}
 
-    def update(self, values: Mapping[str, Tensor], weight: float = 1.0) -> None:
-        """Add the figures of some cases, one or several for each name."""
+    def update(self, values: Mapping[str, Float[Tensor, " n"]]) -> None:
+        """Add the figures of n cases, each by itself: torchmetrics 1.9 leaves a weight out where
+        nan counts.
+        """
         for name, value in values.items():
             if name not in self._means:
                 self._means[name] = MeanMetric(nan_strategy=self._strategy).to(value.device)  # pyright: ignore[reportArgumentType]
-            self._means[name].update(value.detach(), weight)
+            self._means[name].update(value.detach())
 
     def compute(self) -> dict[str, Tensor]:
         """The means by name, and begin anew; all processes call this together."""

@@ -137,7 +137,7 @@ class ReconstructionModule(L.LightningModule):
             means |= {f"cameras_{name}": v.expand(len(predicted)) for name, v in values.items()}
         if out.support is not None:
             means["support_fraction"] = out.support.flatten(1).float().mean(dim=1)
-        self._losses.update(terms, len(predicted))
+        self._losses.update({name: value.expand(len(predicted)) for name, value in terms.items()})
         self._figures.update(means)
         return {"out": out}
 
