@@ -15,15 +15,15 @@ from mvrecon.scenes.sample import Sample, Scene, Thin
 from mvrecon.visual_hull.support import warn_of_gaps
 
 TENSORS = ("views", "volume", "inside")
-#: What a case has where its rig is disturbed.
-ERRORS = ("shift_px", "gain")
+#: What a case has where its rig is disturbed, or its scene has matter.
+OPTIONAL = ("shift_px", "gain", "mu")
 
 
 class SceneDataset(Dataset[dict[str, Any]]):
     """Cases of one scene; each item is a pure function of its index, whichever process asks for it.
 
     An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; where the rig is
-    disturbed also "shift_px" [m 2] and "gain" [m].
+    disturbed also "shift_px" [m 2] and "gain" [m]; where the scene attenuates "mu" [1 d h w], 1/mm.
 
     Args:
         scene: where the cases come from.
@@ -73,7 +73,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             console = Console(stderr=True)
             made = DataLoader(_Making(self), batch_size=None, num_workers=workers)
             items = list(track(made, f"Preparing {what}", transient=True, console=console))
-            keys = [key for key in (*TENSORS, *ERRORS) if items and key in items[0]]
+            keys = [key for key in (*TENSORS, *OPTIONAL) if items and key in items[0]]
             self._ready = {key: torch.stack([i[key] for i in items]) for key in keys}
             self._ready["name"] = [i["name"] for i in items]
         return self._ready
@@ -83,8 +83,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         index = self.indices[item]
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
-        errors = [key for key in ERRORS if getattr(sample, key) is not None]
-        made = {key: getattr(sample, key) for key in (*TENSORS, *errors)}
+        optional = [key for key in OPTIONAL if getattr(sample, key) is not None]
+        made = {key: getattr(sample, key) for key in (*TENSORS, *optional)}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
                 raise ValueError(

@@ -34,6 +34,7 @@ class Sample:
         name: of the case, the same for the same (seed, index).
         shift_px: of each detector along (u, v), which nobody knows; none where there is none.
         gain: of each view, likewise.
+        mu: linear attenuation on the grid in 1/mm; none where the scene has no matter.
     """
 
     views: Float[Tensor, "1 m v u"]
@@ -42,6 +43,7 @@ class Sample:
     name: str
     shift_px: Float[Tensor, "m 2"] | None = None
     gain: Float[Tensor, " m"] | None = None
+    mu: Float[Tensor, "1 d h w"] | None = None
 
 
 class Scene(Protocol):
@@ -88,6 +90,30 @@ class Placing(Protocol):
 
 
 @runtime_checkable
+class Parametrised(Protocol):
+    """A scene that states what was drawn at random for a case."""
+
+    def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
+        """Numbers of the case `index` of the series `seed` by name, as its pose in mm and
+        degrees; the same names for every case.
+        """
+        ...
+
+
+@runtime_checkable
+class Attenuating(Protocol):
+    """A scene with matter that attenuates what its objects emit."""
+
+    def attenuation(
+        self, index: int, seed: int, grid: Grid, factor: int = 1
+    ) -> Float[Tensor, "1 d h w"]:
+        """Linear attenuation in 1/mm of the case `index` of the series `seed`, on
+        `grid.refined(factor)`.
+        """
+        ...
+
+
+@runtime_checkable
 class Finer(Protocol):
     """A scene that gives the object of a case on a finer grid without its views."""
 
@@ -97,6 +123,15 @@ class Finer(Protocol):
         """The values of the case `index` of the series `seed`, which `sample` puts on `grid`, on
         `grid.refined(factor)`.
         """
+        ...
+
+
+@runtime_checkable
+class Pooling(Protocol):
+    """A scene that makes a case of its object on a finer grid."""
+
+    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
+        """The case without views, its truth on `grid` averaged from the values on a finer one."""
         ...
 
 
