@@ -73,7 +73,7 @@ def test_the_folder_holds_cases_rig_settings_and_versions(run):
         p.name for p in folder.iterdir()
     }
     measured = {"grid", "scene", "camera", "projector", "acquisition"}
-    assert set(settings) == {"name", "seed", "cases", "rtk", "plugins"} | measured
+    assert set(settings) == {"name", "seed", "cases", "events", "rtk", "plugins"} | measured
     for case in (folder / "cases").iterdir():
         assert sorted(p.name for p in case.iterdir()) == [
             "truth.nii.gz",
