@@ -86,8 +86,9 @@ def write_view(
     """
     events = Path(events).resolve()
     _, count = header_of(events)
-    with blaming(events, "has no such event or array"), h5py.File(events, "r") as file:
-        shapes = {"raw": file[raw].shape, "label": file["truth"].shape}
+    with blaming(events, "cannot be opened"), h5py.File(events, "r") as file:
+        parts = {"raw": raw, "label": "truth"}
+        shapes = {key: dataset_in(events, file, name, raw).shape for key, name in parts.items()}
     if not 0 <= item < count or shapes["raw"] != shapes["label"]:
         raise Refused(
             f"{events}: expected an event below {count} and an array of shape {shapes['label']}, "

@@ -89,10 +89,6 @@ class RandomCardiac(AttenuatingScene):
                 f"{self.defects} and {self.contrast}"
             )
 
-    def thinnest(self, grid: Grid) -> float:
-        """The least thickness in mm of the left ventricle's wall."""
-        return WALL[0]
-
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
         """The patient's activity.
 

@@ -79,10 +79,6 @@ class Defrise(AnalyticScene):
         sizes = self.discs, self.radius_mm, self.thickness_mm, self.pitch_mm
         return defrise(*sizes, centre, self.value)
 
-    def thinnest(self, grid: Grid) -> float:
-        """The discs' thickness in mm."""
-        return self.thickness_mm
-
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
         """The stack about the centre of `grid`; nothing of it is random."""
         return self._about(grid.centre.tolist())

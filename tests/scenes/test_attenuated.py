@@ -18,9 +18,7 @@ def points(*places):
 
 def ball(radius, value, centre=(0, 0, 0)):
     size = torch.full((1, 3), float(radius))
-    return Phantom(
-        (Solids("ellipsoid", points(centre), torch.eye(3)[None], size, points(value)),)
-    )
+    return Phantom((Solids("ellipsoid", points(centre), torch.eye(3)[None], size, points(value)),))
 
 
 def test_the_central_ray_of_a_filled_ball_has_its_closed_form():

@@ -7,16 +7,15 @@
     index    [n]         of the event in its series
     radon    [n a z s]   optional: sinograms of the slices, activity * mm
     mu       [n d h w]   optional: attenuation in 1/mm
-    pose     [n k]       optional: what was drawn, named by the attribute `columns`
+    pose     [n k]       optional: what was drawn, named by the header's `columns`
     backprojection [n d h w]  optional: A^T counts / (dose A^T 1), for networks in the volume
 
-Attributes of the file: `format`, `settings` (SHA-256 of what the events depend on), `seed`,
-`affine` of the grid (voxel index to world mm), `columns`.
+The attribute `header` is JSON: `format`, and the fields of `Header`.
 """
 
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import h5py
@@ -24,6 +23,7 @@ import numpy as np
 
 from mvrecon.data.hdf5 import FORMAT
 from mvrecon.data.storage import check_chunks, dataset_in
+from mvrecon.data.texts import variable
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import Refused, blaming, shown
 
@@ -35,6 +35,8 @@ NEEDED["index"] = (1, "i")
 OPTIONAL = {"radon": (4, "f"), "mu": (4, "f"), "pose": (2, "f"), "backprojection": (4, "f")}
 #: Level of gzip: higher ones save 2 % of a file and cost several times the time.
 LEVEL = 1
+#: Most bytes of a header.
+TEXT = 2**16
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,8 @@ def write_shard(
         OSError: no space, no permission.
     """
     with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
-        file.attrs.update(format=KIND, settings=header.settings, seed=header.seed)
-        file.attrs.update(affine=header.affine, columns=json.dumps(header.columns))
+        text = json.dumps({"format": KIND, **asdict(header)}).encode()
+        file.attrs.create("header", text, dtype=h5py.string_dtype("utf-8", len(text)))
         fill(file, len(indices), (make(index) for index in indices))
 
 
@@ -89,26 +91,32 @@ def header_of(path: Path) -> tuple[Header, int]:
     Raises:
         Refused: not a file of events, cut short, or with arrays that do not agree.
     """
-    with blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"):
-        with h5py.File(path, "r", locking="best-effort") as file:
-            checked(path, file)
-            a = file.attrs
-            affine = tuple(float(x) for x in a["affine"])  # type: ignore[union-attr]
-            header = Header(
-                str(a["settings"]), int(a["seed"]), affine, tuple(json.loads(str(a["columns"])))
-            )
-            return header, len(file["index"])  # type: ignore[arg-type]
+    with (
+        blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
+        h5py.File(path, "r", locking="best-effort") as file,
+    ):
+        return _header(path, file), len(checked(path, file)["index"])
+
+
+def _header(path: Path, file: h5py.File) -> Header:
+    kind = file.attrs.get_id("header") if "header" in file.attrs else None
+    if kind is None or kind.shape != () or variable(kind.dtype) or kind.dtype.itemsize > TEXT:
+        raise Refused(f"{path}: has no short text as its header; expected {EXPECTED}")
+    values = json.loads(bytes(file.attrs["header"]).decode())  # type: ignore[arg-type]
+    if not isinstance(values, dict) or values.pop("format", None) != KIND:
+        raise Refused(f"{path}: has the header {shown(values)}, expected that of {KIND!r}")
+    values["affine"] = tuple(float(x) for x in values["affine"])
+    values["columns"] = tuple(str(name) for name in values["columns"])
+    return Header(**values)
 
 
 def checked(path: Path, file: h5py.File) -> dict[str, h5py.Dataset]:
     """The arrays of an open file of events.
 
     Raises:
-        Refused: another format, arrays that are missing, of another type or of another number of
+        Refused: arrays that are missing, of another type or of another number of
             events; signed counts, which could be negative.
     """
-    if (kind := str(file.attrs.get("format"))) != KIND:
-        raise Refused(f"{path}: has the format {shown(kind)}, expected {KIND!r}: {EXPECTED}")
     names = [*NEEDED, *(name for name in OPTIONAL if name in file)]
     arrays = {name: dataset_in(path, file, name, EXPECTED) for name in names}
     for name, array in arrays.items():

@@ -1,9 +1,12 @@
-"""Events on disk: what they hold is physics, and neither workers, kills nor damage change a byte."""
+"""Events on disk: what they hold is physics; neither workers, kills nor damage change a byte."""
 
+import multiprocessing
 import pickle
+import resource
 import shutil
 from collections import namedtuple
 from hashlib import sha256
+from pathlib import Path
 from weakref import ref
 
 import h5py
@@ -14,7 +17,7 @@ from torch.utils.data import DataLoader
 
 from mvrecon.data.events.making import EventMaker
 from mvrecon.data.events.reading import Events
-from mvrecon.data.events.shards import fill, header_of
+from mvrecon.data.events.shards import Header, fill, header_of, write_shard
 from mvrecon.data.events.sinograms import Sinograms
 from mvrecon.data.events.writing import SUMS, write_events
 from mvrecon.data.pytorch3dunet import write_view
@@ -211,6 +214,39 @@ def test_one_event_at_a_time_is_in_memory(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         fill(file, 4, make())
         assert file["truth"][:, 0, 0].tolist() == [0, 1, 2, 3]
+
+
+def summed(folder, pipe):
+    """Sum of all truths in a process that may have 48 MiB more than it has."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + 48 * 2**20
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    events = Events(folder, ("truth",))
+    pipe.send(sum(event["truth"].sum().item() for event in (events[k] for k in range(len(events)))))
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits are Linux's")
+def test_a_data_set_larger_than_memory_is_written_and_read(tmp_path):
+    """160 MiB are read within 48."""
+    volume = np.zeros((64, 128, 128), "f4")
+    rest = {"ideal": volume[:1], "counts": np.zeros((1, 1, 1), "u4"), "dose": np.float64(1)}
+
+    def make(index):
+        volume[:] = index
+        return {"truth": volume, "index": np.int64(index), **rest}
+
+    header = Header("none", 0, tuple(torch.eye(4).flatten().tolist()))
+    for shard in range(2):
+        write_shard(
+            tmp_path / f"events-{shard}.h5", header, range(20 * shard, 20 * shard + 20), make
+        )
+    fork = multiprocessing.get_context("fork")
+    here, there = fork.Pipe()
+    process = fork.Process(target=summed, args=(tmp_path, there))
+    process.start()
+    process.join(300)
+    assert process.exitcode == 0
+    assert here.recv() == volume.size * sum(range(40))
 
 
 def test_pytorch_3dunet_sees_an_event_without_a_copy(folder, tmp_path, monkeypatch):
