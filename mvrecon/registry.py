@@ -161,6 +161,14 @@ class Registry:
             check_options(f"The {self.kind} {name!r}", options, parameters)
         return part
 
+    def takes(self, name: str, option: str) -> bool:
+        """Whether a part names this option among its own.
+
+        Raises:
+            LookupError: the name is unknown.
+        """
+        return option in inspect.signature(self.get(name)).parameters
+
     def check(self, config: Mapping[str, Any]) -> None:
         """Check the mapping of `from_config` without building the part.
 

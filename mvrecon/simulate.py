@@ -29,10 +29,14 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
         ValueError: the folder's run has other settings; `rtk` with a rig that RTK does not have, or
             with views that are no attenuation.
 
+    With `events` the folder holds a data set of events in place of cases; see `simulate_events`.
+
     Warns:
         UserWarning: nibabel, which writes the truth, is not installed.
     """
     import_plugins(settings["plugins"])
+    if settings["events"] is not None:
+        return simulate_events(settings, folder)
     from rich.console import Console
     from rich.progress import track
 
@@ -71,6 +75,29 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     return case_folders
 
 
+def simulate_events(settings: dict[str, Any], folder: Path) -> list[Path]:
+    """Make a data set of events in `<folder>/events` and return its files.
+
+    The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`. A run that
+    was stopped goes on with what is missing; the number of workers may change.
+
+    Raises:
+        RuntimeError: another process is at work in the folder.
+        ValueError: the folder's run has other settings; a damaged file, or one of other settings.
+        OSError: the disk has less room than the files need.
+    """
+    from mvrecon.cameras import files
+    from mvrecon.data.events.making import EventMaker
+    from mvrecon.data.events.writing import write_events
+    from mvrecon.engine import run_folder
+
+    maker = EventMaker.of(settings)
+    events = {key: value for key, value in settings["events"].items() if key != "workers"}
+    with run_folder.taken(folder, {**settings, "events": events}):
+        files.save(maker.cameras, folder / "cameras.json")
+        return write_events(folder / "events", maker, settings)
+
+
 def has_nibabel() -> bool:
     """Whether nibabel, which writes the truth, is there.
 
@@ -92,9 +119,12 @@ def task(config: DictConfig) -> None:
     from mvrecon.engine.run_folder import anchored
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    case_folders = simulate(anchored(to_plain(config)), folder)
+    settings = anchored(to_plain(config))
+    case_folders, what = simulate(settings, folder), "case(s)"
+    if settings["events"] is not None:
+        what = "file(s) of events"
     Console(markup=False, highlight=False).print(
-        f"{len(case_folders)} case(s) written to {folder}", soft_wrap=True
+        f"{len(case_folders)} {what} written to {folder}", soft_wrap=True
     )
 
 

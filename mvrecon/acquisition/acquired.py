@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.acquisition.detector import detected
 from mvrecon.acquisition.disturbances import rig_errors
@@ -19,7 +19,7 @@ from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.pixel_integral import PixelIntegral
 from mvrecon.scenes.analytic import case_numbers, generator, mixed
-from mvrecon.scenes.sample import Placing, Sample, Scene, Thin, finer
+from mvrecon.scenes.sample import Attenuating, Placing, Pooling, Sample, Scene, Thin, finer
 
 #: The series of the random numbers of the detector and of rig errors, apart from those that draw
 #: the objects.
@@ -44,6 +44,19 @@ class Projection(NamedTuple):
     rays: int
 
 
+class Seen(NamedTuple):
+    """A case as a perfect detector measures it.
+
+    Args:
+        sample: the case.
+        fine: the object on the finer grid that its views were projected from; none where they are
+            integrals in closed form.
+    """
+
+    sample: Sample
+    fine: Float[Tensor, "1 d h w"] | None = None
+
+
 class Store(Protocol):
     """Where cases are kept, as a perfect detector measures them."""
 
@@ -59,7 +72,9 @@ class Acquired:
 
     A projector that says how its pixels are made of line integrals (`pixel_integral`) takes the
     scene's own; any other is built anew on a finer grid, and sees the object there. Case, truth and
-    name are the scene's. The noise is a function of (seed, index).
+    name are the scene's. The noise is a function of (seed, index). A scene whose objects attenuate
+    does so in every projector that has an option `mu`, in place of the option's value, which is
+    what a reconstruction takes the attenuation for.
 
     Args:
         scene: the objects.
@@ -135,27 +150,64 @@ class Acquired:
         return replace(sample, views=detected(sample.views, self.acquisition, cameras, rng))
 
     def _ideal(self, index: int, seed: int, grid: Grid, rig: Any) -> Sample:
-        """The case as a perfect detector measures it."""
-        if self.acquisition.disturbed is None:
-            source = self._source_of(grid, rig)
-        else:  # a rig of this case alone
-            source = source_of(self.projector, grid, rig, self.acquisition.fine)
+        return self.seen(index, seed, grid, rig).sample
+
+    def seen(self, index: int, seed: int, grid: Grid, rig: Any) -> Seen:
+        """The case as a perfect detector measures it, before any rig errors.
+
+        Raises:
+            ValueError: as `sample`.
+        """
+        matter = self._matter(index, seed, grid)
+        source = self._source_for(matter, grid, rig)
         if isinstance(source, Lines):
             sample = self.scene.sample(index, seed, grid, source.rig)
             views = _pooled(sample.views, source.pixel.rays)
-            return replace(sample, views=views * source.pixel.weight.to(views))
-        sample = self.scene.sample(index, seed, grid, rig)
-        with case_numbers(seed, index):  # the numbers that drew the sample
+            return Seen(replace(sample, views=views * source.pixel.weight.to(views)))
+        with case_numbers(seed, index):  # a scene may draw from the global ones
             volume = finer(self.scene, index, seed, grid, rig, self.acquisition.fine)
+        if isinstance(self.scene, Pooling):
+            sample = self.scene.pooled(index, seed, grid, volume)
+        else:
+            with case_numbers(seed, index):
+                sample = self.scene.sample(index, seed, grid, rig)
         with torch.no_grad():
             views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
-        return replace(sample, views=views)
+        pooled = None if matter is None else avg_pool3d(matter[None], self.acquisition.fine)[0]
+        mu = sample.mu if pooled is None else pooled
+        return Seen(replace(sample, views=views, mu=mu), volume)
+
+    def _matter(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "1 d h w"] | None:
+        """Attenuation of a case on the finer grid in 1/mm; none where it does not act."""
+        if not isinstance(self.scene, Attenuating) or self.projector is None:
+            return None
+        if not PROJECTORS.takes(self.projector["name"], "mu"):
+            return None
+        return self.scene.attenuation(index, seed, grid, self.acquisition.fine)
+
+    def _source_for(
+        self, matter: Float[Tensor, "1 d h w"] | None, grid: Grid, rig: Any
+    ) -> Lines | Projection:
+        if matter is not None and bool(matter.any()):  # an operator of this case alone
+            config = {**(self.projector or {}), "mu": matter[0]}
+            return projection_of(config, grid, rig, self.acquisition.fine)
+        if self.acquisition.disturbed is not None:  # a rig of this case alone
+            return self._made(grid, rig)
+        return self._source_of(grid, rig)
 
     def _source_of(self, grid: Grid, cameras: Cameras) -> Lines | Projection:
         if self._source is None or self._source[0] is not grid or self._source[1] is not cameras:
-            made = source_of(self.projector, grid, cameras, self.acquisition.fine)
-            self._source = (grid, cameras, made)
+            self._source = (grid, cameras, self._made(grid, cameras))
         return self._source[2]
+
+    def _made(self, grid: Grid, cameras: Cameras) -> Lines | Projection:
+        projector, acquisition = self.projector, self.acquisition
+        if projector is not None and isinstance(self.scene, Attenuating):
+            if PROJECTORS.takes(projector["name"], "mu"):
+                projector = {**projector, "mu": None}  # the scene's is zero
+        if projector is not None and not acquisition.closed_form:
+            return projection_of(projector, grid, cameras, acquisition.fine)
+        return source_of(projector, grid, cameras, acquisition.fine)
 
 
 def source_of(
@@ -174,6 +226,17 @@ def source_of(
     A = PROJECTORS.from_config(projector, grid=grid, cameras=cameras)
     if (pixel := A.pixel_integral()) is not None:
         return Lines(cameras if pixel.rays == 1 else cameras.refined(pixel.rays), pixel)
+    return projection_of(projector, grid, cameras, fine)
+
+
+def projection_of(
+    projector: Mapping[str, Any], grid: Grid, cameras: Cameras, fine: int
+) -> Projection:
+    """The projector on a grid `fine` times finer, with finer pixels where it needs them.
+
+    Raises:
+        ValueError: the projector refuses this as well.
+    """
     refusals = []
     for rays in (1, fine):
         rig = cameras if rays == 1 else cameras.refined(rays)

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -41,9 +42,7 @@ def detected(
     if acquisition.photons is not None:
         measured = _transmission(ideal, acquisition, cameras, rng)
     else:
-        primary = blurred(ideal, acquisition.blur_mm, cameras)
-        scatter = acquisition.scatter * blurred(primary, acquisition.scatter_mm, cameras)
-        measured = _emission(primary + scatter, acquisition, rng)
+        measured = _emission(emitted(ideal, acquisition, cameras), acquisition, rng)
     return measured.to(views)
 
 
@@ -71,20 +70,51 @@ def _transmission(
     return -torch.log(number.clamp(min=FLOOR) / photons)
 
 
-def _emission(
+class Counted(NamedTuple):
+    """Counts of one case.
+
+    Args:
+        number: Poisson numbers.
+        dose: their expectation per unit of the views; 0 where nothing is seen.
+    """
+
+    number: Float[Tensor, "1 m v u"]
+    dose: float
+
+
+def counted(
     views: Float[Tensor, "1 m v u"], acquisition: Acquisition, rng: torch.Generator
-) -> Float[Tensor, "1 m v u"]:
+) -> Counted:
+    """Poisson numbers of ideal views, `acquisition.counts` expected in all of them together.
+
+    Raises:
+        ValueError: negative views.
+    """
     total = float(views.sum())
-    if acquisition.counts is None or total == 0:
-        return views + _electronic(views, acquisition, rng)
     if float(views.min()) < 0:
         raise ValueError(
             f"Counts need views of at least 0, got {float(views.min()):.4g}; use noise, or photons "
             f"for line integrals"
         )
-    scale = acquisition.counts / total
-    number = torch.poisson(views * scale, generator=rng)
-    return (number + _electronic(views, acquisition, rng)) / scale
+    dose = (acquisition.counts or 0.0) / total if total else 0.0
+    return Counted(torch.poisson(views * dose, generator=rng), dose)
+
+
+def emitted(
+    views: Float[Tensor, "1 m v u"], acquisition: Acquisition, cameras: Cameras
+) -> Float[Tensor, "1 m v u"]:
+    """Ideal views blurred by the detector, and scatter added, in their unit; float64."""
+    primary = blurred(views.double(), acquisition.blur_mm, cameras)
+    return primary + acquisition.scatter * blurred(primary, acquisition.scatter_mm, cameras)
+
+
+def _emission(
+    views: Float[Tensor, "1 m v u"], acquisition: Acquisition, rng: torch.Generator
+) -> Float[Tensor, "1 m v u"]:
+    if acquisition.counts is None or not views.any():
+        return views + _electronic(views, acquisition, rng)
+    number, dose = counted(views, acquisition, rng)
+    return (number + _electronic(views, acquisition, rng)) / dose
 
 
 def _electronic(like: Tensor, acquisition: Acquisition, rng: torch.Generator) -> Tensor | float:

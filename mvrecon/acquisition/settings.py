@@ -31,10 +31,13 @@ class Acquisition:
             projector's unit. None: no counts.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
+        closed_form: whether projectors of line integrals take a scene's own, in closed form; False:
+            they are built on the finer grid as any other is, which is faster where a phantom has
+            many solids, and has that grid's discretisation in it.
         disturbed: errors of some views that nobody knows, before all that the detector does.
 
     Raises:
-        TypeError: an option that is no number.
+        TypeError: an option that is no number, or a closed_form that is neither true nor false.
         ValueError: numbers that are too small or not finite; photons and counts at once; counts of
             overexposed views.
     """
@@ -46,12 +49,17 @@ class Acquisition:
     photons: float | None = None
     counts: float | None = None
     noise: float = 0.0
+    closed_form: bool = True
     disturbed: Disturbance | None = None
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if name != "disturbed":
+            if name not in ("disturbed", "closed_form"):
                 self._check(name, value)
+        if not isinstance(self.closed_form, bool):
+            raise TypeError(
+                f"Expected acquisition.closed_form as true or false, got {self.closed_form!r}"
+            )
         if self.photons is not None and self.counts is not None:
             raise ValueError(
                 f"An acquisition has photons (transmission) or counts (emission), got photons "

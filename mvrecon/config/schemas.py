@@ -28,6 +28,7 @@ class Simulation(Measurement):
 
     rtk: bool = False
     cases: list[int] = MISSING
+    events: Any = None
 
 
 @dataclass

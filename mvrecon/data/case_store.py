@@ -71,8 +71,10 @@ class CaseStore:
 
 def _write(path: Path, sample: Sample) -> None:
     with written_whole(path) as part, h5py.File(part, "w") as file:
-        for name in ("views", "volume", "inside"):
-            values = getattr(sample, name).cpu().numpy()
+        for name in ("views", "volume", "inside", "mu"):
+            if (tensor := getattr(sample, name)) is None:
+                continue
+            values = tensor.cpu().numpy()
             file.create_dataset(name, data=values, fletcher32=True, chunks=(1, *values.shape[1:]))
         file.attrs["name"] = sample.name
 
@@ -91,6 +93,8 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
     }
     values = {}
     with blaming(path, "is not a case that can be read"), h5py.File(path, "r") as file:
+        if "mu" in file:
+            expected["mu"] = (volume, "float32")
         for name, kind in expected.items():
             dataset = dataset_in(path, file, name, "a case")
             if (dataset.shape, str(dataset.dtype)) != kind:

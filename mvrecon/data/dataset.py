@@ -23,7 +23,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
     """Cases of one scene; each item is a pure function of its index, whichever process asks for it.
 
     An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; where the rig is
-    disturbed also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others.
+    disturbed also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; where
+    the scene attenuates "mu" [1 d h w], 1/mm.
 
     Args:
         scene: where the cases come from.
@@ -87,6 +88,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
         made = {key: getattr(sample, key) for key in TENSORS}
+        if sample.mu is not None:
+            made["mu"] = sample.mu
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
                 raise ValueError(

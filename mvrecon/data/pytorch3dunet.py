@@ -4,12 +4,15 @@ Layout after the project's README (github.com/wolny/pytorch-3dunet): axes z, y, 
 spacing is not kept.
 """
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
 import h5py
 import numpy as np
 
+from mvrecon.data.events.shards import header_of
+from mvrecon.data.hdf5 import FORMAT
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import VOLUME, Refused, blaming, check_file
@@ -63,6 +66,39 @@ def write_example(path: str | Path, example: Example) -> None:
         for name, values in example._asdict().items():
             if values is not None:
                 file.create_dataset(name, data=values, compression="gzip", shuffle=True)
+
+
+def write_view(
+    path: str | Path, events: str | Path, item: int, raw: str = "backprojection"
+) -> None:
+    """Write a file for pytorch-3dunet whose `raw` and `label` are an event in a file of events: no
+    values are copied (HDF5 virtual datasets), the label is the truth.
+
+    Args:
+        path: of the new file; it finds the other by its way from there.
+        events: a file of `mvrecon.data.events`.
+        item: the event's number in it.
+        raw: an array on the truth's voxels, "backprojection" or "mu".
+
+    Raises:
+        Refused: not a file of events, no such event, or an array of other voxels.
+    """
+    events = Path(events).resolve()
+    _, count = header_of(events)
+    with blaming(events, "cannot be opened"), h5py.File(events, "r") as file:
+        parts = {"raw": raw, "label": "truth"}
+        shapes = {key: dataset_in(events, file, name, raw).shape for key, name in parts.items()}
+    if not 0 <= item < count or shapes["raw"] != shapes["label"]:
+        raise Refused(
+            f"{events}: expected an event below {count} and an array of shape {shapes['label']}, "
+            f"got {item} and {raw} {shapes['raw']}"
+        )
+    way = os.path.relpath(events, Path(path).resolve().parent)
+    with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
+        for name, array in (("raw", raw), ("label", "truth")):
+            layout = h5py.VirtualLayout(shapes[name][1:], "f4")
+            layout[:] = h5py.VirtualSource(way, array, shapes[name], "f4")[item]
+            file.create_virtual_dataset(name, layout)
 
 
 def _read(path: Path, file: h5py.File, name: str) -> np.ndarray:

@@ -38,6 +38,28 @@ def euler_rotation(
     return first @ second @ third
 
 
+def euler_degrees(R: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
+    """Euler angles (phi, theta, psi) of rotations in degrees, with R = R_z(phi) R_y(theta)
+    R_z(psi), in float64.
+
+    Convention: theta in [0, 180], phi and psi in (-180, 180]; where theta is 0 or 180, psi is 0.
+
+    Raises:
+        ValueError: matrices that are no rotations.
+    """
+    check_rotation(R)
+    R = R.to(torch.float64)
+    sine = torch.hypot(R[..., 0, 2], R[..., 1, 2])
+    flat = sine < 1e-9
+    phi = torch.where(
+        flat,
+        torch.atan2(R[..., 2, 2].sign() * R[..., 1, 0], R[..., 1, 1]),
+        torch.atan2(R[..., 1, 2], R[..., 0, 2]),
+    )
+    psi = torch.where(flat, 0.0, torch.atan2(R[..., 2, 1], -R[..., 2, 0]))
+    return torch.rad2deg(torch.stack([phi, torch.atan2(sine, R[..., 2, 2]), psi], dim=-1))
+
+
 def random_rotation(
     generator: torch.Generator, count: int | None = None
 ) -> Float[Tensor, "*n 3 3"]:

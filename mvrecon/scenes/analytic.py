@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
@@ -69,13 +69,15 @@ class AnalyticScene(ABC):
         Raises:
             IndexError: the scene has no such case.
         """
+        phantom = self._phantom_of(index, seed, grid)
+        return render(phantom, grid, cameras, f"{self.kind}-{seed}-{index}")
+
+    def _phantom_of(self, index: int, seed: int, grid: Grid) -> Phantom:
         if self.length is not None and not index < self.length:
             raise IndexError(
                 f"The scene {self.kind!r} has {self.length} case(s), got index {index}"
             )
-        return render(
-            self.phantom(generator(seed, index), grid), grid, cameras, f"{self.kind}-{seed}-{index}"
-        )
+        return self.phantom(generator(seed, index), grid)
 
     def finer(
         self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
@@ -86,18 +88,39 @@ class AnalyticScene(ABC):
         phantom = self.phantom(generator(seed, index), grid)
         return voxelise(phantom, grid.refined(factor), max(2, -(-4 // factor)))[None]
 
+    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
+        """The case without views [1 0 0 0], its truth on `grid` the mean of what `finer` gave.
+
+        Raises:
+            IndexError: the scene has no such case.
+        """
+        phantom = self._phantom_of(index, seed, grid)
+        factor = fine.shape[-1] // grid.shape[-1]
+        volume = torch.nn.functional.avg_pool3d(fine[None], factor)[0]
+        inside = touched(phantom, volume[0], grid, max(4, 2 * factor))
+        name = f"{self.kind}-{seed}-{index}"
+        return Sample(volume.new_zeros(1, 0, 0, 0), volume, inside[None], name)
+
 
 def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int = 4) -> Sample:
     """Exact views of a phantom, and its truth as the mean over factor^3 points of each voxel."""
     start, end = cameras.rays()
     views = phantom.integrals(start.detach().cpu(), end.detach().cpu(), cameras.ray_extent)
     volume = voxelise(phantom, grid, factor)
+    inside = touched(phantom, volume, grid, factor)
+    return Sample(views[None].to(torch.float32), volume[None], inside[None], name)
+
+
+def touched(
+    phantom: Phantom, volume: Float[Tensor, "d h w"], grid: Grid, factor: int
+) -> Bool[Tensor, "d h w"]:
+    """The voxels that a phantom touches, whose values on the grid are `volume`."""
     inside = volume > 0
     if any(
         (part.values < 0).any() for part in phantom.parts
     ):  # values may cancel inside the object
         inside |= voxelise(phantom.support(), grid, factor) > 0
-    return Sample(views[None].to(torch.float32), volume[None], inside[None], name)
+    return inside
 
 
 def generator(seed: int, index: int) -> torch.Generator:

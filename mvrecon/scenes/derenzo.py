@@ -8,14 +8,15 @@ triangular lattice of spacing 2 d; row n from the tip has n wells (Derenzo, IEEE
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.geometry.rigid import euler_rotation, random_in_ball, random_rotation
-from mvrecon.scenes.analytic import AnalyticScene, uniform
+from mvrecon.geometry.rigid import euler_degrees, euler_rotation, random_in_ball, random_rotation
+from mvrecon.scenes.analytic import AnalyticScene, generator, uniform
 from mvrecon.scenes.solids import Phantom, Solids
 
 #: Sectors, of 60 degrees each.
@@ -176,6 +177,17 @@ class RandomDerenzo(AnalyticScene):
         Raises:
             ValueError: the phantom in its true size is larger than the field.
         """
+        pose = self._pose(rng, grid)
+        return self._scaled(pose.scale).moved(pose.R, pose.t)
+
+    def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
+        """Pose of a case: place of the centre in mm, ZYZ Euler angles in degrees, scale."""
+        pose = self._pose(generator(seed, index), grid)
+        names = ("x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees", "scale")
+        values = (*pose.t.tolist(), *euler_degrees(pose.R).tolist(), pose.scale)
+        return dict(zip(names, values, strict=True))
+
+    def _pose(self, rng: torch.Generator, grid: Grid) -> "_Pose":
         reach, room = math.hypot(self.radius_mm, self.height_mm / 2), self.radius(grid)
         scale = 1.0 if self.fill is None else uniform(rng, *self.fill) * room / reach
         if scale * reach > room * (1 + 1e-9):
@@ -183,6 +195,13 @@ class RandomDerenzo(AnalyticScene):
                 f"A Derenzo phantom needs a field of radius {reach:g} mm, got {room:g} mm; set "
                 f"`fill`"
             )
-        return self._scaled(scale).moved(
-            random_rotation(rng), grid.centre + random_in_ball(rng, room - scale * reach)
-        )
+        R = random_rotation(rng)
+        return _Pose(R, grid.centre + random_in_ball(rng, room - scale * reach), scale)
+
+
+class _Pose(NamedTuple):
+    """Where a phantom is: X -> R X + t, t in world mm, after its scaling."""
+
+    R: Float[Tensor, "3 3"]
+    t: Float[Tensor, "3"]
+    scale: float

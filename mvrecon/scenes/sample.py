@@ -34,6 +34,7 @@ class Sample:
         inside: the voxels that the object touches.
         name: of the case, the same for the same (seed, index).
         errors: what is wrong with each view and nobody knows, by name; empty where nothing is.
+        mu: linear attenuation on the grid in 1/mm; none where the scene has no matter.
     """
 
     views: Float[Tensor, "1 m v u"]
@@ -41,6 +42,7 @@ class Sample:
     inside: Bool[Tensor, "1 d h w"]
     name: str
     errors: Mapping[str, Shaped[Tensor, "m *n"]] = field(default_factory=dict)
+    mu: Float[Tensor, "1 d h w"] | None = None
 
 
 class Scene(Protocol):
@@ -87,6 +89,30 @@ class Placing(Protocol):
 
 
 @runtime_checkable
+class Parametrised(Protocol):
+    """A scene that states what was drawn at random for a case."""
+
+    def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
+        """Numbers of the case `index` of the series `seed` by name, as its pose in mm and
+        degrees; the same names for every case.
+        """
+        ...
+
+
+@runtime_checkable
+class Attenuating(Protocol):
+    """A scene with matter that attenuates what its objects emit."""
+
+    def attenuation(
+        self, index: int, seed: int, grid: Grid, factor: int = 1
+    ) -> Float[Tensor, "1 d h w"]:
+        """Linear attenuation in 1/mm of the case `index` of the series `seed`, on
+        `grid.refined(factor)`.
+        """
+        ...
+
+
+@runtime_checkable
 class Finer(Protocol):
     """A scene that gives the object of a case on a finer grid without its views."""
 
@@ -96,6 +122,15 @@ class Finer(Protocol):
         """The values of the case `index` of the series `seed`, which `sample` puts on `grid`, on
         `grid.refined(factor)`.
         """
+        ...
+
+
+@runtime_checkable
+class Pooling(Protocol):
+    """A scene that makes a case of its object on a finer grid."""
+
+    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
+        """The case without views, its truth on `grid` averaged from the values on a finer one."""
         ...
 
 

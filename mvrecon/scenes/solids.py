@@ -1,16 +1,18 @@
 """Solids whose line integrals are known in closed form: ellipsoids, finite elliptic cylinders,
-boxes.
+boxes; each may be cut by planes.
 
 In its own frame, p = diag(1/a) R^T (X - c), every solid is a unit ball in its first k axes times a
 slab |p| < 1 in each of the others: an ellipsoid has k = 3, a cylinder k = 2, a box k = 0. A ray p =
 o + t q meets the ball between the roots of |q|^2 t^2 + 2 (o.q) t + |o|^2 - 1, whose discriminant is
-written without cancellation as |q|^2 - |o x q|^2, and each slab between its two planes. Values of
-overlapping solids add up.
+written without cancellation as |q|^2 - |o x q|^2, each slab between its two planes, and each
+half-space n.X <= c that cuts the solid on one side of its plane: all of them are convex, so that a
+ray has one chord. Values of overlapping solids add up.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,6 +34,8 @@ class Solids:
         rotations: each solid's axes in the world, as columns.
         semi_axes: half lengths in mm along the solid's own x, y, z.
         values: what each solid adds to the points inside it.
+        cuts: half-spaces (n, c) in the world: only the points with n.X <= c, in mm, are in the
+            solid. None: whole solids.
 
     Raises:
         ValueError: an unknown kind, shapes that do not agree, values that are not finite, sizes
@@ -43,16 +47,21 @@ class Solids:
     rotations: Float[Tensor, "n 3 3"]
     semi_axes: Float[Tensor, "n 3"]
     values: Float[Tensor, " n"]
+    cuts: Float[Tensor, "n k 4"] | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in ROUND_AXES:
             raise ValueError(f"Unknown kind of solid {self.kind!r}. Known: {', '.join(ROUND_AXES)}")
         n = len(torch.as_tensor(self.values))
+        if self.cuts is None:
+            object.__setattr__(self, "cuts", torch.zeros(n, 0, 4))
+        planes = torch.as_tensor(self.cuts).shape[1]
         for name, shape in (
             ("centres", (n, 3)),
             ("rotations", (n, 3, 3)),
             ("semi_axes", (n, 3)),
             ("values", (n,)),
+            ("cuts", (n, planes, 4)),
         ):
             value = torch.as_tensor(getattr(self, name)).to(torch.float64)
             if value.shape != shape or not value.isfinite().all():
@@ -78,13 +87,21 @@ class Solids:
         """diag(1/a) R^T: from the world's directions to the unit solid's frame."""
         return self.rotations.mT / self.semi_axes[..., None]
 
-    def integrals(
+    @property
+    def unit_cuts(self) -> Float[Tensor, "n k 4"]:
+        """The half-spaces in each unit solid's frame: n.p <= c."""
+        normal, limit = self.cuts[..., :3], self.cuts[..., 3]  # type: ignore[index]
+        own = normal @ self.rotations * self.semi_axes[:, None]
+        rest = limit - (normal @ self.centres[..., None])[..., 0]
+        return torch.cat([own, rest[..., None]], dim=-1)
+
+    def chords(
         self,
         start: Float[Tensor, "r 3"],
         step: Float[Tensor, "r 3"],
         ray_extent: tuple[float, float],
-    ) -> Float[Tensor, " r"]:
-        """Integrals over X = start + t step with t in `ray_extent`, in value * mm; float64."""
+    ) -> "Chords":
+        """Where rays X = start + t step, t in `ray_extent`, are in the solids; float64."""
         A = self.to_unit.to(start.device)
         offset = (A @ self.centres.to(start.device)[..., None])[..., 0]
         k = self.round_axes
@@ -94,6 +111,19 @@ class Solids:
         o = (A[solid, k:] @ start[ray, :, None])[..., 0] - offset[solid, k:]
         q = (A[solid, k:] @ step[ray, :, None])[..., 0]
         enter, leave = _slabs(o, q, enter, leave)
+        cuts = self.cuts.to(start.device)[solid]  # type: ignore[union-attr]
+        o = (cuts[..., :3] @ start[ray, :, None])[..., 0] - cuts[..., 3]
+        q = (cuts[..., :3] @ step[ray, :, None])[..., 0]
+        return Chords(solid, ray, *_half_spaces(o, q, enter, leave))
+
+    def integrals(
+        self,
+        start: Float[Tensor, "r 3"],
+        step: Float[Tensor, "r 3"],
+        ray_extent: tuple[float, float],
+    ) -> Float[Tensor, " r"]:
+        """Integrals over X = start + t step with t in `ray_extent`, in value * mm; float64."""
+        solid, ray, enter, leave = self.chords(start, step, ray_extent)
         chord = torch.where(leave > enter, leave - enter, 0.0) * step.norm(dim=-1)[ray]
         return start.new_zeros(len(start)).index_add(
             0, ray, chord * self.values.to(start.device)[solid]
@@ -102,12 +132,38 @@ class Solids:
     def sums(self, xyz: Float[Tensor, "r 3"]) -> Float[Tensor, " r"]:
         """Sum of the values of the solids around each point; float64."""
         p = torch.einsum("nij,rnj->irn", self.to_unit.to(xyz), xyz[:, None] - self.centres.to(xyz))
-        return contains(p, self.round_axes).to(xyz) @ self.values.to(xyz)
+        inside = contains(p, self.round_axes)
+        for cut in self.cuts.to(xyz).unbind(dim=1):  # type: ignore[union-attr]
+            inside &= xyz @ cut[:, :3].T <= cut[:, 3]
+        return inside.to(xyz) @ self.values.to(xyz)
 
     def moved(self, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]) -> "Solids":
         """The solids after the motion X -> R X + t."""
         R, t = R.to(self.centres), t.to(self.centres)
-        return replace(self, centres=self.centres @ R.T + t, rotations=R @ self.rotations)
+        normal = self.cuts[..., :3] @ R.T  # type: ignore[index]
+        limit = self.cuts[..., 3] + normal @ t  # type: ignore[index]
+        return replace(
+            self,
+            centres=self.centres @ R.T + t,
+            rotations=R @ self.rotations,
+            cuts=torch.cat([normal, limit[..., None]], dim=-1),
+        )
+
+
+class Chords(NamedTuple):
+    """Pairs of a solid and a ray that meet.
+
+    Args:
+        solid: index of the solid.
+        ray: index of the ray.
+        enter: t at which the ray enters the solid; one that is not below `leave` misses it.
+        leave: t at which it leaves.
+    """
+
+    solid: Int[Tensor, " h"]
+    ray: Int[Tensor, " h"]
+    enter: Float[Tensor, " h"]
+    leave: Float[Tensor, " h"]
 
 
 def contains(p: Float[Tensor, "3 ..."], round_axes: int) -> Bool[Tensor, "..."]:
@@ -151,6 +207,20 @@ def _slabs(
             torch.maximum(enter, torch.minimum(a, b)),
             torch.minimum(leave, torch.maximum(a, b)),
         )
+    return enter, leave
+
+
+def _half_spaces(
+    o: Float[Tensor, "h k"],
+    q: Float[Tensor, "h k"],
+    enter: Float[Tensor, " h"],
+    leave: Float[Tensor, " h"],
+) -> tuple[Float[Tensor, " h"], Float[Tensor, " h"]]:
+    """The part between `enter` and `leave` with o + t q <= 0 for each of the planes."""
+    for a, b in zip(o.unbind(dim=-1), q.unbind(dim=-1), strict=True):
+        at = torch.where(b == 0, torch.where(a <= 0, torch.inf, -torch.inf), -a / b)
+        enter = torch.where(b < 0, torch.maximum(enter, at), enter)
+        leave = torch.where(b < 0, leave, torch.minimum(leave, at))
     return enter, leave
 
 

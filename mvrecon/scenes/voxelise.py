@@ -1,9 +1,10 @@
 """Voxel values of an analytic phantom: the mean over points that fill each voxel evenly."""
 
 from itertools import product
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
@@ -53,9 +54,15 @@ def _add(volume: Float[Tensor, "d h w"], grid: Grid, part: Solids, n: int, facto
     full = (radius <= 1 - reach[:k].norm()) & (flat + 2 * reach[k:, None, None, None] <= 1).all(
         dim=0
     )
+    cuts = part.unit_cuts[n]
+    for cut in cuts:
+        beyond = torch.einsum("i,i...->...", cut[:3], p) - cut[3]  # of a voxel's centre
+        half = (cut[:3] @ to_unit).abs().sum() / 2
+        touched &= beyond <= half
+        full &= beyond <= -half
     share = full.to(torch.float64)
     edge = touched & ~full
-    share[edge] = _shares(p[:, edge], to_unit, k, factor)
+    share[edge] = _shares(p[:, edge], to_unit, Shape(k, cuts), factor)
     volume[block] += part.values[n] * share
 
 
@@ -74,14 +81,28 @@ def _block(
     return z, y, x
 
 
+class Shape(NamedTuple):
+    """A unit solid: how many of its axes are round, and the half-spaces that cut it."""
+
+    round_axes: int
+    cuts: Float[Tensor, "k 4"]
+
+    def contains(self, p: Float[Tensor, "3 ..."]) -> Bool[Tensor, "..."]:
+        """Which points are in it."""
+        inside = contains(p, self.round_axes)
+        for cut in self.cuts:
+            inside &= torch.einsum("i,i...->...", cut[:3], p) <= cut[3]
+        return inside
+
+
 def _shares(
-    p: Float[Tensor, "3 e"], to_unit: Float[Tensor, "3 3"], k: int, factor: int
+    p: Float[Tensor, "3 e"], to_unit: Float[Tensor, "3 3"], shape: Shape, factor: int
 ) -> Float[Tensor, " e"]:
     """Share of each voxel's factor^3 points that lie in the solid."""
     steps = ((torch.arange(factor, dtype=torch.float64) + 0.5) / factor - 0.5).tolist()
     points = to_unit @ torch.tensor(list(product(steps, repeat=3)), dtype=torch.float64).T
     shares = [
-        contains(chunk[:, :, None] + points[:, None], k).to(torch.float64).mean(dim=-1)
+        shape.contains(chunk[:, :, None] + points[:, None]).to(torch.float64).mean(dim=-1)
         for chunk in p.split(max(1, POINTS // factor**3), dim=1)
     ]
     return torch.cat(shares)

@@ -3,7 +3,14 @@ import math
 import pytest
 import torch
 
-from mvrecon.geometry.rigid import euler_rotation, inverse, look_at, random_in_ball, random_rotation
+from mvrecon.geometry.rigid import (
+    euler_degrees,
+    euler_rotation,
+    inverse,
+    look_at,
+    random_in_ball,
+    random_rotation,
+)
 
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -104,3 +111,12 @@ def test_a_camera_above_or_below_its_target_has_axes(height):
 def test_a_camera_at_its_target_is_refused():
     with pytest.raises(ValueError, match="must not be at the point"):
         look_at(torch.ones(2, 3), torch.ones(2, 3))
+
+
+def test_euler_angles_are_those_that_make_the_rotation():
+    R = random_rotation(torch.Generator().manual_seed(2), 50)
+    assert torch.allclose(euler_rotation(euler_degrees(R)), R, atol=1e-12)
+    turns = torch.tensor([[30.0, 0, 40], [30, 180, 40], [-170, 0, 0], [10, 90, -100]])
+    same = euler_rotation(euler_degrees(euler_rotation(turns)))
+    assert torch.allclose(same, euler_rotation(turns), atol=1e-9)
+    assert euler_degrees(euler_rotation((20, 130, -50))).tolist() == pytest.approx([20, 130, -50])

@@ -1,0 +1,82 @@
+"""Cases with matter of their own, and the experiments that write them to disk."""
+
+import pytest
+import torch
+
+from mvrecon.acquisition.acquired import Acquired
+from mvrecon.acquisition.settings import Acquisition
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.config import compose
+from mvrecon.data.case_store import CaseStore
+from mvrecon.data.dataset import SceneDataset
+from mvrecon.data.events.making import EventMaker
+from mvrecon.geometry.grid import Grid
+from mvrecon.scenes.analytic import generator
+from mvrecon.scenes.attenuated import attenuated_integrals
+from mvrecon.scenes.cardiac import RandomCardiac
+from mvrecon_spect.hole import Hole
+
+GRID = Grid.centred(32, spacing=10.0, centre=(40, -40, 0))
+RIG = dcspect80(pixels=8, columns=[2, 11], rows=[1])
+SPECT = {"name": "spect", "diameter_mm": 2.3}
+
+
+def seen(scene, acquisition=None, rig=RIG):
+    return Acquired(scene, SPECT, acquisition).sample(5, 0, GRID, rig)
+
+
+def test_a_patient_s_own_matter_attenuates_his_views():
+    """Against the closed form; a quarter of the counts is left."""
+    scene, fine = RandomCardiac(), Acquisition(fine=4)
+    sample = seen(scene, fine)
+    activity, matter = (f(generator(0, 5), GRID) for f in (scene.phantom, scene.matter))
+    rays = attenuated_integrals(activity, matter, *RIG.rays(), RIG.ray_extent)
+    exact = rays * Hole(2.3).weight(RIG)
+    error = (sample.views[0] - exact).norm() / exact.norm()
+    assert error < 0.025
+    assert sample.views.sum().item() == pytest.approx(exact.sum().item(), rel=5e-3)
+    plain = seen(RandomCardiac(attenuates=False))
+    assert (sample.views.sum() / plain.views.sum()).item() == pytest.approx(0.27, abs=0.02)
+    mean = scene.attenuation(5, 0, GRID).mean().item()
+    assert sample.mu.mean().item() == pytest.approx(mean, rel=5e-3)
+    assert not plain.mu.any()
+
+
+def test_the_scene_s_matter_makes_the_views_whatever_the_reconstruction_takes_it_for():
+    wrong = Acquired(RandomCardiac(), {**SPECT, "mu": 0.05}).sample(5, 0, GRID, RIG)
+    assert torch.equal(wrong.views, seen(RandomCardiac()).views)
+
+
+def test_views_from_the_finer_grid_are_near_those_in_closed_form():
+    scene = RandomCardiac(attenuates=False)
+    exact = seen(scene)
+    near = seen(scene, Acquisition(closed_form=False))
+    assert 0 < (near.views - exact.views).norm() / exact.views.norm() < 0.04
+    assert near.volume.allclose(exact.volume, atol=1e-6) and near.name == exact.name
+    assert torch.equal(near.inside, exact.inside)
+
+
+def test_a_data_set_and_a_store_keep_the_matter_of_their_cases(tmp_path):
+    scene = RandomCardiac()
+    stored = Acquired(scene, SPECT, store=CaseStore(tmp_path, {"scene": "cardiac"}, scene))
+    for _ in range(2):  # made, then read
+        case = SceneDataset(stored, GRID, RIG, [5], 0, cache=False)[0]
+        assert torch.equal(case["mu"], seen(scene).mu)
+
+
+@pytest.mark.parametrize("name", ["events", "events_cardiac"])
+def test_the_experiments_make_events_in_true_size(name):
+    small = ("grid.size=[16,16,16]", "camera.pixels=8", "+camera.columns=[3]", "events.angles=4")
+    spacing = {"events": "16.0", "events_cardiac": "20.0"}[name]
+    settings = compose(
+        f"experiment={name}", *small, f"grid.spacing={spacing}", config_name="simulate"
+    )
+    maker = EventMaker.of(settings)
+    event = maker(0)
+    assert event["ideal"].shape == event["counts"].shape == (4, 8, 8)
+    assert event["counts"].sum() == pytest.approx(5e5, abs=5 * 5e5**0.5)
+    assert event["radon"].shape == (4, 16, 23)
+    assert ("mu" in event) == (name == "events_cardiac")
+    assert maker.columns[:6] == (
+        "x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees",
+    )  # fmt: skip
