@@ -74,6 +74,8 @@ class Hdf5Views(ProjectionStack):
         Refused: not HDF5, another layout, cut short, or more declared than there is.
     """
 
+    kind = "integrals"
+
     def __init__(self, path: Path):
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; expected {EXPECTED}")
