@@ -208,7 +208,7 @@ BAD = {
 @pytest.mark.door
 @pytest.mark.parametrize("name", BAD)
 def test_a_file_of_stir_that_does_not_fit_is_refused(tmp_path: Path, name: str):
-    """A pinhole system of STIR whose files do not fit each other, their size or their units is refused."""
+    """A pinhole system of STIR whose files do not fit each other, their size or unit is refused."""
     write_stir(tmp_path, scan())
     file, before, after, message = BAD[name]
     text = (tmp_path / file).read_text()

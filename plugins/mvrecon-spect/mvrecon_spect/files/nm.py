@@ -25,8 +25,8 @@ OTHERS = ("PhaseVector", "RRIntervalVector", "TimeSlotVector", "TimeSliceVector"
 
 class View(NamedTuple):
     """What a view is: detector, rotation and number in the rotation, from 1; angle in degrees,
-    distance of the detector from the axis in mm and duration in s, each None where the file does not
-    say it.
+    distance of the detector from the axis in mm and duration in s, each None where the file
+    does not say it.
     """
 
     detector: int
@@ -109,8 +109,8 @@ def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
     off = (steps / steps.new_tensor(study.pixel_mm) - 1).abs().max().item()
     if len(cameras) != count or cameras.shape != shape or off > 1e-3:
         raise ValueError(
-            f"Expected {count} cameras of {shape} pixels of {study.pixel_mm} mm, as the NM file has "
-            f"them, got {len(cameras)} of {cameras.shape} and {tuple(steps[0].tolist())} mm"
+            f"Expected {count} cameras of {shape} pixels of {study.pixel_mm} mm, as the NM file "
+            f"has them, got {len(cameras)} of {cameras.shape} and {tuple(steps[0].tolist())} mm"
         )
     return cameras
 
