@@ -28,7 +28,7 @@ from mvrecon_spect.projector import Spect
 
 MU, HOLE = 0.01536, 2.3  # water at 140.5 keV in 1/mm; mm
 GRID = mv.Grid.centred(64, spacing=2.0)
-WELLS = {"radius": 60.0, "height": 80.0}
+RADIUS, HEIGHT = 60.0, 80.0  # of the wells' phantom
 DIAMETERS = (16, 14, 12, 10, 8, 6)
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 
@@ -57,7 +57,7 @@ def counts_of(phantom: Phantom, cameras: mv.Cameras, diameter: float) -> torch.T
 
 def inverse_square() -> dict:
     """Counts of a ball that comes 100 mm nearer on the axis of module 0."""
-    camera = mv.dcspect80(pixels=128)[[0]]
+    camera = mv.dcspect80(pixels=512)[[0]]
     pinhole, distance = camera.source[0], camera.source[0].norm()
     nearer = pinhole * (100.0 / distance)
     far, near = (counts_of(ball(18.0, c), camera, HOLE).sum() for c in (pinhole * 0, nearer))
@@ -194,7 +194,7 @@ def wells() -> tuple[list[dict], torch.Tensor]:
     and the noise-free views.
     """
     cameras, fine = mv.dcspect80(pixels=32), GRID.refined(2)
-    phantom = derenzo(DIAMETERS, **WELLS)
+    phantom = derenzo(DIAMETERS, radius=RADIUS, height=HEIGHT)
     ideal = Spect(fine, cameras, HOLE, blur=True)(voxelise(phantom, fine)[None, None])[0, 0]
     counts, _ = drawn(ideal, 5e6, seed=1)
     rows = []
@@ -202,7 +202,7 @@ def wells() -> tuple[list[dict], torch.Tensor]:
         A = Spect(GRID, cameras, HOLE, **options)
         for iterations in (5, 20):
             x = mv.osem(A, counts, iterations, 10, background=1e-3)[0, 0]
-            for sector in valley_to_peak(x, GRID, DIAMETERS, **WELLS):
+            for sector in valley_to_peak(x, GRID, DIAMETERS, RADIUS, HEIGHT):
                 rows.append(
                     {
                         "blur": name,
@@ -216,7 +216,9 @@ def wells() -> tuple[list[dict], torch.Tensor]:
     return rows, ideal
 
 
-def row(figure: str, unit: str, expected: float, measured: float) -> dict:
+def row(
+    figure: str, unit: str, expected: float | torch.Tensor, measured: float | torch.Tensor
+) -> dict:
     """A figure with what it should be."""
     return {
         "figure": figure,

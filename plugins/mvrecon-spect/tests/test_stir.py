@@ -20,6 +20,7 @@ from mvrecon_spect.files.stir import StirScan, read_stir, write_stir
 from mvrecon_spect.files.stir_operator import operator_of
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of, system_of
 from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
+from mvrecon_spect.matter import attenuation_on
 from mvrecon_spect.projector import Spect
 
 POINT = torch.tensor([4.0, -3.0, 2.5], dtype=torch.float64)
@@ -131,7 +132,8 @@ def test_volumes_keep_their_values_and_their_place(tmp_path: Path):
     assert read_interfile(tmp_path / "a.hv")[1].centre.tolist() == [0.0, 0.0, 0.0]
     write_mu(tmp_path / "mu.hv", values, grid)
     assert np.fromfile(tmp_path / "mu.v", "<f4").max() == pytest.approx(10 * values.max().item())
-    torch.testing.assert_close(read_mu(tmp_path / "mu.hv")[0], values)
+    centred = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0))
+    torch.testing.assert_close(attenuation_on(centred, tmp_path / "mu.hv"), values)
     with pytest.warns(UserWarning, match="is the file in 1/mm"):
         write_volume(tmp_path / "a.hv", values / 10, grid)
         read_mu(tmp_path / "a.hv")
