@@ -24,14 +24,14 @@ GRID = mv.Grid.centred(48, spacing=5.0)
 CT_KEV, SPECT_KEV = 70.0, 140.5
 PHOTONS, COUNTS, DRAWS = 1e4, 2e6, 3
 SHIFT = (10.0, 0.0, 0.0)  # mm
-BODY, LUNG = (115.0, 90.0, 115.0), 0.26
+BODY, LUNG = (115.0, 90.0, 100.0), 0.26
 HEART = {"semi_axes": (35.0, 35.0, 45.0), "wall": 12.0, "euler_degrees": (40.0, 60.0, 0.0)}
 #: Kind, centre and half lengths in mm, and how much of water or bone each part adds.
 TORSO = (
     ("cylinder", (20.0, -20.0, 0.0), BODY, 1.0, 0.0),
     ("ellipsoid", (85.0, -10.0, 10.0), (35.0, 50.0, 80.0), LUNG - 1, 0.0),
     ("ellipsoid", (-55.0, -30.0, 10.0), (28.0, 45.0, 80.0), LUNG - 1, 0.0),
-    ("cylinder", (20.0, -85.0, 0.0), (16.0, 16.0, 115.0), -1.0, 1.0),
+    ("cylinder", (20.0, -85.0, 0.0), (16.0, 16.0, 100.0), -1.0, 1.0),
 )
 
 
@@ -67,7 +67,7 @@ def activity() -> Phantom:
 def transmission() -> torch.Tensor:
     """Attenuation at 140.5 keV on GRID from 40 noisy cone-beam views of a fixed inner ring."""
     ring = mv.circular(
-        n_views=40, sid=300.0, sdd=500.0, detector={"pixels": [72, 72], "pixel_mm": 6.5}
+        n_views=40, sid=300.0, sdd=500.0, detector={"pixels": [72, 72], "pixel_mm": 9.0}
     )
     phantom = torso(CT_KEV)
     integrals = phantom.integrals(*ring.rays(), ray_extent=ring.ray_extent).float()
@@ -75,7 +75,7 @@ def transmission() -> torch.Tensor:
     photons = torch.poisson(PHOTONS * torch.exp(-integrals), generator=noise).clamp(min=1)
     views = -torch.log(photons / PHOTONS)[None, None]
     at_70 = mv.sirt(mv.Drr(GRID, ring), views, iterations=30, momentum=True)[0, 0]
-    return attenuation(hounsfield(at_70, CT_KEV), SPECT_KEV)
+    return attenuation(hounsfield(at_70, CT_KEV), SPECT_KEV).clamp(max=tissue_at(SPECT_KEV).bone)
 
 
 def shifted(mu: torch.Tensor) -> torch.Tensor:
@@ -93,8 +93,8 @@ def wall() -> tuple[torch.Tensor, torch.Tensor]:
     return (share > 0.5) & near, (share > 0.5) & ~near
 
 
-def measure(out: Path) -> list[dict]:
-    """A row for each attenuation and draw of noise."""
+def measure(out: Path) -> None:
+    """A row for each attenuation and draw of noise; the table is written after each draw."""
     cameras, fine = mv.dcspect80(pixels=32), GRID.refined(2)
     true_fine = voxelise(torso(SPECT_KEV), fine)
     A = Spect(fine, cameras, mu=true_fine)
@@ -130,8 +130,9 @@ def measure(out: Path) -> list[dict]:
                     "nrmse": f"{error:.4f}",
                 }
             )
-    draw_planes(out / "planes.png", {"truth": truth, **volumes}, true, estimated)
-    return rows
+        save(out / "results.csv", rows)
+        if draw == 0:
+            draw_planes(out / "planes.png", {"truth": truth, **volumes}, true, estimated)
 
 
 def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.Tensor) -> None:
@@ -154,15 +155,15 @@ def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.
     figure.savefig(file, dpi=80)
 
 
-def main(out: Path) -> None:
-    """The table and the picture."""
-    out.mkdir(parents=True, exist_ok=True)
-    rows = measure(out)
-    with (out / "results.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+def save(file: Path, rows: list[dict]) -> None:
+    """Write rows as CSV."""
+    with file.open("w", newline="") as out:
+        table = csv.DictWriter(out, rows[0].keys(), lineterminator="\n")
         table.writeheader()
         table.writerows(rows)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    measure(folder)
