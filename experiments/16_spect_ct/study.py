@@ -24,14 +24,14 @@ GRID = mv.Grid.centred(48, spacing=5.0)
 CT_KEV, SPECT_KEV = 70.0, 140.5
 PHOTONS, COUNTS, DRAWS = 1e4, 2e6, 3
 SHIFT = (10.0, 0.0, 0.0)  # mm
-BODY, LUNG = (115.0, 90.0, 100.0), 0.26
+BODY, LUNG = (112.0, 88.0, 100.0), 0.26
 HEART = {"semi_axes": (35.0, 35.0, 45.0), "wall": 12.0, "euler_degrees": (40.0, 60.0, 0.0)}
 #: Kind, centre and half lengths in mm, and how much of water or bone each part adds.
 TORSO = (
-    ("cylinder", (20.0, -20.0, 0.0), BODY, 1.0, 0.0),
-    ("ellipsoid", (85.0, -10.0, 10.0), (35.0, 50.0, 80.0), LUNG - 1, 0.0),
-    ("ellipsoid", (-55.0, -30.0, 10.0), (28.0, 45.0, 80.0), LUNG - 1, 0.0),
-    ("cylinder", (20.0, -85.0, 0.0), (16.0, 16.0, 100.0), -1.0, 1.0),
+    ("cylinder", (0.0, -20.0, 0.0), BODY, 1.0, 0.0),
+    ("ellipsoid", (70.0, -15.0, 0.0), (30.0, 45.0, 80.0), LUNG - 1, 0.0),
+    ("ellipsoid", (-70.0, -20.0, 0.0), (28.0, 45.0, 80.0), LUNG - 1, 0.0),
+    ("cylinder", (0.0, -85.0, 0.0), (16.0, 16.0, 100.0), -1.0, 1.0),
 )
 
 
