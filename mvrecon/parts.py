@@ -75,6 +75,16 @@ STREAMED = Registry(
     "streamed reconstructor",
     fdk="mvrecon.reconstruct.filtered.streaming:fdk_streamed",
 )
+#: Files of views that are read as one array, by their endings: f(path) -> ProjectionStack.
+VIEW_FILES = Registry(
+    "views",
+    h5="mvrecon.data.projections.arrays:Hdf5Views",
+    hdf5="mvrecon.data.projections.arrays:Hdf5Views",
+    npy="mvrecon.data.projections.arrays:NpyViews",
+    mha="mvrecon.data.projections.arrays:ItkViews",
+    mhd="mvrecon.data.projections.arrays:ItkViews",
+    nrrd="mvrecon.data.projections.arrays:ItkViews",
+)
 #: What corrects views before they are reconstructed: f(A, views, **options) -> CorrectedViews.
 CORRECTIONS = Registry(
     "correct",

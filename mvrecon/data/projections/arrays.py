@@ -73,6 +73,8 @@ class Hdf5Views(ProjectionStack):
         Refused: not HDF5, another layout, cut short, or more declared than there is.
     """
 
+    kind = "integrals"
+
     def __init__(self, path: Path):
         check_file(path, EXPECTED)
         self._sound: set[int] = set()

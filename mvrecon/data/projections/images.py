@@ -142,6 +142,12 @@ def header(file: Path) -> Header:
     with blaming(file, "cannot be read as an image"):
         if file.suffix.lower() not in PILLOW:
             dataset = header_of(file)
+            if dataset.get("Modality") == "NM" and frames_of(dataset) > 1:
+                raise Refused(
+                    f"{file}: expected projections in the order of the file, got frames of "
+                    f"NM, which is to be sorted by its vectors; the plugin mvrecon-spect "
+                    f"reads them (files.nm.read_nm)"
+                )
             return Header((dataset.Rows, dataset.Columns), np.dtype("f4"), frames_of(dataset))
         with _opened(file) as image:
             pages = getattr(image, "n_frames", 1)

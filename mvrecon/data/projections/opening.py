@@ -3,17 +3,10 @@
 from pathlib import Path
 
 from mvrecon.data.dicom import dicom_file
-from mvrecon.data.itk import IO
-from mvrecon.data.projections.arrays import Hdf5Views, ItkViews, NpyViews
 from mvrecon.data.projections.images import PILLOW, ImageFiles, field_files, image_folder
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.files.checks import Refused
-
-ARRAYS = {".h5": Hdf5Views, ".hdf5": Hdf5Views, ".npy": NpyViews, **dict.fromkeys(IO, ItkViews)}
-EXPECTED = (
-    "a folder of TIFF, PNG or DICOM images, or a file that ends in "
-    f"{', '.join([*PILLOW, '.dcm', *ARRAYS])}"
-)
+from mvrecon.parts import VIEW_FILES
 
 
 def open_projections(
@@ -21,8 +14,9 @@ def open_projections(
 ) -> ProjectionStack:
     """Projections in the values and the order they are stored in, read view by view.
 
-    A folder of images is in the order of the numbers in their names, without those that begin with
-    dark or flat; a file of several pages or an array, in its own order.
+    The endings of files with one array are those of the registry `VIEW_FILES`, a plugin's among
+    them. A folder of images is in the order of the numbers in their names, without those that begin
+    with dark or flat; a file of several pages or an array, in its own order.
 
     Args:
         path: a folder, or a file.
@@ -41,14 +35,14 @@ def open_projections(
     if path.is_dir():
         return image_folder(path, pattern, gaps)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file or folder; expected {EXPECTED}")
+        raise FileNotFoundError(f"{path}: no such file or folder; expected {_expected()}")
     if pattern is not None:
         raise Refused(f"{path}: expected a folder for the pattern {pattern!r}, got a file")
-    if stack := ARRAYS.get(path.suffix.lower()):
-        return stack(path)
+    if (ending := path.suffix.lower().lstrip(".")) in VIEW_FILES.names():
+        return VIEW_FILES.build(ending, path)
     if path.suffix.lower() in PILLOW or dicom_file(path):
         return ImageFiles([path])
-    raise Refused(f"{path}: expected {EXPECTED}")
+    raise Refused(f"{path}: expected {_expected()}")
 
 
 def field_beside(path: Path, field: str) -> ProjectionStack | None:
@@ -61,3 +55,8 @@ def field_beside(path: Path, field: str) -> ProjectionStack | None:
         return open_projections(path / field)
     files = field_files(path, field)
     return ImageFiles(files) if files else None
+
+
+def _expected() -> str:
+    endings = [*PILLOW, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
+    return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"

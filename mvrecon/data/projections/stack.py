@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -29,6 +30,9 @@ class ProjectionStack(ABC):
     Raises:
         Refused: no view or too many, or pixels that are not integers or floats.
     """
+
+    #: What the pixels are where the format says it: "integrals" (or counts) or "intensities".
+    kind: Literal["integrals", "intensities"] | None = None
 
     def __init__(
         self,

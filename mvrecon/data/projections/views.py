@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.data.projections.arrays import Hdf5Views
 from mvrecon.data.projections.corrections import Fields, fields, integrals, transmission
 from mvrecon.data.projections.opening import field_beside, open_projections
 from mvrecon.data.projections.region import Region
@@ -234,9 +233,11 @@ def _kind(options: "Measured", stack: ProjectionStack) -> Kind:
         )
     if options.kind is not None:
         return options.kind
-    if not whole and not isinstance(stack, Hdf5Views):
+    if stack.kind is not None:
+        return stack.kind
+    if not whole:
         raise Refused(
             f"{options.path}: expected kind=integrals or kind=intensities for pixels of "
             f"{stack.dtype}, which may be either; got none"
         )
-    return "intensities" if whole else "integrals"
+    return "intensities"

@@ -17,8 +17,8 @@ def attenuation_on(
 
     Args:
         grid: the voxels.
-        mu: a tensor on the grid, a number for all of it, or the path of a volume in 1/mm, which is
-            resampled to the grid, and zero outside of its own.
+        mu: a tensor on the grid, a number for all of it, or the path of a volume in 1/mm (of
+            Interfile, .hv, in 1/cm), which is resampled to the grid, and zero outside of its own.
 
     Raises:
         ValueError: values that cannot be attenuation in 1/mm, or a tensor of another shape.
@@ -26,8 +26,9 @@ def attenuation_on(
     if isinstance(mu, str | Path):
         from mvrecon.data.resample import resample
         from mvrecon.data.volume_files import read_volume
+        from mvrecon_spect.files.interfile_volume import read_mu
 
-        values, source = read_volume(mu)
+        values, source = (read_mu if Path(mu).suffix.lower() == ".hv" else read_volume)(mu)
         check_mu(values, source)
         return resample(values, source, grid).clamp_min(0)
     values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))

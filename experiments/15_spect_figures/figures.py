@@ -1,0 +1,171 @@
+"""DC-SPECT's figures, expected and measured: inverse squares, sensitivity, field, resolution,
+attenuation, MTF, wells, bias of counts; its rig and its 80 views.
+
+python experiments/15_spect_figures/figures.py OUT_FOLDER [geometry] [bias] [edges] [wells]
+"""
+
+import csv
+import sys
+from pathlib import Path
+
+import torch
+from geometry import HOLE, ball, counts_of, geometry, save
+
+import mvrecon as mv
+from mvrecon.engine.export import save_png
+from mvrecon.scenes.derenzo import derenzo
+from mvrecon.scenes.voxelise import voxelise
+from mvrecon.viz.montage import enlarged, radiographs, tiled
+from mvrecon_spect.metrics.contrast import count_bias
+from mvrecon_spect.metrics.derenzo import valley_to_peak
+from mvrecon_spect.metrics.edge import ball_mtf
+from mvrecon_spect.projector import Spect
+
+GRID, PIXELS, SUBSETS = mv.Grid.centred(40, spacing=3.2), 48, 8
+RADIUS, HEIGHT = 60.0, 80.0  # of the wells' phantom
+DIAMETERS = (16, 14, 12, 10, 8, 6)
+BLUR: dict[str, dict[str, bool]] = {"none": {}, "modelled": {"blur": True}}
+AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+
+
+def drawn(ideal: torch.Tensor, total: float, seed: int = 0) -> tuple[torch.Tensor, float]:
+    """Poisson counts [1 1 m v u] of a total, and what an activity of one is on their scale."""
+    scale = total / ideal.sum().item()
+    counts = torch.poisson(scale * ideal.float(), generator=torch.Generator().manual_seed(seed))
+    return counts[None, None], scale
+
+
+def bias(out: Path) -> None:
+    """Bias of the counts of a ball over OSEM's iterations."""
+    cameras = mv.dcspect80(pixels=PIXELS)
+    A = Spect(GRID, cameras, HOLE)
+    ideal = counts_of(ball(40.0), cameras, HOLE)
+    truth = voxelise(ball(40.0), GRID)
+    rows = []
+    for total in (None, 5e6, 5e5, 5e4):
+        counts, scale = (ideal.float()[None, None], 1.0) if total is None else drawn(ideal, total)
+        name = "no noise" if total is None else f"{total:.0e}"
+
+        def watch(iterate, name=name, scale=scale) -> None:
+            x = iterate.volume[0, 0] / scale
+            values = (count_bias(x, truth, mask) for mask in (truth > 0, inner()))
+            rows.append(
+                {"counts": name, "iteration": iterate.number}
+                | {k: f"{v:.4f}" for k, v in zip(("ball", "inner_half"), values, strict=True)}
+            )
+
+        mv.osem(A, counts, 6, SUBSETS, monitor=watch)
+    save(out / "bias.csv", rows)
+
+
+def edges(out: Path) -> None:
+    """MTF in x, y, z from the edge of a ball behind holes of 2.3 mm, without noise, reconstructed
+    without and with their blur.
+    """
+    cameras, fine, rows = mv.dcspect80(pixels=PIXELS), GRID.refined(2), []
+    views = Spect(fine, cameras, HOLE, blur=True)(voxelise(ball(40.0), fine)[None, None])
+    for name, options in BLUR.items():
+        A = Spect(GRID, cameras, HOLE, **options)
+        x = mv.osem(A, views, 8, SUBSETS, background=1e-6)[0, 0]
+        rows += transfer(x, name)
+    save(out / "mtf.csv", rows)
+
+
+def transfer(x: torch.Tensor, blur: str) -> list[dict]:
+    """The modulation transfer function along three axes."""
+    rows = []
+    for name, axis in AXES.items():
+        curve = ball_mtf(x, GRID, (0.0, 0.0, 0.0), 80.0, axis)
+        for frequency, value in zip(curve.frequencies.tolist(), curve.values.tolist(), strict=True):
+            rows.append(
+                {
+                    "curve": f"{name}, blur: {blur}",
+                    "per_mm": f"{frequency:.4f}",
+                    "mtf": f"{value:.4f}",
+                }
+            )
+    return rows
+
+
+def inner() -> torch.Tensor:
+    """Voxels within half of the ball's radius."""
+    return voxelise(ball(20.0), GRID) > 0.99
+
+
+def wells(out: Path) -> None:
+    """Valley to peak of wells behind holes of 2.3 mm, reconstructed without and with their blur,
+    and the noise-free views.
+    """
+    cameras, fine = mv.dcspect80(pixels=PIXELS), GRID.refined(2)
+    phantom = derenzo(DIAMETERS, radius=RADIUS, height=HEIGHT)
+    ideal = Spect(fine, cameras, HOLE, blur=True)(voxelise(phantom, fine)[None, None])[0, 0]
+    images = enlarged(radiographs(ideal), 64)
+    save_png(out / "views.png", tiled([images[r : r + 20] for r in range(0, 80, 20)]))
+    counts, _ = drawn(ideal, 5e6, seed=1)
+    rows = []
+    for name, options in BLUR.items():
+
+        def watch(iterate, name=name) -> None:
+            if iterate.number in (2, 4, 8):
+                rows.extend(sectors(iterate.volume[0, 0], name, iterate.number))
+
+        A = Spect(GRID, cameras, HOLE, **options)
+        mv.osem(A, counts, 8, SUBSETS, background=1e-3, monitor=watch)
+        save(out / "wells.csv", rows)
+
+
+def sectors(x: torch.Tensor, blur: str, iteration: int) -> list[dict]:
+    """Valley to peak of each sector."""
+    return [
+        {
+            "blur": blur,
+            "iteration": iteration,
+            "wells_mm": sector.diameter,
+            "pairs": len(sector.ratios),
+            "valley_to_peak": f"{sector.ratios.mean().item():.3f}",
+            "resolved": f"{sector.resolved:.2f}",
+        }
+        for sector in valley_to_peak(x, GRID, DIAMETERS, RADIUS, HEIGHT)
+    ]
+
+
+def draw(out: Path) -> None:
+    """Error over voxel size, MTF, bias of counts, from the tables."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    panels = (
+        (axes[0], "convergence", "method", "voxels", "error"),
+        (axes[1], "mtf", "curve", "per_mm", "mtf"),
+        (axes[2], "bias", "counts", "iteration", "inner_half"),
+    )
+    for axis, table, key, x, y in panels:
+        with (out / f"{table}.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        for name in dict.fromkeys(r[key] for r in rows):
+            points = [(float(r[x]), float(r[y])) for r in rows if r[key] == name]
+            axis.plot(*zip(*points, strict=True), ".-", label=name)
+        axis.legend()
+    axes[0].set(xscale="log", yscale="log", xlabel="voxels along an edge", ylabel="relative error")
+    axes[1].set(xlabel="1/mm", ylabel="MTF", ylim=(0, 1.5))
+    axes[2].set(xlabel=f"iteration of osem, {SUBSETS} subsets", ylabel="bias, inner half of ball")
+    figure.savefig(out / "figures.png", dpi=90)
+
+
+PARTS = {"geometry": geometry, "bias": bias, "edges": edges, "wells": wells}
+
+
+def main(out: Path, parts: list[str]) -> None:
+    """The tables and pictures of some parts, or of all."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in parts or PARTS:
+        PARTS[name](out)
+    if all((out / f"{table}.csv").exists() for table in ("convergence", "mtf", "bias")):
+        draw(out)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])

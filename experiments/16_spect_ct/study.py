@@ -1,0 +1,169 @@
+"""SPECT/CT: cone-beam views of a stationary inner rig, to attenuation, to 140.5 keV, to OSEM.
+
+python experiments/16_spect_ct/study.py OUT_FOLDER
+"""
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import mvrecon as mv
+from mvrecon.data.attenuation import attenuation, hounsfield, tissue_at
+from mvrecon.data.resample import resample
+from mvrecon.geometry.grid import voxel_centres
+from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon.scenes.ventricle import ventricle
+from mvrecon.scenes.voxelise import voxelise
+from mvrecon_spect.metrics.contrast import count_bias
+from mvrecon_spect.projector import Spect
+
+GRID = mv.Grid.centred(48, spacing=5.0)
+CT_KEV, SPECT_KEV = 70.0, 140.5
+PHOTONS, COUNTS, DRAWS = 1e4, 2e6, 3
+SHIFT = (10.0, 0.0, 0.0)  # mm
+BODY, LUNG = (112.0, 88.0, 100.0), 0.26
+HEART = {"semi_axes": (35.0, 35.0, 45.0), "wall": 12.0, "euler_degrees": (40.0, 60.0, 0.0)}
+#: Kind, centre and half lengths in mm, and how much of water or bone each part adds.
+TORSO = (
+    ("cylinder", (0.0, -20.0, 0.0), BODY, 1.0, 0.0),
+    ("ellipsoid", (70.0, -15.0, 0.0), (30.0, 45.0, 80.0), LUNG - 1, 0.0),
+    ("ellipsoid", (-70.0, -20.0, 0.0), (28.0, 45.0, 80.0), LUNG - 1, 0.0),
+    ("cylinder", (0.0, -85.0, 0.0), (16.0, 16.0, 100.0), -1.0, 1.0),
+)
+
+
+def torso(kev: float) -> Phantom:
+    """Attenuation of a chest with lungs and spine in 1/mm, at an energy in keV."""
+    tissue = tissue_at(kev)
+    return Phantom(
+        tuple(
+            Solids(
+                kind,
+                torch.tensor([centre]),
+                torch.eye(3)[None],
+                torch.tensor([half]),
+                torch.tensor([water * tissue.water + bone * tissue.bone]),
+            )
+            for kind, centre, half, water, bone in TORSO
+        )
+    )
+
+
+def activity() -> Phantom:
+    """A ventricle of activity 8 about blood of 1, in a ball of 1, in the field of all pinholes."""
+    ball = Solids(
+        "ellipsoid",
+        torch.zeros(1, 3),
+        torch.eye(3)[None],
+        torch.full((1, 3), 70.0),
+        torch.ones(1),
+    )
+    return Phantom((ball, *ventricle(value=7.0, **HEART).parts))
+
+
+def transmission() -> torch.Tensor:
+    """Attenuation at 140.5 keV on GRID from 40 noisy cone-beam views of a fixed inner ring."""
+    ring = mv.circular(
+        n_views=40, sid=300.0, sdd=500.0, detector={"pixels": [72, 72], "pixel_mm": 9.0}
+    )
+    phantom = torso(CT_KEV)
+    integrals = phantom.integrals(*ring.rays(), ray_extent=ring.ray_extent).float()
+    noise = torch.Generator().manual_seed(0)
+    photons = torch.poisson(PHOTONS * torch.exp(-integrals), generator=noise).clamp(min=1)
+    views = -torch.log(photons / PHOTONS)[None, None]
+    at_70 = mv.sirt(mv.Drr(GRID, ring), views, iterations=30, momentum=True)[0, 0]
+    return attenuation(hounsfield(at_70, CT_KEV), SPECT_KEV).clamp(max=tissue_at(SPECT_KEV).bone)
+
+
+def shifted(mu: torch.Tensor) -> torch.Tensor:
+    """The same attenuation after the patient moved."""
+    moved = mv.Grid(GRID.shape, GRID.affine.clone())
+    moved.affine[:3, 3] += torch.tensor(SHIFT, dtype=torch.float64)
+    return resample(mu, moved, GRID)
+
+
+def wall() -> tuple[torch.Tensor, torch.Tensor]:
+    """Voxels of the ventricle's wall, those nearer to the mean pinhole and the others."""
+    share = voxelise(ventricle(**HEART), GRID)
+    mean = mv.dcspect80(pixels=4).source.mean(dim=0)
+    near = (voxel_centres(GRID) @ mean) > 0
+    return (share > 0.5) & near, (share > 0.5) & ~near
+
+
+def measure(out: Path) -> None:
+    """A row for each attenuation and draw of noise; the table is written after each draw."""
+    cameras, fine = mv.dcspect80(pixels=32), GRID.refined(2)
+    true_fine = voxelise(torso(SPECT_KEV), fine)
+    A = Spect(fine, cameras, mu=true_fine)
+    ideal = A(voxelise(activity(), fine)[None, None])
+    truth, true = voxelise(activity(), GRID), voxelise(torso(SPECT_KEV), GRID)
+    estimated = transmission()
+    maps = {
+        "none": None,
+        "true": true,
+        "estimated": estimated,
+        "estimated, 10 mm shifted": shifted(estimated),
+    }
+    near, far = wall()
+    inside = voxel_centres(GRID).norm(dim=-1) < 70
+    scale, rows, volumes = COUNTS / ideal.sum().item(), [], {}
+    for draw in range(DRAWS):
+        noise = torch.Generator().manual_seed(draw)
+        counts = torch.poisson(scale * ideal, generator=noise)
+        for name, mu in maps.items():
+            operator = Spect(GRID, cameras, mu=mu)
+            x = mv.osem(operator, counts, 4, 20)[0, 0] / scale
+            volumes.setdefault(name, x)
+            error = ((x - truth)[inside].norm() / truth[inside].norm()).item()
+            sides = (x[near].mean() / truth[near].mean()) / (x[far].mean() / truth[far].mean())
+            off = 0.0 if mu is None else (mu - true).norm().item() / true.norm().item()
+            rows.append(
+                {
+                    "mu": name,
+                    "draw": draw,
+                    "mu_nrmse": "" if mu is None else f"{off:.3f}",
+                    "wall_bias": f"{count_bias(x, truth, near | far):.4f}",
+                    "near_over_far": f"{sides.item():.4f}",
+                    "nrmse": f"{error:.4f}",
+                }
+            )
+        save(out / "results.csv", rows)
+        if draw == 0:
+            draw_planes(out / "planes.png", {"truth": truth, **volumes}, true, estimated)
+
+
+def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.Tensor) -> None:
+    """Middle planes of the activities, and of both attenuations."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, len(volumes) + 2, figsize=(18, 3.2), layout="constrained")
+    shown = {
+        **{f"activity: {name}": (x, 10.0) for name, x in volumes.items()},
+        "mu: true": (true, 0.03),
+        "mu: estimated": (estimated, 0.03),
+    }
+    for axis, (name, (x, top)) in zip(axes, shown.items(), strict=True):
+        axis.imshow(np.flipud(x[24].numpy()), cmap="gray", vmin=0, vmax=top)
+        axis.set_title(name.replace("activity: ", ""), fontsize=9)
+        axis.axis("off")
+    figure.savefig(file, dpi=80)
+
+
+def save(file: Path, rows: list[dict]) -> None:
+    """Write rows as CSV."""
+    with file.open("w", newline="") as out:
+        table = csv.DictWriter(out, rows[0].keys(), lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    measure(folder)

@@ -1,0 +1,1 @@
+"""SPECT's own files: Interfile as STIR writes it, STIR's pinhole systems, DICOM NM."""

@@ -1,0 +1,238 @@
+"""Interfile: a text header with `key := value`, and the numbers in a file of their own beside it.
+
+Keys as in Interfile 3.3 (Todd-Pokropek, Cradduck & Deconinck, Nucl. Med. Commun. 13 (1992) 673) and
+in STIR: case, blanks and a leading "!" do not matter, ";" begins a comment.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mvrecon.cameras.formats.text import number
+from mvrecon.files.atomic import written_whole
+from mvrecon.files.checks import EDGE, VOLUME, Refused, plain_name, shown, text_of
+from mvrecon.registry import hint
+
+#: Types by the header's words and bytes.
+FORMATS = {
+    ("float", 4): "f4",
+    ("float", 8): "f8",
+    ("short float", 4): "f4",
+    ("long float", 8): "f8",
+    **{("signed integer", size): f"i{size}" for size in (1, 2, 4)},
+    **{("unsigned integer", size): f"u{size}" for size in (1, 2, 4)},
+}
+ORDERS = {"littleendian": "<", "bigendian": ">"}
+START, STOP = "interfile", "end of interfile"
+#: Numbers of things of which one is read.
+SINGLE = ("number of time frames", "number of energy windows")
+
+
+@dataclass(frozen=True)
+class Header:
+    """The keys of an Interfile header with their values as text; `text`, `number` and `whole` name
+    the file where a value is missing or wrong.
+    """
+
+    path: Path
+    values: Mapping[str, str]
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """The value of a key in small letters.
+
+        Raises:
+            Refused: there is none, and no default.
+        """
+        value = self.values.get(_key(key)) or default
+        if value is None:
+            raise Refused(
+                f"{self.path}: expected the key {key!r}, got none{hint(_key(key), self.values)}"
+            )
+        return value.strip().lower()
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """The value of a key as a finite number.
+
+        Raises:
+            Refused: no number, or no such key and no default.
+        """
+        try:
+            return number(self.text(key, None if default is None else repr(default)), repr(key))
+        except ValueError as error:
+            raise (
+                error if isinstance(error, Refused) else Refused(f"{self.path}: {error}")
+            ) from None
+
+    def positive(self, key: str, default: float | None = None) -> float:
+        """The value of a key as a positive number.
+
+        Raises:
+            Refused: as `number`, or a number that is not positive.
+        """
+        if not (value := self.number(key, default)) > 0:
+            raise Refused(f"{self.path}: expected a positive {key!r}, got {value:g}")
+        return value
+
+    def whole(self, key: str, default: int | None = None) -> int:
+        """The value of a key as a whole number, 0 or more.
+
+        Raises:
+            Refused: as `number`, or a number that is not whole, negative or beyond 2^40.
+        """
+        value = self.number(key, default)
+        if value != int(value) or not 0 <= value < 2**40:
+            raise Refused(f"{self.path}: expected a whole number for {key!r}, got {value:g}")
+        return int(value)
+
+
+def read_header(path: str | Path) -> Header:
+    """The keys and values of an Interfile header.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: not such a header, cut short, or a key with two values.
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected an Interfile header")
+    pairs = [
+        (_key(key), value.strip())
+        for line in text_of(path).splitlines()
+        for key, mark, value in [line.partition(";")[0].partition(":=")]
+        if mark
+    ]
+    if not pairs or pairs[0][0] != START or pairs[-1][0] != STOP:
+        raise Refused(
+            f"{path}: expected an Interfile header from '!INTERFILE :=' to '!END OF INTERFILE :=', "
+            f"got {shown([key for key, _ in pairs[:1] + pairs[-1:]])}; is it cut short?"
+        )
+    values: dict[str, str] = {}
+    for key, value in pairs:
+        if values.setdefault(key, value) != value:
+            raise Refused(
+                f"{path}: expected one value of {key!r}, got {values[key]!r} and {value!r}"
+            )
+    return Header(path, values)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The numbers of an Interfile, checked against the size of their file.
+
+    Args:
+        path: of the data.
+        dtype: as stored.
+        offset: bytes before the first.
+        shape: the last axis varies fastest.
+        scale: factor of every number.
+    """
+
+    path: Path
+    dtype: np.dtype
+    offset: int
+    shape: tuple[int, ...]
+    scale: float
+
+    def read(self, first: int, last: int) -> np.ndarray:
+        """Items `first` to `last - 1` along the first axis, scaled, float32."""
+        item = math.prod(self.shape[1:])
+        offset = self.offset + first * item * self.dtype.itemsize
+        values = np.fromfile(self.path, self.dtype, (last - first) * item, offset=offset)
+        if len(values) != (last - first) * item:
+            raise Refused(f"{self.path}: expected items {first} to {last - 1}, got a shorter file")
+        scaled = values.astype(np.float64) * self.scale
+        return scaled.astype(np.float32).reshape(last - first, *self.shape[1:])
+
+
+def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
+    """The numbers that belong to a header.
+
+    Args:
+        header: names their file, type, byte order (Interfile's default: big endian) and offset.
+        shape: the last axis varies fastest.
+
+    Raises:
+        FileNotFoundError: the data file is not there.
+        Refused: a name that leaves the header's folder, an unknown number format, several frames or
+            energy windows, or a file of another size than header and shape say.
+    """
+    for key in SINGLE:
+        if (count := header.whole(key, 1)) != 1:
+            raise Refused(f"{header.path}: expected one for {key!r}, got {count}")
+    words = header.text("number format"), header.whole("number of bytes per pixel")
+    order = ORDERS.get(header.text("imagedata byte order", "bigendian"))
+    if words not in FORMATS or order is None:
+        raise Refused(
+            f"{header.path}: expected a number format of {shown(sorted(map(str, FORMATS)))} and "
+            f"the byte order LITTLEENDIAN or BIGENDIAN, got {words} and "
+            f"{header.text('imagedata byte order', 'bigendian')!r}"
+        )
+    offset = header.whole("data offset in bytes", header.whole("data offset in bytes[1]", 0))
+    dtype = np.dtype(order + FORMATS[words])
+    if max(shape) > EDGE or math.prod(shape) * max(8, dtype.itemsize) > VOLUME:
+        raise Refused(
+            f"{header.path}: expected at most {VOLUME} bytes, {EDGE} along an axis, got "
+            f"{tuple(shape)}"
+        )
+    path = _data_file(header)
+    needed, size = offset + math.prod(shape) * dtype.itemsize, path.stat().st_size
+    if needed != size:
+        raise Refused(
+            f"{header.path}: expected {needed} bytes in {path.name} ({tuple(shape)} of {dtype} "
+            f"from byte {offset} on), got {size}; is it cut short, or another format?"
+        )
+    scale = header.number("image scaling factor[1]", header.number("image scaling factor", 1.0))
+    return Numbers(path, dtype, offset, tuple(shape), scale)
+
+
+def write_interfile(
+    path: str | Path, ending: str, lines: Sequence[str], values: np.ndarray
+) -> None:
+    """Write a header with its numbers beside it, float32, little endian; each file is replaced
+    whole or not at all, the header last.
+
+    Args:
+        path: of the header.
+        ending: of the data file, which has the header's name otherwise.
+        lines: of the header beside those about the data.
+        values: the last axis varies fastest.
+    """
+    path = Path(path).expanduser()
+    data = path.with_suffix(ending)
+    plain_name(data.name, path)
+    head = [
+        "!INTERFILE :=",
+        f"name of data file := {data.name}",
+        "!data offset in bytes := 0",
+        "imagedata byte order := LITTLEENDIAN",
+        "!number format := float",
+        "!number of bytes per pixel := 4",
+        *lines,
+        "!END OF INTERFILE :=",
+    ]
+    with written_whole(data) as part:
+        np.ascontiguousarray(values, "<f4").tofile(part)
+    with written_whole(path) as part:
+        part.write_text("\n".join(head) + "\n", encoding="utf-8")
+
+
+def _key(key: str) -> str:
+    """A key without case, leading "!", and blanks that do not matter."""
+    words = re.sub(r"[\s_]+", " ", key.strip().lstrip("!").strip().lower())
+    return re.sub(r"\s*\[\s*(\d+)\s*\]", r"[\1]", words)
+
+
+def _data_file(header: Header) -> Path:
+    """The data file, which lies beside the header."""
+    if not (stated := header.values.get("name of data file")):
+        raise Refused(f"{header.path}: expected the key 'name of data file', got none")
+    path = header.path.parent / plain_name(stated, header.path)
+    if path.is_symlink():
+        raise Refused(f"{header.path}: expected its data beside it, got a link, {path.name}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected the data of {header.path.name}")
+    return path

@@ -1,0 +1,41 @@
+"""Interfile projections (.hs) as measured views, read view by view."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mvrecon.data.projections.stack import ProjectionStack
+from mvrecon.files.checks import Refused
+from mvrecon_spect.files.interfile import numbers_of, read_header
+from mvrecon_spect.files.stir import views_shape
+
+
+class InterfileViews(ProjectionStack):
+    """Counts in Interfile projections, as STIR stores them: rows along the axis, columns across.
+
+    Args:
+        path: of the header, .hs.
+
+    Raises:
+        FileNotFoundError: the header or its data is not there.
+        Refused: missing keys, a size that does not fit the file; negative counts when they are
+            read.
+    """
+
+    kind = "integrals"
+
+    def __init__(self, path: Path):
+        header = read_header(path)
+        views, rows, columns = views_shape(header)
+        self._numbers = numbers_of(header, (views, rows, columns))
+        names = [f"{path.stem} {k}" for k in range(views)]
+        super().__init__(path, names, (rows, columns), np.dtype("f4"))
+
+    def _block(self, first: int, last: int) -> np.ndarray:
+        counts = self._numbers.read(first, last)
+        if (counts < 0).any():
+            raise Refused(
+                f"{self.path}: expected counts, not negative, got {counts.min():g} in views "
+                f"{first} to {last - 1}"
+            )
+        return counts

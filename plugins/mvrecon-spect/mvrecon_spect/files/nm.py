@@ -1,0 +1,172 @@
+"""DICOM NM: frames sorted by their vectors, with energy windows, angles and radii. Needs pydicom.
+
+PS3.3, C.8.4: a frame's place in the vectors EnergyWindowVector, DetectorVector, RotationVector and
+AngularViewVector says what it is; frames may be in any order. Angles are zero at the patient's
+back, and grow towards his left (counter-clockwise, seen from his feet).
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.data.dicom import frames_of, header_of, pixels_of
+from mvrecon.files.checks import Refused, blaming
+
+WINDOW = "EnergyWindowVector"
+VIEW = ("DetectorVector", "RotationVector", "AngularViewVector")
+#: Vectors of gated and dynamic studies, of which one value is read.
+OTHERS = ("PhaseVector", "RRIntervalVector", "TimeSlotVector", "TimeSliceVector", "SliceVector")
+
+
+class View(NamedTuple):
+    """What a view is: detector, rotation and number in the rotation, from 1; angle in degrees,
+    distance of the detector from the axis in mm and duration in s, each None where the file
+    does not say it.
+    """
+
+    detector: int
+    rotation: int
+    number: int
+    angle_degrees: float | None
+    radius_mm: float | None
+    duration_s: float | None
+
+
+class EnergyWindow(NamedTuple):
+    """An energy window: its name, and the lower and upper limits of its ranges in keV."""
+
+    name: str
+    limits_kev: tuple[tuple[float, float], ...]
+
+
+class NmStudy(NamedTuple):
+    """Counts of a DICOM NM file, for each energy window [1 1 m v u], with what the m views are and
+    the size (v, u) of the pixels in mm.
+    """
+
+    windows: tuple[EnergyWindow, ...]
+    counts: tuple[Float[Tensor, "1 1 m v u"], ...]
+    views: tuple[View, ...]
+    pixel_mm: tuple[float, float]
+
+
+def read_nm(path: str | Path) -> NmStudy:
+    """Read the counts of a DICOM NM file, sorted by detector, rotation and angular view.
+
+    Raises:
+        ImportError: pydicom is not installed.
+        Refused: another modality, vectors that do not fit the frames, windows with other views
+            than the first, gated or dynamic frames, counts that are negative.
+    """
+    path = Path(path).expanduser()
+    dataset = header_of(path)
+    if (modality := str(dataset.get("Modality"))) != "NM":
+        raise Refused(f"{path}: expected the modality NM, got {modality}")
+    frames = frames_of(dataset)
+    for name in OTHERS:
+        if len(set(_vector(path, dataset, name, frames))) > 1:
+            raise Refused(f"{path}: expected one value in {name}, got a gated or dynamic study")
+    window, *place = (_vector(path, dataset, name, frames) for name in (WINDOW, *VIEW))
+    places = list(zip(*place, strict=True))
+    known = sorted(set(places))
+    order = {key: frame for frame, key in enumerate(zip(window, places, strict=True))}
+    windows = sorted(set(window))
+    if len(order) != frames or frames != len(windows) * len(known):
+        raise Refused(
+            f"{path}: expected every view once in every energy window, got {frames} frames of "
+            f"{len(windows)} windows and {len(known)} views, {len(order)} of them different"
+        )
+    pixels = torch.from_numpy(pixels_of(path)).reshape(frames, dataset.Rows, dataset.Columns)
+    if not (pixels >= 0).all():
+        raise Refused(f"{path}: expected counts, not negative, got {pixels.min().item():g}")
+    with blaming(path, "has no PixelSpacing in mm"):
+        down, along = (float(step) for step in dataset.PixelSpacing)
+    with blaming(path, "describes its windows, detectors or rotations wrongly"):
+        views = tuple(_view(dataset, key) for key in known)
+        energies = tuple(_window(dataset, index) for index in windows)
+    counts = tuple(pixels[[order[w, key] for key in known]][None, None] for w in windows)
+    return NmStudy(energies, counts, views, (down, along))
+
+
+def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
+    """Check that a rig of pinholes is that of a study, a camera for each view; return it.
+
+    Raises:
+        ValueError: no rig, or one of another number, size of the detectors or of their pixels.
+    """
+    if cameras is None:
+        raise ValueError(
+            "Expected a rig of pinholes for the views of DICOM NM, got none: the format does not "
+            "say where pinholes are; give a camera file (camera=from_file, or matrices)"
+        )
+    count, shape = len(study.views), tuple(study.counts[0].shape[-2:])
+    steps = torch.stack([cameras.v.norm(dim=-1), cameras.u.norm(dim=-1)], dim=-1)
+    off = (steps / steps.new_tensor(study.pixel_mm) - 1).abs().max().item()
+    if len(cameras) != count or cameras.shape != shape or off > 1e-3:
+        raise ValueError(
+            f"Expected {count} cameras of {shape} pixels of {study.pixel_mm} mm, as the NM file "
+            f"has them, got {len(cameras)} of {cameras.shape} and {tuple(steps[0].tolist())} mm"
+        )
+    return cameras
+
+
+def _vector(path: Path, dataset: Any, name: str, frames: int) -> list[int]:
+    """A number for each frame; ones where the file does not have the vector."""
+    if (value := dataset.get(name)) is None:
+        return [1] * frames
+    values = [int(v) for v in (value if isinstance(value, Sequence) else [value])]
+    if len(values) != frames or min(values) < 1:
+        raise Refused(
+            f"{path}: expected {name} of {frames} numbers from 1 on, one a frame, got {len(values)}"
+        )
+    return values
+
+
+def _window(dataset: Any, index: int) -> EnergyWindow:
+    item = _item(dataset, "EnergyWindowInformationSequence", index)
+    ranges = item.get("EnergyWindowRangeSequence") or []
+    limits = [(float(r.EnergyWindowLowerLimit), float(r.EnergyWindowUpperLimit)) for r in ranges]
+    if not all(0 <= low < high for low, high in limits):
+        raise ValueError(f"energy windows need lower < upper keV, got {limits}")
+    return EnergyWindow(str(item.get("EnergyWindowName") or ""), tuple(limits))
+
+
+def _view(dataset: Any, key: tuple[int, int, int]) -> View:
+    """What a view is. With one rotation each detector has its own start angle; with several, the
+    rotations have.
+    """
+    detector, rotation, number = key
+    own = _item(dataset, "DetectorInformationSequence", detector)
+    turns = dataset.get("RotationInformationSequence") or []
+    turn = _item(dataset, "RotationInformationSequence", rotation)
+    first, second = (own, turn) if len(turns) < 2 else (turn, own)
+    angle = _number(first.get("StartAngle"), 0)
+    angle = _number(second.get("StartAngle"), 0) if angle is None else angle
+    if angle is not None and (step := _number(turn.get("AngularStep"), 0)) is not None:
+        sense = {"CW": -1, "CC": 1}[turn.RotationDirection]
+        angle = (angle + sense * step * (number - 1)) % 360
+    radius = _number(turn.get("RadialPosition"), number - 1)
+    if radius is None:
+        radius = _number(own.get("RadialPosition"), number - 1)
+    duration = _number(turn.get("ActualFrameDuration") or dataset.get("ActualFrameDuration"), 0)
+    return View(*key, angle, radius, None if duration is None else duration / 1000)
+
+
+def _item(dataset: Any, name: str, index: int) -> Any:
+    """An item of a sequence, from 1; an empty one where there is no sequence."""
+    items = dataset.get(name)
+    return items[index - 1] if items else {}
+
+
+def _number(value: Any, index: int) -> float | None:
+    """A number, or that of a list at an index; None where there is none."""
+    if value is None or value == "":
+        return None
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return float(value[index]) if len(value) > 1 else float(value[0]) if value else None
+    return float(value)

@@ -1,0 +1,172 @@
+"""STIR's pinhole measurements (PinholeSPECTUB) in and out: Interfile and two text files."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.files.checks import Refused
+from mvrecon_spect.files.interfile import Header, numbers_of, read_header, write_interfile
+from mvrecon_spect.files.stir_system import StirSystem, cameras_of
+from mvrecon_spect.files.stir_text import (
+    DetectorText,
+    read_collimator,
+    read_detector,
+    write_collimator,
+    write_detector,
+)
+
+#: Degrees within which header and detector file must agree.
+DEGREES = 0.05
+
+
+class StirScan(NamedTuple):
+    """A measurement: the system and its counts [1 1 m v u]."""
+
+    system: StirSystem
+    counts: Float[Tensor, "1 1 m v u"]
+
+
+def read_stir(path: str | Path, detector_file: str | Path, collimator_file: str | Path) -> StirScan:
+    """Read a pinhole measurement of STIR: its geometry in mm and its counts.
+
+    Args:
+        path: of the Interfile header, .hs.
+        detector_file, collimator_file: STIR's text files, in cm.
+
+    Raises:
+        FileNotFoundError: a file is not there.
+        Refused: what is missing, does not fit, or disagrees between header and detector file.
+        ValueError: a geometry that cannot be; see `StirSystem`.
+    """
+    header = read_header(path)
+    system = read_system(path, detector_file, collimator_file)
+    numbers = numbers_of(header, (len(system.angles), *system.shape))
+    counts = torch.from_numpy(numbers.read(0, len(system.angles)))
+    if not (counts.isfinite().all() and (counts >= 0).all()):
+        raise Refused(f"{path}: expected counts, finite and not negative, got others")
+    return StirScan(system, counts[None, None])
+
+
+def read_system(
+    path: str | Path, detector_file: str | Path, collimator_file: str | Path
+) -> StirSystem:
+    """Read the geometry of STIR's pinhole system in mm, without the counts; see `read_stir`."""
+    header = read_header(path)
+    detector = read_detector(detector_file)
+    views, rows, columns = views_shape(header)
+    if sum(ring.count for ring in detector.rings) != views:
+        raise Refused(
+            f"{detector_file}: expected as many angles as there are projections in {path}, "
+            f"{views}, got {sum(ring.count for ring in detector.rings)}"
+        )
+    _check_rotation(header, detector)
+    if (orbit := header.text("orbit", "circular")) != "circular":
+        raise Refused(f"{path}: expected a circular orbit, got {orbit!r}")
+    down, along = (header.positive(f"scaling factor (mm/pixel)[{axis}]") for axis in (2, 1))
+    return StirSystem(
+        shape=(rows, columns),
+        pixel_mm=(down, along),
+        radius_mm=header.positive("radius"),
+        detector=detector,
+        collimator=read_collimator(collimator_file),
+    )
+
+
+def views_shape(header: Header) -> tuple[int, int, int]:
+    """Projections, rows and columns that a header of projections declares."""
+    keys = ("number of projections", "matrix size[2]", "matrix size[1]")
+    views, rows, columns = (header.whole(key) for key in keys)
+    if min(views, rows, columns) < 1:
+        raise Refused(
+            f"{header.path}: expected projections with pixels, got {views, rows, columns}"
+        )
+    return views, rows, columns
+
+
+def stir_pinhole(
+    path: str | Path, detector_file: str | Path, collimator_file: str | Path, world: str = "RAS"
+) -> Cameras:
+    """Rig of pinholes in mm from STIR's files, one hole a detector.
+
+    Args:
+        path: of the Interfile header of the projections, .hs.
+        detector_file, collimator_file: STIR's text files, in cm.
+        world: axes of the files, "RAS", "LPS" or "IEC"; see `cameras_of`.
+
+    Raises:
+        ValueError: several holes on a detector, which need `operator_of`; see `read_stir`.
+    """
+    system = read_system(path, detector_file, collimator_file)
+    if system.holes != 1:
+        raise ValueError(
+            f"{collimator_file}: expected one hole a detector for a rig of cameras, got "
+            f"{system.holes}; mvrecon_spect.files.stir_operator.operator_of adds up their images"
+        )
+    return cameras_of(system, world)
+
+
+def write_stir(folder: str | Path, scan: StirScan, name: str = "counts") -> None:
+    """Write a pinhole measurement as STIR reads it: <name>.hs, <name>.s, detector.txt and
+    collimator.txt.
+
+    Raises:
+        ValueError: counts of another shape than the system's, negative or not finite; several
+            rings, for whose angles the header has no words.
+    """
+    system, counts = scan
+    shape = (len(system.angles), *system.shape)
+    if tuple(counts.shape) != (1, 1, *shape) or not (counts.isfinite() & (counts >= 0)).all():
+        raise ValueError(f"Expected counts [1 1 {shape}], not negative, got {tuple(counts.shape)}")
+    if len(system.detector.rings) != 1:
+        raise ValueError(f"Expected one ring, got {len(system.detector.rings)}")
+    folder, ring = Path(folder), system.detector.rings[0]
+    write_detector(folder / "detector.txt", system.detector)
+    write_collimator(folder / "collimator.txt", system.collimator)
+    lines = [
+        "!imaging modality := nucmed",
+        "!version of keys := 3.3",
+        "!type of data := Tomographic",
+        f"!matrix size [1] := {system.shape[1]}",
+        f"!matrix size [2] := {system.shape[0]}",
+        f"scaling factor (mm/pixel) [1] := {system.pixel_mm[1]!r}",
+        f"scaling factor (mm/pixel) [2] := {system.pixel_mm[0]!r}",
+        f"!number of projections := {ring.count}",
+        f"!extent of rotation := {abs(ring.count * ring.step_degrees)!r}",
+        "!process status := acquired",
+        f"!direction of rotation := {'CCW' if ring.step_degrees > 0 else 'CW'}",
+        f"start angle := {ring.first_degrees!r}",
+        "orbit := Circular",
+        f"radius := {system.radius_mm!r}",
+    ]
+    write_interfile(folder / f"{name}.hs", ".s", lines, counts[0, 0].detach().cpu().numpy())
+
+
+def _check_rotation(header: Header, detector: DetectorText) -> None:
+    """Refuse a header whose angles are not those of the detector file, which STIR goes by."""
+    ring = detector.rings[0]
+    turns = header.text("direction of rotation", "ccw" if ring.step_degrees > 0 else "cw")
+    start = header.number("start angle", ring.first_degrees)
+    arc = header.number("extent of rotation", ring.count * abs(ring.step_degrees))
+    arcs = [abs(ring.step_degrees) * count for count in (ring.count, ring.count - 1)]
+    off = (start - ring.first_degrees + 180) % 360 - 180
+    if len(detector.rings) > 1:
+        return
+    if (
+        turns not in ("cw", "ccw")
+        or (turns == "ccw") != (ring.step_degrees > 0)
+        or abs(off) > DEGREES
+    ):
+        raise Refused(
+            f"{header.path}: expected the detector file's angles, from {ring.first_degrees:g} "
+            f"degrees on by {ring.step_degrees:g} (CCW: positive), got a start at {start:g}, "
+            f"{turns}"
+        )
+    if not any(abs(arc - known) <= max(DEGREES, 1e-3 * known) for known in arcs):
+        raise Refused(
+            f"{header.path}: expected an extent of {arcs[0]:g} degrees (or {arcs[1]:g}), as the "
+            f"detector file has it, got {arc:g}"
+        )

@@ -1,0 +1,226 @@
+"""Geometry of STIR's pinhole systems (PinholeSPECTUB).
+
+A detector at the angle t has the axes x' along its rows, y' outwards, z:
+
+    x' = x cos t + y sin t    y' = y cos t - x sin t    t = ang0 + j incr
+
+Its hole has y' = R_c + y_h, R_c the collimator's radius; its plane y' = radius + crystal / 2, for
+the radius of the header is that of the crystal's front. STIR's manual, Pinhole SPECT UB; the sign
+of the angle of `cyl` is that of its program: x' = (R_c + y_h) sin(a - t).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.detector import Detector, detector_centre
+from mvrecon.cameras.formats.text import square_pixels
+from mvrecon.cameras.formats.world import from_world, into_world
+from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
+
+#: mm, and parts of a unit vector, within which a rig must be STIR's to be written.
+CLOSE = 1e-6
+
+
+@dataclass(frozen=True)
+class StirSystem:
+    """A pinhole system as STIR describes it, in mm and degrees.
+
+    Args:
+        shape: pixels of a detector, rows (along z) and columns (along x').
+        pixel_mm: their size, in the same order.
+        radius_mm: from the axis to the crystal's front.
+        detector, collimator: contents of the two text files.
+
+    Raises:
+        ValueError: a hole of no detector, a detector without a hole, a hole behind its detector's
+            plane, or as wide as its way to there: cm and mm are mixed up.
+    """
+
+    shape: tuple[int, int]
+    pixel_mm: tuple[float, float]
+    radius_mm: float
+    detector: DetectorText
+    collimator: CollimatorText
+
+    def __post_init__(self) -> None:
+        known = set(range(len(self.angles)))
+        if (used := {hole.detector for hole in self.collimator.openings}) != known:
+            raise ValueError(
+                f"Expected holes for the detectors 1 to {len(known)}, got "
+                f"{len(used & known)} of them with a hole and {len(used - known)} others"
+            )
+        for hole in self.collimator.openings:
+            outwards = self.hole_place(hole.detector, hole.place_mm)[1]
+            room = self.plane_mm - outwards
+            if not (outwards > 0 and room > max(hole.size_mm)):
+                raise ValueError(
+                    f"Expected a hole between axis and detector, smaller than its way there, got "
+                    f"{max(hole.size_mm):g} mm wide at {outwards:g} mm from the axis, the "
+                    f"detector's plane at {self.plane_mm:g} mm; the header "
+                    f"is in mm, the text files are in cm"
+                )
+
+    @property
+    def plane_mm(self) -> float:
+        """Distance of the detectors' plane from the axis: the middle of the crystal."""
+        return self.radius_mm + self.detector.crystal_mm / 2
+
+    @property
+    def angles(self) -> list[float]:
+        """Angle t of each detector in degrees."""
+        return [
+            ring.first_degrees + j * ring.step_degrees
+            for ring in self.detector.rings
+            for j in range(ring.count)
+        ]
+
+    @property
+    def heights(self) -> list[float]:
+        """Place of each detector's middle along the axis in mm."""
+        return [ring.z_mm for ring in self.detector.rings for _ in range(ring.count)]
+
+    @property
+    def holes(self) -> int:
+        """Number of holes of each detector.
+
+        Raises:
+            ValueError: it is not the same for all.
+        """
+        counts = {
+            sum(hole.detector == index for hole in self.collimator.openings)
+            for index in range(len(self.angles))
+        }
+        if len(counts) != 1:
+            raise ValueError(f"Expected equally many holes on all detectors, got {sorted(counts)}")
+        return counts.pop()
+
+    def hole_place(self, detector: int, place_mm: Sequence[float]) -> tuple[float, float, float]:
+        """Place (x', y', z) of a hole in its detector's axes in mm, y' from the axis."""
+        first, outwards, z = place_mm
+        if self.collimator.model == "pol":
+            return first, self.collimator.radius_mm + outwards, z
+        turn = math.radians(first - self.angles[detector])
+        radius = self.collimator.radius_mm + outwards
+        return radius * math.sin(turn), radius * math.cos(turn), z
+
+
+def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
+    """Pinholes of a system in mm: the holes of the first detector, those of the second, ...
+
+    Rows run along z, columns along x', as STIR stores its projections: nothing is to be flipped.
+
+    Args:
+        system: the geometry.
+        world: axes of the file, see `mvrecon.cameras.formats.world.to_ras`. STIR's are LPS for a
+            patient on his back, head first, and RAS for one on his belly, head first.
+    """
+    openings = sorted(system.collimator.openings, key=lambda hole: hole.detector)
+    index = [hole.detector for hole in openings]
+    angles = torch.deg2rad(torch.tensor(system.angles, dtype=torch.float64)[index])
+    heights = torch.tensor(system.heights, dtype=torch.float64)[index]
+    axes, zero = _axes(angles), torch.zeros_like(angles)
+    places = torch.tensor(
+        [system.hole_place(hole.detector, hole.place_mm) for hole in openings], dtype=torch.float64
+    )
+    middle = torch.stack([zero, zero + system.plane_mm, heights], dim=-1)
+    lifted = places + torch.stack([zero, zero, heights], dim=-1)
+    detector = Detector(system.shape, system.pixel_mm)
+    look = torch.stack([axes[:, 0], axes[:, 2], -axes[:, 1]], dim=1)
+    source, centre = (torch.einsum("mi,mix->mx", place, axes) for place in (lifted, middle))
+    cameras = detector.carried(source, centre, look, extent="behind")
+    return from_world(cameras, world)
+
+
+def accepted(system: StirSystem) -> Bool[Tensor, "m v u"]:
+    """Which pixels each hole's angles of acceptance let it see, those of `cameras_of` in turn."""
+    masks = []
+    rows, columns = system.shape
+    z = (torch.arange(rows, dtype=torch.float64) - (rows - 1) / 2) * system.pixel_mm[0]
+    x = (torch.arange(columns, dtype=torch.float64) - (columns - 1) / 2) * system.pixel_mm[1]
+    for hole in sorted(system.collimator.openings, key=lambda hole: hole.detector):
+        place = system.hole_place(hole.detector, hole.place_mm)
+        room = torch.tensor(system.plane_mm - place[1], dtype=torch.float64)
+        within = [
+            (torch.rad2deg(torch.atan2(way, room)) - tilt).abs() <= half
+            for way, tilt, half in zip(
+                (x - place[0], z - place[2]),
+                hole.axis_degrees,
+                hole.acceptance_degrees,
+                strict=True,
+            )
+        ]
+        masks.append(within[1][:, None] & within[0][None, :])
+    return torch.stack(masks)
+
+
+def system_of(
+    cameras: Cameras,
+    diameter_mm: float,
+    crystal_mm: float = 0.0,
+    sigma_mm: float = 0.0,
+    world: str = "RAS",
+) -> StirSystem:
+    """The system of STIR, in mm, that a rig of pinholes about the z axis is.
+
+    Args:
+        cameras: one pinhole a detector, in the order of equal steps of their angle; detectors
+            parallel to the z axis, rows along it, all as far from it and as high.
+        diameter_mm: of the round holes.
+        crystal_mm: thickness of the crystal, in whose middle the detectors' planes are.
+        sigma_mm: the detector's own standard deviation.
+        world: axes of the files that are to be written.
+
+    Raises:
+        ValueError: another rig; STIR has no other.
+    """
+    rig = into_world(cameras, world)
+    pixel_mm = square_pixels(rig, "STIR")
+    angles = torch.atan2(rig.u[:, 1], rig.u[:, 0])
+    axes = _axes(angles)
+    places, middles = (
+        torch.einsum("mix,mx->mi", axes, point) for point in (rig.source, detector_centre(rig))
+    )
+    degrees = torch.rad2deg(angles)
+    steps = (degrees.diff() + 180) % 360 - 180
+    steps = steps if len(steps) else torch.ones(1).double()
+    off = {
+        "steps of the angle": (steps - steps[0]).abs().max(),
+        "middles beside x' = 0": middles[:, 0].abs().max(),
+        "distances and heights": (middles - middles[0])[:, 1:].abs().max(),
+        "directions of v and z": (rig.v / pixel_mm[0] - axes[:, 2]).abs().max(),
+        "directions of u and x'": (rig.u / pixel_mm[1] - axes[:, 0]).abs().max(),
+    }
+    if cameras.extent != "behind" or max(off.values()) > CLOSE:
+        worst = max(off, key=lambda name: off[name].item())
+        raise ValueError(
+            "Expected pinholes about the z axis in equal steps, with detectors parallel to it and "
+            f"rows along it, got {cameras.extent!r} cameras whose {worst} differ by "
+            f"{off[worst].item():.3g}; STIR has no other"
+        )
+    radius = places[:, 1].mean().item()
+    place = places - places.new_tensor([0.0, radius, middles[0, 2].item()])
+    openings = tuple(
+        Opening(index, (x, y, z), "round", (diameter_mm, diameter_mm))
+        for index, (x, y, z) in enumerate(place.tolist())
+    )
+    ring = Ring(len(cameras), degrees[0].item(), steps[0].item(), middles[0, 2].item())
+    return StirSystem(
+        shape=cameras.shape,
+        pixel_mm=pixel_mm,
+        radius_mm=middles[0, 1].item() - crystal_mm / 2,
+        detector=DetectorText(sigma_mm, crystal_mm, 0.0, (ring,)),
+        collimator=CollimatorText("pol", radius, 0.0, openings),
+    )
+
+
+def _axes(angles: Float[Tensor, " m"]) -> Float[Tensor, "m 3 3"]:
+    """Rows x', y', z of detectors at angles in radians."""
+    cosine, sine, zero = angles.cos(), angles.sin(), torch.zeros_like(angles)
+    rows = [[cosine, sine, zero], [-sine, cosine, zero], [zero, zero, zero + 1]]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=1)

@@ -1,0 +1,135 @@
+"""DICOM NM: frames in any order come back by window, detector, rotation and angular view."""
+
+import random
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.data.projections.opening import open_projections
+from mvrecon_spect.files.nm import NmStudy, paired, read_nm
+
+pydicom = pytest.importorskip("pydicom")
+VECTORS = ("EnergyWindowVector", "DetectorVector", "RotationVector", "AngularViewVector")
+
+
+def study(path: Path, **changes: object) -> Path:
+    """Two windows, two detectors, three views each of 4 x 5 pixels, in a random order; the counts
+    of a frame are its key as a decimal number."""
+    from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+    from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+
+    keys = [(w, d, 1, a) for w in (1, 2) for d in (1, 2) for a in (1, 2, 3)]
+    random.Random(0).shuffle(keys)
+    pixels = np.stack([np.full((4, 5), 1000 * w + 100 * d + a) for w, d, _, a in keys])
+    pixels[:, 0, 1] = 7  # row 0, column 1
+    meta = FileMetaDataset()
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.20"
+    meta.MediaStorageSOPInstanceUID = generate_uid()
+    file = FileDataset(str(path), {}, file_meta=meta, preamble=bytes(128))
+    file.Modality, file.Rows, file.Columns, file.NumberOfFrames = "NM", 4, 5, len(keys)
+    file.SamplesPerPixel, file.PhotometricInterpretation = 1, "MONOCHROME2"
+    file.BitsAllocated = file.BitsStored = 16
+    file.HighBit, file.PixelRepresentation = 15, 0
+    file.PixelSpacing = [2.0, 1.5]
+    for name, values in zip(VECTORS, zip(*keys, strict=True), strict=True):
+        setattr(file, name, list(values))
+    file.EnergyWindowInformationSequence = [
+        item(
+            Dataset,
+            EnergyWindowName=name,
+            EnergyWindowRangeSequence=[
+                item(Dataset, EnergyWindowLowerLimit=low, EnergyWindowUpperLimit=high)
+            ],
+        )
+        for name, low, high in (("scatter", 110.0, 126.0), ("peak", 126.5, 154.5))
+    ]
+    file.DetectorInformationSequence = [
+        item(Dataset, StartAngle=start, CollimatorType="PINH") for start in (10.0, 190.0)
+    ]
+    file.RotationInformationSequence = [
+        item(
+            Dataset,
+            StartAngle=10.0,
+            AngularStep=30.0,
+            RotationDirection="CW",
+            ScanArc=90.0,
+            ActualFrameDuration=20000,
+            RadialPosition=[250.0, 251.0, 252.0],
+            NumberOfFramesInRotation=3,
+        )
+    ]
+    file.PixelData = pixels.astype("<u2").tobytes()
+    for name, value in changes.items():
+        setattr(file, name, value)
+    file.save_as(path)
+    return path
+
+
+def item(kind: type, **values: object):
+    dataset = kind()
+    for name, value in values.items():
+        setattr(dataset, name, value)
+    return dataset
+
+
+@pytest.fixture(scope="module")
+def nm(tmp_path_factory: pytest.TempPathFactory) -> NmStudy:
+    return read_nm(study(tmp_path_factory.mktemp("nm") / "a.dcm"))
+
+
+def test_frames_are_sorted_by_their_vectors(nm: NmStudy):
+    for w, counts in enumerate(nm.counts, 1):
+        expected = [1000 * w + 100 * d + a for d in (1, 2) for a in (1, 2, 3)]
+        assert counts.shape == (1, 1, 6, 4, 5)
+        assert counts[0, 0, :, 2, 2].tolist() == expected
+        assert (counts[0, 0, :, 0, 1] == 7).all()
+    assert nm.windows[1] == ("peak", ((126.5, 154.5),)) and nm.pixel_mm == (2.0, 1.5)
+
+
+def test_angles_run_with_the_direction_from_each_detector_s_start(nm: NmStudy):
+    assert [view.angle_degrees for view in nm.views] == [10.0, 340.0, 310.0, 190.0, 160.0, 130.0]
+    assert [view.radius_mm for view in nm.views] == [250.0, 251.0, 252.0] * 2
+    assert nm.views[0].duration_s == 20.0 and nm.views[4][:3] == (2, 1, 2)
+
+
+@pytest.mark.door
+def test_pinholes_of_nm_come_from_a_camera_file(nm: NmStudy):
+    """DICOM NM does not say where pinholes are: without a rig of the same views it is refused."""
+    rig = dcspect80(pixels=[4, 5])[:6]
+    rig = replace(rig, u=rig.u * 1.5 / rig.u.norm(dim=-1, keepdim=True))
+    rig = replace(rig, v=rig.v * 2.0 / rig.v.norm(dim=-1, keepdim=True))
+    assert paired(nm, rig) is rig
+    with pytest.raises(ValueError, match="does not say where pinholes are"):
+        paired(nm, None)
+    with pytest.raises(ValueError, match="Expected 6 cameras"):
+        paired(nm, rig[torch.arange(5)])
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"Modality": "CT"}, "expected the modality NM, got CT"),
+        ({"DetectorVector": [1] * 12}, "every view once in every energy window"),
+        ({"AngularViewVector": [1, 2]}, "AngularViewVector of 12 numbers"),
+        ({"TimeSlotVector": [1, 2] * 6}, "gated or dynamic"),
+        ({"PixelRepresentation": 1, "PixelData": b"\xff" * 480}, "not negative, got -1"),
+        ({"PixelData": bytes(100)}, "cannot be read"),
+    ],
+)
+def test_an_nm_file_that_does_not_fit_is_refused(tmp_path: Path, changes: dict, message: str):
+    """A DICOM NM file whose vectors, modality, counts or size do not fit is refused."""
+    with pytest.raises(ValueError, match=message):
+        read_nm(study(tmp_path / "a.dcm", **changes))
+
+
+@pytest.mark.door
+def test_nm_frames_are_no_projections_in_the_order_of_the_file(tmp_path: Path):
+    """Frames of DICOM NM, which may be in any order, are refused as projections in their order."""
+    with pytest.raises(ValueError, match="to be sorted by its vectors"):
+        open_projections(study(tmp_path / "a.dcm"))

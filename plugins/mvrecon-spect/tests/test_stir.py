@@ -1,0 +1,236 @@
+"""Pinhole systems of STIR: places by independent arithmetic, round trips, and bad files."""
+
+import math
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon import registry
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.data.projections.measured import Measured
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS
+from mvrecon_spect.files.interfile_volume import read_interfile, read_mu, write_mu
+from mvrecon_spect.files.interfile_volume import write_interfile_volume as write_volume
+from mvrecon_spect.files.stir import StirScan, read_stir, write_stir
+from mvrecon_spect.files.stir_operator import operator_of
+from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of, system_of
+from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
+from mvrecon_spect.matter import attenuation_on
+from mvrecon_spect.projector import Spect
+
+POINT = torch.tensor([4.0, -3.0, 2.5], dtype=torch.float64)
+PLACE = (1.2, -0.4, 0.7)  # of the holes, in mm
+
+
+def system(model: str = "pol", step: float = 80.0, holes: int = 1) -> StirSystem:
+    """Four detectors of 8 x 10 pixels, from 35 degrees on, 47.5 + 3 / 2 mm from the axis."""
+    openings = tuple(
+        Opening(
+            detector,
+            ((35.0 + detector * step) if model == "cyl" else PLACE[0] - 2 * k, *PLACE[1:]),
+            "round",
+            (1.0, 1.0),
+        )
+        for detector in range(4)
+        for k in range(holes)
+    )
+    return StirSystem(
+        shape=(8, 10),
+        pixel_mm=(2.0, 1.5),
+        radius_mm=47.5,
+        detector=DetectorText(0.4, 3.0, 0.4407, (Ring(4, 35.0, step),)),
+        collimator=CollimatorText(model, 28.0, 10.0, openings),  # type: ignore[arg-type]
+    )
+
+
+def scan(step: float = 80.0) -> StirScan:
+    counts = torch.poisson(
+        torch.full((1, 1, 4, 8, 10), 7.0), generator=torch.Generator().manual_seed(0)
+    )
+    return StirScan(system(step=step), counts)
+
+
+@pytest.mark.parametrize("step", [80.0, -80.0])
+def test_a_point_is_seen_where_similar_triangles_put_it(step: float):
+    uvz = cameras_of(system(step=step)).project(POINT)
+    for j in range(4):
+        t = math.radians(35.0 + j * step)
+        x = POINT[0] * math.cos(t) + POINT[1] * math.sin(t)
+        y = POINT[1] * math.cos(t) - POINT[0] * math.sin(t)
+        hole, plane = 28.0 + PLACE[1], 47.5 + 1.5
+        longer = (plane - y) / (
+            hole - y
+        )  # the way from the point to the plane over that to the hole
+        column = (x + (PLACE[0] - x) * longer) / 1.5 + 4.5
+        row = (POINT[2] + (PLACE[2] - POINT[2]) * longer) / 2.0 + 3.5
+        assert uvz[j, :2].tolist() == pytest.approx([column.item(), row.item()], abs=1e-9)
+        assert -uvz[j, 2].item() == pytest.approx((hole - y).item(), abs=1e-9)
+
+
+def test_a_cylinder_s_hole_at_its_detector_s_angle_is_in_its_middle():
+    flat, curved = cameras_of(system()), cameras_of(system("cyl"))
+    along = flat.u / flat.u.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(curved.source, flat.source - PLACE[0] * along)
+
+
+@pytest.mark.parametrize("step", [80.0, -80.0])
+def test_what_is_written_is_read(tmp_path: Path, step: float):
+    first = scan(step)
+    write_stir(tmp_path, first)
+    again = read_stir(*files(tmp_path))
+    assert torch.equal(again.counts, first.counts)
+    for key in ("source", "origin", "u", "v"):
+        torch.testing.assert_close(
+            getattr(cameras_of(again.system), key), getattr(cameras_of(first.system), key)
+        )
+    assert again.system.detector.sigma_mm == pytest.approx(0.4)
+    assert again.system.collimator.openings[2].acceptance_degrees == (45.0, 45.0)
+
+
+def test_a_rig_is_a_system_of_stir_if_it_turns_about_z():
+    rig = cameras_of(system(), world="LPS")
+    again = system_of(rig, diameter_mm=1.0, crystal_mm=3.0, world="LPS")
+    torch.testing.assert_close(cameras_of(again, world="LPS").source, rig.source)
+    torch.testing.assert_close(cameras_of(again, world="LPS").origin, rig.origin)
+    assert again.radius_mm == pytest.approx(47.5)
+    with pytest.raises(ValueError, match="STIR has no other"):
+        system_of(dcspect80(pixels=8), diameter_mm=2.3)
+
+
+def test_holes_of_one_detector_add_up_and_accept_what_their_angles_let_in():
+    grid = Grid.centred(8, spacing=4.0)
+    x = torch.rand(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(1))
+    both = system(holes=2)
+    openings = both.collimator.openings
+    single = [
+        replace(both, collimator=both.collimator._replace(openings=openings[k::2])) for k in (0, 1)
+    ]
+    parts = [Spect(grid, cameras_of(one), 1.0)(x) for one in single]
+    torch.testing.assert_close(operator_of(both, grid)(x), parts[0] + parts[1])
+    # half of 12 degrees: 21.4 mm to the plane, 4.55 mm each way, from the hole at 1.2, 0.7
+    narrow = tuple(replace(hole, acceptance_degrees=(12.0, 12.0)) for hole in openings[::2])
+    one = replace(both, collimator=both.collimator._replace(openings=narrow))
+    columns = [abs((k - 4.5) * 1.5 - 1.2) < 4.55 for k in range(10)]
+    rows = [abs((k - 3.5) * 2.0 - 0.7) < 4.55 for k in range(8)]
+    mask = torch.tensor(rows)[:, None] & torch.tensor(columns)
+    assert torch.equal(accepted(one), mask.expand(4, 8, 10))
+    torch.testing.assert_close(operator_of(one, grid)(x), parts[0] * mask)
+
+
+def test_volumes_keep_their_values_and_their_place(tmp_path: Path):
+    grid = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0), centre=(0.5, 1.0, 9.0))
+    values = torch.rand(grid.shape, generator=torch.Generator().manual_seed(2)) / 20
+    write_volume(tmp_path / "a.hv", values, grid)
+    again, there = read_interfile(tmp_path / "a.hv", place="header")
+    assert torch.equal(again, values)
+    torch.testing.assert_close(there.affine, grid.affine)
+    assert read_interfile(tmp_path / "a.hv")[1].centre.tolist() == [0.0, 0.0, 0.0]
+    write_mu(tmp_path / "mu.hv", values, grid)
+    assert np.fromfile(tmp_path / "mu.v", "<f4").max() == pytest.approx(10 * values.max().item())
+    centred = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0))
+    torch.testing.assert_close(attenuation_on(centred, tmp_path / "mu.hv"), values)
+    with pytest.warns(UserWarning, match="is the file in 1/mm"):
+        write_volume(tmp_path / "a.hv", values / 10, grid)
+        read_mu(tmp_path / "a.hv")
+
+
+def test_integers_of_the_other_byte_order_are_read_and_scaled(tmp_path: Path):
+    values = np.arange(-60, 60, dtype=">i2").reshape(4, 5, 6)
+    header = "\n".join(
+        [
+            "!INTERFILE :=",
+            "name of data file := b.v",
+            "data offset in bytes := 8 ; behind a label",
+            "!Number Format := signed integer",
+            "!number of bytes per pixel := 2",
+            "image scaling factor[1] := 0.5",
+            *(f"matrix size [{k}] := {n}" for k, n in ((1, 6), (2, 5), (3, 4))),
+            *(f"scaling factor (mm/pixel) [{k}] := 2" for k in (1, 2, 3)),
+            "!END OF INTERFILE :=",
+        ]
+    )
+    (tmp_path / "b.hv").write_text(header)
+    (tmp_path / "b.v").write_bytes(bytes(8) + values.tobytes())
+    again, _ = read_interfile(tmp_path / "b.hv")
+    assert np.array_equal(again.numpy(), values.astype(np.float32) / 2)
+
+
+def test_the_files_are_a_scan_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_stir(tmp_path, scan())
+    points = (
+        EntryPoint(
+            "views.hs", "mvrecon_spect.files.interfile_views:InterfileViews", registry.GROUP
+        ),
+        EntryPoint("camera.stir_pinhole", "mvrecon_spect.files.stir:stir_pinhole", registry.GROUP),
+    )
+    monkeypatch.setattr(registry, "installed", lambda: points)
+    views = Measured(path=str(tmp_path / "counts.hs")).open()
+    assert torch.equal(views.whole().views, scan().counts[0, 0])
+    path, detector, collimator = files(tmp_path)
+    rig = CAMERAS.build(
+        "stir_pinhole", path=path, detector_file=detector, collimator_file=collimator
+    )
+    torch.testing.assert_close(views.cameras(rig).source, cameras_of(system()).source)
+
+
+def files(folder: Path) -> tuple[Path, Path, Path]:
+    return folder / "counts.hs", folder / "detector.txt", folder / "collimator.txt"
+
+
+#: File, what is replaced by what, and what the error says.
+BAD = {
+    "cut short": ("counts.hs", "!END OF INTERFILE :=", "", "is it cut short"),
+    "larger than the data": ("counts.hs", "[1] := 10", "[1] := 11", "expected 1408 bytes"),
+    "number format": ("counts.hs", "format := float", "format := bit", "expected a number format"),
+    "no key": ("counts.hs", "radius := 47.5", "", "expected the key 'radius'"),
+    "no number": ("counts.hs", "radius := 47.5", "radius := far", "finite number for 'radius'"),
+    "two values": ("counts.hs", "radius := 47.5", "radius := 47.5\nradius := 4", "one value of"),
+    "radius in cm": ("counts.hs", "radius := 47.5", "radius := 4.75", "text files are in cm"),
+    "turns back": ("counts.hs", "CCW", "CW", "expected the detector file's angles"),
+    "starts elsewhere": ("counts.hs", "start angle := 35", "start angle := 3", "a start at 3"),
+    "other extent": ("counts.hs", "rotation := 320", "rotation := 36", "expected an extent of 320"),
+    "an ellipse": ("counts.hs", "Circular", "Non-circular", "a circular orbit"),
+    "above its folder": ("counts.hs", "counts.s", "../counts.s", "without / "),
+    "frames": ("counts.hs", "orbit", "number of time frames := 2\norbit", "expected one for"),
+    "collimator in mm": ("collimator.txt", "radius (cm): 2.8", "radius (cm): 28.", "are in cm"),
+    "says mm": ("collimator.txt", "radius (cm)", "radius (mm)", "in cm, got it in mm"),
+    "a hole less": ("collimator.txt", "holes: 4", "holes: 5", "expected 5 holes"),
+    "no such hole": ("collimator.txt", "round", "star", "round or rect"),
+    "no such detector": ("collimator.txt", "h4: 4", "h4: 5", "Expected holes for the detectors"),
+    "a line less": ("detector.txt", "Crystal thickness (cm)", "crystal", "is a line missing"),
+    "a view less": ("detector.txt", "Nangles: 4", "Nangles: 3", "as many angles as there are"),
+}
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", BAD)
+def test_a_file_of_stir_that_does_not_fit_is_refused(tmp_path: Path, name: str):
+    """A pinhole system of STIR whose files do not fit each other, their size or unit is refused."""
+    write_stir(tmp_path, scan())
+    file, before, after, message = BAD[name]
+    text = (tmp_path / file).read_text()
+    assert before in text
+    (tmp_path / file).write_text(text.replace(before, after))
+    with pytest.raises(ValueError, match=message):
+        read_stir(*files(tmp_path))
+
+
+@pytest.mark.door
+def test_counts_of_interfile_are_in_a_plain_file_beside_it(tmp_path: Path):
+    """Interfile counts are read from a plain file beside the header, and refused where negative."""
+    inside, outside = tmp_path / "scan", tmp_path / "elsewhere"
+    for folder in (inside, outside):
+        folder.mkdir()
+        write_stir(folder, scan())
+    (inside / "counts.s").unlink()
+    (inside / "counts.s").symlink_to(outside / "counts.s")
+    with pytest.raises(ValueError, match="got a link"):
+        read_stir(*files(inside))
+    (-scan().counts).numpy().astype("<f4").tofile(outside / "counts.s")
+    with pytest.raises(ValueError, match="not negative"):
+        read_stir(*files(outside))
