@@ -67,8 +67,8 @@ def rank_correlation(values: Sequence[float], others: Sequence[float]) -> float:
 
 
 def sentence(quality: Mapping[str, Any]) -> str:
-    """A line of words: the coverage of the intervals where there are any, and the ranks; empty where
-    there is nothing but the view NRMSE.
+    """A line of words: the coverage of the intervals where there are any, and the ranks; empty
+    where there is nothing but the view NRMSE.
     """
     if not quality.keys() - {"view_nrmse"}:
         return ""
