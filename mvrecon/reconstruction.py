@@ -11,6 +11,8 @@ from mvrecon.config.plugins import import_plugins
 
 if TYPE_CHECKING:
     from mvrecon.engine.scan import Scan
+    from mvrecon.engine.solve import Outcome
+    from mvrecon.geometry.grid import Grid
 
 UNITS = ("1/mm", "HU")
 #: What a run writes into its folder beside the volume.
@@ -41,8 +43,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """
     import_plugins(settings["plugins"])
     from mvrecon.cameras import files
-    from mvrecon.data.attenuation import hounsfield
-    from mvrecon.data.volume_files import check_ending, save_volume
+    from mvrecon.data.volume_files import check_ending
     from mvrecon.engine import calibrate, correction, export, run_folder, scan, solve, wrong_cameras
     from mvrecon.engine.evaluation import device_of
     from mvrecon.viz import cameras, montage, rig
@@ -70,12 +71,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         outcome = solve.solve(case, settings, device)
         volume = outcome.volume
         export.save_png(folder / "planes.png", montage.slices(volume, case.grid.spacing))
-        in_hu = settings["unit"] == "HU"
-        save_volume(out, hounsfield(volume) if in_hu else volume, case.grid)
-        if (sigma := outcome.sigma) is not None:
-            if in_hu:  # half of what lies between, as the scale bends at water
-                sigma = (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
-            save_volume(beside(out, ".sigma.nii.gz"), sigma, case.grid)
+        _save(out, outcome, settings["unit"], case.grid)
         table = {
             **_row(settings, case, out),
             **outcome.row(),
@@ -86,6 +82,21 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             table["calibration"] = calibrate.table(estimate, free) | {"cameras": str(beside(out))}
         run_folder.write_results(folder, table)
     return table
+
+
+def _save(out: Path, outcome: "Outcome", unit: str, grid: "Grid") -> None:
+    """Write the volume and, where there is one, its standard deviation beside it, in the unit."""
+    from mvrecon.data.attenuation import hounsfield
+    from mvrecon.data.volume_files import save_volume
+
+    volume, sigma = outcome.volume, outcome.sigma
+    in_hu = unit == "HU"
+    save_volume(out, hounsfield(volume) if in_hu else volume, grid)
+    if sigma is None:
+        return
+    if in_hu:  # half of what lies between, as the scale bends at water
+        sigma = (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
+    save_volume(beside(out, ".sigma.nii.gz"), sigma, grid)
 
 
 def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
