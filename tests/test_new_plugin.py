@@ -67,7 +67,10 @@ def test_the_project_is_written_as_mvrecon_is(project, root: Path):
     command = [sys.executable, "-m", "ruff"]
     for act in (["check"], ["format", "--check"]):
         options = [*act, "--no-cache", f"--config={root / 'pyproject.toml'}", str(folder)]
-        done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+        # from the project's folder: there mvrecon is a library like any other
+        done = subprocess.run(
+            [*command, *options], cwd=folder, capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stdout
     assert not [file for file in folder.rglob("*") if "my_plugin" in file.name]
 
