@@ -1,10 +1,13 @@
 #!/usr/bin/env bash
-# Trains the quickstart, prints its table of results, and says how to look at the run. Arguments go to mvrecon-train.
+# Trains the quickstart, with right cameras and with three wrong ones, prints both tables of results, and says how to look at the
+# runs. Arguments go to mvrecon-train.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh
 
-.venv/bin/mvrecon-train experiment=quickstart "$@"
+for experiment in quickstart quickstart_rig_errors; do
+    .venv/bin/mvrecon-train experiment="$experiment" "$@"
+done
 
 cat <<'TEXT'
 
