@@ -36,7 +36,7 @@ class Events(Dataset[dict[str, Any]]):
     Raises:
         FileNotFoundError: no files of events.
         LookupError: arrays that the files do not have.
-        Refused: a file that is none of events, or files of other grids or rigs.
+        Refused: a file that is none of events, or of another grid.
     """
 
     def __init__(

@@ -191,12 +191,12 @@ def test_counts_that_could_be_negative_are_refused(copy):
 @pytest.mark.parametrize("start", ["fork", "spawn"])
 def test_worker_processes_read_what_this_one_reads(folder, start):
     events = Events(folder)
-    here = torch.stack([events[k]["counts"] for k in range(5)])  # opens files before the fork
+    counts = torch.stack([events[k]["counts"] for k in range(5)])  # opens files before the fork
     loader = DataLoader(events, batch_size=5, num_workers=1, multiprocessing_context=start)
     (batch,) = list(loader)
-    assert torch.equal(batch["counts"], here) and batch["truth"].shape == (5, 1, 8, 12, 10)
+    assert torch.equal(batch["counts"], counts) and batch["truth"].shape == (5, 1, 8, 12, 10)
     again = pickle.loads(pickle.dumps(events))
-    assert torch.equal(again[4]["counts"], here[4])
+    assert torch.equal(again[4]["counts"], counts[4])
 
 
 def test_one_event_at_a_time_is_in_memory(tmp_path):
@@ -241,12 +241,12 @@ def test_a_data_set_larger_than_memory_is_written_and_read(tmp_path):
             tmp_path / f"events-{shard}.h5", header, range(20 * shard, 20 * shard + 20), make
         )
     fork = multiprocessing.get_context("fork")
-    here, there = fork.Pipe()
-    process = fork.Process(target=summed, args=(tmp_path, there))
+    receiver, sender = fork.Pipe()
+    process = fork.Process(target=summed, args=(tmp_path, sender))
     process.start()
     process.join(300)
     assert process.exitcode == 0
-    assert here.recv() == volume.size * sum(range(40))
+    assert receiver.recv() == volume.size * sum(range(40))
 
 
 def test_pytorch_3dunet_sees_an_event_without_a_copy(folder, tmp_path, monkeypatch):
