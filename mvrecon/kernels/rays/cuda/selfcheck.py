@@ -3,9 +3,11 @@ reference.
 """
 
 import logging
-import warnings
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from threading import Lock
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,6 +22,28 @@ logger = logging.getLogger(__name__)
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
 
 
+class Case(NamedTuple):
+    """What is checked at once: a device, a method without its samples, the precision of arithmetic,
+    and whether several volumes share their rays.
+    """
+
+    device: str
+    method: str
+    dtype: torch.dtype
+    several: bool
+
+
+class Verdict(NamedTuple):
+    """Why kernels cannot be used, or None, and whether that is so for good."""
+
+    why: str | None
+    lasting: bool
+
+
+_verdicts: dict[Case, str | None] = {}
+_lock = Lock()
+
+
 @torch.compiler.assume_constant_result
 def reason(
     device: torch.device | str,
@@ -28,7 +52,7 @@ def reason(
     volumes: int = 1,
 ) -> str | None:
     """Why the kernels for some input cannot be used on a device, or None. Tried once, which
-    compiles them; logged once.
+    compiles them; logged once. Only what is true of the device is remembered.
 
     Args:
         device: a CUDA device.
@@ -42,32 +66,47 @@ def reason(
             "cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0
         )
     computed = torch.float64 if dtype == torch.float64 else torch.float32
-    return _reason(str(place), method.partition(":")[0], computed, volumes > 1)
+    case = Case(str(place), method.partition(":")[0], computed, volumes > 1)
+    with _lock:
+        if case in _verdicts:
+            return _verdicts[case]
+        verdict = _apart(partial(_verdict_on, case))
+        if verdict.lasting:
+            _verdicts[case] = verdict.why
+    if verdict.why:
+        what = f"{case.method} of {computed} on {place}"
+        logger.warning("The reference computes %s: %s", what, verdict.why)
+    return verdict.why
 
 
-@cache
-def _reason(device: str, name: str, dtype: torch.dtype, several: bool) -> str | None:
-    # a tiny grid of blocks is no mistake of ours
-    warnings.filterwarnings(
-        "ignore", message="Grid size .* will likely result in GPU under-utilization"
-    )
-    bound, failure = TOLERANCE[dtype], None
+def forget() -> None:
+    """Forget every verdict, so that the next call tries again."""
+    with _lock:
+        _verdicts.clear()
+
+
+def _apart(check: Callable[[], Verdict]) -> Verdict:
+    """What a check says in a thread of its own: inference mode, autocast, derivatives and maps of
+    `torch.func` hold for the thread that asks, and a check inside them would fail.
+    """
+    with ThreadPoolExecutor(1) as fresh:
+        return fresh.submit(check).result()
+
+
+def _verdict_on(case: Case) -> Verdict:
+    bound = TOLERANCE[case.dtype]
     try:
-        for what, error in differences(
-            device, f"{name}:8" if name == "trilinear" else name, dtype, 5 if several else 1
-        ):
+        method = f"{case.method}:8" if case.method == "trilinear" else case.method
+        for what, error in differences(case.device, method, case.dtype, 5 if case.several else 1):
             if not error <= bound:
-                failure = (
-                    failure
-                    or f"{what} differs from the reference by {error:.1e}, expected at most "
-                    f"{bound:.0e}"
-                )
+                why = f"{what} differs from the reference by {error:.1e}, expected at most "
+                return Verdict(f"{why}{bound:.0e}", lasting=True)
+    except torch.OutOfMemoryError as problem:  # another time there may be room
+        return Verdict(str(problem), lasting=False)
     # a missing package, no driver, no compiler, a kernel that fails: all mean the same
     except Exception as problem:
-        failure = f"{type(problem).__name__}: {problem}"
-    if failure:
-        logger.warning("The reference computes %s of %s on %s: %s", name, dtype, device, failure)
-    return failure
+        return Verdict(f"{type(problem).__name__}: {problem}", lasting=True)
+    return Verdict(None, lasting=True)
 
 
 def differences(
