@@ -21,7 +21,8 @@ VARIANTS = {
     for method in range(3)
 }
 #: Runs a kernel, thread by thread, and says where the fields of a scene lie.
-RUN = """
+RUN = (
+    """
 extern "C" void run(void (*kernel)(const Scene), const Scene* s, int across, int down) {
   for (blockIdx.y = 0; blockIdx.y < down; blockIdx.y++)
     for (blockIdx.x = 0; blockIdx.x < across; blockIdx.x++)
@@ -29,7 +30,10 @@ extern "C" void run(void (*kernel)(const Scene), const Scene* s, int across, int
 }
 #define AT(name) (int)offsetof(Scene, name),
 extern "C" const int layout[] = {
-""" + "".join(f"AT({name[0]})\n" for name in Scene._fields_) + "(int)sizeof(Scene)};\n"
+"""
+    + "".join(f"AT({name[0]})\n" for name in Scene._fields_)
+    + "(int)sizeof(Scene)};\n"
+)
 
 
 def compiled(folder: Path) -> ctypes.CDLL:
@@ -101,5 +105,3 @@ def stand_in(monkeypatch, library: ctypes.CDLL, cache: Path) -> Driver:
     ):
         monkeypatch.setattr(module, name, value)
     return stub
-
-

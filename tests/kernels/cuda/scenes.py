@@ -17,7 +17,13 @@ SMALL = Grid.centred(size=(6, 4, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0,
 BODY = Grid.centred(size=(10, 8, 9), spacing=22.0)
 FLAT = Grid.centred(size=(6, 5, 1), spacing=(1.0, 1.2, 0.9), centre=tuple(GRID.centre.tolist()))
 #: A detector of more than a tile, and no multiple of one.
-LARGE = circular(2, 40.0, 70.0, {"pixels": [9, 37], "pixel_mm": [1.2, 0.4]}, start_degrees=13.0)
+LARGE = circular(
+    2,
+    40.0,
+    70.0,
+    {"pixels": [9, 37], "pixel_mm": [1.2, 0.4], "offset_mm": [0.13, 0.07]},
+    start_degrees=13.0,
+)
 #: A source in the volume, its detector so wide that voxels lie on both sides of the source.
 WIDE = circular(2, 40.0, 70.0, {"pixels": [6, 5], "pixel_mm": 25.0})
 WIDE = WIDE.moved(torch.eye(3), GRID.centre)
@@ -55,16 +61,3 @@ def difference(one: torch.Tensor, two: torch.Tensor) -> float:
     greatest = two.detach().abs().max()
     assert greatest > 0
     return float((one.double() - two.detach().double()).abs().max() / greatest)
-
-
-def rays_as_views(grid: Grid, cameras: Cameras) -> torch.Tensor:
-    """Every ray of a rig as a view of one pixel: maps of the constant alone."""
-    rows, columns = cameras.shape
-    v, u = torch.meshgrid(
-        torch.arange(rows) - (rows - 1) / 2,
-        torch.arange(columns) - (columns - 1) / 2,
-        indexing="ij",
-    )
-    p = torch.stack([u, v, torch.ones_like(u)], dim=-1).double().reshape(-1, 3)
-    maps = torch.einsum("mkxc,rc->mrkx", lines_of(cameras, grid), p)
-    return maps.flatten(0, 1)[..., None].contiguous()

@@ -1,42 +1,41 @@
 """The CUDA back end tries itself against the reference, once, before it is used."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
+from mvrecon.kernels.backends import kernels_for
 from mvrecon.kernels.rays import reference
-from mvrecon.kernels.rays.cuda import selfcheck
-from tests.kernels.cuda.scenes import DEVICE, METHODS, SIMULATED, kernels
+from mvrecon.kernels.rays.cuda import driver, nvrtc, selfcheck
+from mvrecon.kernels.rays.cuda import operators as cuda
+from tests.kernels.cuda.scenes import METHODS
 
 
-@kernels
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(("dtype", "volumes"), [(torch.float32, 1), (torch.float64, 3)])
-def test_a_right_back_end_checks_itself_and_stays(method, dtype, volumes):
-    selfcheck.forget()
-    assert selfcheck.reason(DEVICE, method, dtype, volumes) is None
+@pytest.mark.parametrize(
+    ("dtype", "volumes"),
+    [(torch.float32, 1), (torch.float64, 3), (torch.float16, 1), (torch.bfloat16, 3)],
+)
+def test_a_right_back_end_checks_itself_and_stays(method, dtype, volumes, host):
+    assert selfcheck.reason("cpu", method, dtype, volumes) is None
 
 
-@kernels
-def test_a_wrong_back_end_is_found_and_said_once(monkeypatch, caplog):
-    from mvrecon.kernels.rays.cuda import operators as cuda
-
-    selfcheck.forget()
+def test_a_wrong_back_end_is_found_and_said_once(host, monkeypatch, caplog):
     right = cuda.project
     monkeypatch.setattr(cuda, "project", lambda *arguments: right(*arguments) * 1.001)
     for _ in range(2):
-        assert "project differs" in str(selfcheck.reason(DEVICE, "siddon"))
+        assert "project differs" in str(selfcheck.reason("cpu", "siddon"))
     assert len(caplog.records) == 1
-    selfcheck.forget()
 
 
-@pytest.mark.skipif(SIMULATED or DEVICE == "cuda", reason="there is a device")
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
 def test_without_a_device_the_reason_is_recorded():
     selfcheck.forget()
     assert selfcheck.reason("cuda:0")
     selfcheck.forget()
 
 
-@pytest.mark.skipif(SIMULATED, reason="is about torch")
 def test_compiled_code_asks_while_it_is_traced():
     selfcheck.forget()
     missing = torch.device("cuda", 99)
@@ -86,33 +85,51 @@ def modes():
 
 
 @pytest.mark.parametrize("mode", modes())
-def test_the_check_does_not_see_the_modes_of_the_call(mode, monkeypatch):
-    """Matrix products and derivatives of the check are those of a fresh thread."""
-
-    def differences(*case):
-        x = torch.ones(2, 2, requires_grad=True)
-        product = (x @ x).sum()
-        (change,) = torch.autograd.grad(product, x)
-        assert product.dtype == torch.float32 and not torch.is_inference(change)
-        yield "a derivative", float((change - 4).abs().max())
-
-    monkeypatch.setattr(selfcheck, "differences", differences)
-    selfcheck.forget()
+def test_a_first_call_in_any_mode_uses_the_kernels(mode, host):
     reasons = []
     modes()[mode](lambda: reasons.append(selfcheck.reason("cpu")))
-    selfcheck.forget()
     assert reasons == [None]
 
 
-def test_a_full_memory_is_not_remembered(monkeypatch):
-    full = [True]
+REASONS = {
+    "no driver": (driver, "library", OSError("libcuda.so.1 cannot be loaded"), "libcuda.so.1"),
+    "no compiler": (nvrtc, "build", OSError("NVRTC cannot be loaded"), "NVRTC cannot be loaded"),
+    "an old compiler": (nvrtc, "capabilities", [100], "compute capability 10.0 and newer, got 9.0"),
+}
 
-    def differences(*case):
-        if full:
-            raise torch.OutOfMemoryError(f"no room, {full.pop()}")
-        yield "nothing", 0.0
 
-    monkeypatch.setattr(selfcheck, "differences", differences)
-    selfcheck.forget()
-    assert "no room" in str(selfcheck.reason("cpu")) and selfcheck.reason("cpu") is None
-    selfcheck.forget()
+@pytest.mark.parametrize("what", REASONS)
+def test_what_is_missing_is_the_reason(what, host, monkeypatch):
+    module, name, result, words = REASONS[what]
+
+    def fail(*_):
+        if isinstance(result, OSError):
+            raise result
+        return result
+
+    monkeypatch.setattr(module, name, fail)
+    assert words in str(selfcheck.reason("cpu"))
+    monkeypatch.undo()
+    assert words in str(selfcheck.reason("cpu"))  # it is remembered
+
+
+@pytest.mark.parametrize("call", ["cuModuleLoadData", "cuLaunchKernel"])
+def test_what_the_driver_refuses_is_the_reason(call, host):
+    host.failure[call] = 222
+    assert "CUDA's driver: a reason (error 222)" in str(selfcheck.reason("cpu"))
+
+
+def test_a_full_memory_is_not_remembered(host):
+    host.failure["cuLaunchKernel"] = driver.OUT_OF_MEMORY
+    assert "out of memory" in str(selfcheck.reason("cpu"))
+    host.failure.clear()
+    assert selfcheck.reason("cpu") is None
+
+
+def test_auto_falls_back_where_cuda_raises(host):
+    """The tensor says that it is on a GPU, of which there is none."""
+    x = SimpleNamespace(device=torch.device("cuda:0"), shape=(1, 1, 4, 4, 4), dtype=torch.float32)
+    host.failure["cuLaunchKernel"] = 222
+    assert kernels_for(x, "auto", "joseph") == ("reference", reference)
+    with pytest.raises(RuntimeError, match="backend 'cuda' cannot be used on cuda:0: "):
+        kernels_for(x, "cuda", "joseph")

@@ -71,9 +71,7 @@ def load(machine_code: bytes, device: torch.device) -> dict[str, c_void_p]:
     return functions
 
 
-def launch(
-    function: c_void_p, scene: Scene, across: int, down: int, device: torch.device
-) -> None:
+def launch(function: c_void_p, scene: Scene, across: int, down: int, device: torch.device) -> None:
     """Start a kernel on `across` x `down` blocks, on torch's current stream.
 
     Raises:

@@ -55,8 +55,7 @@ class Call:
         self.together = 1 if len(values) == 1 else TOGETHER
         variant, self.method = Variant(self.real, values.dtype, self.together, number), number
         self.kernels = kernels_of(variant, values.device)
-        self.groups, self.box = -(-len(values) // self.together), occupancy.box
-        self.stored = self.box.grown(1, occupancy.shape)
+        self.groups, box = -(-len(values) // self.together), occupancy.box
         maps = lines.detach().double().contiguous()
         self.flags = self.new(1 + len(lines), dtype=torch.int32, zero=True)
         self.tensors = [maps, self.flags]
@@ -65,8 +64,8 @@ class Call:
             flags=self.flags,
             window=(float(window[0]), float(window[1])),
             sizes=occupancy.shape[::-1],
-            corner=self.box.low[::-1],
-            part=self.box.shape[::-1],
+            corner=box.low[::-1],
+            part=box.shape[::-1],
             n_views=len(lines),
             rows=int(detector[0]),
             columns=int(detector[1]),
@@ -94,7 +93,10 @@ class Call:
 
     def read(self, volume: Tensor, occupied: Tensor | None) -> None:
         """Copy volumes [n d h w] of the part that there is to where rays read them."""
-        sizes = [size + 3 for size in self.stored.shape[::-1]]
+        scene = self.scene
+        ends = zip(scene.corner, scene.part, scene.sizes, strict=True)
+        # with a voxel more on either side, and a border of one before and two behind
+        sizes = [min(low + count + 1, n) - max(low - 1, 0) + 3 for low, count, n in ends]
         runs = max(
             -(-sizes[0] // RUN) * sizes[1] * sizes[2], sizes[0] * -(-sizes[1] // RUN) * sizes[2]
         )
@@ -143,18 +145,31 @@ def backproject(
     Raises:
         RuntimeError: torch is to use deterministic algorithms alone, and rays are given one by one.
     """
+    if lines.shape[3] == 1:
+        if torch.are_deterministic_algorithms_enabled():
+            raise RuntimeError(
+                "The adjoint of explicit rays adds up in no fixed order on a GPU, and "
+                "torch.use_deterministic_algorithms was called; it needs cameras, or backend "
+                "'reference'"
+            )
+        return scatter(views, lines, window, occupancy, method)
     y = wide(views).contiguous()
     call = Call(y, lines, window, occupancy, views.shape[2:], method)
-    explicit = lines.shape[3] == 1
-    if explicit and torch.are_deterministic_algorithms_enabled():
-        raise RuntimeError(
-            "The adjoint of explicit rays adds up in no fixed order on a GPU, and "
-            "torch.use_deterministic_algorithms was called; it needs cameras, or backend "
-            "'reference'"
-        )
-    volume = call.new(len(y), *occupancy.box.shape, zero=explicit or not len(lines))
+    volume = call.new(len(y), *occupancy.box.shape, zero=not len(lines))
     call.scene.put(views=y, results=volume)
-    call.over_rays("scatter") if explicit else _gather(call)
+    _gather(call)
+    return volume
+
+
+def scatter(
+    views: Tensor, lines: Tensor, window: Sequence[float], occupancy: Occupancy, method: str
+) -> Float[Tensor, "n d h w"]:
+    """`backproject` ray by ray, with atomic additions: of any rays."""
+    y = wide(views).contiguous()
+    call = Call(y, lines, window, occupancy, views.shape[2:], method)
+    volume = call.new(len(y), *occupancy.box.shape, zero=True)
+    call.scene.put(views=y, results=volume)
+    call.over_rays("scatter")
     return volume
 
 
