@@ -13,7 +13,7 @@ DEVICE void add(double* to, double value) { atomicAdd(to, value); }
 DEVICE void add_bits(int* to, int bits) { atomicOr(to, bits); }
 DEVICE void add_greatest(int* to, int value) { atomicMax(to, value); }
 // The sum over a warp, for its first thread.
-DEVICE double warp_sum(double value) {
+template <class R> DEVICE R warp_sum(R value) {
   for (int i = 16; i; i >>= 1) value += __shfl_down_sync(0xffffffffu, value, i);
   return value;
 }
@@ -36,7 +36,7 @@ template <class R> DEVICE void add(R* to, R value) { *to += value; }
 DEVICE void add_bits(int* to, int bits) { *to |= bits; }
 DEVICE void add_greatest(int* to, int value) { *to = max(*to, value); }
 // Threads run one after the other, so the sum over a warp is made by all of them.
-DEVICE double warp_sum(double value) { return value; }
+template <class R> DEVICE R warp_sum(R value) { return value; }
 DEVICE bool first_of_warp() { return true; }
 #endif
 

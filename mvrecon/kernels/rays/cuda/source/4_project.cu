@@ -90,19 +90,26 @@ template <class T, int NV> DEVICE void store_volumes(const Scene& s) {
   }
 }
 
-// The store that a ray reads, so that slab k, and (b, c) counted from the border, is at k along + b far + c.
+// The store that a ray reads: slab k, and (b, c) counted from the border, lies at k along + b far + c cells. In bytes,
+// since the product of two ints, added to an address, is one instruction.
 template <class T, int NV> struct Store {
-  const Many<T, NV>* from;
-  long long along, far;
+  typedef Many<T, NV> Cell;
+  enum { SIZE = sizeof(Cell) };
+  const char* from;
+  int along, far;
   DEVICE Store(const Scene& s, int axis, int group) {
     Layout l = layout_of(s);
     bool flat = axis == 2;
-    from = (const Many<T, NV>*)s.stores + ((long long)flat * ((s.n_volumes + NV - 1) / NV) + group) * l.cells;
-    along = flat ? l.size[0] * l.size[1] : axis == 0 ? l.size[2] : l.size[0] * l.size[2];
-    far = flat ? l.size[0] : axis == 0 ? l.size[0] * l.size[2] : l.size[2];
-    from -= (pick(l.low, axis) - 1) * along + pick(l.low, axis == 1 ? 0 : 1) * far + pick(l.low, flat ? 0 : 2);
+    along = SIZE * (int)(flat ? l.size[0] * l.size[1] : axis == 0 ? l.size[2] : l.size[0] * l.size[2]);
+    far = SIZE * (int)(flat ? l.size[0] : axis == 0 ? l.size[0] * l.size[2] : l.size[2]);
+    from = (const char*)s.stores + SIZE * ((long long)flat * ((s.n_volumes + NV - 1) / NV) + group) * l.cells;
+    from -= (long long)(pick(l.low, axis) - 1) * along + (long long)pick(l.low, axis == 1 ? 0 : 1) * far + SIZE * pick(l.low, flat ? 0 : 2);
   }
-  DEVICE const Many<T, NV>* at(int k, int b, int c) const { return from + (k * along + b * far + c); }
+  DEVICE const Cell* at(int k, int b, int c) const {
+    return (const Cell*)(from + (long long)k * along + (long long)b * far + (long long)c * SIZE);
+  }
+  DEVICE const Cell* farther(const Cell* p) const { return (const Cell*)((const char*)p + far); }
+  DEVICE const Cell* next_slab(const Cell* p) const { return (const Cell*)((const char*)p + along); }
 };
 
 template <class R, class T, int NV> struct Sum {
@@ -114,7 +121,8 @@ template <class R, class T, int NV> struct Sum {
     UNROLL for (int n = 0; n < NV; n++) total[n] = 0;
   }
   DEVICE void plane(const Many<T, NV>* p, R share, R y, R z) {
-    Many<T, NV> low = p[0], high = p[1], low2 = p[store.far], high2 = p[store.far + 1];
+    const Many<T, NV>* q = store.farther(p);
+    Many<T, NV> low = p[0], high = p[1], low2 = q[0], high2 = q[1];
     UNROLL for (int n = 0; n < NV; n++) {
       R one = number(low.n[n]), two = number(low2.n[n]);
       R lower = one + z * (number(high.n[n]) - one), upper = two + z * (number(high2.n[n]) - two);
@@ -129,7 +137,7 @@ template <class R, class T, int NV> struct Sum {
     int ib = (int)b, ic = (int)c;
     const Many<T, NV>* p = store.at(slab, ib, ic);
     plane(p, step * (1 - x), b - (R)ib, c - (R)ic);
-    plane(p + store.along, step * x, b - (R)ib, c - (R)ic);
+    plane(store.next_slab(p), step * x, b - (R)ib, c - (R)ic);
   }
   DEVICE void passage(int k, R, const Passage<R>& p) {
     Many<T, NV> first = *store.at(k, p.b0, p.c0), last = *store.at(k, p.b1, p.c1);
