@@ -1,9 +1,9 @@
 """Compiling CUDA C++ by the NVRTC that comes with torch, through ctypes."""
 
 import ctypes
+import sys
 from ctypes import byref, c_char_p, c_int, c_size_t, c_void_p
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ def library() -> Any:
     Raises:
         OSError: there is none.
     """
-    paths = [path for root in _roots() for path in root.rglob("libnvrtc.so.*")]
+    paths = [path for root in roots() for path in root.rglob("libnvrtc.so.*")]
     wanted = (torch.version.cuda or "").partition(".")[0]
     # two may be installed: the one that torch was built for
     paths.sort(key=lambda path: (path.suffix[1:] == wanted, path.suffix), reverse=True)
@@ -36,10 +36,9 @@ def library() -> Any:
     raise OSError(f"NVRTC, CUDA's compiler, cannot be loaded: {problem}")
 
 
-def _roots() -> list[Path]:
-    spec = find_spec("nvidia")
-    folders = spec.submodule_search_locations if spec else None
-    return [Path(folder) for folder in folders or ()]
+def roots() -> list[Path]:
+    """Where NVIDIA's wheels are."""
+    return [folder for path in sys.path if (folder := Path(path) / "nvidia").is_dir()]
 
 
 def version() -> str:
