@@ -1,9 +1,6 @@
-"""The scripts for measuring on a GPU: they import, say what they need, and their prototype is
-right.
-"""
+"""The scripts for measuring on a GPU: they import, and say what they need."""
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +15,6 @@ RUN = {
     "check": ["--out", "OUT"],
     "models": ["--out", "OUT"],
     "operators": ["--out", "OUT"],
-    "prototype": ["--out", "OUT"],
     "learn": ["--out", "OUT", "--train", "a.h5", "--test", "b.h5"],
 }
 #: Where there is a GPU, or a build of torch for one, scripts would measure.
@@ -90,10 +86,3 @@ def test_a_script_without_a_gpu_says_so(name: str, ends: Ends):
 def test_waits_are_counted_by_a_build_with_cuda_alone(ends: Ends):
     message = str(ends.codes["waits"])
     assert "waits.py needs a build of torch with CUDA, got torch" in message
-
-
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
-def test_the_prototype_is_the_reference(run_python):
-    done = run_python("scripts/gpu/prototype.py", "--check")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "greatest relative error" in done.stdout

@@ -36,7 +36,6 @@ def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tupl
     if backend == "reference" or not COMPILED:
         return "reference", reference
     if device == "cuda":
-        # it brings torch's compiler, which takes longer than torch
         from mvrecon.kernels.rays.cuda import selfcheck
 
         volumes = tensor.shape[0] * tensor.shape[1]

@@ -24,12 +24,8 @@ OPTIONS: dict[str, Any] = {"fastmath": FASTMATH, "error_model": "numpy", "_nrt":
 
 
 def scalar(function: Callable[..., Any]) -> Any:
-    """A function of scalars, compiled into whatever calls it, on the CPU and on CUDA devices."""
-    dispatcher: Any = njit(forceinline=True, **OPTIONS)(function)
-    # read by numba-cuda alone: it would take some flags of fast mathematics for all, reciprocals
-    # for divisions too
-    dispatcher.targetoptions = {"forceinline": True}
-    return dispatcher
+    """A function of scalars, compiled into whatever calls it."""
+    return njit(forceinline=True, **OPTIONS)(function)
 
 
 def ordered(function: Callable[..., Any]) -> Any:

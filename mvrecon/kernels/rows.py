@@ -3,7 +3,7 @@ driven by voxels.
 
 Numerators and denominators of a row's places are affine in the position i along it, so that the
 part of the row inside the source's box is an interval, cut out by linear inequalities, and no later
-loop tests a bound. Scalar, without a CPU's own, so that a GPU back end can compile the same source.
+loop tests a bound.
 """
 
 from math import ceil, floor

@@ -24,7 +24,7 @@ from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.integrals import METHODS
 from mvrecon.projectors.ray_transform import RayTransform
 
-PACKAGES = ("torch", "triton", "numpy", "numba", "numba-cuda", "llvmlite", "lightning", "kornia")
+PACKAGES = ("torch", "triton", "numpy", "numba", "llvmlite", "lightning", "kornia")
 SKIPS = ("off", "auto", "box")
 VECTORS = ("source", "origin", "u", "v")
 #: The self-check's verdict is kept for good: a first call in one of these modes must not spoil it.
@@ -78,7 +78,7 @@ def self_checks(results: Results) -> None:
     from mvrecon.kernels.rays.cuda import selfcheck
 
     for method in METHODS:
-        for dtype in (torch.float32, torch.float64):
+        for dtype in (torch.float32, torch.float64, torch.bfloat16):
             for volumes in (1, 5):
                 what = f"self-check {method} {dtype} {volumes}"
                 start = time.perf_counter()

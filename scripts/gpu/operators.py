@@ -36,7 +36,7 @@ def case_of(text: str) -> tuple[mv.Grid, mv.Cameras]:
 
 def suits(name: str, volumes: int, pixels: int) -> bool:
     """Whether a program is made for so many volumes and pixels."""
-    if name == "prototype NV=4" and volumes == 1 or name in ONE_VOLUME and volumes > 1:
+    if name in ONE_VOLUME and volumes > 1:
         return False
     return pixels <= MOST_PIXELS.get(name, pixels)
 

@@ -1,4 +1,4 @@
-"""Operators to time: ours, the prototype, and other programs' (nanodrr, DiffDRR, flashdrr, ASTRA)
+"""Operators to time: ours, and other programs' (nanodrr, DiffDRR, flashdrr, ASTRA)
 where they are installed.
 
 Volumes are [n d h w], views [n m v u]. A program that lacks a direction has None in its place.
@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from kernels import Gpu, Host
-from prototype import Joseph
 from torch import Tensor
 
 import mvrecon as mv
@@ -56,12 +54,6 @@ def scattered(grid: mv.Grid, rig: mv.Cameras, device: str) -> Program:
 
     A, whole = mv.Drr(grid, rig).to(device), Occupancy.whole(grid.shape)
     return Program(None, lambda y: cuda.scatter(y, A.fixed_lines, A.ray_extent, whole, "joseph"))
-
-
-def prototype(grid: mv.Grid, rig: mv.Cameras, device: str, nv: int) -> Program:
-    """The kernels of `joseph.cu`."""
-    J = Joseph(mv.Drr(grid, rig), Gpu(nv) if device == "cuda" else Host(nv))
-    return Program(J.forward, J.adjoint)
 
 
 def diffdrr(grid: mv.Grid, rig: mv.Cameras, device: str, method: str) -> Program:
@@ -202,8 +194,6 @@ PROGRAMS: dict[str, Callable[[mv.Grid, mv.Cameras, str], Program]] = {
     "mvrecon joseph skip=off": lambda g, r, d: ours(g, r, d, skip="off"),
     "mvrecon joseph scatter": scattered,
     "mvrecon siddon skip=off": lambda g, r, d: ours(g, r, d, method="siddon", skip="off"),
-    "prototype NV=1": lambda g, r, d: prototype(g, r, d, 1),
-    "prototype NV=4": lambda g, r, d: prototype(g, r, d, 4),
     "nanodrr": nanodrr,
     "nanodrr n samples": lambda g, r, d: nanodrr(g, r, d, max(g.shape)),
     "flashdrr": flashdrr,

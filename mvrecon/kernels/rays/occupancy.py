@@ -79,8 +79,8 @@ class Occupancy:
 
     @classmethod
     def decoded(cls, code: Tensor) -> "Occupancy":
-        """The inverse of `encoded`."""
-        return cls._of(code.numpy())
+        """The inverse of `encoded`; a code on a GPU is waited for."""
+        return cls._of(code.cpu().numpy())
 
     @classmethod
     def unwrapped(cls, code: Tensor) -> "Occupancy":

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, placed
+from mvrecon.geometry.box import placed
 from mvrecon.kernels.derivatives import bent, curved, linear, transposed
 from mvrecon.kernels.mapping import joined
 from mvrecon.kernels.rays import reference
@@ -52,8 +52,7 @@ def _backproject(
     """The exact transpose of `project`: views [n m v u] to volumes [n d h w]."""
     from mvrecon.kernels.rays.cpu import operators as cpu
 
-    occupancy = Occupancy.whole(shape) if support is None else Occupancy.decoded(support)
-    return cpu.backproject(views, lines, window, occupancy, method)
+    return cpu.backproject(views, lines, window, _part(shape, support), method)
 
 
 @torch.library.custom_op("mvrecon::lines_vjp", mutates_args=(), device_types="cpu")
@@ -82,7 +81,9 @@ def occupied(
     method: str,
     skip: str,
 ) -> Tensor:
-    """Where volumes [n d h w] are not zero, in code; see `skip_policy.occupancy_of`."""
+    """Where volumes [n d h w] are not zero, in code, on their device; see
+    `skip_policy.occupancy_of`. A GPU finds the box alone, and nobody waits for it.
+    """
     from mvrecon.kernels.rays.cpu.plan import Scene
     from mvrecon.kernels.rays.cpu.skip_policy import occupancy_of
 
@@ -91,49 +92,52 @@ def occupied(
 
 @occupied.register_kernel("cuda")
 def _(volume, lines, window, detector, method, skip):
-    box = Box.around((volume != 0).any(dim=0))
-    return Occupancy(Box.whole(volume.shape[1:]).high, box).encoded()
+    from mvrecon.kernels.rays.cuda import operators as cuda
+
+    return cuda.occupied_code(volume)
 
 
 @occupied.register_fake
 def _(volume, lines, window, detector, method, skip):
-    return torch.empty(code_size(volume.shape[1:]), dtype=torch.int32)
+    return volume.new_empty(code_size(volume.shape[1:]), dtype=torch.int32)
 
 
 def _read(
     volume: Tensor, support: Tensor | None, occupied: Tensor | None
 ) -> tuple[Tensor, Occupancy]:
     """What is to be read of volumes, and where it lies in the whole."""
-    if support is not None:
-        return volume, Occupancy.decoded(support)
-    if occupied is None:
-        return volume, Occupancy.whole(volume.shape[1:])
+    if support is not None or occupied is None:
+        return volume, _part(volume.shape[1:], support)
     occupancy = Occupancy.decoded(occupied)
     return volume[:, *occupancy.box.slices], occupancy
+
+
+def _part(shape: Sequence[int], support: Tensor | None) -> Occupancy:
+    """Where volumes of a shape lie in the whole."""
+    return Occupancy.whole(shape) if support is None else Occupancy.decoded(support)
 
 
 @_project.register_kernel("cuda")
 def _(volume, lines, window, detector, method, support=None, occupied=None):
     from mvrecon.kernels.rays.cuda import operators as cuda
 
-    part, occupancy = _read(volume, support, occupied)
-    return cuda.project(part, lines, window, occupancy, detector, method)
+    part = _part(volume.shape[1:], support)
+    return cuda.project(volume, lines, window, part, detector, method, occupied)
 
 
 @_backproject.register_kernel("cuda")
 def _(views, lines, window, shape, method, support=None):
     from mvrecon.kernels.rays.cuda import operators as cuda
 
-    occupancy = Occupancy.whole(shape) if support is None else Occupancy.decoded(support)
-    return cuda.backproject(views, lines, window, occupancy, method)
+    return cuda.backproject(views, lines, window, _part(shape, support), method)
 
 
 @_lines_vjp.register_kernel("cuda")
 def _(volume, views, lines, window, method, support=None, occupied=None):
     from mvrecon.kernels.rays.cuda import operators as cuda
 
-    part, occupancy = _read(volume, support, occupied)
-    return cuda.lines_vjp(part, views, lines, window, occupancy, method)
+    part = _part(volume.shape[1:], support)
+    return cuda.lines_vjp(volume, views, lines, window, part, method, occupied)
 
 
 @_project.register_fake

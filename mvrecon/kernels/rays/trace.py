@@ -1,9 +1,9 @@
-"""Where one ray runs through the volume, for every compiled kernel.
+"""Where one ray runs through the volume, for every kernel of the CPU; `cuda/source/2_trace.cu` says
+the same in C++.
 
 A ray is first clipped to the slabs in which it can touch the volume, so that no later loop tests a
 bound. Slabs are counted along its main axis; of the two other axes the `near` one is contiguous in
-memory, the `far` one is not. Everything is scalar and knows no CPU, so that a GPU back end can
-compile the same source.
+memory, the `far` one is not.
 """
 
 from collections import namedtuple

@@ -1,91 +1,79 @@
-"""Every kernel of the CUDA back end is compiled for a device with none at hand: numba-cuda needs no
-driver for it.
+"""The kernels compiled by NVRTC, with no GPU at hand: where NVRTC is installed, as with torch for
+CUDA, or by `pip install nvidia-cuda-nvrtc`.
 """
 
-from types import SimpleNamespace
+import re
 
-import numpy as np
 import pytest
+import torch
 
-pytest.importorskip("numba")
-from numba import cuda, float32, float64, int32, int64, typeof, types  # noqa: E402
-
-from mvrecon.kernels.rays.cuda import loops  # noqa: E402
-from mvrecon.kernels.rays.cuda import operators as back_end  # noqa: E402
-from mvrecon.kernels.rays.occupancy import Occupancy  # noqa: E402
-from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR  # noqa: E402
-
-SCENE = typeof(back_end.scene_of((0.0, 1.0), Occupancy.whole((8, 8, 8)), (16, 16), "trilinear:9"))
-LINES = float64[:, :, :, ::1]
-HOPPER = (9, 0)
-METHODS = (JOSEPH, SIDDON, TRILINEAR)
+from mvrecon.kernels.rays.cuda import nvrtc
+from mvrecon.kernels.rays.cuda.sources import KERNELS, Variant, text_of
+from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR
 
 
-def compilable() -> bool:
-    if (
-        getattr(cuda, "implementation", "") != "NVIDIA"
-    ):  # numba's own CUDA target knows no min and max of two numbers
-        return False
+def installed() -> bool:
     try:
-        cuda.compile_ptx(lambda x: None, types.void(float32), cc=HOPPER, device=False)
-    except Exception:  # no compiler, or the simulator
+        nvrtc.library()
+    except OSError:
         return False
     return True
 
 
-pytestmark = pytest.mark.skipif(
-    not compilable(), reason="needs numba-cuda with its compiler, pip install numba-cuda[cu13]"
-)
+pytestmark = pytest.mark.skipif(not installed(), reason="no NVRTC, pip install nvidia-cuda-nvrtc")
+VARIANTS = [
+    Variant(torch.float32, stored, together, method)
+    for method in (JOSEPH, SIDDON, TRILINEAR)
+    for stored, together in ((torch.float32, 1), (torch.bfloat16, 4))
+]
 
 
-@pytest.fixture(autouse=True)
-def device(monkeypatch):
-    """Functions that a kernel calls are compiled for the device at hand: say which it would be."""
-    described = SimpleNamespace(compute_capability=HOPPER)
-    monkeypatch.setattr("numba.cuda.dispatcher.get_current_device", lambda: described)
+def kernels(variant: Variant, architecture: str) -> dict[str, str]:
+    """PTX by kernel."""
+    text = nvrtc.build(text_of({"": variant}), architecture).decode()
+    parts = re.split(r"\.entry (\w+)", text)[1:]
+    return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
-def assembly(kernel, *arguments) -> str:
-    return cuda.compile_ptx(kernel.py_func, types.void(*arguments), cc=HOPPER, device=False)[0]
+def loops(ptx: str) -> list[str]:
+    """The innermost loops: from a label to the first branch back to it, no other such label
+    between.
+    """
+    lines, labels, found = ptx.splitlines(), {}, []
+    for i, line in enumerate(lines):
+        if label := re.match(r"(\$L\w+):", line):
+            labels[label[1]] = i
+        jump = re.search(r"bra(?:\.uni)?\s+(\$L\w+);", line)
+        if jump and jump[1] in labels:
+            found.append((labels[jump[1]], i))
+    inner = [(a, b) for a, b in found if not any(a < c and d < b for c, d in found)]
+    return ["\n".join(lines[a : b + 1]) for a, b in inner]
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_project_keeps_all_in_registers(method):
-    kernel = loops.project_kernel(method, 4, np.uint32)
-    text = assembly(kernel, float32[::1], LINES, SCENE, float32[:, :, :, ::1])
-    assert "ld.local" not in text and "call" not in text
-    assert (
-        "div.rn.f64" in text and "rcp" not in text
-    )  # a ray on a face stays on it: no division becomes a product
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+def test_steps_are_in_registers_and_single_precision(variant):
+    """For Hopper and Ampere: nothing in local memory, no float64 and no call in a loop of steps;
+    atomic additions for explicit rays alone.
+    """
+    ptx = kernels(variant, "compute_80")
+    assert ptx.keys() == set(KERNELS)
+    assert not any("ld.local" in text or "st.local" in text for text in ptx.values())
+    for name in ("project", "gather", "scatter", "vary"):
+        steps = loops(ptx[name])
+        assert steps, name
+        # of the derivative the loop over pixels, too, has no other inside
+        if name != "vary":
+            assert not [step for step in steps if ".f64" in step or "call" in step], name
+    assert [
+        n
+        for n in ("project", "gather", "vary", "store")
+        if ".add.f32" in ptx[n] and "atom" in ptx[n]
+    ] == []
+    assert "atom.global.add.f32" in ptx["scatter"] or "red.global.add.f32" in ptx["scatter"]
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_scatter_adds_atomically(method):
-    kernel = loops.scatter_kernel(method, 1, np.uint64)
-    text = assembly(kernel, float32[:, :, :, ::1], LINES, SCENE, float32[::1])
-    assert (
-        "atom.global.add.f32" in text or "red.global.add.f32" in text
-    ) and "ld.local" not in text
-
-
-def test_gather_needs_no_atomics():
-    arguments = (
-        float32[:, ::1],
-        float32[:, ::1],
-        float32[:, :, ::1],
-        int32[:, ::1],
-        SCENE,
-        int64,
-        float32[:, :, :, ::1],
-    )
-    text = assembly(loops.gather_kernel(4), *arguments)
-    assert "atom." not in text and "red." not in text and "ld.local" not in text
-    assert assembly(loops.record_kernel(), LINES, SCENE, int64, *arguments[1:4])
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_vary_compiles(method):
-    kernel = loops.vary_kernel(method)
-    assert assembly(
-        kernel, float32[::1], float32[:, :, :, ::1], LINES, SCENE, float64[:, :, :, :, ::1]
-    )
+def test_machine_code_for_hopper_and_a_mistake():
+    variant = VARIANTS[0]
+    assert nvrtc.build(text_of({"": variant}), "sm_90")[:4] == b"\x7fELF"
+    with pytest.raises(nvrtc.CompileError, match="error"):
+        nvrtc.build("an error", "compute_90")

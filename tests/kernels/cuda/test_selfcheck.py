@@ -1,44 +1,43 @@
 """The CUDA back end tries itself against the reference, once, before it is used."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
+from mvrecon.kernels.backends import kernels_for
 from mvrecon.kernels.rays import reference
-from mvrecon.kernels.rays.cuda import selfcheck
-from tests.kernels.cuda.scenes import DEVICE, METHODS, SIMULATED, kernels
+from mvrecon.kernels.rays.cuda import driver, nvrtc, selfcheck
+from mvrecon.kernels.rays.cuda import operators as cuda
+from tests.kernels.cuda.scenes import METHODS
 
 
-@kernels
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(("dtype", "volumes"), [(torch.float32, 1), (torch.float64, 3)])
-def test_a_right_back_end_checks_itself_and_stays(method, dtype, volumes):
-    selfcheck._reason.cache_clear()
-    assert selfcheck.reason(DEVICE, method, dtype, volumes) is None
+@pytest.mark.parametrize(
+    ("dtype", "volumes"),
+    [(torch.float32, 1), (torch.float64, 3), (torch.float16, 1), (torch.bfloat16, 3)],
+)
+def test_a_right_back_end_checks_itself_and_stays(method, dtype, volumes, host):
+    assert selfcheck.reason("cpu", method, dtype, volumes) is None
 
 
-@kernels
-def test_a_wrong_back_end_is_found_and_said_once(monkeypatch, caplog):
-    from mvrecon.kernels.rays.cuda import operators as cuda
-
-    selfcheck._reason.cache_clear()
+def test_a_wrong_back_end_is_found_and_said_once(host, monkeypatch, caplog):
     right = cuda.project
     monkeypatch.setattr(cuda, "project", lambda *arguments: right(*arguments) * 1.001)
     for _ in range(2):
-        assert "project differs" in str(selfcheck.reason(DEVICE, "siddon"))
+        assert "project differs" in str(selfcheck.reason("cpu", "siddon"))
     assert len(caplog.records) == 1
-    selfcheck._reason.cache_clear()
 
 
-@pytest.mark.skipif(SIMULATED or DEVICE == "cuda", reason="there is a device")
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
 def test_without_a_device_the_reason_is_recorded():
-    selfcheck._reason.cache_clear()
+    selfcheck.forget()
     assert selfcheck.reason("cuda:0")
-    selfcheck._reason.cache_clear()
+    selfcheck.forget()
 
 
-@pytest.mark.skipif(SIMULATED, reason="is about torch")
 def test_compiled_code_asks_while_it_is_traced():
-    selfcheck._reason.cache_clear()
+    selfcheck.forget()
     missing = torch.device("cuda", 99)
 
     @torch.compile(backend="eager", fullgraph=True)
@@ -46,7 +45,7 @@ def test_compiled_code_asks_while_it_is_traced():
         return x + 1 if selfcheck.reason(missing, "joseph", x.dtype, len(x)) else x
 
     assert choose(torch.zeros(1)) == 1
-    selfcheck._reason.cache_clear()
+    selfcheck.forget()
 
 
 def test_the_scene_of_the_check_has_rays_of_every_main_axis():
@@ -57,3 +56,80 @@ def test_the_scene_of_the_check_has_rays_of_every_main_axis():
         torch.ones(1, *shape, dtype=torch.float64), lines, window, detector, "siddon"
     )
     assert ((views > 0).sum(dim=(2, 3)) > 10).all()
+
+
+def modes():
+    """What a process's first call may be inside of."""
+
+    def mapped(ask):
+        torch.func.vmap(lambda x: ask() or x)(torch.zeros(2, 1))
+
+    def derived(ask):
+        torch.func.grad(lambda x: ask() or x.sum())(torch.zeros(2))
+
+    def within(mode):
+        def run(ask):
+            with mode:
+                ask()
+
+        return run
+
+    autocast = torch.autocast("cpu", torch.bfloat16)
+    return {
+        "vmap": mapped,
+        "grad": derived,
+        "inference_mode": within(torch.inference_mode()),
+        "no_grad": within(torch.no_grad()),
+        "autocast": within(autocast),
+    }
+
+
+@pytest.mark.parametrize("mode", modes())
+def test_a_first_call_in_any_mode_uses_the_kernels(mode, host):
+    reasons = []
+    modes()[mode](lambda: reasons.append(selfcheck.reason("cpu")))
+    assert reasons == [None]
+
+
+REASONS = {
+    "no driver": (driver, "library", OSError("libcuda.so.1 cannot be loaded"), "libcuda.so.1"),
+    "no compiler": (nvrtc, "build", OSError("NVRTC cannot be loaded"), "NVRTC cannot be loaded"),
+    "an old compiler": (nvrtc, "capabilities", [100], "compute capability 10.0 and newer, got 9.0"),
+}
+
+
+@pytest.mark.parametrize("what", REASONS)
+def test_what_is_missing_is_the_reason(what, host, monkeypatch):
+    module, name, result, words = REASONS[what]
+
+    def fail(*_):
+        if isinstance(result, OSError):
+            raise result
+        return result
+
+    monkeypatch.setattr(module, name, fail)
+    assert words in str(selfcheck.reason("cpu"))
+    monkeypatch.undo()
+    assert words in str(selfcheck.reason("cpu"))  # it is remembered
+
+
+@pytest.mark.parametrize("call", ["cuModuleLoadData", "cuLaunchKernel"])
+def test_what_the_driver_refuses_is_the_reason(call, host):
+    host.failure[call] = 222
+    assert "CUDA's driver: a reason (error 222)" in str(selfcheck.reason("cpu"))
+
+
+def test_a_full_memory_is_not_remembered(host):
+    host.failure["cuLaunchKernel"] = driver.OUT_OF_MEMORY
+    assert "out of memory" in str(selfcheck.reason("cpu"))
+    host.failure.clear()
+    assert selfcheck.reason("cpu") is None
+
+
+def test_auto_falls_back_where_cuda_raises(host):
+    """The tensor says that it is on a GPU, of which there is none."""
+    x = SimpleNamespace(device=torch.device("cuda:0"), shape=(1, 1, 4, 4, 4), dtype=torch.float32)
+    host.failure["cuLaunchKernel"] = 222
+    assert kernels_for(x, "auto", "joseph") == ("reference", reference)
+    with pytest.raises(RuntimeError, match="backend 'cuda' cannot be used on cuda:0: "):
+        kernels_for(x, "cuda", "joseph")

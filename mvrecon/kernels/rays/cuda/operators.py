@@ -1,39 +1,112 @@
 """The compiled operators of CUDA devices: the same three as those of the CPU, on torch's current
-stream.
+stream, without a wait.
 
-Forward and derivative by the geometry are the same to the last bit in every run. So is the adjoint
-where it gathers, voxel by voxel, see `gather.py`; where it scatters, ray by ray, the order of
-additions, and so the last digits, vary; under `torch.use_deterministic_algorithms` it never does.
+Everything is the same to the last bit in every run: the adjoint goes voxel by voxel. Rays given one
+by one alone spread with atomic additions, in no fixed order.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Sequence
 
-import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
-from numba import cuda
 from torch import Tensor
 
-from mvrecon.kernels.padding import INNER, PAD, padded_shape
 from mvrecon.kernels.precision import wide
-from mvrecon.kernels.rays.cuda import loops
-from mvrecon.kernels.rays.cuda.loops import BLOCK, GROUP, TILE, Scene
-from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.kernels.rays.cuda import driver
+from mvrecon.kernels.rays.cuda.kernels import kernels_of
+from mvrecon.kernels.rays.cuda.scene import Scene
+from mvrecon.kernels.rays.cuda.sources import BLOCK, NAMES, QUADS, RUN, TOGETHER, WARP, Variant
+from mvrecon.kernels.rays.occupancy import Occupancy, code_size
 from mvrecon.kernels.rays.trace import numbered
 
-#: Pixels per voxel, by area, up to which a voxel asks all pixels of its picture.
-GATHER = 4.0
-#: Pixels whose rays are kept at a time for the gather, and threads of a derivative: 32 and 36 MB in
-#: single precision.
-RAYS, THREADS = 2**20, 2**17
-#: Voxels from which on a volume needs indices of 64 bits.
-WIDE = 2**32
-#: Stands for infinity: the compiler may take it that there is none.
-FAR = 1e200
+#: The part of a device's memory that the rays of an adjoint may take.
+SHARE = 1 / 16
+#: Threads of a pose gradient, so that a small view is split over blocks.
+THREADS = 2**18
+#: Detector rows and columns that a block takes.
+TILE = (WARP, BLOCK // WARP)
+
+
+class Call:
+    """One call of an operator: its kernels, what they know of the scene, and tensors they use.
+
+    Args:
+        values: volumes [n d h w] or views [n m v u], in a type that the kernels read.
+        lines: of the rays.
+        window: the part of a ray that counts.
+        occupancy: the part of the volume that there is.
+        detector: pixels (rows, columns).
+        method: of the rays.
+    """
+
+    def __init__(
+        self,
+        values: Tensor,
+        lines: Float[Tensor, "m 4 3 k"],
+        window: Sequence[float],
+        occupancy: Occupancy,
+        detector: Sequence[int],
+        method: str,
+    ):
+        number, samples = numbered(method)
+        self.device = values.device
+        self.real = torch.promote_types(values.dtype, torch.float32)
+        self.together = 1 if len(values) == 1 else TOGETHER
+        variant, self.method = Variant(self.real, values.dtype, self.together, number), number
+        self.kernels = kernels_of(variant, values.device)
+        self.groups, box = -(-len(values) // self.together), occupancy.box
+        maps = lines.detach().double().contiguous()
+        self.flags = self.new(1 + len(lines), dtype=torch.int32, zero=True)
+        self.tensors = [maps, self.flags]
+        self.scene = Scene().put(
+            lines=maps,
+            flags=self.flags,
+            window=(float(window[0]), float(window[1])),
+            sizes=occupancy.shape[::-1],
+            corner=box.low[::-1],
+            part=box.shape[::-1],
+            n_views=len(lines),
+            rows=int(detector[0]),
+            columns=int(detector[1]),
+            maps=lines.shape[3],
+            n_volumes=len(values),
+            samples=samples,
+        )
+
+    def new(self, *shape: int, dtype: torch.dtype | None = None, zero: bool = False) -> Tensor:
+        """A tensor on the device, in the type of arithmetic."""
+        make = torch.zeros if zero else torch.empty
+        return make(*shape, dtype=dtype or self.real, device=self.device)
+
+    def start(self, name: str, threads: int, down: int = 1) -> None:
+        """Launch a kernel with so many threads, and blocks downwards."""
+        driver.launch(self.kernels[name], self.scene, -(-threads // BLOCK), down, self.device)
+
+    def over_rays(self, name: str) -> None:
+        """Launch a kernel with a thread a ray, tile by tile, as `pixel_of` counts them."""
+        scene, (high, across) = self.scene, TILE
+        if scene.rows < high or scene.columns < across:
+            high = across = 1
+        tiles = -(-scene.rows // high) * -(-scene.columns // across)
+        self.start(name, scene.n_views * tiles * high * across, self.groups)
+
+    def read(self, volume: Tensor, occupied: Tensor | None) -> None:
+        """Copy volumes [n d h w] of the part that there is to where rays read them."""
+        scene = self.scene
+        ends = zip(scene.corner, scene.part, scene.sizes, strict=True)
+        # with a voxel more on either side, and a border of one before and two behind
+        sizes = [min(low + count + 1, n) - max(low - 1, 0) + 3 for low, count, n in ends]
+        runs = max(
+            -(-sizes[0] // RUN) * sizes[1] * sizes[2], sizes[0] * -(-sizes[1] // RUN) * sizes[2]
+        )
+        cells = math.prod(sizes) * self.together * self.groups
+        stores = self.new(2, cells, dtype=volume.dtype)
+        box = None if occupied is None else occupied[3:9]
+        self.tensors += [volume, stores, *([] if box is None else [box])]
+        self.scene.put(volumes=volume, stores=stores, occupied=box)
+        self.start("survey", self.scene.n_views)
+        self.start("store", runs, 2 * self.groups)
 
 
 def project(
@@ -43,22 +116,20 @@ def project(
     occupancy: Occupancy,
     detector: Sequence[int],
     method: str,
+    occupied: Tensor | None = None,
 ) -> Float[Tensor, "n m v u"]:
-    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is the
-    occupied box.
+    """Line integrals of volumes, in mm times their unit; see `reference.project`.
+
+    Args:
+        volume: the part that `occupancy` says there is; half volumes are read as they are.
+        occupied: the code of an occupancy on the device, outside of whose box volumes are zero.
     """
-    x = wide(volume)
-    scene = scene_of(window, occupancy, detector, method)
-    views = x.new_empty(len(x), len(lines), *detector)
-    kernel = loops.project_kernel(numbered(method)[0], *_shares(len(x), scene))
-    launch(
-        kernel,
-        (_blocks(scene, len(lines)), _groups(len(x))),
-        padded(x, occupancy),
-        maps(lines),
-        scene,
-        views,
-    )
+    x = stored(volume)
+    call = Call(x, lines, window, occupancy, detector, method)
+    views = call.new(len(x), len(lines), *detector)
+    call.read(x, occupied)
+    call.scene.put(views=views)
+    call.over_rays("project")
     return views
 
 
@@ -69,67 +140,57 @@ def backproject(
     occupancy: Occupancy,
     method: str,
 ) -> Float[Tensor, "n d h w"]:
-    """The exact transpose of `project`."""
-    if gathers(occupancy.shape, views.shape[2:], lines.shape[3], method):
-        return gather(views, lines, window, occupancy, method)
-    return scatter(views, lines, window, occupancy, method)
-
-
-def gathers(shape: Sequence[int], detector: Sequence[int], columns: int, method: str) -> bool:
-    """Whether the adjoint goes by voxels: for Joseph's method, where few pixels lie on the picture
-    of a voxel.
-
-    The detector is taken to show the whole volume: to know better would mean to wait for the
-    device.
+    """The exact transpose of `project`.
 
     Raises:
-        RuntimeError: torch is to use deterministic algorithms alone, and there is none.
+        RuntimeError: torch is to use deterministic algorithms alone, and rays are given one by one.
     """
-    possible = method == "joseph" and columns == 3
-    if not torch.are_deterministic_algorithms_enabled():
-        return possible and math.prod(detector) <= GATHER * math.prod(shape) ** (2 / 3)
-    if not possible:
-        what = f"method {method!r}" if columns == 3 else "explicit rays"
-        raise RuntimeError(
-            f"The adjoint of {what} adds up in no fixed order on a GPU, and "
-            f"torch.use_deterministic_algorithms was "
-            "called; it needs a camera's rays by method 'joseph', or backend 'reference'"
-        )
-    return True
-
-
-def gather(
-    views: Tensor, lines: Tensor, window: Sequence[float], occupancy: Occupancy, method: str
-) -> Float[Tensor, "n d h w"]:
-    """`backproject` of Joseph's method by voxels, the same to the last bit in every run."""
-    y, numbers = wide(views).contiguous(), maps(lines)
-    scene = scene_of(window, occupancy, views.shape[2:], method)
-    around = occupancy.read
-    volume = y.new_zeros(len(y), *around.shape)
-    pixels, blocks = math.prod(scene.detector), (-(-around.size // BLOCK), _groups(len(y)))
-    record, collect = loops.record_kernel(), loops.gather_kernel(_group(len(y)))
-    at_once = max(1, RAYS // pixels)
-    for first in range(0, len(lines), at_once):
-        count = min(at_once, len(lines) - first)
-        rays, frames = y.new_empty(8, count * pixels), y.new_empty(count, 3, 4)
-        axes = torch.zeros(count, 3, dtype=torch.int32, device=y.device)
-        launch(record, (-(-count * pixels // BLOCK),), numbers, scene, first, rays, frames, axes)
-        launch(collect, blocks, y.flatten(1), rays, frames, axes, scene, first, volume)
-    return volume[:, *occupancy.box.within(around)]
+    if lines.shape[3] == 1:
+        if torch.are_deterministic_algorithms_enabled():
+            raise RuntimeError(
+                "The adjoint of explicit rays adds up in no fixed order on a GPU, and "
+                "torch.use_deterministic_algorithms was called; it needs cameras, or backend "
+                "'reference'"
+            )
+        return scatter(views, lines, window, occupancy, method)
+    y = wide(views).contiguous()
+    call = Call(y, lines, window, occupancy, views.shape[2:], method)
+    volume = call.new(len(y), *occupancy.box.shape, zero=not len(lines))
+    call.scene.put(views=y, results=volume)
+    _gather(call)
+    return volume
 
 
 def scatter(
     views: Tensor, lines: Tensor, window: Sequence[float], occupancy: Occupancy, method: str
 ) -> Float[Tensor, "n d h w"]:
-    """`backproject` of any method by rays, with atomic additions."""
+    """`backproject` ray by ray, with atomic additions: of any rays."""
     y = wide(views).contiguous()
-    scene = scene_of(window, occupancy, views.shape[2:], method)
-    flat = y.new_zeros(len(y) * scene.size)
-    kernel = loops.scatter_kernel(numbered(method)[0], *_shares(len(y), scene))
-    launch(kernel, (_blocks(scene, len(lines)), _groups(len(y))), y, maps(lines), scene, flat)
-    around = occupancy.read
-    volume = flat.view(len(y), *padded_shape(around.shape))[:, INNER, INNER, INNER]
-    return volume[:, *occupancy.box.within(around)].contiguous()
+    call = Call(y, lines, window, occupancy, views.shape[2:], method)
+    volume = call.new(len(y), *occupancy.box.shape, zero=True)
+    call.scene.put(views=y, results=volume)
+    call.over_rays("scatter")
+    return volume
+
+
+def _gather(call: Call) -> None:
+    """Voxel by voxel, for as many views at a time as there is memory for their rays."""
+    scene = call.scene
+    pixels, n_views = scene.rows * scene.columns, scene.n_views
+    kept = QUADS[call.method] * 4
+    a_pixel = (kept + call.groups * call.together) * call.real.itemsize + 1
+    at_once = max(1, int(SHARE * driver.memory_of(call.device)) // max(1, a_pixel * pixels))
+    count = min(at_once, n_views) * pixels
+    frames = call.new(n_views, 3, 4, dtype=torch.float32)
+    rays, values = call.new(count, kept), call.new(call.groups * count, call.together)
+    axes = call.new(count, dtype=torch.uint8)
+    scene.put(frames=frames, rays=rays, values=values, axes=axes)
+    call.start("survey", n_views)
+    for first in range(0, n_views, at_once):
+        here = min(at_once, n_views - first)
+        scene.put(first_view=first, views_here=here)
+        call.start("record", here * pixels, call.groups)
+        call.start("gather", math.prod(scene.part), call.groups)
 
 
 def lines_vjp(
@@ -139,90 +200,44 @@ def lines_vjp(
     window: Sequence[float],
     occupancy: Occupancy,
     method: str,
+    occupied: Tensor | None = None,
 ) -> Float[Tensor, "m 4 3 k"]:
     """The derivative of <views, project(volume, lines)> by the lines; float64."""
-    x, y = wide(volume), wide(views).contiguous()
-    scene = scene_of(window, occupancy, views.shape[2:], method)
-    threads = min(math.prod(scene.detector), max(1, THREADS // max(1, len(lines))))
-    change = lines.new_zeros(4, 3, lines.shape[3], len(lines), threads, dtype=torch.float64)
-    kernel = loops.vary_kernel(numbered(method)[0])
-    blocks = (-(-len(lines) * threads // BLOCK),)
-    launch(kernel, blocks, padded(x, occupancy), y, maps(lines), scene, change)
-    return change.sum(dim=4).permute(3, 0, 1, 2).contiguous()
+    x = stored(volume)
+    call = Call(x, lines, window, occupancy, views.shape[2:], method)
+    y = views.to(call.real).contiguous()
+    call.read(x, occupied)
+    m, maps = len(lines), lines.shape[3]
+    if maps == 1:
+        change = call.new(m, 1, 12, dtype=torch.float64, zero=True)
+        call.scene.put(views=y, results=change)
+        call.start("vary", m)
+    else:
+        pixels = math.prod(views.shape[2:])
+        blocks = max(1, min(-(-pixels // BLOCK), THREADS // BLOCK // max(1, m)))
+        change = call.new(m, blocks * BLOCK // WARP, 36, dtype=torch.float64, zero=True)
+        call.scene.put(views=y, results=change, blocks_a_view=blocks)
+        call.start("vary", m * blocks * BLOCK)
+    return change.sum(dim=1).view(m, 4, 3, maps)
 
 
-def launch(kernel: Any, blocks: tuple[int, ...], *arguments: Any) -> None:
-    """Start a kernel on torch's current stream; under numba's simulator, run it on tensors in main
-    memory.
-    """
-    if 0 in blocks:
-        return
-    device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
-    if device.type == "cpu":
-        kernel[blocks, BLOCK](*(_shared(argument, Tensor.numpy) for argument in arguments))
-        return
-    index = torch.cuda.current_device() if device.index is None else device.index
-    with torch.cuda.device(index), cuda.gpus[index]:
-        stream = cuda.external_stream(torch.cuda.current_stream(index).cuda_stream)
-        kernel[blocks, BLOCK, stream](
-            *(_shared(argument, partial(cuda.as_cuda_array, sync=False)) for argument in arguments)
-        )
-
-
-def _shared(argument: Any, array_of: Callable[[Tensor], Any]) -> Any:
-    """A tensor as an array on the same memory, any other argument as it is."""
-    return array_of(argument.detach()) if isinstance(argument, Tensor) else argument
-
-
-def scene_of(
-    window: Sequence[float], occupancy: Occupancy, detector: Sequence[int], method: str
-) -> Scene:
-    """The numbers of a scene."""
-    around = occupancy.read
-    depth, height, width = padded_shape(around.shape)
-    rows, columns = (int(size) for size in detector)
-    low, high = (min(max(float(end), -FAR), FAR) for end in window)
-    z, y, x = around.low
-    return Scene(
-        sizes=occupancy.shape[::-1],
-        strides=(1, width, width * height),
-        size=width * height * depth,
-        detector=(rows, columns),
-        tile=TILE if columns >= TILE[0] and rows >= TILE[1] else (1, 1),
-        window=(low, high),
-        samples=numbered(method)[1],
-        box=(*around.low[::-1], *around.high[::-1]),
-        origin=x + width * (y + height * z),
+def occupied_code(volume: Float[Tensor, "n d h w"]) -> Tensor:
+    """The code of the box outside of which volumes are zero, see `Occupancy`, on their device."""
+    x = stored(volume)
+    shape = list(x.shape[1:])
+    code = torch.zeros(code_size(shape), dtype=torch.int32, device=x.device)
+    flags = torch.zeros(6, dtype=torch.int32, device=x.device)
+    part = tuple(shape[::-1])
+    scene = Scene().put(volumes=x, flags=flags, occupied=code, part=part, n_volumes=len(x))
+    kernels = kernels_of(
+        Variant(torch.promote_types(x.dtype, torch.float32), x.dtype, 1, 0), x.device
     )
+    driver.launch(kernels["occupy"], scene, -(-math.prod(shape) // BLOCK), 1, x.device)
+    driver.launch(kernels["bound"], scene, 1, 1, x.device)
+    return code
 
 
-def padded(volume: Float[Tensor, "n d h w"], occupancy: Occupancy) -> Float[Tensor, " p"]:
-    """Volumes, of which only the occupied box exists, in the box that is read, with their border of
-    nothing, in one row.
-    """
-    margins = occupancy.box.margins(occupancy.read)
-    return F.pad(volume, [n + border for n, border in zip(margins, PAD * 3, strict=True)]).flatten()
-
-
-def maps(lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "m 4 3 k"]:
-    """The rays' maps as the kernels read them."""
-    return lines.detach().double().contiguous()
-
-
-def _group(volumes: int) -> int:
-    return 1 if volumes == 1 else GROUP
-
-
-def _groups(volumes: int) -> int:
-    return -(-volumes // _group(volumes))
-
-
-def _shares(volumes: int, scene: Scene) -> tuple[int, type]:
-    """How many volumes share a thread, and the type of flat indices in one of them."""
-    return _group(volumes), np.uint64 if scene.size >= WIDE else np.uint32
-
-
-def _blocks(scene: Scene, views: int) -> int:
-    rows, columns = scene.detector
-    wide, high = scene.tile
-    return -(-views * (-(-columns // wide)) * (-(-rows // high)) * wide * high // BLOCK)
+def stored(volume: Tensor) -> Tensor:
+    """Volumes as the kernels read them: half precision as such."""
+    x = volume.detach()
+    return (x if x.dtype in NAMES else wide(x)).contiguous()

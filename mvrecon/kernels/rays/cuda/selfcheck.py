@@ -3,13 +3,18 @@ reference.
 """
 
 import logging
-import warnings
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from threading import Lock
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.geometry.grid import pixel_centres
+from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.occupancy import Occupancy
 
@@ -18,6 +23,30 @@ logger = logging.getLogger(__name__)
 #: The greatest difference to the reference, by its greatest value: rounding, and where a ray falls
 #: on an edge.
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
+#: Types that kernels read; another is cast to float32 first.
+STORED = (torch.float64, torch.float16, torch.bfloat16)
+
+
+class Case(NamedTuple):
+    """What is checked at once: a device, a method without its samples, the type that volumes are
+    stored in, and whether several of them share their rays.
+    """
+
+    device: str
+    method: str
+    dtype: torch.dtype
+    several: bool
+
+
+class Verdict(NamedTuple):
+    """Why kernels cannot be used, or None, and whether that is so for good."""
+
+    why: str | None
+    lasting: bool
+
+
+_verdicts: dict[Case, str | None] = {}
+_lock = Lock()
 
 
 @torch.compiler.assume_constant_result
@@ -28,12 +57,12 @@ def reason(
     volumes: int = 1,
 ) -> str | None:
     """Why the kernels for some input cannot be used on a device, or None. Tried once, which
-    compiles them; logged once.
+    compiles them; logged once. Only what is true of the device is remembered.
 
     Args:
         device: a CUDA device.
         method: "joseph", "siddon" or "trilinear:samples".
-        dtype: of the volumes or views; all but float64 is computed in float32.
+        dtype: of the volumes or views.
         volumes: how many there are: one has kernels of its own.
     """
     place = torch.device(device)
@@ -41,33 +70,48 @@ def reason(
         place = torch.device(
             "cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0
         )
-    computed = torch.float64 if dtype == torch.float64 else torch.float32
-    return _reason(str(place), method.partition(":")[0], computed, volumes > 1)
+    stored = dtype if dtype in STORED else torch.float32
+    case = Case(str(place), method.partition(":")[0], stored, volumes > 1)
+    with _lock:
+        if case in _verdicts:
+            return _verdicts[case]
+        verdict = _apart(partial(_verdict_on, case))
+        if verdict.lasting:
+            _verdicts[case] = verdict.why
+    if verdict.why:
+        what = f"{case.method} of {stored} on {place}"
+        logger.warning("The reference computes %s: %s", what, verdict.why)
+    return verdict.why
 
 
-@cache
-def _reason(device: str, name: str, dtype: torch.dtype, several: bool) -> str | None:
-    # a tiny grid of blocks is no mistake of ours
-    warnings.filterwarnings(
-        "ignore", message="Grid size .* will likely result in GPU under-utilization"
-    )
-    bound, failure = TOLERANCE[dtype], None
+def forget() -> None:
+    """Forget every verdict, so that the next call tries again."""
+    with _lock:
+        _verdicts.clear()
+
+
+def _apart(check: Callable[[], Verdict]) -> Verdict:
+    """What a check says in a thread of its own: inference mode, autocast, derivatives and maps of
+    `torch.func` hold for the thread that asks, and a check inside them would fail.
+    """
+    with ThreadPoolExecutor(1) as fresh:
+        return fresh.submit(check).result()
+
+
+def _verdict_on(case: Case) -> Verdict:
+    bound = TOLERANCE[torch.promote_types(case.dtype, torch.float32)]
     try:
-        for what, error in differences(
-            device, f"{name}:8" if name == "trilinear" else name, dtype, 5 if several else 1
-        ):
+        method = f"{case.method}:8" if case.method == "trilinear" else case.method
+        for what, error in differences(case.device, method, case.dtype, 5 if case.several else 1):
             if not error <= bound:
-                failure = (
-                    failure
-                    or f"{what} differs from the reference by {error:.1e}, expected at most "
-                    f"{bound:.0e}"
-                )
+                why = f"{what} differs from the reference by {error:.1e}, expected at most "
+                return Verdict(f"{why}{bound:.0e}", lasting=True)
+    except torch.OutOfMemoryError as problem:  # another time there may be room
+        return Verdict(str(problem), lasting=False)
     # a missing package, no driver, no compiler, a kernel that fails: all mean the same
     except Exception as problem:
-        failure = f"{type(problem).__name__}: {problem}"
-    if failure:
-        logger.warning("The reference computes %s of %s on %s: %s", name, dtype, device, failure)
-    return failure
+        return Verdict(f"{type(problem).__name__}: {problem}", lasting=True)
+    return Verdict(None, lasting=True)
 
 
 def differences(
@@ -77,30 +121,34 @@ def differences(
     reference's greatest value.
 
     Raises:
-        ImportError: numba is missing, or on a device numba-cuda: what numba itself brings cannot
-            compile the kernels.
+        OSError: no driver, or no compiler.
+        RuntimeError: the compiler, the driver or the device refuses a kernel.
     """
-    from numba import cuda as numba_cuda
-
-    if device != "cpu" and getattr(numba_cuda, "implementation", "") == "Built-in":
-        raise ImportError("numba-cuda is not installed, pip install mvrecon[cuda]")
     from mvrecon.kernels.rays.cuda import operators as cuda
 
     lines, window, detector, shape = tiny_scene(device)
     occupancy = Occupancy.whole(shape)
     generator = torch.Generator().manual_seed(0)
-    x = torch.rand(volumes, *shape, dtype=dtype, generator=generator).to(device)
-    y = torch.rand(volumes, len(lines), *detector, dtype=dtype, generator=generator).to(device)
+    x = torch.rand(volumes, *shape, generator=generator).to(device, dtype)
+    y = wide(torch.rand(volumes, len(lines), *detector, generator=generator).to(device, dtype))
     moving = lines.clone().requires_grad_()
     with torch.enable_grad():
-        views = reference.project(x, moving, window, detector, method)
+        views = reference.project(wide(x), moving, window, detector, method)
         (change,) = torch.autograd.grad((views * y).sum(), moving)
     volume = reference.backproject(y, lines, window, shape, method)
     yield "project", _error(cuda.project(x, lines, window, occupancy, detector, method), views)
-    yield "scatter", _error(cuda.scatter(y, lines, window, occupancy, method), volume)
-    if method == "joseph":
-        yield "gather", _error(cuda.gather(y, lines, window, occupancy, method), volume)
+    yield "backproject", _error(cuda.backproject(y, lines, window, occupancy, method), volume)
+    single, z = one_by_one(lines, detector), y.flatten(1)[..., None, None]
+    yield "explicit rays", _error(cuda.scatter(z, single, window, occupancy, method), volume)
     yield "lines_vjp", _error(cuda.lines_vjp(x, y, lines, window, occupancy, method), change)
+
+
+def one_by_one(lines: Float[Tensor, "m 4 3 3"], detector: list[int]) -> Float[Tensor, "r 4 3 1"]:
+    """Every ray of some views as a view of one pixel: maps of the constant alone."""
+    centre = lines.new_tensor([(detector[1] - 1) / 2, (detector[0] - 1) / 2])
+    uv = pixel_centres(detector).to(lines) - centre
+    p = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1).reshape(-1, 3)
+    return torch.einsum("mkxc,rc->mrkx", lines, p).flatten(0, 1)[..., None].contiguous()
 
 
 def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:

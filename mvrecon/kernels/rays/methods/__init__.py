@@ -1,1 +1,1 @@
-"""What a ray does in one step, once for each method, for the loops of every compiled back end."""
+"""What a ray does in one step, once for each method, for the loops of the CPU."""

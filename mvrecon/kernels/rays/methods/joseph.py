@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.methods.strides import flat_index
 from mvrecon.kernels.rays.pose_gradient import Slopes
 
 
@@ -69,30 +68,6 @@ def cell(course, s, real):
 
 
 @scalar
-def four(steps, k, cell, share, whole):
-    """The four corners of a cell in slab k, and what each gets of a share."""
-    low = flat_index(steps, k, cell.iy, cell.iz, whole)
-    high, near = whole(low + whole(steps.far)), whole(steps.near)
-    upper = share * cell.y
-    lower = share - upper
-    low_z, high_z = lower * cell.z, upper * cell.z
-    return (low, whole(low + near), high, whole(high + near)), (
-        lower - low_z,
-        low_z,
-        upper - high_z,
-        high_z,
-    )
-
-
-@scalar
-def corners(ray, steps, k, real, whole):
-    """Flat indices and weights of the four voxels of slab k."""
-    course, s = course_of(ray, real), real(k) - real(ray.centre)
-    share = overlap(course.begin, course.end, s, real(0.5))
-    return four(steps, k, cell(course, s, real), share, whole)
-
-
-@scalar
 def hat(t, one):
     """The weight of a voxel at the distance t along an axis, in voxels: that of `split`."""
     return max(one - one, one - abs(t))
@@ -142,18 +117,3 @@ def in_double(sums):
         *(np.float64(sums.by_c), np.float64(sums.by_slope_c)),
         *(np.float64(sums.at_begin), np.float64(sums.at_end)),
     )
-
-
-@scalar
-def slopes(store, n, ray, steps):
-    """How a ray's sum changes with its place, without room for its cells."""
-    flat, real = store.values, store.values.dtype.type
-    course, none, half = course_of(ray, real), real(0), real(0.5)
-    sums, offset = Slopes(none, none, none, none, none, none, none), np.int64(n * store.size)
-    for k in range(ray.first, ray.last):
-        s = real(k) - course.centre
-        iy, iz, y, z = cell(course, s, real)
-        at = offset + np.int64(flat_index(steps, k, iy, iz, np.int64))
-        share = overlap(course.begin, course.end, s, half)
-        sums = bent(sums, course, s, share, face_at(flat, at, steps, y, z))
-    return sums

@@ -110,15 +110,6 @@ def three(steps, k, passage, whole):
 
 
 @scalar
-def corners(ray, steps, k, real, whole):
-    """Flat indices of the at most three cells that a ray crosses in slab k, and its lengths in
-    them.
-    """
-    passage = crossing(course_of(ray, real), real(k) - real(ray.centre), real)
-    return three(steps, k, passage, whole), lengths(passage)
-
-
-@scalar
 def slopes(store, n, ray, steps):
     """How a ray's sum changes with its place, as `pose_gradient.Slopes`: at each plane by the
     difference of the two cells.

@@ -17,15 +17,6 @@ class Steps(NamedTuple):
     origin: Any
 
 
-class Values(NamedTuple):
-    """As much of `packed_volume.Store` as derivatives read: padded volumes in one row, and the size
-    of one.
-    """
-
-    values: Any
-    size: Any
-
-
 @scalar
 def flat_index(steps, k, iy, iz, whole):
     """The flat index of a voxel, of type `whole`: slab k counted from the volume, the others from

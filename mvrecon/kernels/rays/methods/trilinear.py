@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.methods.joseph import Cell, cell, course_of, face_at, four, hat
+from mvrecon.kernels.rays.methods.joseph import Cell, cell, course_of, face_at, hat
 from mvrecon.kernels.rays.methods.strides import flat_index
 from mvrecon.kernels.rays.pose_gradient import Slopes
 from mvrecon.kernels.rays.trace import FAR, NEAR, OWN
@@ -55,20 +55,6 @@ def samples_in(ray, count):
     # one more on each side, for rounding
     first, last = floor((low - ray.begin) / step - 1.5), floor((high - ray.begin) / step + 1.5)
     return int(min(max(first, 0.0), count)), int(min(max(last + 1, 0.0), count))
-
-
-@scalar
-def corners(ray, steps, k, real, whole):
-    """Flat indices and weights of four of the eight voxels about sample k // 2."""
-    course = course_of(ray, real)
-    step = real((ray.end - ray.begin) / steps.samples)
-    s = course.begin + (real(k // 2) + real(0.5)) * step
-    sample = sample_at(course, s, real)
-    slab = sample.slab + k % 2
-    if not (real(ray.enter) <= s <= real(ray.leave) and ray.first <= slab < ray.last):
-        none, zero = whole(0), real(0)
-        return (none, none, none, none), (zero, zero, zero, zero)
-    return four(steps, slab, sample.cell, step * share(sample, slab, real), whole)
 
 
 @scalar

@@ -1,0 +1,111 @@
+"""Loading and launching kernels by CUDA's driver, through ctypes: a launch takes some microseconds,
+since it packs one structure.
+"""
+
+import ctypes
+from ctypes import byref, c_char_p, c_int, c_void_p
+from functools import cache
+from typing import Any
+
+import torch
+
+from mvrecon.kernels.rays.cuda.scene import Scene
+from mvrecon.kernels.rays.cuda.sources import BLOCK, KERNELS
+
+#: What the driver says where the calling thread has no context: none, or that of another device.
+NO_CONTEXT = (201, 400)
+OUT_OF_MEMORY = 2
+
+
+@cache
+def library() -> Any:
+    """CUDA's driver.
+
+    Raises:
+        OSError: there is none, or it finds no device.
+    """
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError as problem:
+        raise OSError(f"CUDA's driver cannot be loaded: {problem}") from problem
+    if code := driver.cuInit(0):
+        raise OSError(f"CUDA's driver cannot be used: {_name(driver, code)}")
+    return driver
+
+
+def version() -> int:
+    """The driver's version, as 13000 for 13.0."""
+    number = c_int()
+    _check(library().cuDriverGetVersion(byref(number)))
+    return number.value
+
+
+def capability_of(device: torch.device) -> int:
+    """The compute capability of a device, as 90 for 9.0."""
+    major, minor = torch.cuda.get_device_capability(device)
+    return 10 * major + minor
+
+
+def memory_of(device: torch.device) -> int:
+    """All memory of a device in bytes: what is free would have to be waited for."""
+    return torch.cuda.get_device_properties(device).total_memory
+
+
+def stream_of(device: torch.device) -> int:
+    """torch's current stream on a device."""
+    return torch.cuda.current_stream(device).cuda_stream
+
+
+def load(machine_code: bytes, device: torch.device) -> dict[str, c_void_p]:
+    """The kernels of machine code or PTX, on a device.
+
+    Raises:
+        RuntimeError: the driver does not take it, being older than the compiler, say.
+    """
+    driver, module = library(), c_void_p()
+    _enter(device)
+    _check(driver.cuModuleLoadData(byref(module), c_char_p(machine_code)))
+    functions = {name: c_void_p() for name in KERNELS}
+    for name, function in functions.items():
+        _check(driver.cuModuleGetFunction(byref(function), module, name.encode()))
+    return functions
+
+
+def launch(function: c_void_p, scene: Scene, across: int, down: int, device: torch.device) -> None:
+    """Start a kernel on `across` x `down` blocks, on torch's current stream.
+
+    Raises:
+        RuntimeError: the driver refuses it.
+        torch.OutOfMemoryError: there is no memory for it.
+    """
+    if not across or not down:
+        return
+    driver, arguments = library(), (c_void_p * 1)(ctypes.addressof(scene))
+    grid = across, down, 1, BLOCK, 1, 1, 0
+    stream = c_void_p(stream_of(device))
+    code = driver.cuLaunchKernel(function, *grid, stream, arguments, None)
+    if code in NO_CONTEXT:
+        _enter(device)
+        code = driver.cuLaunchKernel(function, *grid, stream, arguments, None)
+    _check(code)
+
+
+def _enter(device: torch.device) -> None:
+    """Make the device's context, which torch uses, that of the calling thread."""
+    driver, handle, context = library(), c_int(), c_void_p()
+    _check(driver.cuDeviceGet(byref(handle), device.index or 0))
+    _check(driver.cuDevicePrimaryCtxRetain(byref(context), handle))
+    _check(driver.cuCtxSetCurrent(context))
+
+
+def _check(code: int) -> None:
+    if code == OUT_OF_MEMORY:
+        raise torch.OutOfMemoryError("CUDA's driver: out of memory")
+    if code:
+        raise RuntimeError(f"CUDA's driver: {_name(library(), code)}")
+
+
+def _name(driver: Any, code: int) -> str:
+    text = c_char_p()
+    driver.cuGetErrorString(code, byref(text))
+    return f"{(text.value or b'unknown error').decode()} (error {code})"

@@ -1,0 +1,109 @@
+"""Compiling CUDA C++ by the NVRTC that comes with torch, through ctypes."""
+
+import ctypes
+import sys
+from ctypes import byref, c_char_p, c_int, c_size_t, c_void_p
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+OPTIONS = ("--std=c++17",)
+
+
+class CompileError(RuntimeError):
+    """The source does not compile."""
+
+
+@cache
+def library() -> Any:
+    """NVRTC: the one of torch's own wheels, else the system's.
+
+    Raises:
+        OSError: there is none.
+    """
+    paths = [path for root in roots() for path in root.rglob("libnvrtc.so.*")]
+    wanted = (torch.version.cuda or "").partition(".")[0]
+    # two may be installed: the one that torch was built for
+    paths.sort(key=lambda path: (path.suffix[1:] == wanted, path.suffix), reverse=True)
+    problem: OSError | None = None
+    for name in [*map(str, paths), f"libnvrtc.so.{wanted}" if wanted else "libnvrtc.so"]:
+        try:
+            return ctypes.CDLL(name)
+        except OSError as error:
+            problem = problem or error
+    raise OSError(f"NVRTC, CUDA's compiler, cannot be loaded: {problem}")
+
+
+def roots() -> list[Path]:
+    """Where NVIDIA's wheels are."""
+    return [folder for path in sys.path if (folder := Path(path) / "nvidia").is_dir()]
+
+
+def version() -> str:
+    """NVRTC's version."""
+    major, minor = c_int(), c_int()
+    library().nvrtcVersion(byref(major), byref(minor))
+    return f"{major.value}.{minor.value}"
+
+
+def capabilities() -> list[int]:
+    """The compute capabilities that NVRTC knows, as 90 for 9.0."""
+    count = c_int()
+    library().nvrtcGetNumSupportedArchs(byref(count))
+    values = (c_int * count.value)()
+    library().nvrtcGetSupportedArchs(values)
+    return sorted(values)
+
+
+def target(capability: int, known: list[int]) -> str:
+    """The architecture to compile for: the device's machine code, or for a device newer than NVRTC
+    the newest PTX, which its driver translates.
+
+    Raises:
+        RuntimeError: the device is older than all that NVRTC knows.
+    """
+    if capability in known:
+        return f"sm_{capability}"
+    older = [one for one in known if one < capability]
+    if not older:
+        raise RuntimeError(
+            f"NVRTC {version()} compiles for compute capability {known[0] / 10} and newer, got "
+            f"{capability / 10}"
+        )
+    return f"compute_{older[-1]}"
+
+
+def build(text: str, architecture: str) -> bytes:
+    """Machine code of a text for "sm_90" and the like, PTX for "compute_90".
+
+    Raises:
+        CompileError: it does not compile; with the compiler's message.
+    """
+    nvrtc, program = library(), c_void_p()
+    options = [f"--gpu-architecture={architecture}".encode(), *(o.encode() for o in OPTIONS)]
+    _check(nvrtc.nvrtcCreateProgram(byref(program), text.encode(), b"rays.cu", 0, None, None))
+    try:
+        code = nvrtc.nvrtcCompileProgram(program, len(options), (c_char_p * len(options))(*options))
+        if code:
+            log = _text(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
+            raise CompileError(f"NVRTC error {code}: {log.decode(errors='replace')[:2000]}")
+        what = "CUBIN" if architecture.startswith("sm_") else "PTX"
+        size, into = getattr(nvrtc, f"nvrtcGet{what}Size"), getattr(nvrtc, f"nvrtcGet{what}")
+        return _text(size, into, program)
+    finally:
+        nvrtc.nvrtcDestroyProgram(byref(program))
+
+
+def _text(size_of: Any, write: Any, program: c_void_p) -> bytes:
+    size = c_size_t()
+    _check(size_of(program, byref(size)))
+    into = ctypes.create_string_buffer(size.value)
+    _check(write(program, into))
+    return into.raw
+
+
+def _check(code: int) -> None:
+    if code:
+        raise CompileError(f"NVRTC error {code}")

@@ -1,0 +1,137 @@
+// Kernels along rays, one source for NVRTC and, to test it in main memory, for a C++ compiler. The files of this folder
+// are read one after the other, in the order of their names; `sources.py` adds one line for each variant.
+//
+// A variant has a type R of arithmetic, a type T that volumes are stored in, a number NV of volumes that share a ray's
+// index work (1 or 4), and a method.
+#ifdef __CUDACC__
+#define DEVICE __device__ __forceinline__
+#define UNROLL _Pragma("unroll")
+#define PRAGMA(words) _Pragma(#words)
+#define UNROLL_BY(n) PRAGMA(unroll n)
+DEVICE void add(float* to, float value) { atomicAdd(to, value); }
+DEVICE void add(double* to, double value) { atomicAdd(to, value); }
+DEVICE void add_bits(int* to, int bits) { atomicOr(to, bits); }
+DEVICE void add_greatest(int* to, int value) { atomicMax(to, value); }
+// The sum over a warp, for its first thread.
+template <class R> DEVICE R warp_sum(R value) {
+  for (int i = 16; i; i >>= 1) value += __shfl_down_sync(0xffffffffu, value, i);
+  return value;
+}
+DEVICE bool first_of_warp() { return threadIdx.x % 32 == 0; }
+#else
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstring>
+#define DEVICE inline
+#define UNROLL
+#define UNROLL_BY(n)
+#define __global__
+#define __launch_bounds__(threads)
+
+using std::ceil; using std::fabs; using std::floor; using std::fma; using std::max; using std::min; using std::sqrt;
+struct Place { int x, y; };
+static Place threadIdx, blockIdx;
+template <class R> DEVICE void add(R* to, R value) { *to += value; }
+DEVICE void add_bits(int* to, int bits) { *to |= bits; }
+DEVICE void add_greatest(int* to, int value) { *to = max(*to, value); }
+// Threads run one after the other, so the sum over a warp is made by all of them.
+template <class R> DEVICE R warp_sum(R value) { return value; }
+DEVICE bool first_of_warp() { return true; }
+#endif
+
+enum { BLOCK = 128, WARP = 32, JOSEPH = 0, SIDDON = 1, TRILINEAR = 2 };
+// Flags of a view: bits 0 to 2 are main axes that occur, then: some ray ends inside the volume. Of all views: some main
+// axis may be z.
+enum { SHORT = 8, STEEP = 1, NONE = 3 };
+
+struct Half { unsigned short bits; };
+struct Brain { unsigned short bits; };
+DEVICE float number(float value) { return value; }
+DEVICE double number(double value) { return value; }
+DEVICE float number(Brain value) {
+  unsigned bits = (unsigned)value.bits << 16;
+#ifdef __CUDACC__
+  return __uint_as_float(bits);
+#else
+  float wide;
+  memcpy(&wide, &bits, 4);
+  return wide;
+#endif
+}
+DEVICE float number(Half value) {
+#ifdef __CUDACC__
+  float wide;
+  asm("cvt.f32.f16 %0, %1;" : "=f"(wide) : "h"(value.bits));
+  return wide;
+#else
+  _Float16 narrow;
+  memcpy(&narrow, &value.bits, 2);
+  return (float)narrow;
+#endif
+}
+
+template <class T, int NV> struct alignas(sizeof(T) * NV) Many { T n[NV]; };
+template <class R> struct alignas(16) Quad { R a, b, c, d; };
+
+// All that a kernel is launched with; `scene.py` has the same.
+struct Scene {
+  const double* lines;    // [m 4 3 k]: direction, moment, start, world; k = 3, or 1 for rays given one by one
+  const void* volumes;    // [n d h w] of the part that there is, read
+  void* stores;           // twice [groups cells NV]: y, x, z (z fastest), then z, y, x
+  void* views;            // [n m v u]
+  void* rays;             // [p 2 4] or [p 3 4]: what `record_rays` writes of each
+  unsigned char* axes;    // [p]: main axis, or NONE
+  void* values;           // [groups p NV]: views times mm a slab
+  float* frames;          // [m 3 4]: from voxels about the centre to (u w, v w, w) about the detector's centre
+  int* flags;             // [1 + m]: of all views, of each
+  void* results;          // volumes [n d h w] of the part, or sums [m warps 12 k]
+  int* occupied;          // voxels (z0 y0 x0 z1 y1 x1) beyond which volumes are zero, or nothing
+  double window[2];       // which part of a ray counts
+  int sizes[3];           // voxels of the whole along x, y, z
+  int corner[3], part[3]; // the first voxel, and the voxels, of the part that there is
+  int n_views, rows, columns, maps, n_volumes, samples;
+  int first_view, views_here;  // of the rays that are recorded
+  int blocks_a_view;
+};
+
+struct Box { int low[3], high[3]; };
+// What is stored: the part, and a voxel more, since rounding may move a ray a little.
+DEVICE Box stored_box(const Scene& s) {
+  Box box;
+  UNROLL for (int i = 0; i < 3; i++) {
+    box.low[i] = max(s.corner[i] - 1, 0);
+    box.high[i] = min(s.corner[i] + s.part[i] + 1, s.sizes[i]);
+  }
+  return box;
+}
+// What rays are clipped to.
+DEVICE Box read_box(const Scene& s) {
+  Box box = stored_box(s);
+  if (s.occupied) UNROLL for (int i = 0; i < 3; i++) {
+    box.low[i] = max(box.low[i], s.occupied[2 - i] - 1);
+    box.high[i] = min(box.high[i], s.occupied[5 - i] + 1);
+  }
+  return box;
+}
+
+// By comparison: an array that is indexed at run time would lie in local memory.
+template <class V> DEVICE V pick(const V* three, int axis) { return axis == 0 ? three[0] : axis == 1 ? three[1] : three[2]; }
+
+DEVICE long long thread_of() { return (long long)blockIdx.x * BLOCK + threadIdx.x; }
+
+struct Pixel { int view, v, u; };
+// The pixel of a thread: 32 rows of a column are a warp, four columns a block; on small detectors in one row.
+DEVICE Pixel pixel_of(const Scene& s) {
+  int high = s.rows >= WARP && s.columns >= BLOCK / WARP ? WARP : 1, wide = high == 1 ? 1 : BLOCK / WARP;
+  long long thread = thread_of(), tile = thread / (high * wide);
+  int inside = (int)(thread % (high * wide)), down = (s.rows + high - 1) / high, across = (s.columns + wide - 1) / wide;
+  Pixel p;
+  p.view = (int)(tile / ((long long)down * across));
+  int rest = (int)(tile % ((long long)down * across));
+  p.v = rest % down * high + inside % high;
+  p.u = rest / down * wide + inside / high;
+  return p;
+}
+DEVICE bool on_detector(const Scene& s, Pixel p) { return p.view < s.n_views && p.v < s.rows && p.u < s.columns; }
+DEVICE long long index_of(const Scene& s, int view, int v, int u) { return ((long long)view * s.rows + v) * s.columns + u; }

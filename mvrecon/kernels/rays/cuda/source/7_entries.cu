@@ -1,0 +1,39 @@
+// Where the box of what is not zero lies in volumes: for each axis how far its first voxel is from behind the end, and
+// one more than its last; both 0 for nothing. A thread looks at voxels of one row after the other.
+template <class T> DEVICE void find_occupied(const Scene& s) {
+  long long voxels = (long long)s.part[0] * s.part[1] * s.part[2], at = thread_of();
+  if (at >= voxels) return;
+  bool any = false;
+  for (int n = 0; n < s.n_volumes; n++) any = any || !(number(((const T*)s.volumes)[n * voxels + at]) == 0);
+  if (!any) return;
+  int place[3] = {(int)(at / ((long long)s.part[0] * s.part[1])), (int)(at / s.part[0] % s.part[1]), (int)(at % s.part[0])};
+  UNROLL for (int i = 0; i < 3; i++) {
+    int low = s.part[2 - i] - place[i], high = place[i] + 1;
+    if (s.flags[i] < low) add_greatest(s.flags + i, low);
+    if (s.flags[3 + i] < high) add_greatest(s.flags + 3 + i, high);
+  }
+}
+
+// The head of the code of an occupancy, see `occupancy.py`: shape, first voxel, one behind the last, shares not counted.
+DEVICE void write_occupied(const Scene& s) {
+  if (thread_of() > 0) return;
+  UNROLL for (int i = 0; i < 3; i++) {
+    s.occupied[i] = s.part[2 - i];
+    s.occupied[3 + i] = s.flags[i] ? s.part[2 - i] - s.flags[i] : 0;
+    s.occupied[6 + i] = s.flags[3 + i];
+  }
+  s.occupied[9] = s.occupied[10] = -1;
+  s.occupied[11] = 0;
+}
+
+#define ENTRY(name, kernel) extern "C" __global__ void __launch_bounds__(BLOCK) name(const Scene s) { kernel(s); }
+#define VARIANT(suffix, R, T, NV, METHOD)                                                                              \
+  ENTRY(survey##suffix, survey_rig)                                                                                    \
+  ENTRY(store##suffix, (store_volumes<T, NV>))                                                                         \
+  ENTRY(project##suffix, (project_rays<R, T, NV, METHOD>))                                                             \
+  ENTRY(record##suffix, (record_rays<R, NV, METHOD>))                                                                  \
+  ENTRY(gather##suffix, (gather_voxels<R, NV, METHOD>))                                                                \
+  ENTRY(scatter##suffix, (scatter_rays<R, NV, METHOD>))                                                                \
+  ENTRY(vary##suffix, (vary_rays<R, T, NV, METHOD>))                                                                   \
+  ENTRY(occupy##suffix, find_occupied<T>)                                                                              \
+  ENTRY(bound##suffix, write_occupied)

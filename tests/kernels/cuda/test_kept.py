@@ -1,0 +1,72 @@
+"""Machine code on disk."""
+
+import pytest
+
+from mvrecon.kernels.rays.cuda import kept, nvrtc
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "mvrecon" / "kernels"
+
+
+def never() -> bytes:
+    pytest.fail("it is on disk")
+
+
+def test_code_is_built_once(folder):
+    assert kept.kept("a", lambda: b"code") == b"code"
+    assert kept.kept("a", never) == b"code"
+    assert [file.name for file in folder.iterdir()] == ["a.bin"]
+    assert folder.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("damage", ["cut", "changed", "empty"])
+def test_damaged_code_is_built_anew(damage, folder):
+    """A damaged file of compiled GPU kernels is built anew, never run."""
+    kept.kept("a", lambda: b"code")
+    whole = (folder / "a.bin").read_bytes()
+    damaged = {"cut": whole[:-1], "changed": whole[:-1] + b"E", "empty": b""}[damage]
+    (folder / "a.bin").write_bytes(damaged)
+    assert kept.kept("a", lambda: b"again") == b"again"
+    assert kept.kept("a", never) == b"again"
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("writable", ["file", "folder"])
+def test_code_that_others_may_write_is_not_run(writable, folder, caplog):
+    """Compiled GPU kernels that another user could have written are not run."""
+    kept.kept("a", lambda: b"code")
+    (folder / "a.bin" if writable == "file" else folder).chmod(0o777)
+    assert kept.kept("a", lambda: b"own") == b"own"
+    assert "others may write it" in caplog.text
+
+
+def test_a_folder_that_cannot_be_written_costs_time_alone(folder, caplog):
+    folder.parent.mkdir()
+    folder.write_text("a file")
+    assert kept.kept("a", lambda: b"code") == b"code"
+    assert "cannot be kept" in caplog.text or "cannot be read" in caplog.text
+
+
+def test_a_device_newer_than_the_compiler_gets_what_its_driver_translates():
+    assert nvrtc.target(90, [80, 90]) == "sm_90"
+    assert nvrtc.target(120, [80, 90]) == "compute_90"
+    assert nvrtc.target(86, [75, 80, 90]) == "compute_80"
+
+
+def test_the_same_kernels_are_compiled_once_and_read_afterwards(host, monkeypatch):
+    """By a process, and by the next one."""
+    import torch
+
+    from mvrecon.kernels.rays.cuda.kernels import kernels_of
+    from mvrecon.kernels.rays.cuda.sources import Variant
+
+    variant, device = Variant(torch.float32, torch.float32, 1, 0), torch.device("cpu")
+    first = kernels_of(variant, device)
+    assert kernels_of(variant, device) is first and host.modules == 1
+    kernels_of.cache_clear()
+    monkeypatch.setattr(nvrtc, "build", lambda *_: pytest.fail("it is on disk"))
+    assert kernels_of(variant, device).keys() == first.keys() and host.modules == 2
