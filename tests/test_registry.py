@@ -18,7 +18,9 @@ def dome(**anything: float) -> dict[str, float]:
 
 
 @pytest.fixture
-def cameras() -> Registry:
+def cameras(monkeypatch: pytest.MonkeyPatch) -> Registry:
+    """Three cameras, whatever plugins are installed."""
+    monkeypatch.setattr(registry, "installed", lambda: ())
     cameras = Registry("camera", text="json:dumps")
     cameras.register("ring")(ring)
     cameras.register("dome")(dome)

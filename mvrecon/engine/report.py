@@ -82,7 +82,7 @@ def _accuracy(cameras: Mapping[str, Any]) -> str:
 
 def _spoilt(acquisition: Mapping[str, Any]) -> str:
     """The options of a detector that are not zero, without those that do nothing."""
-    silent = {"fine"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
+    silent = {"fine", "closed_form"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
     errors = acquisition.get("disturbed") or {}
     usual = {"probability": 1, **({"views": 1} if errors.get("lost") else {})}
     disturbed = {f"disturbed.{k}": v for k, v in errors.items() if v != usual.get(k)}

@@ -50,19 +50,6 @@ def test_so_many_views_are_disturbed_and_the_object_is_the_same():
         assert torch.equal(wrong.volume, plain.volume)
 
 
-def test_a_share_of_the_cases_has_errors_and_these_are_whole():
-    kind = {"views": 2, "shift_px": 1.0, "gain": 0.05}
-    draws = [
-        rig_errors(Disturbance(**kind, share=0.5), RIGS["cone"], generator(0, index))
-        for index in range(200)
-    ]
-    wrong = [int(draw.offset_px.any(dim=1).sum()) for draw in draws]
-    assert set(wrong) == {0, 2} and 70 < wrong.count(2) < 130
-    assert [int((draw.gain != 1).sum()) for draw in draws] == wrong
-    with pytest.raises(ValueError, match="share from 0 to 1, got 1.5"):
-        Disturbance(**kind, share=1.5)
-
-
 def test_a_gain_is_a_factor_of_a_view_within_its_bounds():
     plain, wrong = measured().views, measured(views=5, gain=0.05).views
     factor = (wrong.double().sum(dim=(0, 2, 3)) / plain.double().sum(dim=(0, 2, 3)))[:, None, None]

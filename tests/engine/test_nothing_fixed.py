@@ -57,14 +57,14 @@ def test_a_training_step_projects_as_often_as_the_model_says_and_never_asks_for_
         )
         fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
     start, consistency = settings["model"]["start"], settings["model"]["consistency"]
-    # Ax of: each SIRT iteration of the start; the start's residual; all opinions at once (the cross
-    # views); the fused volume's residual, which the refinement sees; each consistency step. Back:
-    # of the last two kinds' adjoints.
-    forward = start + 1 + 1 + (1 + consistency) + (1 + consistency)
-    # A^T of: each SIRT iteration; the opinions' disagreement (not differentiated); the fused
-    # volume's residual; each consistency step. Back: of the cross views (for the loss), of the
-    # fused residual, of each consistency step.
-    adjoint = start + 1 + (1 + consistency) + (1 + 1 + consistency)
+    rounds = len(settings["model"]["rounds"])  # cameras correct in each
+    # A x of: each SIRT iteration of the start; each round's residual; each consistency step; the
+    # truth, for the loss of the corrected views. Back: of each adjoint but the first round's, of
+    # the start's residual, which has no weights before it.
+    forward = start + rounds + consistency + 1 + (2 * rounds - 1) + consistency
+    # A^T of: each SIRT iteration; each round's residual, and what its cameras correct; each
+    # consistency step. Back: of each round's residual but the first, of each consistency step.
+    adjoint = start + 2 * rounds + consistency + (rounds - 1) + consistency
     assert len(steps) == settings["trainer"]["max_steps"]
     assert [step[FORWARD] for step in steps] == [forward] * len(steps)
     assert [step[ADJOINT] for step in steps] == [adjoint] * len(steps)

@@ -79,7 +79,7 @@ def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, root: Path, t
         "-m",
         "mvrecon.simulate",
         f"--config-dir={tmp_path}",
-        "+experiment=evil",
+        "experiment=evil",
         "cases=[0]",
     ]
     command += [f"hydra.run.dir={tmp_path}/out"]

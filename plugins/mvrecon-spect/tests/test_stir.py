@@ -27,7 +27,7 @@ POINT = torch.tensor([4.0, -3.0, 2.5], dtype=torch.float64)
 PLACE = (1.2, -0.4, 0.7)  # of the holes, in mm
 
 
-def system(model: str = "pol", step: float = 80.0, holes: int = 1) -> StirSystem:
+def scanner(model: str = "pol", step: float = 80.0, holes: int = 1) -> StirSystem:
     """Four detectors of 8 x 10 pixels, from 35 degrees on, 47.5 + 3 / 2 mm from the axis."""
     openings = tuple(
         Opening(
@@ -52,12 +52,12 @@ def scan(step: float = 80.0) -> StirScan:
     counts = torch.poisson(
         torch.full((1, 1, 4, 8, 10), 7.0), generator=torch.Generator().manual_seed(0)
     )
-    return StirScan(system(step=step), counts)
+    return StirScan(scanner(step=step), counts)
 
 
 @pytest.mark.parametrize("step", [80.0, -80.0])
 def test_a_point_is_seen_where_similar_triangles_put_it(step: float):
-    uvz = cameras_of(system(step=step)).project(POINT)
+    uvz = cameras_of(scanner(step=step)).project(POINT)
     for j in range(4):
         t = math.radians(35.0 + j * step)
         x = POINT[0] * math.cos(t) + POINT[1] * math.sin(t)
@@ -73,7 +73,7 @@ def test_a_point_is_seen_where_similar_triangles_put_it(step: float):
 
 
 def test_a_cylinder_s_hole_at_its_detector_s_angle_is_in_its_middle():
-    flat, curved = cameras_of(system()), cameras_of(system("cyl"))
+    flat, curved = cameras_of(scanner()), cameras_of(scanner("cyl"))
     along = flat.u / flat.u.norm(dim=-1, keepdim=True)
     torch.testing.assert_close(curved.source, flat.source - PLACE[0] * along)
 
@@ -93,7 +93,7 @@ def test_what_is_written_is_read(tmp_path: Path, step: float):
 
 
 def test_a_rig_is_a_system_of_stir_if_it_turns_about_z():
-    rig = cameras_of(system(), world="LPS")
+    rig = cameras_of(scanner(), world="LPS")
     again = system_of(rig, diameter_mm=1.0, crystal_mm=3.0, world="LPS")
     torch.testing.assert_close(cameras_of(again, world="LPS").source, rig.source)
     torch.testing.assert_close(cameras_of(again, world="LPS").origin, rig.origin)
@@ -105,7 +105,7 @@ def test_a_rig_is_a_system_of_stir_if_it_turns_about_z():
 def test_holes_of_one_detector_add_up_and_accept_what_their_angles_let_in():
     grid = Grid.centred(8, spacing=4.0)
     x = torch.rand(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(1))
-    both = system(holes=2)
+    both = scanner(holes=2)
     openings = both.collimator.openings
     single = [
         replace(both, collimator=both.collimator._replace(openings=openings[k::2])) for k in (0, 1)
@@ -175,7 +175,7 @@ def test_the_files_are_a_scan_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
     rig = CAMERAS.build(
         "stir_pinhole", path=path, detector_file=detector, collimator_file=collimator
     )
-    torch.testing.assert_close(views.cameras(rig).source, cameras_of(system()).source)
+    torch.testing.assert_close(views.cameras(rig).source, cameras_of(scanner()).source)
 
 
 def files(folder: Path) -> tuple[Path, Path, Path]:
