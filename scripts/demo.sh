@@ -4,10 +4,12 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh
 
-.venv/bin/mvrecon-train experiment=quickstart "$@"
+bin=.venv/bin
+if [ -d .venv/Scripts ]; then bin=.venv/Scripts; fi # Windows
+"$bin/mvrecon-train" experiment=quickstart "$@"
 
-cat <<'TEXT'
+cat <<TEXT
 
-Look at the runs:  .venv/bin/tensorboard --logdir outputs --samples_per_plugin images=200
+Look at the runs:  $bin/tensorboard --logdir outputs --samples_per_plugin images=200
 and open http://localhost:6006 in a browser.
 TEXT
