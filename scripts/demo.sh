@@ -5,12 +5,14 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh
 
+bin=.venv/bin
+if [ -d .venv/Scripts ]; then bin=.venv/Scripts; fi # Windows
 for experiment in quickstart quickstart_rig_errors; do
-    .venv/bin/mvrecon-train experiment="$experiment" "$@"
+    "$bin/mvrecon-train" experiment="$experiment" "$@"
 done
 
-cat <<'TEXT'
+cat <<TEXT
 
-Look at the runs:  .venv/bin/tensorboard --logdir outputs --samples_per_plugin images=200
+Look at the runs:  $bin/tensorboard --logdir outputs --samples_per_plugin images=200
 and open http://localhost:6006 in a browser.
 TEXT

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Makes .venv with the versions of constraints.txt: `bash scripts/setup.sh [extras]`, extras such as "io" or "dev".
-# A second run with nothing changed returns at once.
+# A second run with nothing changed returns at once. PYTHON=... says which Python; else the first that fits.
 set -euo pipefail
 shopt -s nullglob
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -12,18 +12,20 @@ for stamp in ".venv/installed-$extras" .venv/installed-dev; do
 done
 
 supported='import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
-for python in python3.11 python3.12 python3.13 python3 none; do
+for python in ${PYTHON:-python3.11 python3.12 python3.13 python3 python} none; do
     if "$python" -c "$supported" 2>/dev/null; then break; fi
 done
 if [ "$python" = none ]; then
-    echo "mvrecon needs Python 3.11, 3.12 or 3.13 with its venv module; found $(python3 --version 2>&1 || true)." >&2
+    echo "mvrecon needs Python 3.11, 3.12 or 3.13 with its venv module; found $("${PYTHON:-python3}" --version 2>&1 || true)." >&2
     exit 1
 fi
 
 echo "Setting up .venv with $("$python" --version), once; this takes some minutes ..."
 rm -f .venv/installed-*
 "$python" -m venv .venv
-install() { .venv/bin/python -m pip --disable-pip-version-check --no-input install --quiet -c constraints.txt "$@"; }
+bin=.venv/bin
+if [ -d .venv/Scripts ]; then bin=.venv/Scripts; fi # Windows
+install() { "$bin/python" -m pip --disable-pip-version-check --no-input install --quiet -c constraints.txt "$@"; }
 
 # torch first and alone: it is by far the largest, and there are several builds of one version.
 torch=$(grep '^torch==' constraints.txt)

@@ -4,7 +4,7 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh dev
 
-export PATH="$PWD/.venv/bin:$PATH" OMP_NUM_THREADS=1
+export PATH="$PWD/.venv/bin:$PWD/.venv/Scripts:$PATH" OMP_NUM_THREADS=1 # Scripts: on Windows
 # the many processes that tests start read each other's bytecode; some containers forbid to keep it
 unset PYTHONDONTWRITEBYTECODE
 ruff check .

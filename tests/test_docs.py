@@ -17,12 +17,13 @@ from hydra.core.override_parser.types import Override
 from mvrecon import compare
 from mvrecon.config import compose
 from mvrecon.parts import REGISTRIES
+from scripts import site_pages
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "scripts").rglob("*.md")]
     + [*(ROOT / "plugins").glob("*.md"), *(ROOT / "plugins").glob("*/README.md")]
-    + [*(ROOT / "experiments").rglob("README.md")]
+    + [*(ROOT / "experiments").rglob("README.md"), *(ROOT / "mvrecon").rglob("README.md")]
 )
 #: Files that a reader makes, that an app writes, and other projects' files.
 ELSEWHERE = {"my_parts.py", "compare.md"}
@@ -131,10 +132,49 @@ def test_a_file_that_is_mentioned_is_there():
     assert missing == set()
 
 
+def anchors(page: str) -> set[str]:
+    """The anchors of a page's headings: small letters, hyphens for spaces, no other signs."""
+    text = re.sub(r"^ *```.*?^ *```", "", page, flags=re.M | re.S)
+    titles = re.findall(r"^#+ +(.*)", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text), re.M)
+    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def broken(file: Path) -> list[str]:
+    """The links of a page to files, folders and headings of the project that are not there."""
+    links = re.findall(r"\]\(([^)\s#]*)#?([^)\s]*)\)", file.read_text())
+    missing = []
+    for path, anchor in [link for link in links if "://" not in link[0]]:
+        target = file.parent / path if path else file
+        target = target / "README.md" if anchor and target.is_dir() else target
+        if not target.exists() or anchor and anchor not in anchors(target.read_text()):
+            missing.append(f"{path}#{anchor}")
+    return missing
+
+
 @pytest.mark.parametrize("file", DOCS, ids=name_of)
 def test_a_link_leads_somewhere(file: Path):
-    links = re.findall(r"\]\(([^)#]+)[^)]*\)", file.read_text())
-    assert [x for x in links if "://" not in x and not (file.parent / x).exists()] == []
+    assert broken(file) == []
+
+
+def test_a_broken_link_is_recognised(tmp_path: Path):
+    page = tmp_path / "page.md"
+    page.write_text("# Two words, `code`\n[a](page.md#two-words-code) [b](#no) [c](no.md)\n")
+    assert broken(page) == ["#no", "no.md#"]
+
+
+def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
+    """Laid out by scripts/site_pages.py: no page is forgotten, links still lead somewhere."""
+    site_pages.main(tmp_path)
+    laid_out = {str(f.relative_to(tmp_path)): f for f in tmp_path.rglob("*.md")}
+    assert set(laid_out) == {*map(name_of, DOCS), "api.md"}
+    assert {page: broken(file) for page, file in laid_out.items() if broken(file)} == {}
+    folders = [
+        link
+        for file in laid_out.values()
+        for link in re.findall(r"\]\(([^)\s#:]+)\)", file.read_text())
+        if (file.parent / link).is_dir()
+    ]
+    assert folders == []  # a site has pages, no folders
 
 
 def test_a_module_or_name_that_is_mentioned_is_there():

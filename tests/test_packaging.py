@@ -117,6 +117,18 @@ def test_every_dependency_is_pinned(root: Path):
             )
 
 
+def test_the_citation_and_the_hooks_have_the_versions_of_the_project(root: Path):
+    import yaml
+
+    import mvrecon
+
+    citation = yaml.safe_load((root / "CITATION.cff").read_text())
+    assert (citation["version"], citation["license"]) == (mvrecon.__version__, "Apache-2.0")
+    pinned = (root / "constraints.txt").read_text().splitlines()
+    hooks = yaml.safe_load((root / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    assert hooks and all(set(hook["additional_dependencies"]) <= set(pinned) for hook in hooks)
+
+
 SHELL = """#!/bin/sh
 # In place of Python and pip: makes .venv, writes down what it is to install;
 # a CPU build of torch is there if $CPU is.
@@ -163,3 +175,22 @@ def test_the_set_up_says_which_torch_it_takes_and_how_large_it_is(
     assert done.returncode == 0, done.stderr
     assert message in done.stdout and " GB to download" in done.stdout
     assert (tmp_path / "installed").read_text().split() == [torch, ".[io]"]
+
+
+def test_the_set_up_takes_the_python_that_is_asked_for_or_none(root: Path, tmp_path: Path):
+    for name, text in {
+        "python3.11": SHELL,
+        "old": "#!/bin/sh\necho Python 3.9.0; exit 1\n",
+    }.items():
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    (tmp_path / "scripts").mkdir()
+    for name in ("constraints.txt", "pyproject.toml"):
+        (tmp_path / name).write_text("")
+    script = shutil.copy(root / "scripts" / "setup.sh", tmp_path / "scripts")
+    environment = {"PATH": f"{tmp_path}:/usr/local/bin:/usr/bin:/bin", "PYTHON": "old"}
+    done = subprocess.run(
+        ["bash", script], env=environment, capture_output=True, text=True, timeout=900, check=False
+    )
+    assert done.returncode == 1 and "found Python 3.9.0" in done.stderr
+    assert not (tmp_path / ".venv").exists()

@@ -18,9 +18,8 @@ def test_a_coarse_grid_tells_what_the_grid_itself_would(module):
     exact = step_bytes(module, 1, edge=24)
     assert step_bytes(module, 1, edge=12) == pytest.approx(exact, rel=0.35)
     weights = 16 * sum(p.numel() for p in module.model.parameters())
-    assert step_bytes(module, 3, edge=12) - weights == pytest.approx(
-        3 * (step_bytes(module, 1, edge=12) - weights)
-    )
+    kept = [step_bytes(module, count, edge=12) - weights for count in (1, 3)]
+    assert kept[1] == pytest.approx(3 * kept[0], rel=0.02)
 
 
 def test_what_cannot_fit_is_refused_with_both_numbers(module, monkeypatch: pytest.MonkeyPatch):

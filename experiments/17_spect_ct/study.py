@@ -1,6 +1,6 @@
 """SPECT/CT: cone-beam views of a stationary inner rig, to attenuation, to 140.5 keV, to OSEM.
 
-python experiments/16_spect_ct/study.py OUT_FOLDER
+python experiments/17_spect_ct/study.py OUT_FOLDER
 """
 
 import csv

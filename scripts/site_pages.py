@@ -1,0 +1,59 @@
+"""Lays out the pages of the documentation's site: python scripts/site_pages.py OUT_FOLDER
+
+The site is made of the same files that a reader of the repository sees, in the same folders, so
+that their links are right in both. What is added: a link to a folder becomes one to its README.md,
+the files that pages link to are copied beside them, and api.md is written from the front door.
+"""
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import mvrecon
+
+ROOT = Path(__file__).parents[1]
+#: A Markdown link with its target, without its anchor.
+LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)(?=[)#])")
+
+
+def pages(config: str) -> list[str]:
+    """The pages that the navigation of mkdocs.yml names, without the one that is written here."""
+    return [page for page in re.findall(r"[\w./-]+\.md$", config, re.M) if page != "api.md"]
+
+
+def lay_out(page: str, out: Path) -> None:
+    """Copy a page and the files that it links to into the folder `out`, at the same paths."""
+
+    def target(link: re.Match[str]) -> str:
+        path = (ROOT / page).parent / link[1]
+        return f"{link[1].rstrip('/')}/README.md" if path.is_dir() else link[1]
+
+    text = LINK.sub(target, (ROOT / page).read_text(encoding="utf-8"))
+    files = {((ROOT / page).parent / link).resolve() for link in LINK.findall(text)}
+    for file in sorted(f for f in files if f.suffix != ".md" and f.is_relative_to(ROOT)):
+        copy = out / file.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, copy)
+    (out / page).parent.mkdir(parents=True, exist_ok=True)
+    (out / page).write_text(text, encoding="utf-8")
+
+
+def api(names: dict[str, str]) -> str:
+    """The page of the front door: each name with the docstring of what it stands for."""
+    lines = ["# Functions and classes", "", "What `mv` has after `import mvrecon as mv`, by name."]
+    for name, place in sorted(names.items(), key=lambda item: item[0].lower()):
+        lines += ["", f"## mv.{name}", "", f"::: {place.replace(':', '.')}"]
+    return "\n".join(lines) + "\n"
+
+
+def main(out: Path) -> None:
+    """Write all pages of mkdocs.yml into the folder `out`, which is emptied first."""
+    shutil.rmtree(out, ignore_errors=True)
+    for page in pages((ROOT / "mkdocs.yml").read_text(encoding="utf-8")):
+        lay_out(page, out)
+    (out / "api.md").write_text(api(mvrecon._DOOR), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
