@@ -11,8 +11,9 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from mvrecon.comparison import pareto, tables
-from mvrecon.comparison.rows import FIGURES, RESULTS, Row, read
+from mvrecon.comparison.rows import FIGURES, Row, read
 from mvrecon.files.atomic import written_whole
+from mvrecon.files.runs import RESULTS
 from mvrecon.registry import hint
 
 #: Columns of a terminal that the table is made for.

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
+from mvrecon.files.runs import EVALUATION
 
 
 def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -50,7 +51,7 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     see = save if options["save"] else None
     elsewhere = bool(options["camera"] or options["grid"])
     run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
-    with run_folder.taken(folder, options, run_folder.EVALUATION):
+    with run_folder.taken(folder, options, EVALUATION):
         table = evaluation.results(settings, run, data, device, see, elsewhere)
         table["checkpoint"] = str(run)
         table["acquisition_of_run"] = trained["acquisition"]

@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
 from mvrecon.files.rank import rank
+from mvrecon.files.runs import RESULTS, read_results
 
 
 def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -90,9 +91,9 @@ def task(config: DictConfig) -> float:
         ]
         settings, folder = resumed(settings["resume"], others)
     run_folder.check(folder, settings)
-    finished = (folder / run_folder.RESULTS).is_file()
+    finished = (folder / RESULTS).is_file()
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
-        return _score(run_folder.read_results(folder))
+        return _score(read_results(folder))
     if table := train(settings, folder):
         show(table, folder)
     return _score(table)

@@ -1,7 +1,9 @@
 """`mvrecon-warmup`: compile the kernels of the CPU once, so that no first call waits for it."""
 
+import argparse
 import sys
 import time
+from collections.abc import Sequence
 
 #: Voxels along an edge, pixels along a detector's, and views: as few as every kernel works with.
 VOXELS, PIXELS, VIEWS = 8, 8, 4
@@ -32,8 +34,9 @@ def warm_up() -> float:
     return time.perf_counter() - begin
 
 
-def main() -> int:
-    """Entry point of `mvrecon-warmup`."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of `mvrecon-warmup`, which has no options."""
+    argparse.ArgumentParser(prog="mvrecon-warmup", description=__doc__).parse_args(arguments)
     seconds = warm_up()
     from mvrecon.kernels.compiling import kept_in
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from mvrecon import warmup
 from mvrecon.config import conf_dir, launch
 from mvrecon.config.plugins import check_plugins, import_plugins, names
 from mvrecon.config.typed import check_parts, fits
@@ -26,21 +27,21 @@ MISTAKES = {
 }
 
 
-def reached(config: object) -> None:
+def reached(*_: object) -> None:
     raise AssertionError("the task was called")
 
 
 @pytest.fixture
 def answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """What `mvrecon-train` writes to the error stream for a command line, in an empty folder."""
+    """What an app writes to the error stream for a command line, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.setattr(sys, "path", [*sys.path])
 
-    def run(*overrides: str, task=reached) -> str:
-        monkeypatch.setattr(sys, "argv", ["mvrecon-train", *overrides])
+    def run(*overrides: str, task=reached, app: str = "train") -> str:
+        monkeypatch.setattr(sys, "argv", [f"mvrecon-{app}", *overrides])
         with pytest.raises(SystemExit) as stop:
-            launch(task, "train")
+            launch(task, app)
         assert stop.value.code
         return capsys.readouterr().err
 
@@ -131,3 +132,17 @@ def test_the_plugin_of_a_page_works_by_its_own_command(
 
 def test_one_string_is_one_module():
     assert names("my_parts") == names(["my_parts"]) == ["my_parts"] and names(None) == []
+
+
+def test_an_option_of_the_run_s_camera_is_asked_for_with_a_plus(answer):
+    text = answer("checkpoint=x", "camera.n_views=6", app="eval")
+    assert text == (
+        "mvrecon-eval: 'camera.n_views' has no value here yet; to set it: +camera.n_views=...\n"
+    )
+
+
+def test_the_app_without_options_refuses_one_before_it_compiles(monkeypatch, capsys):
+    monkeypatch.setattr(warmup, "warm_up", reached)
+    with pytest.raises(SystemExit):
+        warmup.main(["--all"])
+    assert "unrecognized arguments: --all" in capsys.readouterr().err

@@ -80,6 +80,12 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
         assert part["name"] in REGISTRIES[group].names()
 
 
+@pytest.mark.parametrize("choice", ["model=world_unet", "model=single_pass", "camera=random"])
+def test_the_smallest_experiment_takes_any_model_and_camera_as_its_file_has_it(choice: str):
+    group = choice.partition("=")[0]
+    assert compose("experiment=smoke", choice)[group] == compose(choice)[group]
+
+
 def test_every_file_of_acquisitions_sets_every_option():
     from mvrecon.acquisition.settings import Acquisition
 

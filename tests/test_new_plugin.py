@@ -8,8 +8,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
-from mvrecon.config import compose
+from mvrecon.config import check_settings, compose
 from mvrecon.listing import main
 from mvrecon.new_plugin import new_plugin
 from mvrecon.parts import REGISTRIES
@@ -60,6 +61,15 @@ def test_the_project_tests_every_part_and_option(project):
         "name": NAME,
         "iterations": 5,
     }
+
+
+def test_the_training_of_its_readme_has_settings_that_its_parts_take(project):
+    folder, _ = project
+    lines = (folder / "README.md").read_text().splitlines()
+    command = next(line.split() for line in lines if line.strip().startswith("mvrecon-train"))
+    settings = compose(*command[1:])
+    check_settings(OmegaConf.create(settings))
+    assert settings["camera"]["name"] == settings["model"]["name"] == NAME
 
 
 def test_the_project_is_written_as_mvrecon_is(project, root: Path):

@@ -1,15 +1,14 @@
 """The methods of finished runs, read from their folders."""
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mvrecon.files.checks import Refused, blaming, shown, text_of, yaml_of
+from mvrecon.files.checks import Refused, blaming, shown, yaml_of
+from mvrecon.files.runs import EVALUATION, RESULTS, SETTINGS, leaves, read_results
 
-RESULTS, SETTINGS = "results.json", ("eval.yaml", "config.yaml")
 #: Figures of merit that are compared; larger is better for those of `RISING`.
 FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
 #: Settings that say nothing of what is compared, and the most that make up a run's name.
@@ -61,16 +60,15 @@ def read(places: Iterable[str | Path]) -> list[Row]:
 
 
 def _runs(place: Path) -> list[Path]:
-    found = [path.parent for path in sorted(place.expanduser().rglob(RESULTS))]
-    if not found:
+    runs = [path.parent for path in sorted(place.expanduser().rglob(RESULTS))]
+    if not runs:
         raise FileNotFoundError(f"Expected a finished run (with {RESULTS}) in {place}, got none")
-    return found
+    return runs
 
 
 def _rows(folder: Path, name: str) -> Iterator[Row]:
-    path = folder / RESULTS
-    with blaming(path, "is no table of results"):
-        table = json.loads(text_of(path))
+    table = read_results(folder)
+    with blaming(folder / RESULTS, "is no table of results"):
         for label, row in table["methods"].items():
             yield Row(
                 run=name,
@@ -92,7 +90,7 @@ def _number(value: float | None) -> float:
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """Each run by the settings that differ, or by its folder where none does."""
-    settings = [dict(_leaves(_settings(folder))) for folder in folders]
+    settings = [dict(_named(_settings(folder))) for folder in folders]
     keys = [key for key in dict.fromkeys(key for s in settings for key in s)]
     differing = [key for key in keys if len({repr(s.get(key)) for s in settings}) > 1]
     parts = {key.removesuffix(".name") for key in differing if key.endswith(".name")}
@@ -110,16 +108,14 @@ def _below(key: str, parts: Iterable[str]) -> bool:
 
 
 def _settings(folder: Path) -> Mapping[str, Any]:
-    path = next((folder / name for name in SETTINGS if (folder / name).is_file()), None)
+    path = next(
+        (folder / name for name in (EVALUATION, SETTINGS) if (folder / name).is_file()), None
+    )
     settings = yaml_of(path) if path else {}
     if not isinstance(settings, Mapping):
         raise Refused(f"{path}: expected settings by name, got {shown(settings)}")
     return {key: value for key, value in settings.items() if key not in SILENT}
 
 
-def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping) and value:
-        for key, item in value.items():
-            yield from _leaves(item, f"{prefix}.{key}".lstrip("."))
-    else:
-        yield prefix, value
+def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    return ((".".join(map(str, keys)), value) for keys, value in leaves(settings))

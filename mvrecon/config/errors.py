@@ -80,12 +80,12 @@ def sentence(error: BaseException) -> str:
     if isinstance(cause, ConfigKeyError | ConfigAttributeError):
         parent = cause.parent_node
         known = {str(key) for key in parent or ()} - {"hydra"}
+        if not known:  # as the camera of an evaluation, which is the run's
+            return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
-        return _joined(
-            [re.sub(r"\s*(full_key|object_type|reference_type)\b.*", "", t) for t in texts]
-        )
+        return _joined([TAIL.sub("", text) for text in texts])
     return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
 
 

@@ -17,6 +17,7 @@ from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
 
 from mvrecon.files.checks import plain_name, shown, yaml_of
+from mvrecon.files.runs import leaves
 from mvrecon.registry import hint
 
 #: Keys of the section `hydra` that any file may set, or that Hydra fills in when it composes.
@@ -130,11 +131,11 @@ def check_foreign(
     trusted = compose(
         [line for line in overrides if line.lstrip("+~").startswith(("hydra", "out="))]
     )
-    section, expected = (dict(_leaves(_hydra(c))) for c in (config, trusted))
+    section, expected = (dict(leaves(_hydra(c))) for c in (config, trusted))
     changed = sorted(
-        key
-        for key in {**section, **expected}
-        if section.get(key) != expected.get(key) and not _open(key)
+        name
+        for keys in {**section, **expected}
+        if section.get(keys) != expected.get(keys) and not _open(name := ".".join(map(str, keys)))
     )
     if changed:
         raise PermissionError(f"A config sets {shown(changed)}; only a command line may")
@@ -158,11 +159,3 @@ def _hydra(config: DictConfig) -> dict[str, Any]:
 
 def _open(key: str) -> bool:
     return any(f"{key}.".startswith(f"hydra.{prefix}.") for prefix in OPEN)
-
-
-def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(node, dict) and node:
-        for key, value in node.items():
-            yield from _leaves(value, f"{prefix}.{key}".lstrip("."))
-    else:
-        yield prefix, node

@@ -61,24 +61,24 @@ class ManyRigs(Dataset[dict[str, Any]]):
         together: int = 1,
     ):
         self.together = together
-        self.each = len(indices) // len(rigs) // together * together
-        if not self.each:
+        self.per_rig = len(indices) // len(rigs) // together * together
+        if not self.per_rig:
             raise ValueError(
                 f"Expected a batch of {together} cases for each of {len(rigs)} rigs, got "
                 f"{len(indices)} cases"
             )
         self.parts = [
-            SceneDataset(scene, grid, cameras, indices[i :: len(rigs)][: self.each], seed)
+            SceneDataset(scene, grid, cameras, indices[i :: len(rigs)][: self.per_rig], seed)
             for i, cameras in enumerate(rigs)
         ]
 
     def __len__(self) -> int:
-        return self.each * len(self.parts)
+        return self.per_rig * len(self.parts)
 
     def __getitem__(self, item: int) -> dict[str, Any]:
         if not 0 <= item < len(self):
             raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
-        rig, case = divmod(item, self.each)
+        rig, case = divmod(item, self.per_rig)
         return {**self.parts[rig][case], "rig": rig + 1}
 
     def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
@@ -107,7 +107,7 @@ class RigOrder(EpochOrder):
 
     def order(self, rng: torch.Generator) -> Tensor:
         """The items of one epoch."""
-        each = self.count // self.rigs
-        own = [rig * each + torch.randperm(each, generator=rng) for rig in range(self.rigs)]
+        per_rig = self.count // self.rigs
+        own = [rig * per_rig + torch.randperm(per_rig, generator=rng) for rig in range(self.rigs)]
         batches = torch.cat(own).reshape(-1, self.together)
         return batches[torch.randperm(len(batches), generator=rng)].flatten()

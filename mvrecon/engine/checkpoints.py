@@ -12,11 +12,11 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoint_check import check_archive, check_known, check_settings
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.engine.run_folder import SETTINGS
 from mvrecon.engine.storage import read
 from mvrecon.engine.trained_reconstructor import model_on
 from mvrecon.files.atomic import check_plain
 from mvrecon.files.checks import blaming, plain_name
+from mvrecon.files.runs import SETTINGS
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 

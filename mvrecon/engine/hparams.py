@@ -1,11 +1,12 @@
 """The board's table of runs: the settings of every method beside its figures on the test scenes."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mvrecon.engine.fit import BOARD, methods
 from mvrecon.engine.loggers import Board
+from mvrecon.files.runs import leaves
 
 #: Settings of a run that make no difference to what comes out, or whose place is taken by `model`.
 SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "model")
@@ -30,13 +31,10 @@ def write(folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any]) -
         costs = {f"test/{name}": row[key] for name, key in COSTS.items() if row[key] is not None}
         options = {key: value for key, value in model.items() if key != "name"}
         named = {"method": label, "model": {"": model["name"], **options}}
-        board.log_hyperparams(dict(_leaves(named | shared)), figures | costs)
+        values = {".".join(filter(None, keys)): v for keys, v in leaves(named | shared)}
+        board.log_hyperparams({k: _plain(v) for k, v in values.items()}, figures | costs)
         board.finalize("success")
 
 
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping) and value:
-        for key, item in value.items():
-            yield from _leaves(item, f"{name}.{key}".strip("."))
-    else:
-        yield name, value if isinstance(value, bool | int | float | str) else str(value)
+def _plain(value: Any) -> bool | float | str:
+    return value if isinstance(value, bool | int | float | str) else str(value)

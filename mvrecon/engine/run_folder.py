@@ -22,9 +22,9 @@ from mvrecon.engine.old_names import current
 from mvrecon.files.atomic import claimed, written_whole
 from mvrecon.files.checks import Refused, blaming, shown, text_of, yaml_of
 from mvrecon.files.places import of_weights
+from mvrecon.files.runs import RESULTS, SETTINGS, VERSIONS
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
-SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
 #: Settings whose text is a file or a folder.
 PLACES = ("path", "dark", "flat", "like", "out", "checkpoint")
 DIGESTS, RIG = "digests.json", "rig.json"
@@ -181,20 +181,6 @@ def write_results(folder: Path, results: dict[str, Any]) -> None:
     """
     whole = {**results, "command": sys.argv, "versions": versions()}
     write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
-
-
-def read_results(folder: Path) -> dict[str, Any]:
-    """The results that a run has written.
-
-    Raises:
-        Refused: it has none, or the file is none of a run's.
-    """
-    path = folder / RESULTS
-    with blaming(path, "is no table of results"):
-        table = json.loads(text_of(path))
-    if not isinstance(table, dict) or "methods" not in table:
-        raise Refused(f"{path}: expected a table of results, got {shown(table)}")
-    return table
 
 
 def write(path: Path, text: str) -> None:

@@ -38,7 +38,7 @@ def test_every_batch_is_of_one_training_rig_and_every_epoch_has_all():
 def test_the_views_of_a_case_are_those_of_its_rig():
     data = build()
     data.setup("fit")
-    item = data.sets["train"][data.sets["train"].each]  # the first of the second rig
+    item = data.sets["train"][data.sets["train"].per_rig]  # the first of the second rig
     assert item["rig"] == 2
     rig = CAMERAS.from_config(camera_of(CAMERA, 2))
     sample = data._measured("train").sample(1, 2, data.grid, rig)
