@@ -26,7 +26,7 @@ DOCS = sorted(
     + [*(ROOT / "experiments").rglob("README.md"), *(ROOT / "mvrecon").rglob("README.md")]
 )
 #: Files that a reader makes, that an app writes, and other projects' files.
-ELSEWHERE = {"my_parts.py", "compare.md"}
+ELSEWHERE = {"my_parts.py", "compare.md", "api.md", "page.md", "no.md"}
 #: Words of Lightning's that SECURITY.md forbids, and the pages that say so or that tell the past.
 UNSAFE, HISTORY = "load_from_checkpoint", {"SECURITY.md", "CHANGELOG.md"}
 
