@@ -51,10 +51,11 @@ class PixelAligned(nn.Module):
         self.encoder = PlainUNet(2, 1, features, widths)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
-        views = admitted(views, self.projector.cameras, self.encoder.first.weight)
+        views = admitted(views, self.projector.cameras, self.encoder.first.weight).contiguous()
         scale = content_scale(views)
         images = (views / scale).squeeze(1).flatten(0, 1)[:, None].contiguous()
-        features = self.encoder(images).unflatten(0, (len(views), -1))
+        with torch.autocast(views.device.type, enabled=False):  # logits suffer in half precision
+            features = self.encoder(images).unflatten(0, (len(views), -1))
         volume = self.volume(features) * scale / self.chord
         return Reconstruction(volume=volume * anything(views))
 

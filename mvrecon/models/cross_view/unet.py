@@ -80,7 +80,9 @@ class PlainUNet(nn.Module):
             x = block(x)
         for level in reversed(range(len(self.up))):
             x = self.up[level](self.finer[level](x) + skips[level])
-        return self.last(x)
+        # sums of few products: not half precision, whose rounding would stay in what it predicts
+        with torch.autocast(x.device.type, enabled=False):
+            return self.last(x.to(self.last.weight.dtype))
 
 
 class Block(nn.Module):
