@@ -23,7 +23,7 @@ from mvrecon.parts import NETWORKS
 from mvrecon.registry import GROUP
 
 EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))
-EVALUATIONS = {"chest_ct"}  # experiments of mvrecon-eval
+EVALUATIONS = {"chest_ct", "quickstart_rig_errors"}  # experiments of mvrecon-eval
 
 
 def plain(node: object) -> bool:
