@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
 
-from mvrecon.metrics import coverage, opinion_spread, view_metrics, volume_metrics
+from mvrecon.metrics import coverage, opinion_spread, ssim_map, view_metrics, volume_metrics
 
 
 def case(shape=(1, 8, 9, 10)):
@@ -58,6 +59,32 @@ def test_ssim_of_two_constants_is_its_luminance_term():
     )
     assert figures["ssim"] == pytest.approx(expected, abs=1e-6)
     assert figures["ssim_inside"] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 9, 6, 14), (1, 1, 12, 14)])
+def test_ssim_is_that_of_torchmetrics_in_a_hundredth_of_its_memory(shape):
+    """The window is applied axis by axis: no voxel has its 1331 surroundings copied."""
+    rng = torch.Generator().manual_seed(0)
+    a, b = torch.rand(2, *shape, generator=rng, dtype=torch.float64)
+    images = [v[None, :, 0] if shape[1] == 1 else v[None] for v in (a, b)]
+    expected, local = structural_similarity_index_measure(
+        *images, data_range=0.8, return_full_image=True
+    )
+    similarity = ssim_map(a, b, 0.8)
+    assert similarity.mean().item() == pytest.approx(expected.item(), abs=1e-12)
+    assert torch.allclose(similarity, local[0].view_as(similarity), atol=1e-12)
+
+
+def test_figures_of_64_voxels_an_edge_take_a_few_volumes_of_memory(run_python):
+    code = (
+        "import torch; from mvrecon.metrics import volume_metrics;"
+        "from mvrecon.files.memory import peak_since, restarted_peak;"
+        "a, b = torch.rand(2, 1, 64, 64, 64); volume_metrics(a, b, a > 0, 1.0);"
+        "start = restarted_peak(); volume_metrics(a, b, a > 0, 1.0);"
+        "assert start is None or peak_since(start) < 20 * 8 * 64**3, peak_since(start)"
+    )
+    done = run_python("-c", code)
+    assert done.returncode == 0, done.stderr
 
 
 def test_ssim_inside_is_the_mean_of_the_map_over_the_object():
