@@ -188,8 +188,8 @@ def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
     system = replace(
         scanner(),
         shape=(16, 16),
-        detector=replace(scanner().detector, rings=(ring,)),
-        collimator=replace(scanner().collimator, openings=holes),
+        detector=scanner().detector._replace(rings=(ring,)),
+        collimator=scanner().collimator._replace(openings=holes),
     )
     grid, truth = Grid.centred(10, spacing=2.0), torch.zeros(1, 1, 10, 10, 10)
     truth[..., 3:5, 4:6, 6:8], truth[..., 6:8, 2:4, 3:5] = 2e4, 1e4
