@@ -37,12 +37,6 @@ def mlem(
     at few counts leaves bins with counts that no voxel explains (OSEM: Hudson and Larkin, IEEE
     Trans. Med. Imaging 13, 1994).
 
-    Where a subset sees less of a voxel than its share, s_k < s / n, its step is shortened to that
-    part of it: x <- x + x (A_k^T (y_k / ybar_k) - s_k) / max(s_k, s / n), between OSEM's and
-    RAMLA's (Browne and De Pierro, IEEE Trans. Med. Imaging 15 (1996) 687). OSEM's own would follow
-    the noise of the one ray that grazes the voxel, and adds counts with every subset: 60 % more in
-    a ball of voxels much finer than the gap of rays.
-
     No gradient: counts that require one are refused.
 
     Args:
@@ -72,12 +66,35 @@ def mlem(
     watch = Watch(common.get("monitor"), partial(likelihood_of_residual, counts))
     for number in range(1, iterations + 1):
         for part, s in zip(parts, sums, strict=True):
-            most = torch.maximum(s, share)
-            rest = (most - s) + part.explained(x)  # of x most: what these views do not see stays
-            x = x * torch.where(most > 0, rest / torch.where(most > 0, most, 1), 1)
+            x = _step(x, part, s, share)
         if watch.ends(number, x, partial(unexplained, A, counts, background, x)):
             break
     return watch.result(x)
+
+
+def _step(
+    x: Float[Tensor, "b c d h w"],
+    part: PoissonLikelihood,
+    s: Float[Tensor, "1 1 d h w"],
+    share: Float[Tensor, "1 1 d h w"],
+) -> Float[Tensor, "b c d h w"]:
+    """One step by a subset: OSEM's where the subset has its share of a voxel's sensitivity, else
+    shortened to the part of the share that it has.
+
+    x <- x + x (A_k^T (y_k / ybar_k) - s_k) / max(s_k, s / n), between OSEM and RAMLA (Browne and De
+    Pierro, IEEE Trans. Med. Imaging 15 (1996) 687). OSEM's own step follows the noise of the one
+    ray that grazes a voxel, and adds counts with every subset: 60 % in one iteration where voxels
+    are much finer than the gap of rays.
+
+    Args:
+        x: the volume.
+        part: the subset's likelihood.
+        s: its sensitivity s_k.
+        share: s / n, the mean sensitivity of the n subsets.
+    """
+    most = torch.maximum(s, share)
+    rest = (most - s) + part.explained(x)
+    return x * torch.where(most > 0, rest / torch.where(most > 0, most, 1), 1)
 
 
 @without_gradient
