@@ -15,10 +15,16 @@ from PIL import Image as Pillow
 import mvrecon.reconstruction
 import mvrecon.simulate
 from mvrecon.cameras import files
+from mvrecon.cameras.formats import rtk_xml
 from mvrecon.data.attenuation import WATER
+from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.volume_files import read_volume
-from mvrecon.engine.scan import open_scan
+from mvrecon.engine.scan import Scan, check_unit, open_scan
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import PROJECTORS
+from mvrecon.projectors.drr import Drr
+from mvrecon.projectors.operator import Scaled
 from tests.engine.runs import call
 
 VALUE = WATER
@@ -249,3 +255,23 @@ def test_a_grid_larger_than_memory_is_refused_with_its_size(scan, tmp_path, caps
     options = ("grid.like=null", "grid.size=[40000, 40000, 40000]", "grid.spacing=0.01")
     assert run(scan, tmp_path / "run", *options) == 1
     assert "GiB" in capsys.readouterr().err
+
+
+@pytest.mark.door
+def test_line_integrals_are_no_counts(scan, monkeypatch):
+    """Line integrals given as counts, and counts given as line integrals, are refused."""
+
+    class Counts(Scaled):
+        def __init__(self, grid, cameras):
+            super().__init__(Drr(grid, cameras), pixels=torch.tensor(1e-4))
+
+    monkeypatch.setitem(PROJECTORS._parts, "counts", Counts)
+    cameras = rtk_xml.read(scan / "geometry.xml", {"pixels": [36, 40], "pixel_mm": 9.0}, "IEC")
+    measured = Measured(path=str(scan / "views.h5")).open()
+    for name, unit, message in (
+        ("counts", measured.stack.unit, "got line integrals in 1/mm \\* mm"),
+        ("drr", "counts of activity", "made them is 'counts'"),
+    ):
+        case = Scan(measured, cameras, Grid.centred(4, spacing=48.0), {"name": name})
+        with pytest.raises(ValueError, match=message):
+            check_unit(unit, case, 0)

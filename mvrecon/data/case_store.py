@@ -20,6 +20,8 @@ from mvrecon.scenes.sample import Sample, Scene
 #: Raised where what a scene, a projector or a file of this store is has changed: older files are
 #: not read.
 VERSION = 1
+#: Maps of attenuation that a case may have.
+MAPS = ("mu", "mu_measured")
 
 
 class CaseStore:
@@ -71,7 +73,7 @@ class CaseStore:
 
 def _write(path: Path, sample: Sample) -> None:
     with written_whole(path) as part, h5py.File(part, "w") as file:
-        for name in ("views", "volume", "inside", "mu"):
+        for name in ("views", "volume", "inside", *MAPS):
             if (tensor := getattr(sample, name)) is None:
                 continue
             values = tensor.cpu().numpy()
@@ -93,8 +95,7 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
     }
     values = {}
     with blaming(path, "is not a case that can be read"), h5py.File(path, "r") as file:
-        if "mu" in file:
-            expected["mu"] = (volume, "float32")
+        expected |= {name: (volume, "float32") for name in MAPS if name in file}
         for name, kind in expected.items():
             dataset = dataset_in(path, file, name, "a case")
             if (dataset.shape, str(dataset.dtype)) != kind:

@@ -24,7 +24,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
 
     An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; where the rig is
     disturbed also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; where
-    the scene attenuates "mu" [1 d h w], 1/mm.
+    the scene attenuates "mu" [1 d h w], 1/mm, and where it was scanned "mu_measured".
 
     Args:
         scene: where the cases come from.
@@ -88,8 +88,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
         made = {key: getattr(sample, key) for key in TENSORS}
-        if sample.mu is not None:
-            made["mu"] = sample.mu
+        maps = {"mu": sample.mu, "mu_measured": sample.mu_measured}
+        made |= {key: mu for key, mu in maps.items() if mu is not None}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
                 raise ValueError(

@@ -18,7 +18,6 @@ from mvrecon.engine.run_folder import versions
 from mvrecon.files.memory import peak, restarted_peak
 from mvrecon.files.places import check_places
 from mvrecon.models.output import Reconstruction
-from mvrecon.parts import MODELS
 from mvrecon.viz import cameras, montage
 from mvrecon.viz.planes import Image
 
@@ -183,11 +182,12 @@ class BoardReview(L.Callback):
             module.projector.grid.spacing,
         )
         volumes = {module.hparams["model"]["name"]: out.volume[case, 0]}
-        volumes |= {name: v[case, 0] for name, v in self._baselines(module, batch["views"]).items()}
+        own = module.on(batch)
+        volumes |= {name: v[case, 0] for name, v in self._baselines(own, batch["views"]).items()}
         support = (
             {} if out.support is None else {"support": outlined(truth, out.support[case, 0], top)}
         )
-        predicted = module.projector(out.volume[case][None])[0, 0]
+        predicted = own.A(out.volume)[case, 0]
         shown = {
             "planes": montage.planes(truth, volumes | support, top, spacing),
             "mip": montage.projections(truth, volumes, top, spacing),
@@ -205,13 +205,9 @@ class BoardReview(L.Callback):
             shown["cameras"] = cameras.alignments(by.shift_px[case], by.gain[case], truth)
         return shown
 
-    def _baselines(self, module: Any, views: Tensor) -> dict[str, Tensor]:
+    def _baselines(self, own: Any, views: Tensor) -> dict[str, Tensor]:
         if not self._fixed:  # the scenes are the same at every review, so once is enough
-            models = {
-                name: MODELS.build(name, projector=module.projector).to(views.device)
-                for name in self.baselines
-            }
-            self._fixed = {name: model(views).volume for name, model in models.items()}
+            self._fixed = {name: own.by(name, views).volume for name in self.baselines}
         return self._fixed
 
 

@@ -18,7 +18,8 @@ from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
 from mvrecon.engine.module import Settings, build_projector
-from mvrecon.engine.on_rig import with_weights_of
+from mvrecon.engine.on_case import plain, projected, reconstructed
+from mvrecon.engine.on_rig import OnRig, with_weights_of
 from mvrecon.engine.quality import quality_of, quality_row
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of
 from mvrecon.files.memory import peak_since, restarted_peak
@@ -39,7 +40,7 @@ See = Callable[[dict[str, Any], dict[str, Tensor]], None]
 
 @torch.inference_mode()
 def evaluate(
-    models: Mapping[str, nn.Module],
+    models: Mapping[str, nn.Module | OnRig],
     batches: Iterable[dict[str, Any]],
     A: Projector,
     data_range: float,
@@ -51,7 +52,8 @@ def evaluate(
     ("cameras", where it does), of each model on each scene.
 
     Args:
-        models: by label, all for the grid and the rig of `A`.
+        models: by label, all for the grid and the rig of `A`; `OnRig` where a method's operator may
+            be each case's own.
         batches: test scenes, in batches of any size; the models get them one by one.
         A: re-projects the volumes for the error of the views.
         data_range: for PSNR and SSIM.
@@ -59,17 +61,17 @@ def evaluate(
         see: called with every scene and its reconstructions by label.
     """
     A = A.to(device)
-    ready = {label: model.to(device).eval() for label, model in models.items()}
+    ready = {label: _ready(model, device) for label, model in models.items()}
     scores: Scores = {label: [] for label in models}
     for scene in (case for batch in batches for case in _singly(batch, device)):
         volumes = {}
         for label, model in ready.items():
             if not scores[label]:
-                model(scene["views"])  # the first call compiles and fills caches
-            milliseconds, needed, out = _measured(model, scene["views"])
+                reconstructed(model, scene)  # the first call compiles and fills caches
+            milliseconds, needed, out = _measured(model, scene)
             volume = out.volume
             figures = volume_metrics(volume[0], scene["volume"][0], scene["inside"][0], data_range)
-            figures |= view_metrics(A(volume), scene["views"])
+            figures |= view_metrics(projected(A, volume, scene), scene["views"])
             costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
             scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
             volumes[label] = volume
@@ -120,11 +122,9 @@ def results(
     for label, method in trained.items():
         known = data.digests("test", rig=not elsewhere)
         digests.compare(known, method.digests, finished(folder, label))
-    A = next(iter(trained.values())).module.projector
-    if elsewhere:
-        A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
     models = {
-        label: _on(A, method) if elsewhere else method.module.model
+        label: _elsewhere(settings, method) if elsewhere else method.module.own
         for label, method in trained.items()
     }
     names: list[str] = []
@@ -165,15 +165,18 @@ def validation_psnr(
     path = finished(folder, label)
     module = load(path).module if path.exists() else build_module(settings, model, data.data_range)
     batches = DataLoader(data.sets["val"])
-    models = {label: module.model}
+    models = {label: module.own}
     scores = evaluate(models, batches, module.projector, data.data_range, device)
     return mean_and_spread([score["psnr"] for score in scores[label]])["mean"]
 
 
-def _on(A: Projector, method: Trained) -> nn.Module:
-    """A method's model on another operator; one without training is made for it already."""
-    model = method.module.model
-    return with_weights_of(model, method.module.hparams["model"], A) if method.steps else model
+def _elsewhere(settings: Settings, method: Trained) -> OnRig:
+    """A method's model on another rig and grid; one without training is made for them already."""
+    own = method.module.own
+    if not method.steps:
+        return own
+    A = build_projector(settings["grid"], settings["camera"], own.projector)
+    return OnRig(A, with_weights_of(own.model, own.options, plain(A)), own.projector, own.options)
 
 
 def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
@@ -234,15 +237,24 @@ def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:
         }
 
 
-def _measured(model: nn.Module, views: Tensor) -> tuple[float, int | None, Reconstruction]:
+def _ready(model: nn.Module | OnRig, device: str) -> nn.Module | OnRig:
+    if isinstance(model, OnRig):
+        return model.ready(torch.device(device), training=False)
+    return model.to(device).eval()
+
+
+def _measured(
+    model: nn.Module | OnRig, scene: dict[str, Any]
+) -> tuple[float, int | None, Reconstruction]:
     """Milliseconds and bytes of one reconstruction, above what was in use before, and what came
     out.
     """
+    views = scene["views"]
     before = torch.cuda.memory_allocated() if views.is_cuda else restarted_peak()
     if views.is_cuda:
         torch.cuda.reset_peak_memory_stats()
     start = time.perf_counter()
-    out = model(views)
+    out = reconstructed(model, scene)
     if views.is_cuda:
         torch.cuda.synchronize()
     milliseconds = 1e3 * (time.perf_counter() - start)

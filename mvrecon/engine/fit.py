@@ -1,6 +1,7 @@
 """One run: its data, its methods, and the training of every method that has weights to learn."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,19 @@ def build_data(settings: Settings) -> SceneData:
 
 
 def build_module(settings: Settings, model: Settings, data_range: float) -> ReconstructionModule:
-    """A method of a run, with fresh weights."""
+    """A method of a run, with fresh weights.
+
+    Its key `assume` has options of the projector that are this method's alone: what it takes the
+    measurement for.
+
+    Raises:
+        TypeError: an assumption that is no mapping.
+    """
     geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
+    model = dict(model)
+    if not isinstance(assumed := model.pop("assume", None) or {}, Mapping):
+        raise TypeError(f"Expected options of the projector for assume, got {assumed!r}")
+    geometry["projector"] = {**geometry["projector"], **assumed}
     if rigs := settings["data"].get("rigs", 0):
         geometry["rigs"] = rigs
     return ReconstructionModule(

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from mvrecon.data.rigs import camera_of
 from mvrecon.engine.means import Means
+from mvrecon.engine.on_case import CaseAttenuation, OnCases, OwnAttenuation, on_cases, plain
 from mvrecon.engine.on_rig import OnRig, with_weights_of
 from mvrecon.engine.quality import quality_of
 from mvrecon.engine.schedule import build_optimizer, build_schedule
@@ -25,10 +26,13 @@ Settings = dict[str, Any]
 def build_projector(
     grid: Mapping[str, Any], camera: Mapping[str, Any], projector: Mapping[str, Any]
 ) -> Projector:
-    """The projector of a grid (options of `Grid.centred`) and a rig (name and options)."""
-    return PROJECTORS.from_config(
-        projector, grid=Grid.centred(**grid), cameras=CAMERAS.from_config(camera)
-    )
+    """The projector of a grid (options of `Grid.centred`) and a rig (name and options); where its
+    mu is that of each case, `OwnAttenuation`.
+    """
+    rig, own = CAMERAS.from_config(camera), CaseAttenuation.of(projector)
+    settings = dict(projector) if own is None else {**projector, "mu": None}
+    A = PROJECTORS.from_config(settings, grid=Grid.centred(**grid), cameras=rig)
+    return A if own is None else OwnAttenuation(A, projector, own)
 
 
 class ReconstructionModule(L.LightningModule):
@@ -57,15 +61,28 @@ class ReconstructionModule(L.LightningModule):
         super().__init__()
         self.save_hyperparameters(logger=False)
         self.projector = self._projector(0)
-        self.model = MODELS.from_config(model, projector=self.projector)
-        rig = OnRig(self.projector, self.model, geometry["projector"])
-        self._rigs = {0: rig}  # no module: a checkpoint has the weights once
+        self.model = MODELS.from_config(model, projector=plain(self.projector))
+        own = OnRig(self.projector, self.model, geometry["projector"], model)
+        self._rigs = {0: own}  # no module: a checkpoint has the weights once
         self.loss = ReconstructionLoss(data_range, **loss)
         self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
 
-    def forward(self, views: Tensor) -> Reconstruction:
-        """Reconstruct; see the model."""
-        return self.model(views)
+    def forward(self, views: Tensor, **case: Tensor) -> Reconstruction:
+        """Reconstruct; see the model.
+
+        Args:
+            views: as the model takes them.
+            case: where the projector's mu is that of each case, "mu" or "mu_measured" [b 1 d h w]
+                in 1/mm.
+        """
+        if not isinstance(self.projector, OwnAttenuation):
+            return self.model(views)
+        return self.on({"views": views, **case}).model(views)
+
+    @property
+    def own(self) -> OnRig:
+        """The model on its own rig."""
+        return self._rigs[0]
 
     def _projector(self, rig: int) -> Projector:
         geometry = self.hparams["geometry"]
@@ -77,9 +94,13 @@ class ReconstructionModule(L.LightningModule):
         rig = int(batch["rig"][0]) if "rig" in batch else 0
         if rig not in self._rigs:
             A, options = self._projector(rig), self.hparams["model"]
-            model = with_weights_of(self.model, options, A)
-            self._rigs[rig] = OnRig(A, model, self.hparams["geometry"]["projector"])
+            model = with_weights_of(self.model, options, plain(A))
+            self._rigs[rig] = OnRig(A, model, self.hparams["geometry"]["projector"], options)
         return self._rigs[rig].ready(self.device, self.training)
+
+    def on(self, batch: dict[str, Any]) -> OnRig | OnCases:
+        """The model on the rig of a batch, by the operators of its cases where these differ."""
+        return on_cases(self._on_rig(batch), batch)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """The loss of one batch.
@@ -87,7 +108,8 @@ class ReconstructionModule(L.LightningModule):
         Raises:
             FloatingPointError: a loss that is not finite.
         """
-        terms = self._terms(self._on_rig(batch).model(batch["views"]), batch)
+        own = self.on(batch)
+        terms = self._terms(own, own.model(batch["views"]), batch)
         if not terms["total"].isfinite():
             shown = ", ".join(f"{name} {value.item():.4g}" for name, value in terms.items())
             raise FloatingPointError(
@@ -106,21 +128,22 @@ class ReconstructionModule(L.LightningModule):
             )
         return terms["total"]
 
-    def _terms(self, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def _terms(
+        self, own: OnRig | OnCases, out: Reconstruction, batch: dict[str, Any]
+    ) -> dict[str, Tensor]:
         """The loss, with the truth's own views where views are corrected towards them."""
         if self.loss.compares_views(out):
-            A = self._on_rig(batch).corrected.to(batch["volume"].device)
-            batch = {**batch, "true_views": A(batch["volume"])}
+            batch = {**batch, "true_views": own.corrected(batch["volume"])}
         return self.loss(out, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
         """Judge a batch by the loss and the figures of merit; hand the reconstruction on to the
         board.
         """
-        rig = self._on_rig(batch)
-        out = rig.model(batch["views"])
-        terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
-        predicted = rig.A(out.volume)
+        own = self.on(batch)
+        out = own.model(batch["views"])
+        terms = {f"loss_{name}": value for name, value in self._terms(own, out, batch).items()}
+        predicted = own.A(out.volume)
         figures = [
             volume_metrics(volume, truth, inside, self.hparams["data_range"])
             | view_metrics(view, measured)

@@ -5,8 +5,10 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
+from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 
@@ -19,11 +21,13 @@ class OnRig:
         A: operator of the rig.
         model: for it.
         projector: name and options of the operator.
+        options: name and options of the model.
     """
 
     A: Projector
     model: nn.Module
     projector: dict[str, Any]
+    options: dict[str, Any]
 
     @cached_property
     def corrected(self) -> Projector:
@@ -33,7 +37,12 @@ class OnRig:
         cameras = getattr(self.model, "corrected_cameras", None)
         if cameras is None:
             return self.A
-        return PROJECTORS.from_config(self.projector, grid=self.A.grid, cameras=cameras)
+        A = PROJECTORS.from_config(self.projector, grid=self.A.grid, cameras=cameras)
+        return A.to(self.A.device)
+
+    def by(self, name: str, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
+        """What a model without training makes of views."""
+        return MODELS.build(name, projector=self.A).to(views.device)(views)
 
     def ready(self, device: torch.device, training: bool) -> "OnRig":
         """The same on a device, for training or not."""

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,6 +15,7 @@ from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import Corrected
 from mvrecon.data.volume_files import read_volume
+from mvrecon.files.checks import Refused
 from mvrecon.files.memory import check_memory
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, PROJECTORS
@@ -21,6 +23,9 @@ from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
 VOLUMES = 3
+#: Of the grid's diagonal: as much a line integral of ones reaches in any view, and counts behind a
+#: pinhole, or a grey value, never.
+LINE = 0.02
 
 
 class Views(Protocol):
@@ -93,10 +98,45 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     rig = CAMERAS.from_config(_with_pixels(settings["camera"], measured.stack.shape))
     cameras = measured.cameras(rig)
     grid = _grid(settings["grid"], cameras)
-    check_rig_sees(cameras, grid)
+    seeing = int(check_rig_sees(cameras, grid).nonzero()[0, 0])
     bytes_needed = 4 * VOLUMES * math.prod(grid.shape)
     check_memory(bytes_needed, f"A reconstruction of {grid.shape} voxels")
-    return Scan(measured, cameras, grid, settings["projector"])
+    scan = Scan(measured, cameras, grid, settings["projector"])
+    if measured.stack.unit is not None:
+        check_unit(measured.stack.unit, scan, seeing)
+    return scan
+
+
+def check_unit(unit: str, scan: Scan, view: int) -> None:
+    """Check that views are what the projector makes: line integrals or not.
+
+    Args:
+        unit: of the views as their file has it: "... * mm" of line integrals, "<projector> of ..."
+            of others.
+        scan: that they are of.
+        view: one that sees the grid.
+
+    Raises:
+        Refused: line integrals for a projector of counts, or counts for one of line integrals.
+    """
+    affine = scan.grid.affine.clone()
+    affine[:3, :3] *= torch.tensor(scan.grid.shape[::-1], dtype=affine.dtype) / 2
+    affine[:3, 3] = scan.grid.centre - affine[:3, :3].sum(dim=1) / 2
+    blocks = Grid((2, 2, 2), affine)  # the same box
+    A = PROJECTORS.from_config(scan.projector, grid=blocks, cameras=scan.cameras[view : view + 1])
+    most = A(torch.ones(1, 1, *blocks.shape)).max().item()
+    diagonal = (affine[:3, :3].sum(dim=1) * 2).norm().item()
+    name = scan.projector["name"]
+    if unit.endswith("* mm") and 0 < most < LINE * diagonal:
+        raise Refused(
+            f"expected views in the unit of the projector {name!r}, got line integrals in {unit}; "
+            f"projector=drr is for those"
+        )
+    if " of " in unit and most >= LINE * diagonal:
+        raise Refused(
+            f"expected line integrals for the projector {name!r}, got views in the unit {unit!r}; "
+            f"the projector that made them is {unit.partition(' of ')[0]!r}"
+        )
 
 
 def _with_pixels(camera: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Any]:

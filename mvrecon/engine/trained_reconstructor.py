@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.data import digests
+from mvrecon.engine.on_case import plain
 from mvrecon.engine.on_rig import with_weights_of
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
@@ -58,7 +59,7 @@ def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple
 
     module = load(checkpoint, method).module
     many = module.hparams["geometry"].get("rigs", 0) > 0
-    for difference in _differences(A, module.projector, many):
+    for difference in _differences(A, plain(module.projector), many):
         warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=3)
     return model_on(A, module, checkpoint), module.hparams["data_range"]
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.engine.module import ReconstructionModule
+from mvrecon.engine.on_case import CaseAttenuation
 from mvrecon.files.memory import memory_at_hand
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import MODELS, PROJECTORS
@@ -59,9 +60,12 @@ def step_bytes(module: ReconstructionModule, batch_size: int, edge: int = EDGE) 
         edge: voxels along the shortest edge of the grid that it is measured on.
     """
     A, settings = module.projector, module.hparams
+    projector = dict(settings["geometry"]["projector"])
+    if CaseAttenuation.of(projector):
+        projector["mu"] = None  # a case's own takes no more
     factor = max(1, min(A.grid.shape) // edge)
     coarse = PROJECTORS.from_config(
-        settings["geometry"]["projector"],
+        projector,
         grid=_coarse_grid(A.grid, factor),
         cameras=_coarse_rig(A.cameras, factor),
     )

@@ -33,9 +33,9 @@ def mlem(
     x) = sum(y). A voxel that is zero stays zero; after one step those are the voxels that no counts
     reach (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 1982). With subsets, cameras taken in turn,
     n steps make one iteration: nearly n times as fast, but no longer sure to converge. A voxel is
-    then zero for ever as soon as one subset that sees it has no counts for it, which at few counts
-    leaves bins with counts that no voxel explains (OSEM: Hudson and Larkin, IEEE Trans. Med.
-    Imaging 13, 1994).
+    then zero for ever as soon as one subset that sees its share of it has no counts for it, which
+    at few counts leaves bins with counts that no voxel explains (OSEM: Hudson and Larkin, IEEE
+    Trans. Med. Imaging 13, 1994).
 
     No gradient: counts that require one are refused.
 
@@ -62,15 +62,39 @@ def mlem(
         check_start(A, start, counts)
     parts = subset_likelihoods(A, counts, background, subsets, skip_zero_bins)
     sums = [part.sensitivity(parts[0].counts.dtype) for part in parts]
-    x = admitted(parts, sums, start)
+    x, share = admitted(parts, sums, start), torch.stack(sums).mean(dim=0)
     watch = Watch(common.get("monitor"), partial(likelihood_of_residual, counts))
     for number in range(1, iterations + 1):
         for part, s in zip(parts, sums, strict=True):
-            # a voxel that these views do not see, though others do, is left to the others
-            x = torch.where(s > 0, x * (part.explained(x) / torch.where(s > 0, s, 1)), x)
+            x = _step(x, part, s, share)
         if watch.ends(number, x, partial(unexplained, A, counts, background, x)):
             break
     return watch.result(x)
+
+
+def _step(
+    x: Float[Tensor, "b c d h w"],
+    part: PoissonLikelihood,
+    s: Float[Tensor, "1 1 d h w"],
+    share: Float[Tensor, "1 1 d h w"],
+) -> Float[Tensor, "b c d h w"]:
+    """One step by a subset: OSEM's where the subset has its share of a voxel's sensitivity, else
+    shortened to the part of the share that it has.
+
+    x <- x + x (A_k^T (y_k / ybar_k) - s_k) / max(s_k, s / n), between OSEM and RAMLA (Browne and De
+    Pierro, IEEE Trans. Med. Imaging 15 (1996) 687). OSEM's own step follows the noise of the one
+    ray that grazes a voxel, and adds counts with every subset: 60 % in one iteration where voxels
+    are much finer than the gap of rays.
+
+    Args:
+        x: the volume.
+        part: the subset's likelihood.
+        s: its sensitivity s_k.
+        share: s / n, the mean sensitivity of the n subsets.
+    """
+    most = torch.maximum(s, share)
+    rest = (most - s) + part.explained(x)
+    return x * torch.where(most > 0, rest / torch.where(most > 0, most, 1), 1)
 
 
 @without_gradient
@@ -83,8 +107,8 @@ def osem(
     skip_zero_bins: bool = True,
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
-    """MLEM over ordered subsets of the cameras, x <- x / s_k A_k^T (y_k / (A_k x + r)), in the unit
-    of the volume.
+    """MLEM over ordered subsets of the cameras, x <- x / s_k A_k^T (y_k / (A_k x + r)) where a
+    subset sees its share of a voxel, in the unit of the volume.
 
     No gradient, as `mlem`.
 

@@ -35,6 +35,7 @@ class Sample:
         name: of the case, the same for the same (seed, index).
         errors: what is wrong with each view and nobody knows, by name; empty where nothing is.
         mu: linear attenuation on the grid in 1/mm; none where the scene has no matter.
+        mu_measured: what a transmission scan makes of it; none where there was none.
     """
 
     views: Float[Tensor, "1 m v u"]
@@ -43,6 +44,7 @@ class Sample:
     name: str
     errors: Mapping[str, Shaped[Tensor, "m *n"]] = field(default_factory=dict)
     mu: Float[Tensor, "1 d h w"] | None = None
+    mu_measured: Float[Tensor, "1 d h w"] | None = None
 
 
 class Scene(Protocol):

@@ -82,6 +82,8 @@ class Hdf5Views(ProjectionStack):
             views = dataset_in(path, file, "views", EXPECTED)
             if views.ndim != 3 or views.dtype.kind != "f":
                 raise Refused(f"{path}: has {views.dtype} {views.shape}; expected {EXPECTED}")
+            unit = views.attrs.get("unit")
+            self.unit = unit if isinstance(unit, str) else None
             names = [f"view {k}" for k in range(len(views))]
             super().__init__(path, names, views.shape[1:], views.dtype)
 

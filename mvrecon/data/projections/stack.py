@@ -34,6 +34,8 @@ class ProjectionStack(ABC):
 
     #: What the pixels are where the format says it: "integrals" (or counts) or "intensities".
     kind: Literal["integrals", "intensities"] | None = None
+    #: Unit of the pixels where the file says it, as `mvrecon-simulate` does.
+    unit: str | None = None
 
     def __init__(
         self,

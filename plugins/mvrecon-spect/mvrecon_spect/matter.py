@@ -9,6 +9,12 @@ from torch import Tensor
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.attenuated import check_mu
 
+#: What a map of each case's own needs.
+OF_CASES = (
+    "; each case's own map is known to mvrecon-train and mvrecon-eval alone, with a scene that "
+    "attenuates (cardiac, nema, spect_ct)"
+)
+
 
 def attenuation_on(
     grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path
@@ -21,9 +27,10 @@ def attenuation_on(
             Interfile, .hv, in 1/cm), which is resampled to the grid, and zero outside of its own.
 
     Raises:
+        TypeError: no tensor, number or path, such as the name of a map of each case.
         ValueError: values that cannot be attenuation in 1/mm, or a tensor of another shape.
     """
-    if isinstance(mu, str | Path):
+    if isinstance(mu, str | Path) and str(mu) not in ("case", "measured"):
         from mvrecon.data.resample import resample
         from mvrecon.data.volume_files import read_volume
         from mvrecon_spect.files.interfile_volume import read_mu
@@ -31,6 +38,8 @@ def attenuation_on(
         values, source = (read_mu if Path(mu).suffix.lower() == ".hv" else read_volume)(mu)
         check_mu(values, source)
         return resample(values, source, grid).clamp_min(0)
+    if not isinstance(mu, Tensor | float | int):
+        raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}{OF_CASES}")
     values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))
     check_mu(values, grid)
     return values

@@ -1,0 +1,125 @@
+"""Attenuation of each case's own in models, and the experiments that use it."""
+
+from functools import cache
+
+import pytest
+import torch
+
+import mvrecon as mv
+from mvrecon.config import compose
+from mvrecon.engine.evaluation import evaluate
+from mvrecon.engine.fit import build_data, build_module, methods
+from mvrecon.engine.module import build_projector
+from mvrecon.engine.on_case import CaseAttenuation
+from mvrecon_spect.projector import Spect
+from mvrecon_spect.spect_ct import SpectCt
+
+#: A patient in 10 x 8 x 8 voxels, and networks of a few weights.
+TINY = (
+    "model=cross_view_small",
+    "camera.pixels=8",
+    "camera.columns=[3]",
+    "compare.world_unet.rounds=[{resolution: full, widths: [2], cameras: null}]",
+    "compare.bsrem.reconstructor.iterations=1",
+    "data.sizes={train: 2, val: 0, test: 2}",
+)
+GRIDS = {
+    "dcspect_derenzo": ("grid.size=[8,8,8]", "grid.spacing=20"),
+    "dcspect_cardiac": ("grid.size=[10,8,8]", "grid.spacing=32"),
+    "dcspect_ct": ("grid.size=[10,8,8]", "grid.spacing=32", "scene.iterations=4"),
+}
+
+
+@cache
+def settings_of(name: str) -> dict:
+    return compose(f"experiment={name}", *TINY, *GRIDS[name])
+
+
+@cache
+def data_of(name: str):
+    data = build_data(settings_of(name))
+    data.setup("test")
+    data.setup("fit")
+    return data
+
+
+@cache
+def module_of(name: str, label: str):
+    settings = settings_of(name)
+    return build_module(settings, methods(settings)[label], 1.0)
+
+
+def batch_of(name: str) -> dict:
+    return next(iter(data_of(name).test_dataloader()))
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_an_experiment_takes_a_step_and_judges_every_method(name: str):
+    data, settings = data_of(name), settings_of(name)
+    module, batch = module_of(name, "cross_view"), next(iter(data.train_dataloader()))
+    own = module.on(batch)
+    module._terms(own, own.model(batch["views"]), batch)["total"].backward()
+    slopes = [p.grad for p in module.parameters() if p.grad is not None]
+    assert any(slope.any() for slope in slopes) and all(s.isfinite().all() for s in slopes)
+    rows = {label: module_of(name, label).own for label in methods(settings)}
+    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    scores = evaluate(rows, data.test_dataloader(), A, 1.0)
+    assert set(scores) == set(rows)
+    assert all(
+        0 < s["nrmse"] < 3 and 0 < s["view_nrmse"] < 2 for row in scores.values() for s in row
+    )
+
+
+def test_each_case_of_a_batch_is_reconstructed_by_its_own_attenuation():
+    batch, module = batch_of("dcspect_cardiac"), module_of("dcspect_cardiac", "osem")
+    made = module.on(batch).model(batch["views"]).volume
+    grid, cameras = module.projector.grid, module.projector.cameras
+    for case in range(2):
+        A = Spect(grid, cameras, mu=batch["mu"][case, 0])
+        views = batch["views"][case : case + 1]
+        assert torch.equal(made[case : case + 1], mv.osem(A, views, 4))
+    assert not torch.equal(batch["mu"][0], batch["mu"][1])
+    assert torch.equal(module(batch["views"], mu=batch["mu"]).volume, made)
+
+
+def test_a_method_may_take_the_attenuation_for_something_else():
+    batch = batch_of("dcspect_ct")
+    plain = module_of("dcspect_ct", "osem_none")
+    A = Spect(plain.projector.grid, plain.projector.cameras)
+    assert torch.equal(plain.on(batch).model(batch["views"]).volume, mv.osem(A, batch["views"], 4))
+    maps = [
+        CaseAttenuation.of({"mu": mu}).maps_of(batch, A.grid)[0]
+        for mu in ("measured", {"of": "measured", "shift_mm": [32, 0, 0]})
+    ]
+    assert torch.equal(maps[0], batch["mu_measured"][0, 0])
+    torch.testing.assert_close(maps[1][..., 1:], maps[0][..., :-1])
+    assert not maps[1][..., 0].any()
+
+
+def test_a_scan_measures_the_attenuation_of_its_patient():
+    """Mean over the torso to 3 %, each case with its own noise, the same at every call."""
+    batch, scene = batch_of("dcspect_ct"), data_of("dcspect_ct").scenes["test"]
+    true, known = batch["mu"], batch["mu_measured"]
+    assert known.sum().item() == pytest.approx(true.sum().item(), rel=0.03)
+    assert (known - true).norm() < 0.35 * true.norm()
+    again = scene.sample(0, 0, data_of("dcspect_ct").grid, data_of("dcspect_ct").cameras)
+    assert torch.equal(again.mu_measured, known[0])
+
+
+@pytest.mark.door
+def test_attenuation_that_no_case_brings_is_refused():
+    """A projector that wants each case's attenuation refuses cases without, and to act without."""
+    batch, module = batch_of("dcspect_derenzo"), module_of("dcspect_cardiac", "osem")
+    with pytest.raises(ValueError, match="as of the scene cardiac or nema"):
+        module.on(batch)
+    with pytest.raises(ValueError, match="as of the scene cardiac or nema"):
+        module(batch["views"])
+    with pytest.raises(TypeError, match="projector of a case"):
+        module.projector(batch["volume"])
+    with pytest.raises(TypeError, match="known to mvrecon-train and mvrecon-eval alone"):
+        Spect(module.projector.grid, module.projector.cameras, mu="case")
+    for wrong in ({"of": "guessed"}, {"shift_mm": [1, 2]}):
+        with pytest.raises(ValueError, match=r"projector\.mu of case or measured"):
+            CaseAttenuation.of({"mu": wrong})
+    with pytest.raises(ValueError, match="a scene with matter"):
+        SpectCt({"name": "derenzo"}, {"name": "circular"})
