@@ -27,13 +27,14 @@ class OnRig:
 
     @cached_property
     def corrected(self) -> Projector:
-        """The operator of the views that the model corrects: its own, or one of the same kind for
-        the model's `corrected_cameras`.
+        """The operator of the views that the model corrects: its own, or one for the model's
+        `corrected_cameras`, of the same kind unless the model has a `corrected_projector`.
         """
         cameras = getattr(self.model, "corrected_cameras", None)
         if cameras is None:
             return self.A
-        return PROJECTORS.from_config(self.projector, grid=self.A.grid, cameras=cameras)
+        config = getattr(self.model, "corrected_projector", self.projector)
+        return PROJECTORS.from_config(config, grid=self.A.grid, cameras=cameras)
 
     def ready(self, device: torch.device, training: bool) -> "OnRig":
         """The same on a device, for training or not."""
