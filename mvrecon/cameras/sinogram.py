@@ -29,8 +29,7 @@ def sinogram_rig(grid: Grid, angles: int, bins: int | None = None) -> Cameras:
     axes = grid.affine[:3, :3] / grid.affine.new_tensor([x, y, z])
     if not torch.allclose(axes.T @ axes, torch.eye(3).to(axes), atol=1e-6):
         raise ValueError(
-            f"Sinograms of slices need a grid with axes at right angles, got "
-            f"{grid.affine.tolist()}"
+            f"Sinograms of slices need a grid with axes at right angles, got {grid.affine.tolist()}"
         )
     width = min(x, y)
     diagonal = math.hypot(grid.shape[2] * (x / width), grid.shape[1] * (y / width))

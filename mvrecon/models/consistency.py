@@ -50,7 +50,7 @@ class Consistency(nn.Module):
 
     def __init__(self, steps: Steps):
         super().__init__()
-        options = dict(steps) if isinstance(steps, Mapping) else {"steps": steps}
+        options: dict[str, Any] = dict(steps) if isinstance(steps, Mapping) else {"steps": steps}
         check_options("Consistency", options, ("steps", "noise", "rule", "background"))
         count, noise = int(options.get("steps", 3)), options.get("noise", "gaussian")
         if count < 0 or noise not in ("gaussian", "poisson"):
@@ -58,7 +58,10 @@ class Consistency(nn.Module):
                 f"Expected 0 consistency steps or more, and the noise gaussian or poisson, got "
                 f"{count} and {noise!r}"
             )
-        self.poisson, self.em = noise == "poisson", _is_em(noise, options.get("rule", "gradient"))
+        self.poisson, self.em = (
+            noise == "poisson",
+            _is_em(noise, str(options.get("rule", "gradient"))),
+        )
         self.background = float(options.get("background", 0.0))
         if not 0 <= self.background < math.inf or (self.background and not self.em):
             raise ValueError(
@@ -86,7 +89,7 @@ class Consistency(nn.Module):
             if self.poisson and not self.em and number == 0:
                 geometry = weighted_for_counts(geometry, expected)
             residual = views - expected
-            unmet: Tensor | bool = True
+            unmet = torch.ones_like(residual[:, :, :1, :1, :1], dtype=torch.bool)
             if sigma is not None and not self.training:
                 unmet = (residual / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
                 if not unmet.any():

@@ -93,7 +93,8 @@ class RadonUNet(nn.Module):
         self.corrected_cameras = rig[list(range(angles // 2))]
         self.radon = Radon(grid, self.corrected_cameras)
         self.cropping = Cropping(projector, Options())
-        self.start, self.filter = checked_start(start), filter
+        self.start = checked_start(start)
+        self.filter: Filter = filter
         self.chord = typical_chord(grid)
         inputs = 2 + len(cameras)
         self.net = PlainUNet(3, inputs, features, widths, zero=1, precision=precision)
@@ -130,9 +131,7 @@ class RadonUNet(nn.Module):
         change = self.head(images).unflatten(0, (len(views), -1)).transpose(1, 2)
         return ideal[:, :1] + self.chord * change
 
-    def backprojected(
-        self, projections: Float[Tensor, "b 1 a z s"]
-    ) -> Float[Tensor, "b 1 d h w"]:
+    def backprojected(self, projections: Float[Tensor, "b 1 a z s"]) -> Float[Tensor, "b 1 d h w"]:
         """Filtered back-projection of the slices, in the unit of (projections / mm); linear."""
         slices = Slices(self.radon.grid, self.corrected_cameras)
         return filtered(slices, projections, self.filter)
