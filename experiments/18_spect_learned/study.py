@@ -68,8 +68,8 @@ ARMS = {
     "cross_view": ("model=cross_view_counts",),
 }
 MAIN = tuple(name for name in ARMS if name != "mean_fusion_own")
-WEIGHTS = (3e-3, 1e-2, 2e-2, 3e-2, 1e-1)
-ITERATIONS = 24
+WEIGHTS = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)
+ITERATIONS = 12
 
 #: From counts of several cases to their volumes.
 Method = Callable[[torch.Tensor], torch.Tensor]

@@ -58,10 +58,8 @@ class Consistency(nn.Module):
                 f"Expected 0 consistency steps or more, and the noise gaussian or poisson, got "
                 f"{count} and {noise!r}"
             )
-        self.poisson, self.em = (
-            noise == "poisson",
-            _is_em(noise, str(options.get("rule", "gradient"))),
-        )
+        self.poisson = noise == "poisson"
+        self.em = _is_em(noise, str(options.get("rule", "gradient")))
         self.background = float(options.get("background", 0.0))
         if not 0 <= self.background < math.inf or (self.background and not self.em):
             raise ValueError(
