@@ -100,6 +100,7 @@ MODELS = Registry(
     geometry_free="mvrecon.models.baselines:GeometryFree",
     dif_net="mvrecon.models.pixel_aligned:DifNet",
     svct="mvrecon.models.pixel_aligned:Svct",
+    radon_unet="mvrecon.models.radon_unet:RadonUNet",
     fbp_unet="mvrecon.models.sparse_view.schools:FbpUNet",
     sinogram_unet="mvrecon.models.sparse_view.schools:SinogramUNet",
     dual_domain="mvrecon.models.sparse_view.schools:DualDomain",

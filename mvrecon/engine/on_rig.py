@@ -31,13 +31,14 @@ class OnRig:
 
     @cached_property
     def corrected(self) -> Projector:
-        """The operator of the views that the model corrects: its own, or one of the same kind for
-        the model's `corrected_cameras`.
+        """The operator of the views that the model corrects: its own, or one for the model's
+        `corrected_cameras`, of the same kind unless the model has a `corrected_projector`.
         """
         cameras = getattr(self.model, "corrected_cameras", None)
         if cameras is None:
             return self.A
-        A = PROJECTORS.from_config(self.projector, grid=self.A.grid, cameras=cameras)
+        config = getattr(self.model, "corrected_projector", self.projector)
+        A = PROJECTORS.from_config(config, grid=self.A.grid, cameras=cameras)
         return A.to(self.A.device)
 
     def by(self, name: str, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:

@@ -2,6 +2,7 @@
 data-consistency steps.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -18,12 +19,12 @@ from mvrecon.registry import check_options
 
 #: The least number of counts that a pixel is taken to expect, relative to the mean of its case.
 LEAST = 0.01
-#: How many steps, or a mapping of steps and noise.
+#: How many steps, or a mapping of steps, noise, rule and background.
 Steps = int | Mapping[str, Any]
 
 
 class Consistency(nn.Module):
-    """A few learned-length gradient steps towards the data, x + lambda_k C A^T R (y - A x).
+    """A few learned-length steps towards the data, x + lambda_k C A^T R (y - A x).
 
     C and R are the inverse column and row sums of A (SIRT, Gregor & Benson 2008), so a step of
     length one is stable for every rig. The steps' lengths are learned, as in ItNet (Genzel et al.
@@ -31,19 +32,26 @@ class Consistency(nn.Module):
     the inverse column sums that belong to it, as stable (De Pierro, IEEE Trans. Med. Imaging 14
     (1995) 132).
 
+    The rule "em" is expectation maximisation, x + lambda_k x / s A^T (y / (A x + r) - 1) with s =
+    A^T 1 (Shepp & Vardi, IEEE Trans. Med. Imaging 1 (1982) 113). Lengths up to one never lower the
+    Poisson likelihood: they lie between x and the maximum of its separable surrogate. At one, and
+    without r, a step keeps the counts, <s, x> = sum(y). Volumes and views are cut off at zero.
+
     Args:
-        steps: how many; none leaves the volume as it is. Or `{steps: 3, noise: poisson}`, for
-            counts; noise gaussian is the default.
+        steps: how many; none leaves the volume as it is. Or `{steps: 3, noise: poisson, rule: em}`,
+            for counts: noise gaussian, rule gradient and background 0 are the default. The
+            background is r of "em", relative to the mean of the views that rays of the mask make.
 
     Raises:
         TypeError: a mapping with other keys.
-        ValueError: a number of steps below 0, or another noise.
+        ValueError: a number of steps or a background below 0, another noise or rule, or a rule or a
+            background that the noise does not have.
     """
 
     def __init__(self, steps: Steps):
         super().__init__()
-        options = dict(steps) if isinstance(steps, Mapping) else {"steps": steps}
-        check_options("Consistency", options, ("steps", "noise"))
+        options: dict[str, Any] = dict(steps) if isinstance(steps, Mapping) else {"steps": steps}
+        check_options("Consistency", options, ("steps", "noise", "rule", "background"))
         count, noise = int(options.get("steps", 3)), options.get("noise", "gaussian")
         if count < 0 or noise not in ("gaussian", "poisson"):
             raise ValueError(
@@ -51,6 +59,12 @@ class Consistency(nn.Module):
                 f"{count} and {noise!r}"
             )
         self.poisson = noise == "poisson"
+        self.em = _is_em(noise, str(options.get("rule", "gradient")))
+        self.background = float(options.get("background", 0.0))
+        if not 0 <= self.background < math.inf or (self.background and not self.em):
+            raise ValueError(
+                f"Expected a background of 0 or more, with rule em alone, got {self.background}"
+            )
         self.lengths = nn.Parameter(torch.ones(count))
 
     def forward(
@@ -66,19 +80,61 @@ class Consistency(nn.Module):
         chi^2 per measurement, the mean of ((y - A x) / sigma)^2, is at most 1. In training every
         sample takes every step.
         """
+        if self.em and len(self.lengths):
+            volume, views = volume.clamp_min(0), views.clamp_min(0)
         for number, length in enumerate(self.lengths):
             expected = geometry.A(volume)
-            if self.poisson and number == 0:
+            if self.poisson and not self.em and number == 0:
                 geometry = weighted_for_counts(geometry, expected)
             residual = views - expected
-            if sigma is None or self.training:
-                volume = volume + length * geometry.back(residual)
-                continue
-            unmet = (residual / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
-            if not unmet.any():
-                break
-            volume = volume + length * unmet * geometry.back(residual)
+            unmet = torch.ones_like(residual[:, :, :1, :1, :1], dtype=torch.bool)
+            if sigma is not None and not self.training:
+                unmet = (residual / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
+                if not unmet.any():
+                    break
+            if self.em:
+                change = em_change(geometry, volume, views, expected, self.background)
+                volume = (volume + length * unmet * change).clamp_min(0)
+            else:
+                volume = volume + length * unmet * geometry.back(residual)
         return volume
+
+
+def _is_em(noise: str, rule: str) -> bool:
+    if rule not in ("gradient", "em") or (rule == "em" and noise != "poisson"):
+        raise ValueError(
+            f"Expected the rule gradient, or em with the noise poisson, got {rule!r} with {noise!r}"
+        )
+    return rule == "em"
+
+
+def em_change(
+    geometry: Geometry,
+    volume: Float[Tensor, "b 1 d h w"],
+    measured: Float[Tensor, "b 1 m v u"],
+    expected: Float[Tensor, "b 1 m v u"],
+    background: float = 0.0,
+) -> Float[Tensor, "b 1 d h w"]:
+    """What expectation maximisation changes of a volume, x / s A^T (y / (A x + r) - 1), in its
+    unit; differentiable. A voxel that no ray passes stays.
+
+    Args:
+        geometry: with C the inverse column sums of A.
+        volume: x, nowhere negative.
+        measured: y, nowhere negative.
+        expected: A x.
+        background: r relative to the mean of y over the rays that meet the mask.
+    """
+    reached = geometry.row > 0
+    if background:
+        number = reached.expand_as(measured).sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
+        total = (measured * reached).sum(dim=(1, 2, 3, 4), keepdim=True)
+        expected = expected + background * total / number
+    # a ray of nothing explains no counts, and all its voxels are zero
+    possible = reached & (expected > 0)
+    ratio = torch.where(possible, measured / torch.where(possible, expected, 1), 0)
+    seen = geometry.column > 0
+    return volume * torch.where(seen, geometry.column * geometry.A.T(ratio) - 1, 0)
 
 
 @torch.no_grad()

@@ -27,6 +27,21 @@ COARSE = 2
 UNSEEN = -1e4
 
 
+def at_voxels(
+    features: Float[Tensor, "b m c v u"], cameras: Cameras, grid: Grid
+) -> Float[Tensor, "b m c d h w"]:
+    """Each view's features at the projections of voxels' centres, in their unit; zero where a
+    camera sees none.
+    """
+    return torch.stack(
+        [
+            backproject(one[:, :, None], cameras[[k]], grid)
+            for k, one in enumerate(features.unbind(1))
+        ],
+        dim=1,
+    )
+
+
 class PixelAligned(nn.Module):
     """Features of the views by one 2-D U-Net, brought to the voxels of a grid.
 
@@ -67,14 +82,7 @@ class PixelAligned(nn.Module):
         self, features: Float[Tensor, "b m c v u"], grid: Grid
     ) -> Float[Tensor, "b m c d h w"]:
         """Each view's features at the projections of voxels' centres; zero where it sees none."""
-        cameras = self.projector.cameras
-        return torch.stack(
-            [
-                backproject(one[:, :, None], cameras[[k]], grid)
-                for k, one in enumerate(features.unbind(1))
-            ],
-            dim=1,
-        )
+        return at_voxels(features, self.projector.cameras, grid)
 
 
 class DifNet(PixelAligned):

@@ -3,15 +3,19 @@
 import pytest
 import torch
 
-from mvrecon.models.consistency import Consistency, weighted_for_counts
+from mvrecon.models.consistency import Consistency, em_change, weighted_for_counts
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.parts import MODELS
+from mvrecon.projectors.operator import Scaled
+from mvrecon.reconstruct.mlem import mlem
+from mvrecon.reconstruct.poisson import negative_log_likelihood
 from mvrecon.testing import check_model
 from tests.models.cross_view.test_model import SMALL
 from tests.models.rig import small_projector
 from tests.models.test_single_pass import OPTIONS
 
 COUNTED = {"steps": 3, "noise": "poisson"}
+EM = {**COUNTED, "rule": "em"}
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +78,62 @@ def test_bright_pixels_count_less_than_with_equal_noise(geometry):
 def test_a_model_of_counts_starts_from_osem_and_keeps_the_contract(name):
     start = {"name": "osem", "iterations": 5, "subsets": 2}
     own = {**OPTIONS, "cross_view": {"rounds": SMALL["M3"]}}.get(name, {})
-    options = {**own, "start": start, "consistency": COUNTED}
+    steps = EM if name == "cross_view" else COUNTED
+    options = {**own, "start": start, "consistency": steps}
     check_model(name, small_projector(), **options)
+
+
+@pytest.fixture(scope="module")
+def counted():
+    """An operator with pixel weights, as that of SPECT, and Poisson counts of a volume with voids,
+    in float64.
+    """
+    A = small_projector(pixels=8)
+    weights = 0.5 + torch.rand(A.range_shape, generator=torch.Generator().manual_seed(3))
+    A = Scaled(A, pixels=weights.double())
+    whole = whole_geometry(A)
+    geometry = whole.to(torch.float64)
+    truth = volume(geometry).double()
+    truth[..., :3] = 0
+    counts = torch.poisson(A(truth), generator=torch.Generator().manual_seed(1))
+    return geometry, truth, counts
+
+
+def test_a_step_of_length_one_is_mlem_and_keeps_the_counts(counted):
+    """The change of em is that of one iteration of `mlem`; sensitivity times activity is the
+    number of counts.
+    """
+    geometry, truth, counts = counted
+    A, start = geometry.A, torch.ones_like(truth)
+    x = start + em_change(geometry, start, counts, A(start))
+    torch.testing.assert_close(x, mlem(A, counts, 1, start=start), rtol=1e-5, atol=1e-6)
+    assert A(x).sum().item() == pytest.approx(counts.sum().item(), rel=1e-5)
+    torch.testing.assert_close(x, Consistency({**EM, "steps": 1}).double()(geometry, start, counts))
+
+
+@pytest.mark.parametrize("background", [0.0, 0.1])
+def test_no_em_step_up_to_length_one_lowers_the_likelihood(counted, background):
+    geometry, truth, counts = counted
+    r = background * counts[(geometry.row > 0).expand_as(counts)].mean()
+    steps = Consistency({**EM, "steps": 1, "background": background}).double()
+    for length in (0.3, 0.7, 1.0):
+        torch.nn.init.constant_(steps.lengths, length)
+        x = 0.1 + volume(geometry).double().flip(2)  # no multiple of the truth
+        values = [negative_log_likelihood(counts, geometry.A(x) + r).item()]
+        for _ in range(4):
+            x = steps(geometry, x, counts).detach()
+            values.append(negative_log_likelihood(counts, geometry.A(x) + r).item())
+        assert all(b < a for a, b in zip(values, values[1:], strict=False))
+
+
+def test_exact_data_are_a_fixed_point_of_em_and_gradients_reach_volume_and_lengths(counted):
+    geometry, truth, _ = counted
+    steps, x = Consistency(EM).double(), truth.clone().requires_grad_()
+    after = steps(geometry, x, geometry.A(truth))
+    torch.testing.assert_close(after, truth, rtol=1e-5, atol=1e-9)
+    other = (truth + 0.5).requires_grad_()
+    steps(geometry, other, geometry.A(truth)).square().sum().backward()
+    assert all(g.isfinite().all() and g.any() for g in (other.grad, steps.lengths.grad))
 
 
 @pytest.mark.door
@@ -85,11 +143,13 @@ def test_a_model_of_counts_starts_from_osem_and_keeps_the_contract(name):
         ({"steps": 2, "noise": "laplace"}, "gaussian or poisson"),
         ({"stops": 2}, "did you mean 'steps'"),
         (-1, "0 consistency steps or more"),
+        ({"rule": "em"}, "em with the noise poisson"),
+        ({**COUNTED, "background": 0.1}, "with rule em alone"),
     ],
 )
 def test_consistency_that_there_is_not_is_refused(steps, message):
-    """A model refuses consistency steps of another noise, of an unknown option, or fewer than
-    none.
+    """A model refuses consistency steps of another noise or rule, of an unknown option, or fewer
+    than none.
     """
     with pytest.raises((TypeError, ValueError), match=message):
         MODELS.build("backprojection_unet", small_projector(), consistency=steps)
