@@ -21,9 +21,7 @@ from mvrecon.files.rank import rank
 from mvrecon.files.runs import RESULTS, read_results
 
 
-def train(
-    settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ()
-) -> dict[str, Any]:
+def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
 

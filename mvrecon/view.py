@@ -42,7 +42,7 @@ def view(
     place = Path(out).expanduser() if out else Path(f"{name_of(path)}.html")
     rig = None if cameras is None else from_file(Path(cameras).expanduser())
     values, grid = read_volume(path)
-    text = page(values, grid, rig, window, first)
+    text = page(values, grid, rig, window, first, name_of(path))
     with written_whole(place) as part:
         part.write_text(text, encoding="utf-8")
     return place

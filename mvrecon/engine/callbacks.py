@@ -185,9 +185,7 @@ class BoardReview(L.Callback):
             for kind, image in self._sheets(pl_module, batch, out, number, units).items():
                 save_png(folder / f"{kind}.png", image)
                 for board in _boards(trainer):
-                    board.add_image(
-                        f"{kind}/{name}", image, trainer.global_step, dataformats="HWC"
-                    )
+                    board.add_image(f"{kind}/{name}", image, trainer.global_step, dataformats="HWC")
 
     def _sheets(
         self, module: Any, batch: Any, out: Reconstruction, number: int, units: tuple[str, str]

@@ -1,4 +1,4 @@
-"""Views as labelled tiles side by side, every kind of image with one fixed window of grey values."""
+"""Views as labelled tiles side by side, with one fixed window of grey values."""
 
 from collections.abc import Sequence
 

@@ -6,6 +6,8 @@ NIfTI).
 """
 
 import math
+import re
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -18,14 +20,16 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz.planes import LETTERS
-from mvrecon.viz.rig_mesh import COLOURS, box, segments
+from mvrecon.viz.rig_mesh import COLOURS, Segments, box, segments
 
-#: Which of a page's pictures is seen first; the others are switched on in its panel. Beside them
-#: the most voxels: of more, blocks are joined into their mean, of the projection into their maximum.
+#: The pictures on a page, and the most voxels of each: of more, blocks are joined into their mean,
+#: of the projection into their maximum.
 VOXELS = {"slices": 2**24, "mip": 2**21, "volume": 2**21}
 #: Magnitudes that are kept as 16-bit floating-point numbers, to three digits.
 HALF = (1e-2, 6e4)
-#: Text without a box and without TeX.
+TITLE = re.compile("<title>.*?</title>")
+#: Colour behind all; text without a box and without TeX.
+BACKGROUND = 0x202024
 PLAIN = {"label_box": False, "is_html": True, "group": "directions"}
 #: What the page may do: run its own program; nothing is loaded from elsewhere.
 POLICY = (
@@ -40,6 +44,7 @@ def page(
     cameras: Cameras | None = None,
     window: tuple[float, float] | None = None,
     first: str = "slices",
+    title: str = "mvrecon",
 ) -> str:
     """HTML of a volume in the world, in mm, with the rig around it.
 
@@ -49,6 +54,7 @@ def page(
         cameras: the rig; none by default.
         window: values that are black and white; by default the 1st and the 99.9th percentile.
         first: what is seen first, one of `VOXELS`.
+        title: of the page.
 
     Raises:
         ImportError: k3d is not installed.
@@ -65,8 +71,10 @@ def page(
     if not low < high:
         raise ValueError(f"Expected a window from a lower to a higher value, got {low} to {high}")
     k3d = _k3d()
-    plot = k3d.plot(grid_visible=False, axes=["x / mm", "y / mm", "z / mm"], background_color=0)
-    _add_rig(plot, k3d, cameras, grid)
+    plot = k3d.plot(grid_visible=False, camera_auto_fit=False, background_color=BACKGROUND)
+    parts = {"grid": box(grid)} if cameras is None else segments(cameras, grid)
+    plot.camera = _camera(torch.cat(list(parts.values())).flatten(0, 1), grid)
+    _add_lines(plot, k3d, parts)
     _add_letters(plot, k3d, grid)
     for name, make in {"slices": k3d.volume_slice, "mip": k3d.mip, "volume": k3d.volume}.items():
         values, coarse = reduced(volume, grid, VOXELS[name], most=name == "mip")
@@ -83,7 +91,8 @@ def page(
             **at,
         )
     policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-    return plot.get_snapshot(6).replace("<head>", f"<head>\n    {policy}", 1)
+    written = TITLE.sub(lambda _: f"<title>{escape(title)}</title>", plot.get_snapshot(6), count=1)
+    return written.replace("<head>", f"<head>\n    {policy}", 1)
 
 
 def reduced(
@@ -131,8 +140,16 @@ def box_matrix(grid: Grid) -> Float[np.ndarray, "4 4"]:
     return (grid.affine @ to_index).numpy()
 
 
-def _add_rig(plot: Any, k3d: Any, cameras: Cameras | None, grid: Grid) -> None:
-    parts = {"grid": box(grid)} if cameras is None else segments(cameras, grid)
+def _camera(points: Float[Tensor, "n 3"], grid: Grid) -> list[float]:
+    """Where the page looks from (front, right, above), what at (the grid's middle), and what is
+    up.
+    """
+    reach = 1.7 * (points - grid.centre).norm(dim=1).max()
+    eye = grid.centre + reach * torch.tensor([0.45, 0.8, 0.4], dtype=torch.float64)
+    return [*eye.tolist(), *grid.centre.tolist(), 0.0, 0.0, 1.0]
+
+
+def _add_lines(plot: Any, k3d: Any, parts: dict[str, Segments]) -> None:
     for name, lines in parts.items():
         red, green, blue = COLOURS[name]
         plot += k3d.lines(

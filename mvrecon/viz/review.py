@@ -148,9 +148,7 @@ def opinions(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
     return sheet(f"{case.name}: opinions", columns, PLANES)
 
 
-def uncertainty(
-    case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
-) -> Image:
+def uncertainty(case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]) -> Image:
     """Three middle planes of the size of a volume's error and of its expected standard deviation,
     to scale, both from 0 to an eighth of the range.
     """
@@ -166,9 +164,7 @@ def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
     Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
     """
     scale = Scale(0.0, 3 / len(volumes), "weight (one third: equal)")
-    columns = [
-        Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))
-    ]
+    columns = [Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))]
     return sheet(f"{case.name}: weights of cameras", columns, PLANES)
 
 
