@@ -23,6 +23,8 @@ SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "model"
 #: Figures of the table, and what they are called in the results.
 FIGURES = {"psnr": "psnr", "ssim": "ssim", "view_nrmse": "view_nrmse"}
 COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
+#: Folder of the test's events in a method's.
+TEST = "test"
 #: The most test scenes that are shown, and the most slices of each.
 CASES, SLICES = 2, 16
 
@@ -40,19 +42,20 @@ def close(
     where the run has a board.
 
     A setting has a name of its own, such as camera.n_views: TensorBoard puts those that differ
-    between runs first.
+    between runs first. Beside them it shows all numbers of the folder, so that the test's have one
+    of their own.
     """
     if not wanted(settings):
         return
     shared = {key: value for key, value in settings.items() if key not in SILENT}
     for label, model in methods(dict(settings)).items():
-        row, board = table["methods"][label], Board(str(folder / label))
+        row, board = table["methods"][label], Board(str(folder / label / TEST))
         figures = {f"test/{name}": row[key]["mean"] for name, key in FIGURES.items()}
         costs = {f"test/{name}": row[key] for name, key in COSTS.items() if row[key] is not None}
         options = {key: value for key, value in model.items() if key != "name"}
         settled = {"method": label, "model": {"": model["name"], **options}}
         values = {".".join(filter(None, keys)): v for keys, v in leaves(settled | shared)}
-        board.log_hyperparams({k: _plain(v) for k, v in values.items()}, figures | costs)
+        board.log_session({k: _plain(v) for k, v in values.items()}, figures | costs)
         if label == next(iter(table["methods"])):
             rows = list(rows_of(table, settings["name"], folder))
             board.experiment.add_text("text/results", markdown(cells(rows, rows[0])))
@@ -90,7 +93,7 @@ class Slices:
             named(label, volume[0], scene, 0, case.data_range): volume[0, 0]
             for label, volume in volumes.items()
         }
-        board = Board(str(self.folder / self.label))
+        board = Board(str(self.folder / self.label / TEST))
         step = -(-len(truth) // SLICES)
         for z in range(step // 2, len(truth), step):
             image = review.slices(case, truth, shown, z)

@@ -102,6 +102,19 @@ class Board(TensorBoardLogger):
         shown = {on_board(name): value for name, value in metrics.items() if name != "epoch"}
         super().log_metrics(shown, step)
 
+    def log_session(self, settings: Mapping[str, Any], figures: Mapping[str, float]) -> None:
+        """Log settings and figures for the table HPARAMS, without saying which settings there are:
+        TensorBoard then takes those of all runs, first those that differ.
+        """
+        from torch.utils.tensorboard.summary import hparams
+
+        _, begin, end = hparams(dict(settings), dict(figures))
+        writer = self.experiment._get_file_writer()
+        writer.add_summary(begin)
+        writer.add_summary(end)
+        for name, value in figures.items():
+            self.experiment.add_scalar(name, value, 0)
+
     def rewind(self, step: int) -> None:
         """Make TensorBoard hide what an interrupted run logged from a step on: the resumed run logs
         it again.
