@@ -47,7 +47,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.data.volume_files import check_ending
     from mvrecon.engine import calibrate, correction, export, run_folder, scan, solve, wrong_cameras
     from mvrecon.engine.evaluation import device_of
-    from mvrecon.viz import cameras, montage, rig
+    from mvrecon.viz import cameras, review, rig
 
     if settings["unit"] not in UNITS:
         raise ValueError(f"Expected the unit 1/mm or HU, got {settings['unit']!r}")
@@ -71,7 +71,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = solve.solve(case, settings, device)
         volume = outcome.volume
-        export.save_png(folder / "planes.png", montage.slices(volume, case.grid.spacing))
+        shown = review.Case(out.name, case.grid, 1.0, "1/mm")
+        export.save_png(folder / "planes.png", review.scan(shown, volume))
         _save(out, outcome, settings["unit"], case.grid)
         table = {
             **_row(settings, case, out),

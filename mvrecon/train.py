@@ -6,6 +6,7 @@ Torch is imported inside the task, so that `--help` and typing mistakes are answ
 
 import math
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from mvrecon.files.rank import rank
 from mvrecon.files.runs import RESULTS, read_results
 
 
-def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
 
@@ -27,13 +28,18 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
     `checkpoints/`, `review/` and `results.json`.
 
+    Args:
+        settings: plain.
+        folder: of the run.
+        overrides: what the command line changed, for the board.
+
     Raises:
         RuntimeError: another process is at work in the folder.
         ValueError: an unknown accelerator; the folder's run has other settings, another rig or
             other data.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.engine import evaluation, fit, hparams, processes, progress, run_folder
+    from mvrecon.engine import board, evaluation, fit, processes, progress, run_folder
 
     progress.silence_lightning()
     # Lightning's own use of torch, of which no user can be rid
@@ -47,9 +53,10 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         run_folder.keep_measurement(folder, data)
         with processes.started(folder, settings["trainer"]):
             fit.fit_all(settings, data, folder)
-        table = evaluation.results(settings, folder, data, device)
+        slices = board.Slices(folder, settings, data.grid, data.data_range, data.unit)
+        table = evaluation.results(settings, folder, data, device, slices)
         table["validation_psnr"] = evaluation.validation_psnr(settings, folder, data, device)
-        hparams.write(folder, settings, table)
+        board.close(folder, settings, table, overrides)
         run_folder.write_results(folder, table)
     return table
 
@@ -92,7 +99,7 @@ def task(config: DictConfig) -> float:
     finished = (folder / RESULTS).is_file()
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
         return _score(read_results(folder))
-    if table := train(settings, folder):
+    if table := train(settings, folder, HydraConfig.get().overrides.task):
         show(table, folder)
     return _score(table)
 

@@ -38,6 +38,7 @@ def run(tmp_path_factory):
         "seed=3",
         "logger=default",
         "callbacks=default",
+        "callbacks.board.cases=1",
     )
 
 
@@ -52,12 +53,14 @@ def test_a_run_folder_holds_what_it_should(run):
         "checkpoints",
         "review",
     } <= names
-    boards = {path.parent.name for path in folder.rglob("events.*")}
-    assert boards == {"cross_view", "sirt"} and not list(folder.rglob("hparams.yaml"))
+    boards = {path.parent.relative_to(folder).as_posix() for path in folder.rglob("events.*")}
+    assert boards == {"cross_view", "cross_view/test", "sirt/test"} and not list(
+        folder.rglob("hparams.yaml")
+    )
     settings = yaml.safe_load((folder / "config.yaml").read_text())
     assert settings["name"] == "smoke" and settings["seed"] == 3 and "hydra" not in settings
     assert {"planes.png", "mip.png", "views.png", "opinions.png", "weights.png"} <= {
-        p.name for p in (folder / "review").iterdir()
+        p.name for p in next((folder / "review").iterdir()).iterdir()
     }
 
 
@@ -74,13 +77,22 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     board = EventAccumulator(str(run[0] / "cross_view")).Reload()
-    tags = board.Tags()
-    assert {f"review/{name}" for name in ("planes", "mip", "views", "opinions", "weights")} <= set(
-        tags["images"]
-    )
-    curves = {"loss/total", "val/psnr", "time/step_ms"}
-    assert curves | {"test/psnr", "test/ssim", "test/view_nrmse", "test/ms"} <= set(tags["scalars"])
-    assert any("text/run" in tag for tag in tags["tensors"])
+    test = EventAccumulator(str(run[0] / "cross_view/test"), {"images": 0, "tensors": 0}).Reload()
+    tags, results = board.Tags(), test.Tags()
+    kinds = [tag.split("/")[0] for tag in tags["images"]]
+    assert sorted(kinds) == ["mip", "opinions", "planes", "views", "weights"]
+    assert [tag.split("/")[0] for tag in results["images"]] == ["slices"] * 2
+    assert len(test.Images(results["images"][0])) == 16
+    curves = {"loss/total", "figures/psnr", "optimizer/lr-AdamW", "time/step_ms"}
+    assert curves <= set(tags["scalars"]) and "epoch" not in tags["scalars"]
+    assert min(tags["scalars"]).startswith("figures/")
+    costs = {f"test_costs/{name}" for name in ("ms", "peak_mb", "train_seconds")}
+    assert set(results["scalars"]) - costs == {"test/psnr", "test/ssim", "test/view_nrmse"}
+    assert "text/run/text_summary" in tags["tensors"] and "rig_FACE" in tags["tensors"]
+    text = test.Tensors("text/overrides/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "seed=3" in text and "experiment=smoke" in text
+    table = test.Tensors("text/results/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "| cross_view |" in table and "| sirt |" in table
     assert "hp_metric" not in tags["scalars"]
 
 

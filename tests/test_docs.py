@@ -14,7 +14,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
-from mvrecon import compare
+from mvrecon import compare, view
 from mvrecon.config import compose
 from mvrecon.parts import REGISTRIES
 from scripts import site_pages
@@ -27,6 +27,8 @@ DOCS = sorted(
 )
 #: Files that a reader makes, that an app writes, and other projects' files.
 ELSEWHERE = {"my_parts.py", "compare.md", "api.md", "page.md", "no.md"}
+#: Apps whose command line is not Hydra's.
+PARSERS = {"compare": compare.parser, "view": view.parser}
 #: Words of Lightning's that SECURITY.md forbids, and the pages that say so or that tell the past.
 UNSAFE, HISTORY = "load_from_checkpoint", {"SECURITY.md", "CHANGELOG.md"}
 
@@ -84,8 +86,8 @@ def test_a_command_of_a_page_composes(page: str, command: str):
     if app == "warmup":
         assert not options, command
         return
-    if app == "compare":
-        compare.parser().parse_args(options)
+    if app in PARSERS:
+        PARSERS[app]().parse_args(options)
         return
     given = OverridesParser.create().parse_overrides([w for w in options if not w.startswith("-")])
     compose(*map(first_value, given), config_name=app)

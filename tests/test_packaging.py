@@ -77,6 +77,7 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
         "mvrecon-list": "mvrecon.listing:main",
         "mvrecon-compare": "mvrecon.compare:main",
         "mvrecon-warmup": "mvrecon.warmup:main",
+        "mvrecon-view": "mvrecon.view:main",
     }
 
 

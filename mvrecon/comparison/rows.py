@@ -69,18 +69,23 @@ def _runs(place: Path) -> list[Path]:
 def _rows(folder: Path, name: str) -> Iterator[Row]:
     table = read_results(folder)
     with blaming(folder / RESULTS, "is no table of results"):
-        for label, row in table["methods"].items():
-            yield Row(
-                run=name,
-                method=str(label),
-                scenes=tuple(map(str, table["scenes"])),
-                figures={key: tuple(map(_number, row[key]["values"])) for key in FIGURES},
-                ms=_number(row["ms_per_volume"]),
-                train_seconds=_number(row["train_seconds"]),
-                parameters=int(row["parameters"]),
-                peak_mb=_number(row.get("peak_mb")),
-                folder=folder,
-            )
+        yield from rows_of(table, name, folder)
+
+
+def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
+    """The methods of a table of results, under a run's name."""
+    for label, row in table["methods"].items():
+        yield Row(
+            run=run,
+            method=str(label),
+            scenes=tuple(map(str, table["scenes"])),
+            figures={key: tuple(map(_number, row[key]["values"])) for key in FIGURES},
+            ms=_number(row["ms_per_volume"]),
+            train_seconds=_number(row["train_seconds"]),
+            parameters=int(row["parameters"]),
+            peak_mb=_number(row.get("peak_mb")),
+            folder=folder,
+        )
 
 
 def _number(value: float | None) -> float:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,11 @@ class SceneData(L.LightningDataModule):
     def unit(self) -> str:
         """Unit of the volumes' values."""
         return self.scenes["test"].unit
+
+    @cached_property
+    def unit_of_views(self) -> str:
+        """Unit of the views' values."""
+        return self._measured("train").unit_of_views(self.grid, self.cameras)
 
     def indices(self, part: str) -> list[int]:
         """The cases of "train", "val" or "test".

@@ -13,13 +13,18 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
-from mvrecon.engine.export import save_png
+from mvrecon.cameras.camera import Cameras
+from mvrecon.engine.export import file_name, save_png
 from mvrecon.engine.run_folder import versions
 from mvrecon.files.memory import peak, restarted_peak
 from mvrecon.files.places import check_places
+from mvrecon.metrics import volume_metrics
 from mvrecon.models.output import Reconstruction
-from mvrecon.viz import cameras, montage
+from mvrecon.viz import cameras, review, rig_mesh
 from mvrecon.viz.planes import Image
+
+#: How TensorBoard draws the rig: in its own colours, from either side, without lights.
+MATERIAL = {"material": {"cls": "MeshBasicMaterial", "side": 2}}
 
 
 def peak_megabytes() -> dict[str, float]:
@@ -116,11 +121,12 @@ class CompileModel(L.Callback):
 
 
 class BoardReview(L.Callback):
-    """Pictures of the same few validation scenes during training, in TensorBoard and in `review/`.
+    """Sheets of the same few validation scenes during training, in TensorBoard and in `review/`, a
+    card and a folder for each scene; and the rig, its rays and its grid in 3-D.
 
     Args:
         every: of how many validations one is pictured.
-        cases: how many of the first batch's scenes are shown, one above the other.
+        cases: how many of the first batch's scenes are shown.
         baselines: training-free models shown beside ours.
     """
 
@@ -129,18 +135,26 @@ class BoardReview(L.Callback):
     ):
         self.every, self.cases, self.baselines = every, cases, tuple(baselines)
         self.n_validations = 0
-        self._fixed: dict[str, Tensor] = {}
+        self._fixed: list[dict[str, Tensor]] = []
         self._shown: tuple[Any, Reconstruction] | None = None
 
-    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log the command line and the versions."""
+    def on_fit_start(self, trainer: L.Trainer, pl_module: Any) -> None:
+        """Log the command line, the versions and the rig."""
+        lines = [f"    {name} {version}" for name, version in versions().items()]
+        text = "\n".join([f"    {' '.join(sys.argv)}", "", *lines])
+        A = pl_module.projector
         for board in _boards(trainer):
-            lines = [f"    {name} {version}" for name, version in versions().items()]
-            board.add_text(
-                "text/run",
-                "\n".join([f"    {' '.join(sys.argv)}", "", *lines]),
-                trainer.global_step,
-            )
+            board.add_text("text/run", text, trainer.global_step)
+            if isinstance(A.cameras, Cameras):
+                rods = rig_mesh.mesh(rig_mesh.segments(A.cameras, A.grid))
+                board.add_mesh(
+                    "rig",
+                    rods.vertices[None].float(),
+                    colors=rods.colours[None],
+                    faces=rods.faces[None],
+                    config_dict=MATERIAL,
+                    global_step=trainer.global_step,
+                )
 
     def on_validation_batch_end(
         self,
@@ -155,60 +169,70 @@ class BoardReview(L.Callback):
         if batch_idx == 0 and trainer.is_global_zero and not trainer.sanity_checking:
             self._shown = batch, outputs["out"]
 
-    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Write the pictures at every `every`-th validation."""
+    def on_validation_epoch_end(self, trainer: Any, pl_module: L.LightningModule) -> None:
+        """Write the sheets at every `every`-th validation."""
         if self._shown is None or trainer.sanity_checking:
             return
         (batch, out), self._shown = self._shown, None
         self.n_validations += 1
         if (self.n_validations - 1) % self.every:
             return
-        cases = [
-            self._pictures(pl_module, batch, out, case)
-            for case in range(min(self.cases, len(out.volume)))
-        ]
-        for name in cases[0]:
-            image = montage.tiled([[pictures[name]] for pictures in cases])
-            save_png(Path(trainer.default_root_dir) / "review" / f"{name}.png", image)
-            for board in _boards(trainer):
-                board.add_image(f"review/{name}", image, trainer.global_step, dataformats="HWC")
+        units = trainer.datamodule.unit, trainer.datamodule.unit_of_views
+        for number in range(min(self.cases, len(out.volume))):
+            name = file_name(batch["name"][number])
+            folder = Path(trainer.default_root_dir) / "review" / name
+            for kind, image in self._sheets(pl_module, batch, out, number, units).items():
+                save_png(folder / f"{kind}.png", image)
+                for board in _boards(trainer):
+                    board.add_image(f"{kind}/{name}", image, trainer.global_step, dataformats="HWC")
 
-    def _pictures(
-        self, module: Any, batch: Any, out: Reconstruction, case: int
+    def _sheets(
+        self, module: Any, batch: Any, out: Reconstruction, number: int, units: tuple[str, str]
     ) -> dict[str, Image]:
-        truth, top, spacing = (
-            batch["volume"][case, 0],
-            module.hparams["data_range"],
-            module.projector.grid.spacing,
-        )
-        volumes = {module.hparams["model"]["name"]: out.volume[case, 0]}
-        own = module.on(batch)
-        volumes |= {name: v[case, 0] for name, v in self._baselines(own, batch["views"]).items()}
-        support = (
-            {} if out.support is None else {"support": outlined(truth, out.support[case, 0], top)}
-        )
-        predicted = own.A(out.volume)[case, 0]
+        truth, top, rig = batch["volume"][number, 0], module.hparams["data_range"], module.on(batch)
+        case = review.Case(batch["name"][number], module.projector.grid, top, *units)
+        scored = case._replace(name=f"{case.name}: PSNR in dB, SSIM")
+        label = named(module.hparams["model"]["name"], out.volume[number], batch, number, top)
+        volumes = {label: out.volume[number, 0], **self._baselines(rig, batch, top)[number]}
+        rim = None if out.support is None else outlined(truth, out.support[number, 0], top)
+        predicted = rig.A(out.volume)[number, 0]
+        measured = batch["views"][number, 0]
         shown = {
-            "planes": montage.planes(truth, volumes | support, top, spacing),
-            "mip": montage.projections(truth, volumes, top, spacing),
-            "views": montage.views(batch["views"][case, 0], predicted),
+            "planes": review.planes(scored, truth, volumes, rim),
+            "mip": review.projections(scored, truth, volumes),
+            "views": review.views(measured, predicted, case.name, case.unit_of_views),
         }
         if out.opinions is not None:
-            shown["opinions"] = montage.opinions(out.opinions[case, :, 0], top, spacing)
+            shown["opinions"] = review.opinions(case, out.opinions[number, :, 0])
         if out.weights is not None:
-            shown["weights"] = montage.weights(out.weights[case, :, 0], spacing)
+            shown["weights"] = review.weights(case, out.weights[number, :, 0])
         if out.sigma is not None:
-            error, sigma = out.volume[case, 0] - truth, out.sigma[case, 0]
-            shown["uncertainty"] = montage.uncertainty(error, sigma, top, spacing)
+            error, sigma = out.volume[number, 0] - truth, out.sigma[number, 0]
+            shown["uncertainty"] = review.uncertainty(case, error, sigma)
         if (by := out.alignment) is not None:
-            truth = batch["shift_px"][case] if "shift_px" in batch else None
-            shown["cameras"] = cameras.alignments(by.shift_px[case], by.gain[case], truth)
+            known = batch["shift_px"][number] if "shift_px" in batch else None
+            shown["cameras"] = cameras.alignments(by.shift_px[number], by.gain[number], known)
         return shown
 
-    def _baselines(self, own: Any, views: Tensor) -> dict[str, Tensor]:
+    def _baselines(self, rig: Any, batch: Any, top: float) -> list[dict[str, Tensor]]:
+        """Volumes of the baselines for each case, by name and figures."""
         if not self._fixed:  # the scenes are the same at every review, so once is enough
-            self._fixed = {name: own.by(name, views).volume for name in self.baselines}
+            views = batch["views"]
+            self._fixed = [{} for _ in range(min(self.cases, len(views)))]
+            for name in self.baselines:
+                volumes = rig.by(name, views).volume
+                for number, shown in enumerate(self._fixed):
+                    shown[named(name, volumes[number], batch, number, top)] = volumes[number, 0]
         return self._fixed
+
+
+def named(
+    name: str, volume: Float[Tensor, "1 d h w"], batch: Any, number: int, data_range: float
+) -> str:
+    """A method's name above its PSNR in dB and its SSIM for a case of a batch."""
+    truth, inside = batch["volume"][number], batch["inside"][number]
+    figures = volume_metrics(volume, truth, inside, data_range)
+    return f"{name}\n{figures['psnr']:.2f}  {figures['ssim']:.3f}"
 
 
 def outlined(

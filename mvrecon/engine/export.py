@@ -16,7 +16,7 @@ from mvrecon.data.nifti import save_nifti
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.files.atomic import written_whole
 from mvrecon.geometry.grid import Grid
-from mvrecon.viz import montage
+from mvrecon.viz import montage, review
 from mvrecon.viz.planes import Image
 
 #: Line integral of which one grey value of 16 bits is left.
@@ -35,11 +35,12 @@ def save_case(
 
     Returns the scene's own folder in `folder`.
     """
-    case = folder / _file_name(scene["name"][0])
+    case = folder / file_name(scene["name"][0])
     truth = scene["volume"][0, 0]
     shown = {label: volume[0, 0] for label, volume in volumes.items()}
     save_png(case / "views.png", montage.gallery(scene["views"][0, 0]))
-    save_png(case / "planes.png", montage.planes(truth, shown, data_range, grid.spacing))
+    heading = review.Case(scene["name"][0], grid, data_range)
+    save_png(case / "planes.png", review.planes(heading, truth, shown))
     if find_spec("nibabel"):
         for label, volume in {"truth": truth, **shown}.items():
             save_nifti(case / f"{label}.nii.gz", volume, grid)
@@ -59,7 +60,7 @@ def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str
         views: line integrals, or what another projector makes.
         unit: of the views.
     """
-    case = folder / _file_name(name)
+    case = folder / file_name(name)
     for m, image in enumerate(montage.radiographs(views)):
         save_png(case / f"view_{m:03d}.png", image)
     with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
@@ -81,7 +82,7 @@ def save_truth(
     Raises:
         ImportError: nibabel is not installed.
     """
-    path = folder / _file_name(name) / "truth.nii.gz"
+    path = folder / file_name(name) / "truth.nii.gz"
     save_nifti(path, hounsfield(volume) if unit == "1/mm" else volume, grid)
     return path
 
@@ -90,7 +91,7 @@ def save_placement(folder: Path, name: str, placement: Float[Tensor, "4 4"]) -> 
     """Write where a case came from as `placement.json`: the affine map in mm from the file's world
     to the rig's, and its last column, the shift.
     """
-    path = folder / _file_name(name) / "placement.json"
+    path = folder / file_name(name) / "placement.json"
     record = {"file_to_rig": placement.tolist(), "shift_mm": placement[:3, 3].tolist()}
     with written_whole(path) as part:
         part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
@@ -116,7 +117,7 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
             f"Expected line integrals of attenuation below {OPAQUE:g} for 16-bit images, got "
             f"{top:.3g}; scene.value=0.02 is near water, in 1/mm"
         )
-    case = folder / _file_name(name)
+    case = folder / file_name(name)
     return write_projections(case / "projections", views.flip(-2), Exposure(photons=None))
 
 
@@ -128,5 +129,6 @@ def save_png(path: Path, image: Image) -> None:
         Pillow.fromarray(image).save(part, format="PNG")
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
+    """The name of a case as that of a folder."""
     return re.sub(r"[^\w.-]+", "_", name)

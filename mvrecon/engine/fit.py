@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
-from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 from rich.console import Console
 
 from mvrecon.config.targets import instantiate
@@ -172,6 +172,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         for node in (settings["logger"] or {}).values()
         if node
     ]
+    callbacks += [LearningRateMonitor("step")] if loggers else []  # it refuses to be without
     options = {
         "enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks),
         **settings["trainer"],

@@ -2,6 +2,7 @@
 
 import csv
 import os
+from collections.abc import Mapping
 from typing import Any
 
 from lightning.fabric.loggers.logger import rank_zero_experiment
@@ -68,9 +69,26 @@ class MetricsFile(CSVLogger):
         self.experiment.rewind(step)
 
 
+#: What a number is called on the board, by its beginning: TensorBoard sorts its groups by name, and
+#: results come first, before `loss`.
+ON_BOARD = {
+    "val/loss_": "loss_validation/",
+    "val/cameras_": "cameras/",
+    "val/quality_": "quality/",
+    "val/": "figures/",
+    "lr-": "optimizer/lr-",
+}
+
+
+def on_board(name: str) -> str:
+    """The board's name of a logged number."""
+    start = next((start for start in ON_BOARD if name.startswith(start)), "")
+    return ON_BOARD.get(start, "") + name[len(start) :]
+
+
 class Board(TensorBoardLogger):
     """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has
-    them.
+    them. Numbers have names of its own (`ON_BOARD`), and the epoch is left out.
 
     Args:
         save_dir: the folder.
@@ -78,6 +96,24 @@ class Board(TensorBoardLogger):
 
     def __init__(self, save_dir: str):
         super().__init__(save_dir, name="", version="", default_hp_metric=False)
+
+    def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
+        """Log numbers by their names on the board."""
+        shown = {on_board(name): value for name, value in metrics.items() if name != "epoch"}
+        super().log_metrics(shown, step)
+
+    def log_session(self, settings: Mapping[str, Any], figures: Mapping[str, float]) -> None:
+        """Log settings and figures for the table HPARAMS, without saying which settings there are:
+        TensorBoard then takes those of all runs, first those that differ.
+        """
+        from torch.utils.tensorboard.summary import hparams
+
+        _, begin, end = hparams(dict(settings), dict(figures))
+        writer = self.experiment._get_file_writer()
+        writer.add_summary(begin)
+        writer.add_summary(end)
+        for name, value in figures.items():
+            self.experiment.add_scalar(name, value, 0)
 
     def rewind(self, step: int) -> None:
         """Make TensorBoard hide what an interrupted run logged from a step on: the resumed run logs

@@ -8,7 +8,7 @@ from mvrecon.viz.montage import labelled, tiled
 from mvrecon.viz.planes import Image
 
 #: Edge of a tile and image pixels of a detector's pixel; radius of a dot.
-EDGE, SCALE, DOT = 96, 24, 4
+EDGE, SCALE, DOT = 172, 43, 6
 GREY, WHITE, GREEN = (90, 90, 90), (255, 255, 255), (0, 190, 90)
 
 
@@ -21,7 +21,7 @@ def alignments(
     green ring.
 
     A tile's middle is a camera as it should be, its circle a pixel; shifts beyond the tile lie at
-    its edge. At most eight tiles a row.
+    its edge. At most four tiles a row.
 
     Args:
         shift_px: estimated, along columns (to the right) and rows (downwards).
@@ -34,7 +34,7 @@ def alignments(
         labelled(_tile(shift, truth), f"{m}: gain {factor:.3f}")
         for m, (shift, truth, factor) in enumerate(cameras)
     ]
-    wide = min(8, len(tiles))
+    wide = min(4, len(tiles))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % wide)
     return tiled([tiles[i : i + wide] for i in range(0, len(tiles), wide)])
 

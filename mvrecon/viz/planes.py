@@ -4,6 +4,7 @@ Convention: an image's rows run downwards; planes that hold the z axis are shown
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,10 +12,23 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mvrecon.geometry.grid import Grid
+
 Image = UInt8[np.ndarray, "h w 3"]
 Window = tuple[float, float]
 Spacing = tuple[float, float, float]
 CUBES: Spacing = (1.0, 1.0, 1.0)
+#: Where the world's axes x, y, z begin and end: left, right, posterior, anterior, feet, head.
+LETTERS = (("L", "R"), ("P", "A"), ("F", "H"))
+
+
+class Edges(NamedTuple):
+    """Letters of the directions in which the edges of an image lie."""
+
+    left: str
+    right: str
+    top: str
+    bottom: str
 
 
 def middle_planes(
@@ -28,6 +42,22 @@ def middle_planes(
     """
     d, h, w = (n // 2 for n in volume.shape)
     return _to_scale([volume[d], volume[:, h], volume[:, :, w]], spacing)
+
+
+def letters(grid: Grid) -> list[Edges]:
+    """Directions at the edges of the planes across z, y and x: L and R, P and A, F and H.
+
+    Convention: the world is the patient's, as in NIfTI: +x to the right (R), +y to the front (A),
+    +z to the head (H). Of an oblique grid's axis, the world's nearest.
+    """
+    x, y, z = (_ends(grid.affine[:3, axis]) for axis in range(3))
+    return [Edges(*x, *y), Edges(*x, z[1], z[0]), Edges(*y, z[1], z[0])]
+
+
+def _ends(direction: Float[Tensor, "3"]) -> tuple[str, str]:
+    nearest = int(direction.abs().argmax())
+    first, last = LETTERS[nearest]
+    return (first, last) if direction[nearest] > 0 else (last, first)
 
 
 def brightest(

@@ -12,6 +12,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.files.atomic import written_whole
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz.planes import Image
+from mvrecon.viz.rig_mesh import box, outlines
 
 #: Pixels: a panel's edge, its rim, and the strip of text above it.
 EDGE, RIM, STRIP = 560, 46, 34
@@ -66,7 +67,8 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     rig = cameras.to("cpu")
     chosen = sorted({0, min(1, len(rig) - 1), *range(0, len(rig), max(1, len(rig) // VIEWS))})
     with torch.no_grad():
-        shapes = [_outline(rig, m) for m in chosen]
+        corners, starts = outlines(rig)
+    shapes = [(starts[m], corners[m]) for m in chosen]
     points = torch.cat([part for shape in shapes for part in shape])
     if grid is not None:
         points = torch.cat([points, grid.corners()])
@@ -94,18 +96,6 @@ def save_picture(path: str | Path, cameras: Cameras, grid: Grid | None = None) -
         Pillow.fromarray(picture(cameras, grid)).save(part, format="PNG")
 
 
-def _outline(rig: Cameras, m: int) -> tuple[Tensor, Tensor]:
-    """Where a view's rays start (four of a parallel beam, else one source), and the corners of its
-    detector: first pixel, end of the first row, opposite corner, end of the first column.
-    """
-    rows, columns = rig.shape
-    steps = rig.origin.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
-    ends = steps * steps.new_tensor([columns, rows]) - 0.5
-    across = ends[:, :1] * rig.u[m] + ends[:, 1:] * rig.v[m]
-    starts = rig.source[m] + across if rig.parallel else rig.source[m, None]
-    return starts, rig.origin[m] + across
-
-
 def _camera(draw, panel: Panel, m: int, shape: tuple[Tensor, Tensor]) -> None:
     starts, corners = shape
     source, outline = panel.place(starts), panel.place(corners)
@@ -131,12 +121,8 @@ def _camera(draw, panel: Panel, m: int, shape: tuple[Tensor, Tensor]) -> None:
 
 
 def _box(draw, panel: Panel, grid: Grid) -> None:
-    """The twelve edges of the grid's box; corners are in the order of three binary digits."""
-    corners = panel.place(grid.corners())
-    for a in range(8):
-        for bit in (1, 2, 4):
-            if not a & bit:
-                draw.line([corners[a], corners[a | bit]], fill=BOX, width=2)
+    for edge in box(grid):
+        draw.line(panel.place(edge), fill=BOX, width=2)
 
 
 def _axes(draw, panel: Panel, title: str, low: Tensor, high: Tensor) -> None:

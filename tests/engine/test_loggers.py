@@ -6,7 +6,8 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mvrecon.engine.loggers import Board
-from mvrecon.viz import montage
+from mvrecon.geometry.grid import Grid
+from mvrecon.viz import review
 
 VOLUMES = {
     "one voxel": torch.rand(1, 1, 1),
@@ -39,10 +40,10 @@ def test_a_resumed_run_logs_again_what_came_after_its_checkpoint_once(tmp_path):
 @pytest.mark.parametrize("name", VOLUMES)
 def test_the_board_shows_any_volume(name, tmp_path):
     x = VOLUMES[name]
+    case = review.Case(name, Grid.centred(shape=x.shape, spacing=1.0), 1.0)
     pictures = {
-        "planes": montage.planes(x, {"x": x}, 1.0),
-        "mip": montage.projections(x, {"x": x}, 1.0),
-        "views": montage.views(x.nan_to_num(), x),
+        "planes": review.planes(case, x, {"x": x}),
+        "views": review.views(x.nan_to_num(), x),
     }
     board = Board(str(tmp_path))
     for tag, picture in pictures.items():
@@ -53,3 +54,23 @@ def test_the_board_shows_any_volume(name, tmp_path):
     assert set(shown.Tags()["images"]) == set(pictures) and shown.Tags()["histograms"] == ["zeros"]
     for tag, picture in pictures.items():
         assert (shown.Images(tag)[0].height, shown.Images(tag)[0].width) == picture.shape[:2]
+
+
+def test_the_board_shows_results_first_and_no_epoch(tmp_path):
+    board = Board(str(tmp_path))
+    logged = {
+        "loss/total": 1.0,
+        "val/psnr": 30.0,
+        "val/loss_total": 2.0,
+        "epoch": 1,
+        "lr-Adam": 0.1,
+    }
+    board.log_metrics(logged, 5)
+    board.finalize("success")
+    tags = EventAccumulator(str(tmp_path)).Reload().Tags()["scalars"]
+    assert sorted(tags) == [
+        "figures/psnr",
+        "loss/total",
+        "loss_validation/total",
+        "optimizer/lr-Adam",
+    ]

@@ -24,5 +24,5 @@ def test_a_dot_is_at_its_shift_and_a_ring_at_the_truth():
 
 def test_many_cameras_go_into_rows_and_far_shifts_stay_in_the_picture():
     image = alignments(torch.full((10, 2), 99.0), torch.ones(10))
-    assert image.shape == (2 * (EDGE + LABEL) + GAP, 8 * EDGE + 7 * GAP, 3)
+    assert image.shape == (3 * (EDGE + LABEL) + 2 * GAP, 4 * EDGE + 3 * GAP, 3)
     assert (image[EDGE + LABEL - 1, EDGE - 1] == WHITE).all()

@@ -1,0 +1,75 @@
+"""What sheets of a review show: errors, differences from the mean, weights, and the patient's
+directions.
+"""
+
+import pytest
+import torch
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.viz import review
+from mvrecon.viz.planes import Edges, letters
+
+GRID = Grid.centred(size=(8, 6, 4), spacing=(1.0, 1.0, 2.0))
+CASE = review.Case("patient 7", GRID, 2.0, "1/mm", "1")
+
+
+@pytest.fixture(autouse=True)
+def columns(monkeypatch):
+    """A sheet is its columns."""
+    monkeypatch.setattr(review, "sheet", lambda title, columns, rows: columns)
+
+
+def test_every_volume_stands_above_its_error():
+    truth = torch.rand(GRID.shape)
+    shown = review.planes(CASE, truth, {"ours": truth + 0.5, "sirt": 0.5 * truth})
+    assert [column.name for column in shown] == ["truth", "ours", "sirt"]
+    volumes, errors = shown[1].panels[::2], shown[1].panels[1::2]
+    for before, volume, error in zip(shown[0].panels[::2], volumes, errors, strict=True):
+        torch.testing.assert_close(volume.pixels - before.pixels, error.pixels)
+        assert (volume.scale.low, volume.scale.high) == (0.0, 2.0)
+        assert error.scale.low == -error.scale.high and "1/mm" in error.scale.name
+
+
+def test_opinions_are_differences_from_their_mean():
+    volumes = torch.rand(5, *GRID.shape)
+    mean, *others = review.opinions(CASE, volumes)
+    assert len(others) == 5
+    for k, plane in enumerate(mean.panels):
+        together = sum(column.panels[k].pixels for column in others)
+        torch.testing.assert_close(together, torch.zeros_like(plane.pixels), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_equal_weights_are_at_one_third_for_any_number_of_cameras(count):
+    for column in review.weights(CASE, torch.full((count, *GRID.shape), 1 / count)):
+        panel = column.panels[0]
+        assert panel.pixels.max() / panel.scale.high == pytest.approx(1 / 3)
+
+
+def test_of_many_cameras_a_few_are_shown_with_the_nrmse_of_their_views():
+    measured = torch.rand(80, 3, 4) + 1
+    shown = review.views(measured, 1.1 * measured)
+    assert [column.name.split("\n") for column in shown] == [
+        [f"camera {10 * k}", "0.100"] for k in range(review.CAMERAS)
+    ]
+
+
+def test_a_stack_of_slices_is_the_volume():
+    truth = torch.rand(GRID.shape)
+    stack = [review.slices(CASE, truth, {"x": truth}, z)[0].panels[0] for z in range(len(truth))]
+    torch.testing.assert_close(torch.stack([panel.pixels for panel in stack]), truth)
+
+
+def test_letters_say_where_the_patient_s_directions_are():
+    """In a grid along the world, in one turned about z by 90 degrees, and in the images: a voxel
+    near an edge lies where the letter says.
+    """
+    assert letters(GRID)[0] == Edges("L", "R", "P", "A")
+    assert letters(GRID)[1] == Edges("L", "R", "H", "F")
+    assert letters(GRID)[2] == Edges("P", "A", "H", "F")
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    assert letters(GRID.moved(turn, torch.zeros(3)))[0] == Edges("P", "A", "R", "L")
+    head = torch.zeros(GRID.shape)
+    head[-1] = 1.0  # the greatest z
+    for panel in CASE.panels(head, CASE.value())[1:]:
+        assert panel.pixels[0].min() > panel.pixels[-1].max() and panel.edges.top == "H"
