@@ -155,7 +155,7 @@ def evaluation_draws_nothing(subject: Subject) -> float:
     """Scenes by index, evaluation of a model, pictures, and what is written to the board."""
     from mvrecon.engine.evaluation import evaluate
     from mvrecon.engine.loggers import Board
-    from mvrecon.viz import montage
+    from mvrecon.viz import review
 
     grid = Grid.centred(size=(9, 8, 7), spacing=1.0)
     rig = rig_about(grid)
@@ -172,7 +172,8 @@ def evaluation_draws_nothing(subject: Subject) -> float:
         scores = evaluate({"model": model}, [batch], A, 1.0)
         board = Board(folder)
         board.log_metrics({"psnr": scores["model"][0]["psnr"]}, 0)
-        picture = montage.views(scene.views[0], A(scene.volume[None])[0, 0])
+        predicted = A(scene.volume[None])[0, 0]
+        picture = review.views(scene.views[0], predicted, "0", "mm")
         board.experiment.add_image("views", picture, 0, dataformats="HWC")
         board.finalize("success")
     return float(len(drawn))
