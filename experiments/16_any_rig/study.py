@@ -1,6 +1,6 @@
 """What does one network for any rig lose against one for each? Resumable, run by run.
 
-python experiments/16_any_rig/study.py train --seconds 4800  # every run that is not there yet
+python experiments/16_any_rig/study.py train --own 1000  # every run that is not there yet
 python experiments/16_any_rig/study.py table  # results.csv
 """
 
@@ -14,29 +14,25 @@ from pathlib import Path
 
 import torch
 
+from mvrecon.parts import CAMERAS
+
 HERE = Path(__file__).parent
-#: Processor seconds of a training step, the mean over rigs.
-STEP = 0.86
-#: Cases, rigs and patients of the study, and of a trial of the script in a minute.
-SIZES = {"whole": ("1920", "48", "33"), "trial": ("8", "2", "1")}
+#: Settings of a trial of the script in a minute.
+TRIAL = ("data.sizes={train: 8, val: 1, test: 1}", "data.rigs=2")
+TRIAL_STEPS = ("trainer.max_steps=2", "trainer.val_check_interval=2")
 
 
-def overrides(options: argparse.Namespace, seed: int, rigs: int) -> list[str]:
+def overrides(options: argparse.Namespace, seed: int, rigs: bool) -> list[str]:
     """The command line of a training, judged on the rig `seed`."""
-    cases, _, patients = SIZES[options.size]
-    steps = max(2, round(options.seconds / STEP))
-    every = min(steps, 480)
     return [
         "experiment=any_rig",
         *(["~compare.sirt"] if rigs else []),
+        *((*TRIAL, *TRIAL_STEPS) if options.trial else ()),
         f"camera.seed={seed}",
-        f"data.rigs={rigs}",
-        f"data.sizes={{train: {cases}, val: 1, test: {patients}}}",
+        *([] if rigs else ["data.rigs=0"]),
         f"data.cache={options.runs / 'cases'}",
         f"scene.path={options.data / 'openkbp_train.h5'}",
         f"test_scene.path={options.data / 'openkbp_val.h5'}",
-        f"trainer.max_steps={steps}",
-        f"trainer.val_check_interval={every}",
         "callbacks=quiet",
         "logger=csv",
     ]
@@ -51,13 +47,18 @@ def run(app: str, folder: Path, *arguments: str) -> None:
 
 
 def train(options: argparse.Namespace) -> None:
-    """Train the network for any rig, judge it on every rig, and train one for each rig."""
+    """Train the network for any rig, judge it and SIRT on every rig, and train one for each rig of
+    `own`.
+    """
     whole = options.runs / "any"
-    run("train", whole, *overrides(options, 0, int(SIZES[options.size][1])))
+    run("train", whole, *overrides(options, 0, rigs=True))
+    sirt = "{name: sirt, iterations: 25, momentum: true}"
+    compared = f"+compare.sirt={{name: classical, reconstructor: {sirt}}}"
     for seed in options.rigs:
         folder = options.runs / str(seed)
-        run("eval", folder / "any", f"checkpoint={whole}", f"+camera.seed={seed}")
-        run("train", folder / "own", *overrides(options, seed, 0))
+        run("eval", folder / "any", f"checkpoint={whole}", f"+camera.seed={seed}", compared)
+        if seed in options.own:
+            run("train", folder / "own", *overrides(options, seed, rigs=False))
 
 
 def psnr(path: Path, method: str) -> torch.Tensor:
@@ -69,16 +70,19 @@ def table(options: argparse.Namespace) -> None:
     """Write a row for each rig: the mean PSNR of each arm, and the paired difference."""
     with open(HERE / "results.csv", "w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(("rig", "views", "any_rig", "own_rig", "sirt", "any_less_own", "half_95"))
+        writer.writerow(("rig", "views", "any_rig", "sirt", "own_rig", "any_less_own", "half_95"))
         for seed in options.rigs:
             folder = options.runs / str(seed)
-            views = len(json.loads((folder / "own" / "rig.json").read_text())["cameras"])
-            ours = psnr(folder / "any" / "results.json", "cross_view")
-            own, sirt = (psnr(folder / "own" / "results.json", m) for m in ("cross_view", "sirt"))
-            difference = ours - own
-            half = 1.96 * difference.std() / len(difference) ** 0.5
-            figures = (ours.mean(), own.mean(), sirt.mean(), difference.mean(), half)
-            writer.writerow((seed, views, *(f"{value:.3f}" for value in figures)))
+            settings = json.loads((folder / "any" / "results.json").read_text())["geometry"]
+            views = len(CAMERAS.from_config(settings["camera"]))
+            ours, sirt = (psnr(folder / "any" / "results.json", m) for m in ("cross_view", "sirt"))
+            row = [seed, views, f"{ours.mean():.3f}", f"{sirt.mean():.3f}"]
+            if (own := folder / "own" / "results.json").exists():
+                alone = psnr(own, "cross_view")
+                difference = ours - alone
+                half = 1.96 * difference.std() / len(difference) ** 0.5
+                row += [f"{v:.3f}" for v in (alone.mean(), difference.mean(), half)]
+            writer.writerow(row)
 
 
 def main() -> None:
@@ -88,8 +92,10 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the patients")
     parser.add_argument("--runs", type=Path, default=Path("outputs/16_any_rig"))
     parser.add_argument("--rigs", nargs="+", type=int, default=[1000, 2000, 3000], help="seeds")
-    parser.add_argument("--seconds", type=float, default=4800, help="of one thread, training")
-    parser.add_argument("--size", choices=SIZES, default="whole")
+    parser.add_argument(
+        "--own", nargs="*", type=int, default=[], help="rigs with their own network"
+    )
+    parser.add_argument("--trial", action="store_true", help="a few steps on a few cases")
     options = parser.parse_args()
     options.data, options.runs = options.data.resolve(), options.runs.resolve()
     {"train": train, "table": table}[options.task](options)
