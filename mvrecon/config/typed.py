@@ -37,10 +37,24 @@ def check_parts(settings: Mapping[str, Any]) -> None:
         if part.error:
             continue  # whoever builds it says what is wrong
         options = {key: value for key, value in node.items() if key != "name"}
+        if path == "model" or path.rpartition(".")[0] == "compare":
+            _check_assumed(path, options.pop("assume", None), settings.get("projector"))
         if not part.catch_all:
             check_options(f"{path} (the {kind} {name!r})", options, part.options)
         for key, value in options.items():
             _check_type(f"{path}.{key}", value, part.options.get(key, Option()))
+
+
+def _check_assumed(path: str, assumed: Any, projector: Mapping[str, Any] | None) -> None:
+    """Check what a method takes the projector for: some of its options."""
+    if assumed is None or not projector or "name" not in projector:
+        return
+    if not isinstance(assumed, Mapping):
+        raise TypeError(f"{path}.assume: expected options of the projector, got {shown(assumed)}")
+    part = describe("projector", projector["name"])
+    if not part.error and not part.catch_all:
+        where = f"{path}.assume (the projector {projector['name']!r})"
+        check_options(where, assumed, part.options)
 
 
 def _check_type(path: str, value: Any, option: Option) -> None:

@@ -7,6 +7,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.config import compose
+from mvrecon.config.typed import check_parts
 from mvrecon.engine.evaluation import evaluate
 from mvrecon.engine.fit import build_data, build_module, methods
 from mvrecon.engine.module import build_projector
@@ -61,6 +62,7 @@ def test_an_experiment_takes_a_step_and_judges_every_method(name: str):
     module._terms(own, own.model(batch["views"]), batch)["total"].backward()
     slopes = [p.grad for p in module.parameters() if p.grad is not None]
     assert any(slope.any() for slope in slopes) and all(s.isfinite().all() for s in slopes)
+    check_parts(settings)  # as the app does before it starts
     rows = {label: module_of(name, label).own for label in methods(settings)}
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
     scores = evaluate(rows, data.test_dataloader(), A, 1.0)
@@ -77,7 +79,7 @@ def test_each_case_of_a_batch_is_reconstructed_by_its_own_attenuation():
     for case in range(2):
         A = Spect(grid, cameras, mu=batch["mu"][case, 0])
         views = batch["views"][case : case + 1]
-        assert torch.equal(made[case : case + 1], mv.osem(A, views, 4))
+        assert torch.equal(made[case : case + 1], mv.osem(A, views, 3))
     assert not torch.equal(batch["mu"][0], batch["mu"][1])
     assert torch.equal(module(batch["views"], mu=batch["mu"]).volume, made)
 
@@ -86,7 +88,7 @@ def test_a_method_may_take_the_attenuation_for_something_else():
     batch = batch_of("dcspect_ct")
     plain = module_of("dcspect_ct", "osem_none")
     A = Spect(plain.projector.grid, plain.projector.cameras)
-    assert torch.equal(plain.on(batch).model(batch["views"]).volume, mv.osem(A, batch["views"], 4))
+    assert torch.equal(plain.on(batch).model(batch["views"]).volume, mv.osem(A, batch["views"], 3))
     maps = [
         CaseAttenuation.of({"mu": mu}).maps_of(batch, A.grid)[0]
         for mu in ("measured", {"of": "measured", "shift_mm": [32, 0, 0]})
@@ -121,5 +123,9 @@ def test_attenuation_that_no_case_brings_is_refused():
     for wrong in ({"of": "guessed"}, {"shift_mm": [1, 2]}):
         with pytest.raises(ValueError, match=r"projector\.mu of case or measured"):
             CaseAttenuation.of({"mu": wrong})
+    for wrong, message in (({"muh": 0}, "no option 'muh'"), (0.1, "expected options of the")):
+        settings = {"projector": {"name": "drr"}, "model": {"name": "sirt", "assume": wrong}}
+        with pytest.raises(TypeError, match=message):
+            check_parts(settings)
     with pytest.raises(ValueError, match="a scene with matter"):
         SpectCt({"name": "derenzo"}, {"name": "circular"})
