@@ -2,8 +2,8 @@
 makes, and filtered back-projection of the slices.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -65,7 +65,7 @@ class RadonUNet(nn.Module):
     #: Its lifted views are channels.
     counts_cameras = True
     #: What the truth's own projections are made by.
-    corrected_projector: dict[str, Any] = {"name": "radon"}  # noqa: RUF012
+    corrected_projector: ClassVar[Mapping[str, Any]] = {"name": "radon"}
 
     def __init__(
         self,
