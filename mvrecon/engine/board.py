@@ -51,7 +51,9 @@ def close(
     for label, model in methods(dict(settings)).items():
         row, board = table["methods"][label], Board(str(folder / label / TEST))
         figures = {f"test/{name}": row[key]["mean"] for name, key in FIGURES.items()}
-        costs = {f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None}
+        costs = {
+            f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
+        }
         options = {key: value for key, value in model.items() if key != "name"}
         settled = {"method": label, "model": {"": model["name"], **options}}
         values = {".".join(filter(None, keys)): v for keys, v in leaves(settled | shared)}
