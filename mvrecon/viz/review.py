@@ -139,9 +139,9 @@ def opinions(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
     """Three middle planes of the mean of the cameras' volumes, and of how each camera's own differs
     from it, to scale.
 
-    The mean from 0 to the range; a difference to a fourth of it, blue to red.
+    The mean from 0 to the range; a difference to an eighth of it, blue to red.
     """
-    mean, apart = volumes.mean(dim=0), case.error(0.25, "opinion - mean")
+    mean, apart = volumes.mean(dim=0), case.error(1 / 8, "opinion - mean")
     columns = [Column("mean", case.panels(mean, case.value(name="mean")))]
     for m in _chosen(len(volumes), CAMERAS - 1):
         columns.append(Column(f"camera {m}", case.panels(volumes[m] - mean, apart)))

@@ -183,7 +183,7 @@ def _letters(axes: "Axes", tile: Tile, edges: Edges, size: float) -> None:
         (edges.bottom, middle[0], bottom, "center", "bottom"),
     )
     for letter, x, y, ha, va in places:
-        axes.text(x, y, letter, color="#ffd200", fontsize=size, ha=ha, va=va)
+        axes.text(x, y, letter, color="#f0a000", fontsize=size, ha=ha, va=va)
 
 
 def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int) -> None:
