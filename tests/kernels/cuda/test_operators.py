@@ -10,6 +10,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from mvrecon.geometry.box import Box
+from mvrecon.kernels.cuda.field import Field
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.rays.cuda.scene import Scene
@@ -164,10 +165,11 @@ def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_no
     assert set(host.streams) == {7} and host.modules == 1
 
 
-def test_the_packed_structure_is_that_of_the_source(library):
-    fields = [getattr(Scene, name[0]).offset for name in Scene._fields_]
-    layout = (c_int * (1 + len(fields))).in_dll(library, "layout")
-    assert [*fields, ctypes.sizeof(Scene)] == list(layout)
+@pytest.mark.parametrize("packed", [Scene, Field])
+def test_the_packed_structure_is_that_of_the_source(packed, libraries):
+    fields = [getattr(packed, name[0]).offset for name in packed._fields_]
+    layout = (c_int * (1 + len(fields))).in_dll(libraries[packed], f"layout_{packed.__name__}")
+    assert [*fields, ctypes.sizeof(packed)] == list(layout)
 
 
 def test_no_rays_and_no_voxels_launch_nothing(host):
