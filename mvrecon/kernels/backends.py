@@ -11,14 +11,15 @@ BACKENDS = ("auto", "cpu", "cuda", "reference")
 COMPILED = find_spec("numba") is not None
 
 
-def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tuple[str, ModuleType]:
+def kernels_for(tensor: Tensor, backend: str, purpose: str | None = None) -> tuple[str, ModuleType]:
     """The back end's name and its functions along rays, for volumes or views [b c ..].
 
     Args:
         tensor: what is to be projected or back-projected.
         backend: "auto" takes the compiled one of the tensor's device where that can be had, else
             the reference.
-        method: of the rays; without it, the name alone tells, and a GPU has none but the reference.
+        purpose: the method of rays, or "warp", "look" or "hull", of which the name alone tells;
+            without it a GPU has none but the reference.
 
     Raises:
         ValueError: an unknown back end, or a compiled one for a tensor elsewhere.
@@ -36,13 +37,15 @@ def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tupl
     if backend == "reference" or not COMPILED:
         return "reference", reference
     if device == "cuda":
+        from mvrecon.kernels.cuda.checks import CHECKS
         from mvrecon.kernels.rays.cuda import selfcheck
 
         volumes = tensor.shape[0] * tensor.shape[1]
+        check = CHECKS.get(purpose or "")
         why = (
-            selfcheck.reason(tensor.device, method, tensor.dtype, volumes)
-            if method
-            else "only rays have kernels there"
+            selfcheck.reason(tensor.device, purpose, tensor.dtype, volumes, check)
+            if purpose
+            else "there are no such kernels"
         )
         if why and backend == "cuda":
             raise RuntimeError(f"backend 'cuda' cannot be used on {tensor.device}: {why}")

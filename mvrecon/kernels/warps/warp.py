@@ -31,11 +31,12 @@ def warp(
         volumes: values on s lattices; batch and channels share the work of finding the places.
         maps: from `geometry.lattice.lattice_maps`, float64.
         shape: samples (d, h, w) of the output.
-        backend: "cpu" (compiled), "reference" (torch, any device), or "auto": compiled in main
-            memory.
+        backend: "cpu" or "cuda" (compiled), "reference" (torch, any device), or "auto": compiled
+            where it can be had on the tensors' device.
 
     Raises:
-        ValueError: sizes that do not agree, an unknown back end, or "cpu" for tensors elsewhere.
+        ValueError: sizes that do not agree, an unknown back end, or one for tensors elsewhere.
+        RuntimeError: "cuda" cannot be used, and why.
     """
     if (
         volumes.ndim != 6
@@ -49,5 +50,6 @@ def warp(
         )
     if volumes.dtype not in (torch.float32, torch.float64):
         return warp(volumes.float(), maps, shape, backend).to(volumes.dtype)
-    kernels = warp_ops if kernels_for(volumes, backend)[0] == "cpu" else warp_reference
+    chosen, _ = kernels_for(volumes, backend, "warp")
+    kernels = warp_reference if chosen == "reference" else warp_ops
     return kernels.warp(volumes, maps, list(shape))

@@ -7,7 +7,6 @@ from ctypes import c_int
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from mvrecon.geometry.box import Box
 from mvrecon.kernels.cuda.field import Field
@@ -18,6 +17,7 @@ from mvrecon.kernels.rays.cuda.selfcheck import one_by_one
 from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.kernels.cuda.host import Driver
 from tests.kernels.cuda.scenes import CASES, METHODS, RIGS, difference, scene, whole
+from tests.kernels.cuda.waits import Waits
 
 #: One volume, and a whole group of four and a part of one.
 PRECISIONS = [(torch.float64, 1, 1e-11), (torch.float32, 5, 3e-6)]
@@ -129,22 +129,6 @@ def test_views_in_pieces_give_the_same_volume(method, host, monkeypatch):
     monkeypatch.setattr(cuda, "SHARE", 0.0)
     assert difference(cuda.backproject(y, lines, window, part, method), volume) < 1e-6
     assert host.launches == ["survey", *["record", "gather"] * len(lines)]
-
-
-class Waits(TorchDispatchMode):
-    """Names of the operations that would wait for a device."""
-
-    ASKED = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2"}
-
-    def __init__(self):
-        super().__init__()
-        self.names: list[str] = []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        name = func.overloadpacket.__name__
-        if name in self.ASKED or (name == "_to_copy" and "device" in (kwargs or {})):
-            self.names.append(name)
-        return func(*args, **(kwargs or {}))
 
 
 def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_none(host):

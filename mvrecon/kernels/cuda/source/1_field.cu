@@ -22,7 +22,19 @@ struct Field {
 
 DEVICE int size_of(const int* three) { return three[0] * three[1] * three[2]; }
 DEVICE double middle(int size) { return (size - 1) * 0.5; }
-DEVICE bool within(int i, int size) { return 0 <= i && i < size; }
+DEVICE bool within(int i, int size) { return (unsigned)i < (unsigned)size; }
+
+// One over a number, in float to its last digit: the compiler's own division calls a function where a number is tiny.
+DEVICE double inverse(double x) { return 1 / x; }
+DEVICE float inverse(float x) {
+#ifdef __CUDACC__
+  float per;
+  asm("rcp.approx.f32 %0, %1;" : "=f"(per) : "f"(x));
+  return per;
+#else
+  return 1 / x;
+#endif
+}
 
 // A bilinear map [2 3] at a centred index.
 template <class T> DEVICE T value(const T* map, const T* p) {

@@ -18,20 +18,22 @@ template <class R> struct Cell {
   bool counts;
   int at[8];  // -1: beyond the source, where all is zero
   R part[3];
-  double p[3], top[3], under[3];
-  DEVICE Cell(const Field& f, const double* map, int sample) : counts(true) {
+  double p[3], place[3], per[3];  // about the centre; and one over what a place is divided by
+  DEVICE Cell(const Field& f, const double* map, int sample) {
     int index[3], low[3];
     unravel(f.shape, sample, index);
     UNROLL for (int i = 0; i < 3; i++) p[i] = index[i] - middle(f.shape[i]);
-    under[X] = under[1] = value(map + ACROSS, p);
-    under[2] = value(map + DEPTH, p);
+    double across = value(map + ACROSS, p), depth = value(map + DEPTH, p);
+    counts = across > 0 && depth > 0;
+    per[0] = per[1] = inverse(across);
+    per[2] = inverse(depth);
     UNROLL for (int i = 0; i < 3; i++) {
-      top[i] = value(map + 6 * i, p);
-      double place = top[i] / under[i] + middle(f.source[i]);
-      counts = counts && under[i] > 0 && place > -1 && place < f.source[i];
-      if (!counts) place = 0;
-      low[i] = (int)floor(place);
-      part[i] = (R)(place - low[i]);
+      place[i] = value(map + 6 * i, p) * per[i];
+      double from_first = place[i] + middle(f.source[i]);
+      counts = counts && from_first > -1 && from_first < f.source[i];
+      if (!counts) from_first = 0;
+      low[i] = (int)floor(from_first);
+      part[i] = (R)(from_first - low[i]);
     }
     UNROLL for (int n = 0; n < 8; n++) {
       int x = low[0] + n % 2, y = low[1] + n / 2 % 2, z = low[2] + n / 4;
@@ -91,8 +93,8 @@ template <class R> DEVICE void vary_maps(const Field& f) {
     if (counts) slopes_of(f, cell, pair, sample, slope);
     double by[5] = {0, 0, 0, 0, 0};
     UNROLL for (int i = 0; i < 3; i++) {
-      by[i] = counts ? slope[i] / cell.under[i] : 0;
-      by[i < 2 ? 3 : 4] -= counts ? by[i] * (cell.top[i] / cell.under[i]) : 0;
+      by[i] = counts ? slope[i] * cell.per[i] : 0;
+      by[i < 2 ? 3 : 4] -= counts ? by[i] * cell.place[i] : 0;
     }
     UNROLL for (int i = 0; i < MAP; i++) {
       double factor = (i % 3 < 2 ? cell.p[i % 3] : 1) * (i % 6 < 3 ? 1 : cell.p[2]);

@@ -60,19 +60,20 @@ struct Samples { int low[3], high[3]; };  // x, y, z; the last one among them
 
 // The samples whose cells may hold a voxel. Along x, y and z alone every place is a quotient of linear functions, so the
 // greatest and the least are at corners, where the denominator has one sign.
-DEVICE Samples samples_near(const Field& f, const float* inverse, const int* voxel) {
+DEVICE Samples samples_near(const Field& f, const float* map, const int* voxel) {
   float low[3], high[3];
   int ahead[2] = {0, 0}, behind[2] = {0, 0};
   for (int corner = 0; corner < 8; corner++) {
-    float p[3], under[2];
+    float p[3], per[2];
     UNROLL for (int i = 0; i < 3; i++) p[i] = voxel[i] - (f.source[i] - 1) * 0.5f + (corner >> i & 1 ? 1 : -1);
     UNROLL for (int i = 0; i < 2; i++) {
-      under[i] = value(inverse + ACROSS + 6 * i, p);
-      ahead[i] += under[i] > 0;
-      behind[i] += under[i] < 0;
+      float under = value(map + ACROSS + 6 * i, p);
+      ahead[i] += under > 0;
+      behind[i] += under < 0;
+      per[i] = inverse(under);
     }
     UNROLL for (int i = 0; i < 3; i++) {
-      float place = value(inverse + 6 * i, p) / under[i / 2];
+      float place = value(map + 6 * i, p) * per[i / 2];
       low[i] = corner ? min(low[i], place) : place;
       high[i] = corner ? max(high[i], place) : place;
     }
@@ -118,20 +119,21 @@ template <class R> DEVICE void add_samples(const Field& f, const Part& part, con
   }
   Near<R> x(map + X, map + ACROSS, by[0], p), y(map + Y, map + ACROSS, by[1], p), z(map + Z, map + DEPTH, by[2], p);
   Near<R> across(map + ACROSS, map, 0, p), depth(map + DEPTH, map, 0, p);
-  long long samples = size_of(f.shape);
+  int samples = size_of(f.shape);
   const R* values = (const R*)f.origin + part.values * samples;
   for (int k = s.low[2]; k <= s.high[2]; k++)
     for (int j = s.low[1]; j <= s.high[1]; j++) {
       int up = k - s.low[2], down = j - s.low[1];
       Along<R> xs(x, down, up), ys(y, down, up), zs(z, down, up), wide(across, down, up), deep(depth, down, up);
-      const R* row = values + ((long long)k * f.shape[1] + j) * f.shape[0];
+      const R* row = values + (k * f.shape[1] + j) * f.shape[0];
       for (int i = s.low[0]; i <= s.high[0]; i++) {
         int right = i - s.low[0];
-        R w = wide.at(right), d = deep.at(right), per = 1 / w;
-        R weight = hat(xs.at(right) * per) * hat(ys.at(right) * per) * hat(zs.at(right) / d);
+        R w = wide.at(right), d = deep.at(right), per = inverse(w);
+        R weight = hat(xs.at(right) * per) * hat(ys.at(right) * per) * hat(zs.at(right) * inverse(d));
         if (!(w > 0 && d > 0 && weight > 0)) continue;
-        UNROLL for (int c = 0; c < PLANES; c++)
-          if (c < part.here) total[c] += weight * row[c * samples + i];
+        const R* value = row + i;
+        UNROLL for (int c = 0; c < PLANES; c++, value += samples)
+          if (c < part.here) total[c] += weight * *value;
       }
     }
 }

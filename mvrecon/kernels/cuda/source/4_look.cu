@@ -11,7 +11,7 @@ template <class R> struct Ramp {
 
 // The pixel nearest to a place, on the detector: places are counted from it, so that their digits are those of a cell.
 DEVICE int pixel_at(double top, double under, int size) {
-  float place = (float)(top / under + middle(size));
+  float place = (float)top * inverse((float)under) + (size - 1) * 0.5f;
   return under > 0 ? (int)min(max(floor(place), 0.0f), size - 1.0f) : 0;
 }
 
@@ -38,7 +38,7 @@ template <class R> DEVICE void see(const Field& f, const double* map, const R* v
   Ramp<R> under(base[2], step[2]), begun(base[3] - f.window[0], step[3]), left(f.window[1] - base[3], -step[3]);
   R low_u = (R)(-1 - u0), high_u = (R)(f.source[0] - u0), low_v = (R)(-1 - v0), high_v = (R)(f.source[1] - v0);
   UNROLL for (int t = 0; t < ALONG; t++) {
-    R w = under.at(t), per = 1 / w, u = us.at(t) * per, v = vs.at(t) * per;
+    R w = under.at(t), per = inverse(w), u = us.at(t) * per, v = vs.at(t) * per;
     bool counts = w > 0 && begun.at(t) > 0 && left.at(t) > 0 && low_u < u && u < high_u && low_v < v && v < high_v;
     if (counts) total[t] += (f.weighted ? per * per : (R)1) * bilinear(f, view, u, v, u0, v0);
   }

@@ -28,13 +28,13 @@ struct Beam {
     int ahead = 0, behind = 0, b = (axis + 1) % 3, c = (axis + 2) % 3;
     UNROLL for (int n = 0; n < 4; n++) {
       Pencil ray(map, u + (n % 2 ? 1 : -1), v + (n / 2 ? 1 : -1));
-      double along = pick(ray.direction, axis);
+      double along = pick(ray.direction, axis), per = inverse(along);
       ahead += along > 0;
       behind += along < 0;
-      from[n][0] = (float)(pick(ray.moment, c) / along);
-      from[n][1] = (float)(-pick(ray.moment, b) / along);
-      by[n][0] = (float)(pick(ray.direction, b) / along);
-      by[n][1] = (float)(pick(ray.direction, c) / along);
+      from[n][0] = (float)(pick(ray.moment, c) * per);
+      from[n][1] = (float)(-pick(ray.moment, b) * per);
+      by[n][0] = (float)(pick(ray.direction, b) * per);
+      by[n][1] = (float)(pick(ray.direction, c) * per);
     }
     bounded = ahead == 4 || behind == 4;
   }
@@ -69,8 +69,8 @@ template <class R> DEVICE void show_up(const Field& f) {
   const double* map = f.maps + (long long)m * IMAGE;
   double u = at % f.source[0] - middle(f.source[0]), v = at / f.source[0] % f.source[1] - middle(f.source[1]);
   Pencil ray(map, u, v);
-  double x = fabs(ray.direction[0]), y = fabs(ray.direction[1]), z = fabs(ray.direction[2]);
-  int axis = x >= y && x >= z ? 0 : y >= z ? 1 : 2, b = (axis + 1) % 3, c = (axis + 2) % 3;
+  double dx = fabs(ray.direction[0]), dy = fabs(ray.direction[1]), dz = fabs(ray.direction[2]);
+  int axis = dx >= dy && dx >= dz ? 0 : dy >= dz ? 1 : 2, b = (axis + 1) % 3, c = (axis + 2) % 3;
   Beam beam(map, u, v, axis);
   const R* volume = (const R*)f.origin + (long long)blockIdx.y * plane * f.shape[2];
   long long step_b = b == 0 ? 1 : b == 1 ? f.shape[0] : plane, step_c = c == 0 ? 1 : c == 1 ? f.shape[0] : plane;
@@ -84,17 +84,15 @@ template <class R> DEVICE void show_up(const Field& f) {
     if (low_b > high_b || low_c > high_c) continue;
     UNROLL for (int i = 0; i < 3; i++) p[i] = i == axis ? s : (i == b ? low_b : low_c) - middle(f.shape[i]);
     Slab<R> us(map, map + 12, u, p, b, c), vs(map + 6, map + 12, v, p, b, c), under(map + 12, map, 0, p, b, c);
-    Slab<R> begun(map + 18, map, 0, p, b, c), left = begun;
+    Slab<R> way(map + 18, map, 0, p, b, c);
     double fraction = map[18] * p[0] + map[19] * p[1] + map[23] * p[2] + map[20];
-    begun.one = (R)(fraction - f.window[0]);
-    left.one = (R)(f.window[1] - fraction);
-    left.b = -left.b;
-    left.c = -left.c;
+    R begin = (R)(f.window[0] - fraction), end = (R)(f.window[1] - fraction);
+    way.one = 0;
     for (int j = low_c; j <= high_c; j++)
       for (int i = low_b; i <= high_b; i++) {
-        R w = under.at(i - low_b, j - low_c), per = 1 / w;
-        R weight = hat(us.at(i - low_b, j - low_c) * per) * hat(vs.at(i - low_b, j - low_c) * per);
-        if (!(w > 0 && weight > 0 && begun.at(i - low_b, j - low_c) > 0 && left.at(i - low_b, j - low_c) > 0)) continue;
+        int x = i - low_b, y = j - low_c;
+        R w = under.at(x, y), per = inverse(w), weight = hat(us.at(x, y) * per) * hat(vs.at(x, y) * per), share = way.at(x, y);
+        if (!(w > 0 && weight > 0 && begin < share && share < end)) continue;
         total += weight * (f.weighted ? per * per : (R)1) * volume[slab * step + i * step_b + j * step_c];
       }
   }
