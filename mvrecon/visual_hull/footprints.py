@@ -18,6 +18,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.devices import beside
 
 #: Part of a pixel by which rounding to float32 may shift a ray.
 ROUNDING = 1e-3
@@ -81,8 +82,7 @@ def footprints(
             that ball; the further it is grown, the more it meets of thinner bodies.
     """
     images, w = _images(cameras, grid, bricks, reach)
-    margin, slack = _gaps(cameras) if gaps else (w.new_zeros(2, len(w), 1), w.new_zeros(len(w), 1))
-    more = max(0.0, gaps - 1) * (margin - 0.5)
+    margin, slack, more = _margins(cameras, gaps)
     near, far = w.amin(dim=1), w.amax(dim=1)
     first, last = cameras.ray_extent
     across = (
@@ -102,17 +102,33 @@ def footprints(
     return Footprints(low.long(), torch.where(unseen, low, torch.maximum(low, high)).long(), whole)
 
 
+def print_numbers(cameras: Cameras, grid: Grid, gaps: float) -> Float[Tensor, "m 17"]:
+    """What of each view the kernel of footprints reads: the map from voxels, and by how much
+    footprints are grown; see `kernels/cuda/source/6_footprints.cu`.
+    """
+    margin, slack, more = _margins(cameras, gaps)
+    return torch.cat(
+        [_maps(cameras, grid).flatten(1), margin[..., 0].T, slack, more[..., 0].T], dim=1
+    )
+
+
+def _maps(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 3 4"]:
+    """From voxels about the grid's centre to pixels (u w, v w, w), of parallel beams (u, v, w)."""
+    # a rig has no flat camera, and whether there is an inverse is not waited for
+    inverse = torch.linalg.inv_ex(cameras.frame.detach()).inverse
+    turn = inverse @ beside(grid.affine[:3, :3], inverse)
+    shift = inverse @ (beside(grid.centre, inverse) - cameras.source.detach())[..., None]
+    return torch.cat([turn, shift], dim=-1)
+
+
 def _images(
     cameras: Cameras, grid: Grid, bricks: Bricks, reach: float
 ) -> tuple[Float[Tensor, "2 m 8 n"], Float[Tensor, "m 8 n"]]:
     """Pixels (u, v) of the corners of bricks grown by `reach`, not finite where w = 0; and their
     fraction w.
     """
-    inverse = torch.linalg.inv(cameras.frame.detach())
-    turn = inverse @ grid.affine[:3, :3].to(inverse)
-    shift = inverse @ (grid.centre.to(inverse) - cameras.source.detach())[..., None]
-    maps = torch.cat([turn, shift], dim=-1)  # from voxels about the grid's centre
-    centre = grid.centre_index.to(inverse)[:, None] + 0.5
+    maps = _maps(cameras, grid)
+    centre = grid.centre_index.to(maps)[:, None] + 0.5
     faces = bricks.low.T.flip(0) - centre - reach, bricks.high.T.flip(0) - centre + reach
     one = torch.ones_like(faces[0][0])
     corners = [
@@ -141,6 +157,18 @@ def _diagonals(cameras: Cameras) -> Float[Tensor, " m"]:
     """The longer diagonal of each camera's pixels in mm."""
     u, v = cameras.u.detach(), cameras.v.detach()
     return torch.maximum((u + v).norm(dim=-1), (u - v).norm(dim=-1))
+
+
+def _margins(
+    cameras: Cameras, gaps: float
+) -> tuple[Float[Tensor, "2 m 1"], Float[Tensor, "m 1"], Float[Tensor, "2 m 1"]]:
+    """By how many pixels (u, v) a footprint is wider than its brick's image, the part of a ray that
+    this takes, and by how many pixels more it is grown.
+    """
+    margin, slack = _gaps(cameras)
+    if not gaps:
+        margin, slack = torch.zeros_like(margin), torch.zeros_like(slack)
+    return margin, slack, max(0.0, gaps - 1) * (margin - 0.5)
 
 
 def _gaps(cameras: Cameras) -> tuple[Float[Tensor, "2 m 1"], Float[Tensor, "m 1"]]:
