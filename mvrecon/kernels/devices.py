@@ -5,4 +5,4 @@ from torch import Tensor
 
 def beside(tensor: Tensor, like: Tensor) -> Tensor:
     """A tensor in the type and the place of another; the host does not wait for a GPU's copy."""
-    return tensor.to(like, non_blocking=like.is_cuda)
+    return tensor.to(like, non_blocking=not like.is_cpu)

@@ -58,7 +58,7 @@ def backproject(
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     maps = image_maps(cameras, grid).to(views.device)
     values = wide(views).flatten(0, 1)
-    chosen, _ = kernels_for(values[None], backend, "look")
+    chosen, _ = kernels_for(views, backend, "look")
     kernels = voxel_reference if chosen == "reference" else voxel_ops
     volumes = kernels.look(
         values, maps, list(cameras.ray_extent), weight == "distance", list(grid.shape)

@@ -159,10 +159,10 @@ def _foreground(
 
 def _tried(device: str, dtype: torch.dtype) -> selfcheck.Tried:
     """A hull in one launch, of three views of a box of bright pixels."""
-    detector = {"pixels": [9, 11], "pixel_mm": 3.0}
-    cameras, grid = circular(3, 40.0, 70.0, detector), Grid.centred(size=(9, 8, 7), spacing=1.5)
+    detector = {"pixels": [40, 44], "pixel_mm": 1.0}
+    cameras, grid = circular(3, 40.0, 70.0, detector), Grid.centred(size=(13, 12, 10), spacing=1.5)
     bright = torch.zeros(1, 3, *cameras.shape, dtype=torch.bool, device=device)
-    bright[..., 3:6, 4:8] = True
+    bright[..., 18:23, 20:24] = True
     rule = Rule(2, REACH, 1, True)
     expected = refined(bright, cameras.to(torch.device(device)), grid, rule)
     yield "hull", selfcheck.error_of(at_once(bright, cameras, grid, rule).float(), expected.float())

@@ -14,6 +14,7 @@ class Waits(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func.overloadpacket.__name__
-        if name in self.ASKED or (name == "_to_copy" and "device" in (kwargs or {})):
+        copied = name == "_to_copy" and "device" in (kwargs or {})
+        if name in self.ASKED or (copied and not (kwargs or {}).get("non_blocking")):
             self.names.append(name)
         return func(*args, **(kwargs or {}))
