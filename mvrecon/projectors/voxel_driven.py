@@ -16,6 +16,7 @@ from mvrecon.kernels.backends import kernels_for
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.kernels.voxels import reference as voxel_reference
+from mvrecon.kernels.voxels.trial import differences
 from mvrecon.projectors.checks import check
 
 Weight = Literal["none", "distance"]
@@ -58,7 +59,7 @@ def backproject(
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     maps = image_maps(cameras, grid).to(views.device)
     values = wide(views).flatten(0, 1)
-    chosen, _ = kernels_for(views, backend, "look")
+    chosen, _ = kernels_for(views, backend, "look", differences)
     kernels = voxel_reference if chosen == "reference" else voxel_ops
     volumes = kernels.look(
         values, maps, list(cameras.ray_extent), weight == "distance", list(grid.shape)

@@ -3,7 +3,7 @@ of the views (Laurentini, IEEE PAMI 16, 1994).
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,21 +14,15 @@ from mvrecon.cameras.rigs import circular
 from mvrecon.cameras.views import check_finite
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.cuda.bricks import Prints, Rule, judge
+from mvrecon.kernels.cuda import bricks
+from mvrecon.kernels.footprints import Rule
 from mvrecon.kernels.rays.cuda import selfcheck
-from mvrecon.visual_hull.footprints import (
-    Bricks,
-    footprint_sums,
-    footprints,
-    print_numbers,
-    summed_area_tables,
-)
+from mvrecon.visual_hull.footprints import Bricks, footprints, prints_of, summed_area_tables
+from mvrecon.visual_hull.judging import AT_ONCE, judged, proofs
 
 #: Views at a time, of all items of a batch: a brick that some of them prove empty is skipped in
 #: the next.
 VIEWS = 8
-#: Footprints at a time, which bounds the memory (500 bytes a footprint).
-AT_ONCE = 2**15
 #: Diagonals of a pixel by which footprints are grown: 1 proves bodies absent that are nowhere
 #: thinner than that, and 2 takes in twice the length of what is half as wide, which so covers as
 #: much of the detector.
@@ -82,19 +76,23 @@ def visual_hull(
         )
     rule = Rule(brick, REACH, witnesses, keep_unseen)
     foreground = _foreground(views, threshold)
-    if views.is_cuda and not selfcheck.reason(views.device, "hull", tried=_tried):
+    if views.is_cuda and not selfcheck.reason(views.device, "hull", torch.float64, 1, _tried):
         return at_once(foreground, cameras, grid, rule)
     return refined(foreground, cameras.to(views.device), grid, rule)
 
 
 def at_once(
-    foreground: Bool[Tensor, "b m v u"], cameras: Cameras, grid: Grid, rule: Rule
+    foreground: Bool[Tensor, "b m v u"],
+    cameras: Cameras,
+    grid: Grid,
+    rule: Rule,
+    judge: Callable[..., Tensor] = judged,
 ) -> Bool[Tensor, "b z y x"]:
-    """The bricks that stay, on a GPU: all of them and all views in one launch."""
+    """The bricks that stay, all of them and all views at once."""
+    prints = prints_of(cameras, grid, GAPS)
+    numbers = prints.numbers.to(foreground.device, non_blocking=foreground.is_cuda)
     tables = summed_area_tables(foreground)
-    numbers = print_numbers(cameras, grid, GAPS).to(foreground.device, non_blocking=True)
-    prints = Prints(numbers, cameras.ray_extent, cameras.parallel)
-    return judge(tables, prints, rule, grid.shape)
+    return judge(tables, prints._replace(numbers=numbers), rule, grid.shape)
 
 
 def refined(
@@ -165,7 +163,8 @@ def _tried(device: str, dtype: torch.dtype) -> selfcheck.Tried:
     bright[..., 18:23, 20:24] = True
     rule = Rule(2, REACH, 1, True)
     expected = refined(bright, cameras.to(torch.device(device)), grid, rule)
-    yield "hull", selfcheck.error_of(at_once(bright, cameras, grid, rule).float(), expected.float())
+    stays = at_once(bright, cameras, grid, rule, bricks.judge)
+    yield "hull", selfcheck.error_of(stays.float(), expected.float())
 
 
 def _edges(brick: int, shape: Sequence[int]) -> Iterator[int]:
@@ -208,8 +207,8 @@ def _witnesses(
             prints = footprints(
                 cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), REACH, GAPS
             )
-            none = footprint_sums(table, prints) == 0
-            empty[:, some] += (none & prints.whole).sum(dim=1, dtype=torch.int32)
-            dark[:, some] &= none.all(dim=1)
+            proved, unlit = proofs(table, prints)
+            empty[:, some] += proved
+            dark[:, some] &= unlit
         undecided = undecided[(empty[:, undecided] < enough).any(dim=0)]
     return empty, dark

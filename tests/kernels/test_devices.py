@@ -3,10 +3,9 @@
 from types import SimpleNamespace
 
 import pytest
-import torch
 
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.visual_hull.footprints import print_numbers
+from mvrecon.visual_hull.footprints import prints_of
 from tests.kernels.cuda.waits import Waits
 from tests.projectors.rigs import CONE, GRID, PARALLEL
 
@@ -17,10 +16,15 @@ def test_what_is_made_of_cameras_stays_on_their_device(rig):
     tensors = {name: getattr(rig, name).to("meta") for name in ("source", "origin", "u", "v")}
     distance, frame = rig.distance.to("meta"), rig.frame.to("meta")
     away = SimpleNamespace(
-        **tensors, shape=rig.shape, parallel=rig.parallel, distance=distance, frame=frame
+        **tensors,
+        shape=rig.shape,
+        parallel=rig.parallel,
+        ray_extent=rig.ray_extent,
+        distance=distance,
+        frame=frame,
     )
     with Waits() as waits:
-        lines, numbers = lines_of(away, GRID), print_numbers(away, GRID, 2.0)
+        lines, numbers = lines_of(away, GRID), prints_of(away, GRID, 2.0).numbers
     assert lines.is_meta and lines.shape == (len(rig), 4, 3, 3)
     assert numbers.is_meta and numbers.shape == (len(rig), 17)
     assert waits.names == []

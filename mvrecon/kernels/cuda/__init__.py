@@ -1,1 +1,1 @@
-"""Kernels of CUDA devices with a thread a voxel, a sample or a pixel, where those along rays have one a ray."""
+"""Kernels of CUDA devices that have a thread a voxel, a sample or a pixel."""

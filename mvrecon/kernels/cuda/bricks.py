@@ -2,37 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from mvrecon.geometry.box import bricks_along
 from mvrecon.kernels.cuda.field import Field
 from mvrecon.kernels.cuda.launching import blocks, numbers_of, start
 from mvrecon.kernels.cuda.sources import Part
-
-
-class Prints(NamedTuple):
-    """The views' footprints: seventeen numbers a view, which part of a ray counts, and whether the
-    beams are parallel.
-    """
-
-    numbers: Float[Tensor, "m 17"]
-    window: Sequence[float]
-    parallel: bool
-
-
-class Rule(NamedTuple):
-    """When a brick is empty: its edge in voxels, and by how much interpolation reaches beyond; how
-    many views must agree; and whether bricks stay that no view sees whole.
-    """
-
-    edge: int
-    reach: float
-    enough: int
-    keep_unseen: bool
+from mvrecon.kernels.footprints import Prints, Rule
 
 
 def judge(

@@ -38,14 +38,14 @@ def _show(
 
 @_look.register_kernel("cuda")
 def _(views, maps, window, weighted, shape):
-    from mvrecon.kernels.cuda import voxels as cuda
+    from mvrecon.kernels.voxels import cuda
 
     return cuda.look(views, maps, window, weighted, shape)
 
 
 @_show.register_kernel("cuda")
 def _(volumes, maps, window, weighted, detector):
-    from mvrecon.kernels.cuda import voxels as cuda
+    from mvrecon.kernels.voxels import cuda
 
     return cuda.show(volumes, maps, window, weighted, detector)
 

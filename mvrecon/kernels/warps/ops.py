@@ -44,21 +44,21 @@ def _warp_vjp(volumes: Tensor, values: Tensor, maps: Tensor) -> Tensor:
 
 @_warp.register_kernel("cuda")
 def _(volumes, maps, shape):
-    from mvrecon.kernels.cuda import warps as cuda
+    from mvrecon.kernels.warps import cuda
 
     return cuda.warp(volumes, maps, shape)
 
 
 @_warp_back.register_kernel("cuda")
 def _(values, maps, shape):
-    from mvrecon.kernels.cuda import warps as cuda
+    from mvrecon.kernels.warps import cuda
 
     return cuda.warp_back(values, maps, shape)
 
 
 @_warp_vjp.register_kernel("cuda")
 def _(volumes, values, maps):
-    from mvrecon.kernels.cuda import warps as cuda
+    from mvrecon.kernels.warps import cuda
 
     return cuda.warp_vjp(volumes, values, maps)
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from mvrecon.kernels.backends import kernels_for
 from mvrecon.kernels.warps import ops as warp_ops
 from mvrecon.kernels.warps import reference as warp_reference
+from mvrecon.kernels.warps.trial import differences
 
 
 def warp(
@@ -50,6 +51,6 @@ def warp(
         )
     if volumes.dtype not in (torch.float32, torch.float64):
         return warp(volumes.float(), maps, shape, backend).to(volumes.dtype)
-    chosen, _ = kernels_for(volumes, backend, "warp")
+    chosen, _ = kernels_for(volumes, backend, "warp", differences)
     kernels = warp_reference if chosen == "reference" else warp_ops
     return kernels.warp(volumes, maps, list(shape))

@@ -5,7 +5,8 @@ the CPU.
 import pytest
 import torch
 
-from mvrecon.kernels.cuda.bricks import Rule
+from mvrecon.kernels.cuda import bricks
+from mvrecon.kernels.footprints import Rule
 from mvrecon.kernels.rays.cuda import selfcheck
 from mvrecon.visual_hull import hull
 from tests.kernels.cuda.waits import Waits
@@ -26,14 +27,16 @@ def test_the_same_bricks_stay(kind, host):
             stays = hull.refined(bright, world.cameras, world.grid, rule)
             host.launches.clear()
             with Waits() as waits:
-                assert hull.at_once(bright, world.cameras, world.grid, rule).equal(stays)
-            assert waits.names == ["equal"] and host.launches == ["judge"]
+                fast = hull.at_once(bright, world.cameras, world.grid, rule, bricks.judge)
+            assert waits.names == [] and host.launches == ["judge"]
+            assert fast.equal(stays)
+            assert hull.at_once(bright, world.cameras, world.grid, rule).equal(stays)
             assert 0 < stays.float().mean() <= 1
 
 
 def test_a_wrong_hull_is_not_used(host, monkeypatch):
     assert selfcheck.reason("cpu", "hull", tried=hull._tried) is None
     selfcheck.forget()
-    right = hull.at_once
-    monkeypatch.setattr(hull, "at_once", lambda *arguments: ~right(*arguments))
+    right = bricks.judge
+    monkeypatch.setattr(bricks, "judge", lambda *arguments: ~right(*arguments))
     assert "hull differs" in str(selfcheck.reason("cpu", "hull", tried=hull._tried))

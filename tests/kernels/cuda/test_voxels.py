@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.cuda import voxels as cuda
-from mvrecon.kernels.voxels import reference
+from mvrecon.kernels.voxels import cuda, reference
 from mvrecon.projectors.voxel_driven import image_maps
 from tests.kernels.cuda.scenes import RIGS, difference
 from tests.kernels.cuda.waits import Waits

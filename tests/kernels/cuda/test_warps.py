@@ -8,8 +8,7 @@ import torch
 from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
-from mvrecon.kernels.cuda import warps as cuda
-from mvrecon.kernels.warps import reference
+from mvrecon.kernels.warps import cuda, reference
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
 from tests.kernels.warps.scenes import OTHER, RIGS, SMALL, generic, lattices

@@ -57,9 +57,7 @@ def stream_of(device: torch.device) -> int:
     return torch.cuda.current_stream(device).cuda_stream
 
 
-def load(
-    machine_code: bytes, names: Sequence[str], device: torch.device
-) -> dict[str, c_void_p]:
+def load(machine_code: bytes, names: Sequence[str], device: torch.device) -> dict[str, c_void_p]:
     """The kernels of machine code or PTX by their names, on a device.
 
     Raises:
@@ -74,9 +72,7 @@ def load(
     return functions
 
 
-def launch(
-    function: c_void_p, scene: Packed, across: int, down: int, device: torch.device
-) -> None:
+def launch(function: c_void_p, scene: Packed, across: int, down: int, device: torch.device) -> None:
     """Start a kernel on `across` x `down` blocks, on torch's current stream.
 
     Raises:

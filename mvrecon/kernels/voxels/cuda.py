@@ -1,5 +1,5 @@
-"""Voxel-driven back-projection on CUDA devices, and its transpose: the same to the last bit in every
-run.
+"""Voxel-driven back-projection on CUDA devices, and its transpose: the same to the last bit in
+every run.
 """
 
 import math
