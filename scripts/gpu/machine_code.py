@@ -10,12 +10,10 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
-from mvrecon.kernels.cuda import sources as fields
 from mvrecon.kernels.rays.cuda import nvrtc
 from mvrecon.kernels.rays.cuda.sources import Variant, text_of
 from mvrecon.kernels.rays.trace import METHODS
@@ -34,10 +32,10 @@ def tool(name: str) -> str:
     return str(paths[0])
 
 
-def assembled(source: str, capability: int, folder: Path) -> tuple[str, str]:
+def assembled(variant: Variant, capability: int, folder: Path) -> tuple[str, str]:
     """The messages of the assembler, and the machine code as text."""
     ptx, cubin = folder / "rays.ptx", folder / "rays.cubin"
-    text = nvrtc.build(source, f"compute_{capability}")
+    text = nvrtc.build(text_of({"": variant}), f"compute_{capability}")
     ptx.write_bytes(text.rstrip(b"\0"))
     command = [tool("ptxas"), "-v", "-arch", f"sm_{capability}", str(ptx), "-o", str(cubin)]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
@@ -67,15 +65,15 @@ def count(pattern: str, instructions: list[str]) -> int:
     return sum(bool(re.search(pattern, one)) for one in instructions)
 
 
-def rows(source: str, kernels: Sequence[str], capability: int, folder: Path) -> list[str]:
-    """A line of a table for each kernel of a text."""
-    said, shown = assembled(source, capability, folder)
+def rows(variant: Variant, capability: int, folder: Path) -> list[str]:
+    """A line of a table for each kernel."""
+    said, shown = assembled(variant, capability, folder)
     pattern = r"entry function '(\w+)'.*?(\d+) bytes spill stores.*?Used (\d+) registers"
     used = {name: (registers, spilt) for name, spilt, registers in re.findall(pattern, said, re.S)}
     parts = re.split(r"\.section\s+\.text\.(\w+)", shown)[1:]
     lines = []
     for name, body in zip(parts[::2], parts[1::2], strict=True):
-        if name in kernels:
+        if name in KERNELS:
             every, inner = loops(body)
             steps = "; ".join(
                 f"{len(loop)} ({count(DOUBLE, loop)} float64, {count(LOAD, loop)} loads)"
@@ -92,24 +90,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--capability", type=int, default=90)
     options = parser.parse_args()
-    tables = {
-        f"{method}, {stored}, {together} volumes a ray": (
-            text_of({"": Variant(torch.float32, stored, together, number)}),
-            KERNELS,
-        )
-        for method, number in METHODS.items()
-        for stored, together in STORED
-    }
-    for purpose, kernels in fields.KERNELS.items():
-        part = fields.Part(purpose, torch.float32)
-        tables[purpose] = fields.text_of({"": part}), kernels
     with tempfile.TemporaryDirectory() as folder:
-        for title, (source, kernels) in tables.items():
-            print(f"\n{title}\n")
-            print("| kernel | registers | bytes spilt | instructions | float64 | inner loops |")
-            print("|---|---:|---:|---:|---:|---|")
-            lines = rows(source, kernels, options.capability, Path(folder))
-            print("\n".join(lines), flush=True)
+        for method, number in METHODS.items():
+            for stored, together in STORED:
+                print(f"\n{method}, {stored}, {together} volumes a ray\n")
+                print("| kernel | registers | bytes spilt | instructions | float64 | inner loops |")
+                print("|---|---:|---:|---:|---:|---|")
+                variant = Variant(torch.float32, stored, together, number)
+                print("\n".join(rows(variant, options.capability, Path(folder))), flush=True)
 
 
 if __name__ == "__main__":
