@@ -1,5 +1,5 @@
-"""Warps, voxel-driven back-projection and hull compiled by NVRTC, with no GPU at hand: where NVRTC is
-installed.
+"""Warps, voxel-driven back-projection and hull compiled by NVRTC, with no GPU at hand: where NVRTC
+is installed.
 """
 
 import re
