@@ -1,7 +1,9 @@
 """Which back end serves a tensor."""
 
+from collections.abc import Callable
 from importlib.util import find_spec
 from types import ModuleType
+from typing import Any
 
 from torch import Tensor
 
@@ -11,14 +13,21 @@ BACKENDS = ("auto", "cpu", "cuda", "reference")
 COMPILED = find_spec("numba") is not None
 
 
-def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tuple[str, ModuleType]:
+def kernels_for(
+    tensor: Tensor,
+    backend: str,
+    purpose: str | None = None,
+    tried: Callable[..., Any] | None = None,
+) -> tuple[str, ModuleType]:
     """The back end's name and its functions along rays, for volumes or views [b c ..].
 
     Args:
         tensor: what is to be projected or back-projected.
         backend: "auto" takes the compiled one of the tensor's device where that can be had, else
             the reference.
-        method: of the rays; without it, the name alone tells, and a GPU has none but the reference.
+        purpose: the method of rays, or what else the kernels are for, of which the name alone
+            tells; without it a GPU has none but the reference.
+        tried: of another purpose, what its kernels are tried on, see `selfcheck.reason`.
 
     Raises:
         ValueError: an unknown back end, or a compiled one for a tensor elsewhere.
@@ -40,9 +49,9 @@ def kernels_for(tensor: Tensor, backend: str, method: str | None = None) -> tupl
 
         volumes = tensor.shape[0] * tensor.shape[1]
         why = (
-            selfcheck.reason(tensor.device, method, tensor.dtype, volumes)
-            if method
-            else "only rays have kernels there"
+            selfcheck.reason(tensor.device, purpose, tensor.dtype, volumes, tried)
+            if purpose
+            else "there are no such kernels"
         )
         if why and backend == "cuda":
             raise RuntimeError(f"backend 'cuda' cannot be used on {tensor.device}: {why}")

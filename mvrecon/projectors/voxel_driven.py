@@ -16,6 +16,7 @@ from mvrecon.kernels.backends import kernels_for
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.kernels.voxels import reference as voxel_reference
+from mvrecon.kernels.voxels.trial import differences
 from mvrecon.projectors.checks import check
 
 Weight = Literal["none", "distance"]
@@ -47,17 +48,19 @@ def backproject(
             parallel beams. Feldkamp, Davis and Kress, Practical cone-beam algorithm, JOSA A 1,
             1984, eq. 28 weigh with d^2 / (d + r . x)^2 = (SID / z)^2, d = SID from the source to
             the axis of rotation: that is (SID / SDD)^2 times this weight.
-        backend: "cpu" (compiled), "reference" (torch, any device), or "auto".
+        backend: "cpu" or "cuda" (compiled), "reference" (torch, any device), or "auto".
 
     Raises:
         ValueError: an unknown weight or back end, a wrong rank, size or device.
+        RuntimeError: "cuda" cannot be used, and why.
     """
     if weight not in ("none", "distance"):
         raise ValueError(f"Unknown weight {weight!r}. Known: none, distance")
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     maps = image_maps(cameras, grid).to(views.device)
     values = wide(views).flatten(0, 1)
-    kernels = voxel_ops if kernels_for(views, backend)[0] == "cpu" else voxel_reference
+    chosen, _ = kernels_for(views, backend, "look", differences)
+    kernels = voxel_reference if chosen == "reference" else voxel_ops
     volumes = kernels.look(
         values, maps, list(cameras.ray_extent), weight == "distance", list(grid.shape)
     )

@@ -18,6 +18,8 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.devices import beside
+from mvrecon.kernels.footprints import Prints
 
 #: Part of a pixel by which rounding to float32 may shift a ray.
 ROUNDING = 1e-3
@@ -80,17 +82,22 @@ def footprints(
             as a pixel's diagonal magnified to there (`ray_gap`), a ray of the grown footprint meets
             that ball; the further it is grown, the more it meets of thinner bodies.
     """
-    images, w = _images(cameras, grid, bricks, reach)
-    margin, slack = _gaps(cameras) if gaps else (w.new_zeros(2, len(w), 1), w.new_zeros(len(w), 1))
-    more = max(0.0, gaps - 1) * (margin - 0.5)
+    return footprints_of(prints_of(cameras, grid, gaps), cameras.shape, grid.shape, bricks, reach)
+
+
+def footprints_of(
+    prints: Prints, detector: Sequence[int], shape: Sequence[int], bricks: Bricks, reach: float
+) -> Footprints:
+    """The footprints of bricks of a grid of `shape`, on detectors of (rows, columns)."""
+    numbers, (first, last) = prints.numbers, prints.window
+    margin, more = (numbers[:, part].T[..., None] for part in (slice(12, 14), slice(15, 17)))
+    slack = numbers[:, 14:15]
+    images, w = _images(prints, shape, bricks, reach)
     near, far = w.amin(dim=1), w.amax(dim=1)
-    first, last = cameras.ray_extent
-    across = (
-        (near <= 0) & (far >= 0) & (not cameras.parallel)
-    )  # such a brick may have an image anywhere
+    across = (near <= 0) & (far >= 0) & (not prints.parallel)  # its image may be anywhere
     unseen = (far <= first) | (near >= last)
     low, high = images.amin(dim=2) - margin - ROUNDING, images.amax(dim=2) + margin + ROUNDING
-    size = low.new_tensor(cameras.shape[::-1]).reshape(2, 1, 1)
+    size = low.new_tensor(detector[::-1]).reshape(2, 1, 1)
     whole = (
         ((low > -1) & (high < size)).all(dim=0)
         & (near >= first + slack)
@@ -102,18 +109,39 @@ def footprints(
     return Footprints(low.long(), torch.where(unseen, low, torch.maximum(low, high)).long(), whole)
 
 
+def prints_of(cameras: Cameras, grid: Grid, gaps: float) -> Prints:
+    """What the footprints of a rig's views are told from, on the cameras' device; `gaps` as of
+    `footprints`.
+    """
+    margin, slack = _gaps(cameras)
+    if not gaps:
+        margin, slack = torch.zeros_like(margin), torch.zeros_like(slack)
+    more = max(0.0, gaps - 1) * (margin - 0.5)
+    maps = _maps(cameras, grid).flatten(1)
+    numbers = torch.cat([maps, margin[..., 0].T, slack, more[..., 0].T], dim=1)
+    return Prints(numbers, cameras.ray_extent, cameras.parallel)
+
+
+def _maps(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 3 4"]:
+    """From voxels about the grid's centre to pixels (u w, v w, w), of parallel beams (u, v, w)."""
+    # a rig has no flat camera, and whether there is an inverse is not waited for
+    inverse = torch.linalg.inv_ex(cameras.frame.detach()).inverse
+    turn = inverse @ beside(grid.affine[:3, :3], inverse)
+    shift = inverse @ (beside(grid.centre, inverse) - cameras.source.detach())[..., None]
+    return torch.cat([turn, shift], dim=-1)
+
+
 def _images(
-    cameras: Cameras, grid: Grid, bricks: Bricks, reach: float
+    prints: Prints, shape: Sequence[int], bricks: Bricks, reach: float
 ) -> tuple[Float[Tensor, "2 m 8 n"], Float[Tensor, "m 8 n"]]:
     """Pixels (u, v) of the corners of bricks grown by `reach`, not finite where w = 0; and their
     fraction w.
     """
-    inverse = torch.linalg.inv(cameras.frame.detach())
-    turn = inverse @ grid.affine[:3, :3].to(inverse)
-    shift = inverse @ (grid.centre.to(inverse) - cameras.source.detach())[..., None]
-    maps = torch.cat([turn, shift], dim=-1)  # from voxels about the grid's centre
-    centre = grid.centre_index.to(inverse)[:, None] + 0.5
-    faces = bricks.low.T.flip(0) - centre - reach, bricks.high.T.flip(0) - centre + reach
+    maps = prints.numbers[:, :12].unflatten(1, (3, 4))
+    sides = [(bricks.low.to(maps), -reach), (bricks.high.to(maps), reach)]
+    faces = [
+        [index[:, 2 - axis] - shape[2 - axis] / 2 + by for axis in range(3)] for index, by in sides
+    ]
     one = torch.ones_like(faces[0][0])
     corners = [
         torch.stack([faces[i][0], faces[j][1], faces[k][2], one])
@@ -122,7 +150,7 @@ def _images(
     q = (maps.transpose(0, 1).reshape(-1, 4) @ torch.cat(corners, dim=1)).reshape(
         3, len(maps), 8, -1
     )
-    return (q[:2] if cameras.parallel else q[:2] / q[2]), q[2]
+    return (q[:2] if prints.parallel else q[:2] / q[2]), q[2]
 
 
 def ray_gap(cameras: Cameras, grid: Grid) -> float:

@@ -2,28 +2,27 @@
 of the views (Laurentini, IEEE PAMI 16, 1994).
 """
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.rigs import circular
 from mvrecon.cameras.views import check_finite
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.visual_hull.footprints import (
-    Bricks,
-    footprint_sums,
-    footprints,
-    summed_area_tables,
-)
+from mvrecon.kernels.cuda import bricks
+from mvrecon.kernels.footprints import Rule
+from mvrecon.kernels.rays.cuda import selfcheck
+from mvrecon.visual_hull.footprints import Bricks, footprints, prints_of, summed_area_tables
+from mvrecon.visual_hull.judging import AT_ONCE, judged, proofs
 
 #: Views at a time, of all items of a batch: a brick that some of them prove empty is skipped in
 #: the next.
 VIEWS = 8
-#: Footprints at a time, which bounds the memory (500 bytes a footprint).
-AT_ONCE = 2**15
 #: Diagonals of a pixel by which footprints are grown: 1 proves bodies absent that are nowhere
 #: thinner than that, and 2 takes in twice the length of what is half as wide, which so covers as
 #: much of the detector.
@@ -34,6 +33,8 @@ SHARE = 10
 #: Bricks of so many times the edge are tried first; an empty one of them has only empty bricks in
 #: it.
 COARSER = 4
+#: Voxels by which interpolation carries a value beyond the faces of its voxel.
+REACH = 0.5
 
 
 def visual_hull(
@@ -73,9 +74,33 @@ def visual_hull(
         raise ValueError(
             f"Need a brick's edge and witnesses of at least 1, got {brick} and {witnesses}"
         )
-    cameras, background = cameras.to(views.device), _background(threshold, views)
-    foreground = views[:, 0] > background[:, 0]
-    kept = views.new_ones((len(views), 1, 1, 1), dtype=torch.bool)
+    rule = Rule(brick, REACH, witnesses, keep_unseen)
+    foreground = _foreground(views, threshold)
+    if views.is_cuda and not selfcheck.reason(views.device, "hull", torch.float64, 1, _tried):
+        return at_once(foreground, cameras, grid, rule)
+    return refined(foreground, cameras.to(views.device), grid, rule)
+
+
+def at_once(
+    foreground: Bool[Tensor, "b m v u"],
+    cameras: Cameras,
+    grid: Grid,
+    rule: Rule,
+    judge: Callable[..., Tensor] = judged,
+) -> Bool[Tensor, "b z y x"]:
+    """The bricks that stay, all of them and all views at once."""
+    prints = prints_of(cameras, grid, GAPS)
+    numbers = prints.numbers.to(foreground.device, non_blocking=foreground.is_cuda)
+    tables = summed_area_tables(foreground)
+    return judge(tables, prints._replace(numbers=numbers), rule, grid.shape)
+
+
+def refined(
+    foreground: Bool[Tensor, "b m v u"], cameras: Cameras, grid: Grid, rule: Rule
+) -> Bool[Tensor, "b z y x"]:
+    """The bricks that stay, from coarse to fine ones, some views at a time."""
+    brick, _, witnesses, keep_unseen = rule
+    kept = foreground.new_ones((len(foreground), 1, 1, 1))
     for edge in _edges(brick, grid.shape):
         counts = bricks_along(grid.shape, edge)
         kept = _repeated(kept, COARSER, counts) if kept[0].numel() > 1 else kept.expand(-1, *counts)
@@ -118,15 +143,28 @@ def check_measured(views: Float[Tensor, "b 1 m v u"], cameras: Cameras) -> None:
     check_finite(views)
 
 
-def _background(
-    threshold: float | Float[Tensor, "b 1 m v u"], views: Float[Tensor, "b 1 m v u"]
-) -> Tensor:
-    background = torch.as_tensor(threshold).to(views)
-    if background.isnan().any():
-        raise ValueError(
-            f"Expected a threshold, got {int(background.isnan().sum())} values that are NaN"
-        )
-    return background.expand_as(views)
+def _foreground(
+    views: Float[Tensor, "b 1 m v u"], threshold: float | Float[Tensor, "b 1 m v u"]
+) -> Bool[Tensor, "b m v u"]:
+    # a number is checked on the host, since a tensor of one would have to be copied to a GPU
+    several = isinstance(threshold, Tensor)
+    limits = threshold.to(views).expand_as(views) if several else float(threshold)
+    bad = int(limits.isnan().sum()) if isinstance(limits, Tensor) else int(math.isnan(limits))
+    if bad:
+        raise ValueError(f"Expected a threshold, got {bad} values that are NaN")
+    return (views > limits)[:, 0]
+
+
+def _tried(device: str, dtype: torch.dtype) -> selfcheck.Tried:
+    """A hull in one launch, of three views of a box of bright pixels."""
+    detector = {"pixels": [40, 44], "pixel_mm": 1.0}
+    cameras, grid = circular(3, 40.0, 70.0, detector), Grid.centred(size=(13, 12, 10), spacing=1.5)
+    bright = torch.zeros(1, 3, *cameras.shape, dtype=torch.bool, device=device)
+    bright[..., 18:23, 20:24] = True
+    rule = Rule(2, REACH, 1, True)
+    expected = refined(bright, cameras.to(torch.device(device)), grid, rule)
+    stays = at_once(bright, cameras, grid, rule, bricks.judge)
+    yield "hull", selfcheck.error_of(stays.float(), expected.float())
 
 
 def _edges(brick: int, shape: Sequence[int]) -> Iterator[int]:
@@ -167,10 +205,10 @@ def _witnesses(
         table = summed_area_tables(foreground[:, chosen])
         for some in undecided.split(max(1, AT_ONCE // (batch * len(chosen)))):
             prints = footprints(
-                cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), gaps=GAPS
+                cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), REACH, GAPS
             )
-            none = footprint_sums(table, prints) == 0
-            empty[:, some] += (none & prints.whole).sum(dim=1, dtype=torch.int32)
-            dark[:, some] &= none.all(dim=1)
+            proved, unlit = proofs(table, prints)
+            empty[:, some] += proved
+            dark[:, some] &= unlit
         undecided = undecided[(empty[:, undecided] < enough).any(dim=0)]
     return empty, dark

@@ -25,7 +25,8 @@ from mvrecon.visual_hull.footprints import (
     footprints,
     summed_area_tables,
 )
-from mvrecon.visual_hull.hull import AT_ONCE, check_measured
+from mvrecon.visual_hull.hull import check_measured
+from mvrecon.visual_hull.judging import AT_ONCE
 
 #: Views in a group whose counts are added.
 GROUP = 10

@@ -20,6 +20,7 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.devices import beside
 
 #: The four linear maps of a view in `lines_of`.
 DIRECTION, MOMENT, START, WORLD = range(4)
@@ -67,7 +68,7 @@ def lines_of_rays(rays: ExplicitRays, grid: Grid) -> Float[Tensor, "r 4 3 1"]:
 
 def _voxels(grid: Grid, like: Tensor) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
     """The grid's centre in world mm, and what takes mm to voxels (x, y, z); where `like` is."""
-    return grid.centre.to(like), torch.linalg.inv(grid.affine[:3, :3]).to(like)
+    return beside(grid.centre, like), beside(torch.linalg.inv(grid.affine[:3, :3]), like)
 
 
 def tensors_of(rays: Cameras | ExplicitRays) -> list[Tensor]:

@@ -36,6 +36,20 @@ def _show(
     return cpu.show(volumes, maps, window, weighted, detector)
 
 
+@_look.register_kernel("cuda")
+def _(views, maps, window, weighted, shape):
+    from mvrecon.kernels.voxels import cuda
+
+    return cuda.look(views, maps, window, weighted, shape)
+
+
+@_show.register_kernel("cuda")
+def _(volumes, maps, window, weighted, detector):
+    from mvrecon.kernels.voxels import cuda
+
+    return cuda.show(volumes, maps, window, weighted, detector)
+
+
 @_look.register_fake
 def _(views, maps, window, weighted, shape):
     return views.new_empty(len(views), *shape)

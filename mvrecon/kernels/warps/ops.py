@@ -42,6 +42,27 @@ def _warp_vjp(volumes: Tensor, values: Tensor, maps: Tensor) -> Tensor:
     return cpu.warp_vjp(volumes, values, maps)
 
 
+@_warp.register_kernel("cuda")
+def _(volumes, maps, shape):
+    from mvrecon.kernels.warps import cuda
+
+    return cuda.warp(volumes, maps, shape)
+
+
+@_warp_back.register_kernel("cuda")
+def _(values, maps, shape):
+    from mvrecon.kernels.warps import cuda
+
+    return cuda.warp_back(values, maps, shape)
+
+
+@_warp_vjp.register_kernel("cuda")
+def _(volumes, values, maps):
+    from mvrecon.kernels.warps import cuda
+
+    return cuda.warp_vjp(volumes, values, maps)
+
+
 @_warp.register_fake
 def _(volumes, maps, shape):
     return volumes.new_empty(*volumes.shape[:2], maps.shape[1], volumes.shape[2], *shape)

@@ -11,6 +11,7 @@ from torch import Tensor
 from mvrecon.kernels.backends import kernels_for
 from mvrecon.kernels.warps import ops as warp_ops
 from mvrecon.kernels.warps import reference as warp_reference
+from mvrecon.kernels.warps.trial import differences
 
 
 def warp(
@@ -31,11 +32,12 @@ def warp(
         volumes: values on s lattices; batch and channels share the work of finding the places.
         maps: from `geometry.lattice.lattice_maps`, float64.
         shape: samples (d, h, w) of the output.
-        backend: "cpu" (compiled), "reference" (torch, any device), or "auto": compiled in main
-            memory.
+        backend: "cpu" or "cuda" (compiled), "reference" (torch, any device), or "auto": compiled
+            where it can be had on the tensors' device.
 
     Raises:
-        ValueError: sizes that do not agree, an unknown back end, or "cpu" for tensors elsewhere.
+        ValueError: sizes that do not agree, an unknown back end, or one for tensors elsewhere.
+        RuntimeError: "cuda" cannot be used, and why.
     """
     if (
         volumes.ndim != 6
@@ -49,5 +51,6 @@ def warp(
         )
     if volumes.dtype not in (torch.float32, torch.float64):
         return warp(volumes.float(), maps, shape, backend).to(volumes.dtype)
-    kernels = warp_ops if kernels_for(volumes, backend)[0] == "cpu" else warp_reference
+    chosen, _ = kernels_for(volumes, backend, "warp", differences)
+    kernels = warp_reference if chosen == "reference" else warp_ops
     return kernels.warp(volumes, maps, list(shape))

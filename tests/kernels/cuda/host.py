@@ -9,8 +9,11 @@ from pathlib import Path
 
 import torch
 
-from mvrecon.kernels.rays.cuda.scene import Scene
-from mvrecon.kernels.rays.cuda.sources import BLOCK, NAMES, Variant, text_of
+from mvrecon.kernels.cuda.field import Field
+from mvrecon.kernels.cuda.sources import Part, source
+from mvrecon.kernels.rays.cuda import sources as rays
+from mvrecon.kernels.rays.cuda.scene import Packed, Scene
+from mvrecon.kernels.rays.cuda.sources import BLOCK, NAMES, Variant
 
 F, D, H, B = torch.float32, torch.float64, torch.float16, torch.bfloat16
 #: Types of arithmetic and of storage, and how many volumes share a ray.
@@ -20,38 +23,51 @@ VARIANTS = {
     for real, stored, together in TYPES
     for method in range(3)
 }
-#: Runs a kernel, thread by thread, and says where the fields of a scene lie.
-RUN = (
-    """
-extern "C" void run(void (*kernel)(const Scene), const Scene* s, int across, int down) {
+PARTS = {
+    f"_{NAMES[real]}_{purpose}": Part(purpose, real)
+    for purpose, reals in {"warp": (F, D), "look": (F, D), "hull": (D,)}.items()
+    for real in reals
+}
+EVERY = {**VARIANTS, **PARTS}
+
+
+def running(packed: type[Packed]) -> str:
+    """What runs a kernel, thread by thread, and says where the fields of its structure lie."""
+    name = packed.__name__
+    fields = "".join(f"(int)offsetof({name}, {field[0]}),\n" for field in packed._fields_)
+    return f"""
+extern "C" void run_{name}(void (*kernel)(const {name}), const {name}* s, int across, int down) {{
   for (blockIdx.y = 0; blockIdx.y < down; blockIdx.y++)
     for (blockIdx.x = 0; blockIdx.x < across; blockIdx.x++)
       for (threadIdx.x = 0; threadIdx.x < BLOCK; threadIdx.x++) kernel(*s);
-}
-#define AT(name) (int)offsetof(Scene, name),
-extern "C" const int layout[] = {
+}}
+extern "C" const int layout_{name}[] = {{
+{fields}(int)sizeof({name})}};
 """
-    + "".join(f"AT({name[0]})\n" for name in Scene._fields_)
-    + "(int)sizeof(Scene)};\n"
-)
 
 
-def compiled(folder: Path) -> ctypes.CDLL:
-    """The kernels of all variants, by g++."""
-    source, library = folder / "rays.cpp", folder / "rays.so"
-    source.write_text(text_of(VARIANTS) + RUN)
-    options = ["-O1", "-std=c++17", "-shared", "-fPIC"]
-    subprocess.run(["g++", *options, str(source), "-o", str(library)], check=True)
-    return ctypes.CDLL(str(library))
+def compiled(folder: Path) -> dict[type[Packed], ctypes.CDLL]:
+    """The kernels of all variants, by g++, one library for each structure."""
+    parts = "".join(part.line(suffix) for suffix, part in PARTS.items())
+    texts = {Scene: rays.text_of(VARIANTS), Field: source() + parts}
+    compilers, libraries = [], {}
+    for packed, text in texts.items():
+        code, library = folder / f"{packed.__name__}.cpp", folder / f"{packed.__name__}.so"
+        code.write_text(text + running(packed))
+        options = ["-O1", "-std=c++17", "-shared", "-fPIC"]
+        compilers.append(subprocess.Popen(["g++", *options, str(code), "-o", str(library)]))
+        libraries[packed] = library
+    assert not any(compiler.wait() for compiler in compilers)
+    return {packed: ctypes.CDLL(str(library)) for packed, library in libraries.items()}
 
 
 class Driver:
     """What stands in for libcuda: the same functions, on the CPU."""
 
-    def __init__(self, library: ctypes.CDLL):
-        self.library, self.launches, self.modules = library, [], 0
+    def __init__(self, libraries: dict[type[Packed], ctypes.CDLL]):
+        self.libraries, self.launches, self.modules = libraries, [], 0
         self.failure = {}  # error codes by function
-        self.names: dict[int, str] = {}
+        self.names: dict[int, tuple[str, type[Packed]]] = {}
         self.streams: list[int] = []
 
     def __getattr__(self, name):
@@ -60,15 +76,17 @@ class Driver:
         return lambda *_: self.failure.get(name, 0)
 
     def cuModuleLoadData(self, module, code: c_char_p) -> int:
-        lines = [variant.line("") for variant in VARIANTS.values()]
+        lines = [variant.line("") for variant in EVERY.values()]
         module._obj.value = 1 + lines.index(code.value.decode())
         self.modules += 1
         return self.failure.get("cuModuleLoadData", 0)
 
     def cuModuleGetFunction(self, function, module, name: bytes) -> int:
-        symbol = name.decode() + list(VARIANTS)[module.value - 1]
-        function._obj.value = ctypes.cast(getattr(self.library, symbol), c_void_p).value
-        self.names[function._obj.value] = name.decode()
+        suffix = list(EVERY)[module.value - 1]
+        packed = Field if suffix in PARTS else Scene
+        code = getattr(self.libraries[packed], name.decode() + suffix)
+        function._obj.value = ctypes.cast(code, c_void_p).value
+        self.names[function._obj.value] = name.decode(), packed
         return 0
 
     def cuLaunchKernel(self, function, *numbers) -> int:
@@ -77,9 +95,11 @@ class Driver:
         assert grid[2:] == [1, BLOCK, 1, 1, 0] and extra is None
         if self.failure:
             return self.failure.get("cuLaunchKernel", 0)
-        self.launches.append(self.names[function.value])
+        name, packed = self.names[function.value]
+        self.launches.append(name)
         self.streams.append(stream.value or 0)
-        self.library.run(function, c_void_p(arguments[0]), c_int(across), c_int(down))
+        run = getattr(self.libraries[packed], f"run_{packed.__name__}")
+        run(function, c_void_p(arguments[0]), c_int(across), c_int(down))
         return 0
 
     def cuGetErrorString(self, code, text) -> int:
@@ -87,11 +107,11 @@ class Driver:
         return 0
 
 
-def stand_in(monkeypatch, library: ctypes.CDLL, cache: Path) -> Driver:
+def stand_in(monkeypatch, libraries: dict[type[Packed], ctypes.CDLL], cache: Path) -> Driver:
     """Put the CPU in the place of a device, its driver and its compiler."""
     from mvrecon.kernels.rays.cuda import driver, kept, nvrtc
 
-    stub = Driver(library)
+    stub = Driver(libraries)
     last = lambda text, architecture: text.splitlines(keepends=True)[-1].encode()  # noqa: E731
     for module, name, value in (
         (driver, "library", lambda: stub),

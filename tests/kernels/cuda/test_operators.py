@@ -7,9 +7,9 @@ from ctypes import c_int
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from mvrecon.geometry.box import Box
+from mvrecon.kernels.cuda.field import Field
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.rays.cuda.scene import Scene
@@ -17,6 +17,7 @@ from mvrecon.kernels.rays.cuda.selfcheck import one_by_one
 from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.kernels.cuda.host import Driver
 from tests.kernels.cuda.scenes import CASES, METHODS, RIGS, difference, scene, whole
+from tests.kernels.cuda.waits import Waits
 
 #: One volume, and a whole group of four and a part of one.
 PRECISIONS = [(torch.float64, 1, 1e-11), (torch.float32, 5, 3e-6)]
@@ -130,22 +131,6 @@ def test_views_in_pieces_give_the_same_volume(method, host, monkeypatch):
     assert host.launches == ["survey", *["record", "gather"] * len(lines)]
 
 
-class Waits(TorchDispatchMode):
-    """Names of the operations that would wait for a device."""
-
-    ASKED = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2"}
-
-    def __init__(self):
-        super().__init__()
-        self.names: list[str] = []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        name = func.overloadpacket.__name__
-        if name in self.ASKED or (name == "_to_copy" and "device" in (kwargs or {})):
-            self.names.append(name)
-        return func(*args, **(kwargs or {}))
-
-
 def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_none(host):
     x, y, lines, window, detector = scene("cone", torch.float32)
     part = whole(x.shape[1:])
@@ -164,10 +149,11 @@ def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_no
     assert set(host.streams) == {7} and host.modules == 1
 
 
-def test_the_packed_structure_is_that_of_the_source(library):
-    fields = [getattr(Scene, name[0]).offset for name in Scene._fields_]
-    layout = (c_int * (1 + len(fields))).in_dll(library, "layout")
-    assert [*fields, ctypes.sizeof(Scene)] == list(layout)
+@pytest.mark.parametrize("packed", [Scene, Field])
+def test_the_packed_structure_is_that_of_the_source(packed, libraries):
+    fields = [getattr(packed, name[0]).offset for name in packed._fields_]
+    layout = (c_int * (1 + len(fields))).in_dll(libraries[packed], f"layout_{packed.__name__}")
+    assert [*fields, ctypes.sizeof(packed)] == list(layout)
 
 
 def test_no_rays_and_no_voxels_launch_nothing(host):

@@ -9,6 +9,8 @@ from mvrecon.kernels.backends import kernels_for
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.cuda import driver, nvrtc, selfcheck
 from mvrecon.kernels.rays.cuda import operators as cuda
+from mvrecon.kernels.voxels import trial as voxel_trial
+from mvrecon.kernels.warps import trial as warp_trial
 from tests.kernels.cuda.scenes import METHODS
 
 
@@ -133,3 +135,21 @@ def test_auto_falls_back_where_cuda_raises(host):
     assert kernels_for(x, "auto", "joseph") == ("reference", reference)
     with pytest.raises(RuntimeError, match="backend 'cuda' cannot be used on cuda:0: "):
         kernels_for(x, "cuda", "joseph")
+
+
+@pytest.mark.parametrize(("trial", "name"), [(warp_trial, "warp_back"), (voxel_trial, "show")])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_warps_and_back_projection_check_themselves(trial, name, dtype, host, monkeypatch):
+    purpose, tried = trial.__name__, trial.differences
+    assert selfcheck.reason("cpu", purpose, dtype, tried=tried) is None
+    selfcheck.forget()
+    right = getattr(trial.cuda, name)
+    monkeypatch.setattr(trial.cuda, name, lambda *arguments: right(*arguments) * 1.001)
+    why = selfcheck.reason("cpu", purpose, dtype, tried=tried)
+    assert f"{name} differs from the reference" in str(why)
+    x = SimpleNamespace(device=torch.device("cuda:0"), shape=(1, 1, 4, 4, 4), dtype=dtype)
+    selfcheck.forget()
+    host.failure["cuLaunchKernel"] = 222
+    assert kernels_for(x, "auto", purpose, tried) == ("reference", reference)
+    with pytest.raises(RuntimeError, match="backend 'cuda' cannot be used on cuda:0: "):
+        kernels_for(x, "cuda", purpose, tried)

@@ -3,14 +3,15 @@ since it packs one structure.
 """
 
 import ctypes
+from collections.abc import Sequence
 from ctypes import byref, c_char_p, c_int, c_void_p
 from functools import cache
 from typing import Any
 
 import torch
 
-from mvrecon.kernels.rays.cuda.scene import Scene
-from mvrecon.kernels.rays.cuda.sources import BLOCK, KERNELS
+from mvrecon.kernels.rays.cuda.scene import Packed
+from mvrecon.kernels.rays.cuda.sources import BLOCK
 
 #: What the driver says where the calling thread has no context: none, or that of another device.
 NO_CONTEXT = (201, 400)
@@ -56,8 +57,8 @@ def stream_of(device: torch.device) -> int:
     return torch.cuda.current_stream(device).cuda_stream
 
 
-def load(machine_code: bytes, device: torch.device) -> dict[str, c_void_p]:
-    """The kernels of machine code or PTX, on a device.
+def load(machine_code: bytes, names: Sequence[str], device: torch.device) -> dict[str, c_void_p]:
+    """The kernels of machine code or PTX by their names, on a device.
 
     Raises:
         RuntimeError: the driver does not take it, being older than the compiler, say.
@@ -65,13 +66,13 @@ def load(machine_code: bytes, device: torch.device) -> dict[str, c_void_p]:
     driver, module = library(), c_void_p()
     _enter(device)
     _check(driver.cuModuleLoadData(byref(module), c_char_p(machine_code)))
-    functions = {name: c_void_p() for name in KERNELS}
+    functions = {name: c_void_p() for name in names}
     for name, function in functions.items():
         _check(driver.cuModuleGetFunction(byref(function), module, name.encode()))
     return functions
 
 
-def launch(function: c_void_p, scene: Scene, across: int, down: int, device: torch.device) -> None:
+def launch(function: c_void_p, scene: Packed, across: int, down: int, device: torch.device) -> None:
     """Start a kernel on `across` x `down` blocks, on torch's current stream.
 
     Raises:

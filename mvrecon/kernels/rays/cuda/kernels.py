@@ -1,5 +1,6 @@
 """The compiled kernels of a variant on a device."""
 
+from collections.abc import Sequence
 from ctypes import c_void_p
 from functools import cache
 from hashlib import sha256
@@ -8,7 +9,7 @@ import torch
 
 from mvrecon.kernels.rays.cuda import driver, nvrtc
 from mvrecon.kernels.rays.cuda.kept import kept
-from mvrecon.kernels.rays.cuda.sources import Variant, text_of
+from mvrecon.kernels.rays.cuda.sources import KERNELS, Variant, text_of
 
 
 @cache
@@ -19,10 +20,14 @@ def kernels_of(variant: Variant, device: torch.device) -> dict[str, c_void_p]:
         OSError: no driver, no compiler.
         RuntimeError: the compiler or the driver refuses it.
     """
-    text, architecture = (
-        text_of({"": variant}),
-        nvrtc.target(driver.capability_of(device), nvrtc.capabilities()),
-    )
+    return loaded(text_of({"": variant}), KERNELS, device)
+
+
+def loaded(text: str, names: Sequence[str], device: torch.device) -> dict[str, c_void_p]:
+    """The kernels of a text by name, from machine code on disk or compiled; raises as
+    `kernels_of`.
+    """
+    architecture = nvrtc.target(driver.capability_of(device), nvrtc.capabilities())
     made_of = (text, architecture, *nvrtc.OPTIONS, nvrtc.version(), str(driver.version()))
     name = sha256("\n".join(made_of).encode()).hexdigest()
-    return driver.load(kept(name, lambda: nvrtc.build(text, architecture)), device)
+    return driver.load(kept(name, lambda: nvrtc.build(text, architecture)), names, device)

@@ -2,24 +2,15 @@
 
 import ctypes
 from ctypes import c_double, c_int, c_void_p
-from typing import Any
+from typing import Any, Self
 
 from torch import Tensor
 
 
-class Scene(ctypes.Structure):
-    """Addresses and numbers of one call; the source says what each one is."""
+class Packed(ctypes.Structure):
+    """Addresses and numbers of one call."""
 
-    _fields_ = [
-        *((name, c_void_p) for name in ("lines", "volumes", "stores", "views", "rays", "axes")),
-        *((name, c_void_p) for name in ("values", "frames", "flags", "results", "occupied")),
-        ("window", c_double * 2),
-        *((name, c_int * 3) for name in ("sizes", "corner", "part")),
-        *((name, c_int) for name in ("n_views", "rows", "columns", "maps", "n_volumes")),
-        *((name, c_int) for name in ("samples", "first_view", "views_here", "blocks_a_view")),
-    ]
-
-    def put(self, **values: Any) -> "Scene":
+    def put(self, **values: Any) -> Self:
         """Write some fields: tensors as their addresses, sequences as arrays."""
         for name, value in values.items():
             if isinstance(value, Tensor):
@@ -29,3 +20,16 @@ class Scene(ctypes.Structure):
             else:
                 setattr(self, name, value)
         return self
+
+
+class Scene(Packed):
+    """Addresses and numbers of a call along rays; the source says what each one is."""
+
+    _fields_ = [
+        *((name, c_void_p) for name in ("lines", "volumes", "stores", "views", "rays", "axes")),
+        *((name, c_void_p) for name in ("values", "frames", "flags", "results", "occupied")),
+        ("window", c_double * 2),
+        *((name, c_int * 3) for name in ("sizes", "corner", "part")),
+        *((name, c_int) for name in ("n_views", "rows", "columns", "maps", "n_volumes")),
+        *((name, c_int) for name in ("samples", "first_view", "views_here", "blocks_a_view")),
+    ]

@@ -27,9 +27,13 @@ TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
 STORED = (torch.float64, torch.float16, torch.bfloat16)
 
 
+#: What was tried, and its greatest difference to the reference, by the reference's greatest value.
+Tried = Iterator[tuple[str, float]]
+
+
 class Case(NamedTuple):
-    """What is checked at once: a device, a method without its samples, the type that volumes are
-    stored in, and whether several of them share their rays.
+    """What is checked at once: a device, a method without its samples or another purpose, the type
+    that volumes are stored in, and whether several of them share their rays.
     """
 
     device: str
@@ -55,27 +59,29 @@ def reason(
     method: str = "joseph",
     dtype: torch.dtype = torch.float32,
     volumes: int = 1,
+    tried: Callable[[str, torch.dtype], Tried] | None = None,
 ) -> str | None:
     """Why the kernels for some input cannot be used on a device, or None. Tried once, which
     compiles them; logged once. Only what is true of the device is remembered.
 
     Args:
         device: a CUDA device.
-        method: "joseph", "siddon" or "trilinear:samples".
+        method: "joseph", "siddon" or "trilinear:samples", or another purpose of kernels.
         dtype: of the volumes or views.
         volumes: how many there are: one has kernels of its own.
+        tried: of another purpose, what is tried on a device in a type of arithmetic.
     """
     place = torch.device(device)
     if place.type == "cuda" and place.index is None:
         place = torch.device(
             "cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0
         )
-    stored = dtype if dtype in STORED else torch.float32
-    case = Case(str(place), method.partition(":")[0], stored, volumes > 1)
+    stored = dtype if dtype in (STORED if tried is None else STORED[:1]) else torch.float32
+    case = Case(str(place), method.partition(":")[0], stored, volumes > 1 and tried is None)
     with _lock:
         if case in _verdicts:
             return _verdicts[case]
-        verdict = _apart(partial(_verdict_on, case))
+        verdict = _apart(partial(_verdict_on, case, tried))
         if verdict.lasting:
             _verdicts[case] = verdict.why
     if verdict.why:
@@ -98,11 +104,12 @@ def _apart(check: Callable[[], Verdict]) -> Verdict:
         return fresh.submit(check).result()
 
 
-def _verdict_on(case: Case) -> Verdict:
+def _verdict_on(case: Case, tried: Callable[[str, torch.dtype], Tried] | None) -> Verdict:
     bound = TOLERANCE[torch.promote_types(case.dtype, torch.float32)]
+    method = f"{case.method}:8" if case.method == "trilinear" else case.method
+    rays = partial(differences, method=method, volumes=5 if case.several else 1)
     try:
-        method = f"{case.method}:8" if case.method == "trilinear" else case.method
-        for what, error in differences(case.device, method, case.dtype, 5 if case.several else 1):
+        for what, error in (tried or rays)(case.device, case.dtype):
             if not error <= bound:
                 why = f"{what} differs from the reference by {error:.1e}, expected at most "
                 return Verdict(f"{why}{bound:.0e}", lasting=True)
@@ -114,11 +121,8 @@ def _verdict_on(case: Case) -> Verdict:
     return Verdict(None, lasting=True)
 
 
-def differences(
-    device: str, method: str, dtype: torch.dtype, volumes: int
-) -> Iterator[tuple[str, float]]:
-    """What was tried on a tiny scene, and its greatest difference to the reference, by the
-    reference's greatest value.
+def differences(device: str, dtype: torch.dtype, method: str, volumes: int) -> Tried:
+    """What was tried of the kernels along rays, on a tiny scene.
 
     Raises:
         OSError: no driver, or no compiler.
@@ -136,11 +140,11 @@ def differences(
         views = reference.project(wide(x), moving, window, detector, method)
         (change,) = torch.autograd.grad((views * y).sum(), moving)
     volume = reference.backproject(y, lines, window, shape, method)
-    yield "project", _error(cuda.project(x, lines, window, occupancy, detector, method), views)
-    yield "backproject", _error(cuda.backproject(y, lines, window, occupancy, method), volume)
+    yield "project", error_of(cuda.project(x, lines, window, occupancy, detector, method), views)
+    yield "backproject", error_of(cuda.backproject(y, lines, window, occupancy, method), volume)
     single, z = one_by_one(lines, detector), y.flatten(1)[..., None, None]
-    yield "explicit rays", _error(cuda.scatter(z, single, window, occupancy, method), volume)
-    yield "lines_vjp", _error(cuda.lines_vjp(x, y, lines, window, occupancy, method), change)
+    yield "explicit rays", error_of(cuda.scatter(z, single, window, occupancy, method), volume)
+    yield "lines_vjp", error_of(cuda.lines_vjp(x, y, lines, window, occupancy, method), change)
 
 
 def one_by_one(lines: Float[Tensor, "m 4 3 3"], detector: list[int]) -> Float[Tensor, "r 4 3 1"]:
@@ -169,5 +173,6 @@ def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:
     return torch.stack(maps).to(device), [0.0, 1.0], [5, 6], [5, 4, 6]
 
 
-def _error(got: Tensor, expected: Tensor) -> float:
+def error_of(got: Tensor, expected: Tensor) -> float:
+    """The greatest difference, by the greatest value of what is expected."""
     return float((got - expected.detach()).abs().max() / expected.detach().abs().max())

@@ -41,8 +41,6 @@ template <class R, int NV, int METHOD> DEVICE void record_rays(const Scene& s) {
   if ((*flags & bits) != bits) add_bits(flags, bits);
 }
 
-template <class R> DEVICE R hat(R t) { return max((R)0, 1 - fabs(t)); }
-
 // What a ray gives to a voxel, in slabs: exactly what the walk of its method gives. b and c count the voxel from the
 // border along far and near axis; s is its slab.
 template <class R, int METHOD> struct Weight {

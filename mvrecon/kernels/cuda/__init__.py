@@ -1,0 +1,1 @@
+"""Kernels of CUDA devices that have a thread a voxel, a sample or a pixel."""

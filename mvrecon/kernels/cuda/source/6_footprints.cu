@@ -1,0 +1,63 @@
+// The visual hull: which bricks are proved empty, a thread a brick; see `visual_hull/footprints.py` and `hull.py`.
+// A view has 17 numbers: the map [3 4] from voxels about the centre to (u w, v w, w), parallel beams to (u, v, w), how much
+// further a ray may be (u, v), the part of a ray that this takes, and how much more footprints are grown by (u, v).
+enum { PRINT = 17 };
+#define ROUNDING 1e-3
+
+struct Print {
+  int low[2], high[2];
+  bool whole;  // all of the brick is seen
+  DEVICE Print(const Field& f, const double* view, const double* near, const double* far) : whole(true) {
+    double least[3], greatest[3];
+    for (int corner = 0; corner < 8; corner++) {
+      double q[3];
+      UNROLL for (int i = 0; i < 3; i++) {
+        const double* row = view + 4 * i;
+        q[i] = row[0] * (corner & 1 ? far : near)[0] + row[1] * (corner & 2 ? far : near)[1] + row[2] * (corner & 4 ? far : near)[2] + row[3];
+      }
+      UNROLL for (int i = 0; i < 3; i++) {
+        double place = i < 2 && !f.parallel ? q[i] / q[2] : q[i];
+        least[i] = corner ? min(least[i], place) : place;
+        greatest[i] = corner ? max(greatest[i], place) : place;
+      }
+    }
+    // such a brick may have its image anywhere
+    bool across = least[2] <= 0 && greatest[2] >= 0 && !f.parallel;
+    bool unseen = greatest[2] <= f.window[0] || least[2] >= f.window[1];
+    whole = !across && least[2] >= f.window[0] + view[14] && greatest[2] <= f.window[1] - view[14];
+    UNROLL for (int i = 0; i < 2; i++) {
+      double a = least[i] - view[12 + i] - ROUNDING, b = greatest[i] + view[12 + i] + ROUNDING, size = f.source[i];
+      whole = whole && a > -1 && b < size;
+      low[i] = across ? 0 : (int)min(max(ceil(a - view[15 + i]), 0.0), size);
+      high[i] = across ? (int)size : (int)min(floor(max(b + view[15 + i], -2.0)) + 1, size);
+      high[i] = unseen ? low[i] : max(low[i], high[i]);
+    }
+  }
+};
+
+// Into kept [b z y x]: whether fewer views than enough prove a brick empty. From tables [b m v+1 u+1] of the pixels above and
+// left of a corner that are no background.
+DEVICE void judge_bricks(const Field& f) {
+  long long at = thread_of(), bricks = size_of(f.shape);
+  if (at >= bricks) return;
+  int brick[3];
+  unravel(f.shape, (int)at, brick);
+  double near[3], far[3];
+  UNROLL for (int i = 0; i < 3; i++) {
+    int voxels = f.voxels[i], low = brick[i] * f.edge;
+    near[i] = low - (middle(voxels) + 0.5) - f.reach;
+    far[i] = min(low + f.edge, voxels) - (middle(voxels) + 0.5) + f.reach;
+  }
+  int width = f.source[0] + 1, empty = 0;
+  long long corners = (long long)width * (f.source[1] + 1);
+  const int* table = (const int*)f.origin + (long long)blockIdx.y * f.kinds * corners;
+  bool dark = true;
+  for (int m = 0; m < f.kinds && empty < f.enough; m++, table += corners) {
+    Print p(f, f.maps + (long long)m * PRINT, near, far);
+    const int *above = table + (long long)p.low[1] * width, *below = table + (long long)p.high[1] * width;
+    bool none = below[p.high[0]] - above[p.high[0]] - below[p.low[0]] + above[p.low[0]] == 0;
+    empty += none && p.whole;
+    dark = dark && none;
+  }
+  ((unsigned char*)f.result)[blockIdx.y * bricks + at] = empty < f.enough && (f.keep_unseen || !dark);
+}

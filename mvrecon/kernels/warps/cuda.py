@@ -1,0 +1,80 @@
+"""Warps on CUDA devices: the same three operators as on the CPU, the same to the last bit in every
+run.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.kernels.cuda.field import Field
+from mvrecon.kernels.cuda.launching import blocks, numbers_of, start
+from mvrecon.kernels.cuda.sources import MAP, PLANES, Part
+from mvrecon.kernels.rays.cuda.sources import BLOCK, WARP
+
+#: Threads of a derivative by the maps, so that a small warp is split over blocks.
+THREADS = 2**18
+
+
+def _field(
+    maps: Tensor, items: int, channels: int, source: Sequence[int], shape: Sequence[int]
+) -> Field:
+    return Field().put(
+        maps=maps,
+        source=tuple(map(int, reversed(source))),
+        shape=tuple(map(int, reversed(shape))),
+        sources=maps.shape[0],
+        kinds=maps.shape[1],
+        items=items,
+        channels=channels,
+    )
+
+
+def warp(
+    volumes: Float[Tensor, "n s c d h w"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int]
+) -> Float[Tensor, "n s k c d h w"]:
+    """Volumes on other lattices; see `warps.reference.warp`."""
+    x, numbers = volumes.detach().contiguous(), numbers_of(maps)
+    items, sources, channels = x.shape[:3]
+    values = x.new_empty(items, sources, maps.shape[1], channels, *shape)
+    field = _field(numbers, items, channels, x.shape[3:], shape)
+    field.put(origin=x, result=values, blocks=blocks(math.prod(shape)))
+    blocks(math.prod(x.shape[3:]))
+    across = sources * maps.shape[1] * field.blocks
+    start(Part("warp", x.dtype), "warp", field, x, across, items * -(-channels // PLANES))
+    return values
+
+
+def warp_back(
+    values: Float[Tensor, "n s k c d h w"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int]
+) -> Float[Tensor, "n s c d h w"]:
+    """The exact transpose of `warp`: every voxel finds its samples by the inverse maps."""
+    y, numbers = values.detach().contiguous(), numbers_of(maps)
+    items, sources, kinds, channels = y.shape[:4]
+    volumes = y.new_empty(items, sources, channels, *shape)
+    inverse = torch.empty(maps.shape, dtype=torch.float32, device=y.device)
+    field = _field(numbers, items, channels, shape, y.shape[4:])
+    field.put(origin=y, result=volumes, inverse=inverse, blocks=blocks(math.prod(shape)))
+    blocks(math.prod(y.shape[4:]))
+    part = Part("warp", y.dtype)
+    start(part, "invert", field, y, blocks(sources * kinds))
+    start(part, "warp_back", field, y, sources * field.blocks, items * -(-channels // PLANES))
+    return volumes
+
+
+def warp_vjp(
+    volumes: Float[Tensor, "n s c d h w"],
+    values: Float[Tensor, "n s k c d h w"],
+    maps: Float[Tensor, "s k 5 2 3"],
+) -> Float[Tensor, "s k 5 2 3"]:
+    """The derivative of <values, warp(volumes, maps)> by the maps; float64."""
+    x, y, numbers = volumes.detach().contiguous(), values.detach().contiguous(), numbers_of(maps)
+    pairs = maps.shape[0] * maps.shape[1]
+    field = _field(numbers, len(x), x.shape[2], x.shape[3:], y.shape[4:])
+    count = min(blocks(math.prod(y.shape[4:])), max(1, THREADS // BLOCK // max(1, pairs)))
+    sums = numbers.new_zeros(pairs, count * BLOCK // WARP, MAP)
+    field.put(origin=x, by=y, result=sums, blocks=count)
+    start(Part("warp", x.dtype), "warp_vary", field, x, pairs * count)
+    return sums.sum(dim=1).view(maps.shape)

@@ -1,0 +1,56 @@
+"""Warps, voxel-driven back-projection and hull compiled by NVRTC, with no GPU at hand: where NVRTC
+is installed.
+"""
+
+import re
+
+import pytest
+import torch
+
+from mvrecon.kernels.cuda.sources import KERNELS, Part, text_of
+from mvrecon.kernels.rays.cuda import nvrtc
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiler():
+    try:
+        nvrtc.library()
+    except OSError as problem:
+        pytest.skip(str(problem))
+
+
+def loops(ptx: str) -> list[str]:
+    """The innermost loops: from a label to a branch back to it, no other such pair inside."""
+    lines, labels, ends = ptx.splitlines(), {}, []
+    for i, line in enumerate(lines):
+        if label := re.match(r"(\$L\w+):", line):
+            labels[label[1]] = i
+        jump = re.search(r"bra(?:\.uni)?\s+(\$L\w+);", line)
+        if jump and jump[1] in labels:
+            ends.append((labels[jump[1]], i))
+    inner = [(a, b) for a, b in ends if not any(a < c and d < b for c, d in ends)]
+    return ["\n".join(lines[a : b + 1]) for a, b in inner]
+
+
+@pytest.mark.parametrize("capability", [80, 90])
+@pytest.mark.parametrize("purpose", KERNELS)
+def test_inner_loops_are_in_registers_and_single_precision(purpose, capability):
+    """Nothing in local memory but the hull's corners, no atomic addition; no float64 and no call in
+    the inner loops of warps.
+    """
+    text = nvrtc.build(text_of({"": Part(purpose, torch.float32)}), f"compute_{capability}")
+    parts = re.split(r"\.entry (\w+)", text.decode())[1:]
+    ptx = dict(zip(parts[::2], parts[1::2], strict=True))
+    every = "".join(ptx.values())
+    assert ptx.keys() == set(KERNELS[purpose]) and "atom." not in every and "red." not in every
+    if purpose != "hull":
+        assert "ld.local" not in every and "st.local" not in every
+    for name in ptx.keys() & {"warp", "warp_back"}:
+        inner = loops(ptx[name])
+        assert inner and not [loop for loop in inner if ".f64" in loop or "call" in loop], name
+
+
+@pytest.mark.parametrize("purpose", KERNELS)
+def test_machine_code_for_hopper_in_float64(purpose):
+    source = text_of({"": Part(purpose, torch.float64)})
+    assert nvrtc.build(source, "sm_90")[:4] == b"\x7fELF"

@@ -1,0 +1,58 @@
+"""Voxel-driven back-projection of CUDA devices, compiled by g++ and run in main memory, against the
+reference.
+"""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.voxels import cuda, reference
+from mvrecon.projectors.voxel_driven import image_maps
+from tests.kernels.cuda.scenes import RIGS, difference
+from tests.kernels.cuda.waits import Waits
+
+#: A column of a thread's voxels and a part of one, of a world that leans.
+TALL = Grid.centred(size=(5, 6, 19), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
+KINDS = ["cone", "dome", "parallel", "line", "inside", "wide", "slice", "large", "dcspect80"]
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-11), (torch.float32, 3e-6)])
+@pytest.mark.parametrize("kind", [*KINDS, "tall"])
+def test_volumes_and_the_transpose_are_those_of_the_reference(kind, dtype, bound, host):
+    torch.manual_seed(1)
+    grid, cameras = (TALL, RIGS["dome"][1]) if kind == "tall" else RIGS[kind]
+    maps, window = image_maps(cameras, grid), list(cameras.ray_extent)
+    y = torch.randn(2, len(cameras), *cameras.shape, dtype=dtype)
+    for weighted in (False, True):
+        wide = y.double().requires_grad_()
+        volumes = reference.look(wide, maps, window, weighted, list(grid.shape))
+        x = torch.randn(volumes.shape, dtype=dtype)
+        (views,) = torch.autograd.grad((volumes * x).sum(), wide)
+        rest = maps, window, weighted
+        assert difference(cuda.look(y, *rest, list(grid.shape)), volumes) < bound
+        assert difference(cuda.show(x, *rest, list(cameras.shape)), views) < bound
+
+
+def test_a_back_projection_launches_one_kernel_and_waits_for_none(host):
+    grid, cameras = RIGS["cone"]
+    rest = image_maps(cameras, grid), list(cameras.ray_extent), True
+    y = torch.randn(1, len(cameras), *cameras.shape)
+    with Waits() as waits:
+        x = cuda.look(y, *rest, list(grid.shape))
+        cuda.show(x, *rest, list(cameras.shape))
+    assert waits.names == [] and host.launches == ["look", "show"]
+    assert not cuda.look(y[:, :0], rest[0][:0], *rest[1:], list(grid.shape)).any()
+
+
+def test_a_beam_wider_than_its_source_is_near_has_its_transpose(host):
+    """Pixels whose rays open by more than a right angle touch voxels without bound."""
+    grid, cameras = RIGS["wide"]
+    near = replace(cameras, source=cameras.source + 0.9 * (grid.centre - cameras.source))
+    maps, window = image_maps(near, grid), list(near.ray_extent)
+    x = torch.randn(1, *grid.shape, dtype=torch.float64)
+    y = torch.randn(1, len(near), *near.shape, dtype=torch.float64)
+    one = (cuda.look(y, maps, window, False, list(grid.shape)) * x).sum()
+    two = (cuda.show(x, maps, window, False, list(near.shape)) * y).sum()
+    assert one.abs() > 1e-3 and (one - two).abs() < 1e-11 * x.norm() * y.norm()
