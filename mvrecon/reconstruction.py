@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
+from mvrecon.files.runs import RESULTS, SETTINGS, VERSIONS
 
 if TYPE_CHECKING:
     from mvrecon.engine.scan import Scan
@@ -17,13 +18,13 @@ if TYPE_CHECKING:
 UNITS = ("1/mm", "HU")
 #: What a run writes into its folder beside the volume.
 WRITTEN = (
-    "config.yaml",
-    "versions.txt",
+    SETTINGS,
+    VERSIONS,
     "rig.json",
     "rig.png",
     "planes.png",
     "cameras.png",
-    "results.json",
+    RESULTS,
 )
 
 

@@ -4,7 +4,6 @@ scenes.
 Torch is imported inside the task, so that `--help` and typing mistakes are answered at once.
 """
 
-import logging
 import math
 import warnings
 from pathlib import Path
@@ -34,10 +33,9 @@ def train(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             other data.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.engine import evaluation, fit, hparams, processes, run_folder
+    from mvrecon.engine import evaluation, fit, hparams, processes, progress, run_folder
 
-    for part in ("pytorch", "fabric"):
-        logging.getLogger(f"lightning.{part}").setLevel(logging.WARNING)
+    progress.silence_lightning()
     # Lightning's own use of torch, of which no user can be rid
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))

@@ -15,155 +15,52 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
+from arms import ALIGNED, ARMS, CLASSICAL, REGIMES, paths, settings
 
 from mvrecon.config import compose
-from mvrecon.engine.fit import build_module
+from mvrecon.engine.fit import build_data, build_module
+from mvrecon.engine.module import ReconstructionModule
 
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
-BASE = (
-    "experiment=open_kbp_cross_view",
-    "~compare.world_rounds",
-    "~compare.world_unet",
-    "scene.vary=exact",
-    "data.sizes.train=648",
-    "callbacks=quiet",
-    "logger=csv",
-)
-NARROW = "rounds=[{resolution: full, widths: [16,32,64], cameras: null}]"
-HALF = "{resolution: half, widths: [32,48,64]"
-CAMERAS = "cameras: {name: rays2d}"
-
-#: What differs between the models.
-ARMS = {
-    "cross_view": ("model=cross_view",),
-    "no_opinions": ("model=cross_view", "model.rounds.0.opinions=null"),
-    "one_round": (
-        "model=cross_view",
-        f"model.rounds=[{{resolution: full, widths: [16,32,64], {CAMERAS}}}]",
-    ),
-    "three_rounds": (
-        "model=cross_view",
-        f"model.rounds=[{HALF}, {CAMERAS}}}, {HALF}}}, {{resolution: full, widths: [16,32,64]}}]",
-    ),
-    "world_rounds": ("model=world_rounds",),
-    "world_unet": ("model=world_unet", f"model.{NARROW}"),
-}
-ALIGNED = {
-    "cross_view_aligned": ("model=corrected", "model@model.model=cross_view"),
-    "world_unet_aligned": (
-        "model=corrected",
-        "model@model.model=world_unet",
-        f"model.model.{NARROW}",
-    ),
-}
-CLASSICAL = {
-    "sirt": ("model=sirt", "model.iterations=25"),
-    "sirt_aligned": ("model=corrected", "model@model.model=sirt", "model.model.iterations=25"),
-    "tv": (
-        "model=classical",
-        "reconstructor@model.reconstructor=fista_tv",
-        "model.reconstructor.weight=1e-4",
-    ),
-    "tv_aligned": (
-        "model=corrected",
-        "model@model.model=classical",
-        "reconstructor@model.model.reconstructor=fista_tv",
-        "model.model.reconstructor.weight=1e-4",
-    ),
-}
-
-
-class Regime(NamedTuple):
-    """What differs between the views of the regimes.
-
-    Args:
-        views: overrides of rig and acquisition.
-        support: that the networks work in; a hull of views that err can cut into the object.
-    """
-
-    views: tuple[str, ...] = ()
-    support: str = "hull"
-
-
-def _disturbed(options: str) -> Regime:
-    return Regime((f"acquisition={{disturbed: {{{options}}}}}",), "none")
-
-
-REGIMES = {
-    "clean": Regime(),
-    "photons_1e4": Regime(("acquisition=photons", "acquisition.photons=1e4")),
-    "photons_1e3": Regime(("acquisition=photons", "acquisition.photons=1e3"), "none"),
-    "rig": _disturbed("views: 3, shift_px: 1.0, gain: 0.05"),
-    "rig_one": _disturbed("views: 1, shift_px: 1.0, gain: 0.05"),
-    "rig_all": _disturbed("views: 8, shift_px: 1.0, gain: 0.05"),
-    "tilt": _disturbed("views: 3, tilt_deg: 5.0"),
-    "motion": _disturbed("views: 3, motion_mm: 15.0"),
-    "lost": _disturbed("views: 1, lost: 1"),
-    "saturated": _disturbed("views: 3, saturated: 0.2"),
-    "truncated": _disturbed("views: 1, truncated: 0.25"),
-    "views_2": Regime(("camera.n_views=2",)),
-    "views_3": Regime(("camera.n_views=3",)),
-    "views_4": Regime(("camera.n_views=4",)),
-    "views_16": Regime(("camera.n_views=16",)),
-    "pixels_half": Regime(
-        ("camera.detector.pixels=[96,96]", "camera.detector.pixel_mm=[9.0,10.0]")
-    ),
-    "pixels_third": Regime(
-        ("camera.detector.pixels=[144,144]", "camera.detector.pixel_mm=[6.0,6.6667]")
-    ),
-}
-
-
-def settings(regime: str, arm: str) -> list[str]:
-    """The overrides of an arm in a regime."""
-    views, support = REGIMES[regime]
-    options = [*BASE, *(ARMS | ALIGNED | CLASSICAL)[arm], *views]
-    if arm not in ARMS:  # options of the experiment's own model, which these have not
-        options += ["~model.support", "~model.precision"]
-    if arm in CLASSICAL:
-        return options
-    inside = "model.model" if arm in ALIGNED else "model"
-    return [*options, f"{inside}.support={support}", f"{inside}.precision=auto"]
-
-
-def paths(data: Path) -> list[str]:
-    """The overrides that say where the patients lie."""
-    files = ("scene.path", "openkbp_train.h5"), ("test_scene.path", "openkbp_val.h5")
-    return [f"{key}={data / name}" for key, name in files]
 
 
 def pace(options: argparse.Namespace) -> None:
     """Measure the processor seconds of a training step of each arm in each regime that was asked
-    for; alignment is not in it, since it is computed once a case.
+    for, the mean over real cases; alignment is not in it, since it is computed once a case.
     """
     torch.set_num_threads(1)
     rows = _paces()
-    for regime, arm in product(options.regimes, ARMS):
-        run = compose(*settings(regime, arm), *paths(options.data))
-        module = build_module(run, run["model"], 0.04)
-        volume = torch.zeros(4, 1, 32, 32, 32)
-        volume[:, :, 6:26, 8:24, 6:26] = 0.02
-        views = module.projector(volume)
-        batch = {"views": views, "volume": volume, "true_views": views}
-        optimizer = torch.optim.AdamW(module.parameters(), 1e-4)
-        times = []
-        for _ in range(6):
-            start = time.process_time()
-            module._terms(module.model(views), batch)["total"].backward()
-            optimizer.step()
-            optimizer.zero_grad()
-            times.append(time.process_time() - start)
-        rows[regime, arm] = min(times[1:])
-    with open(PACE, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("regime", "arm", "seconds_per_step"))
-        writer.writerows((*key, f"{value:.3f}") for key, value in rows.items())
+    cases = ("data.sizes={train: 24, val: 1, test: 1}", f"data.cache={options.runs / 'cases'}")
+    for regime, arm in product(options.regimes, (arm for arm in ARMS if arm in options.arms)):
+        run = compose(*settings(REGIMES[regime], arm), *paths(options.data), *cases)
+        data = build_data(run)
+        data.prepare_data()
+        data.setup("fit")
+        module = build_module(run, run["model"], data.data_range)
+        rows[regime, arm] = _seconds_a_step(module, data.train_dataloader())
+        with open(PACE, "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(("regime", "arm", "seconds_per_step"))
+            writer.writerows((*key, f"{value:.3f}") for key, value in rows.items())
+
+
+def _seconds_a_step(module: ReconstructionModule, batches: Iterable[dict]) -> float:
+    """Mean processor time of a training step; the first makes the geometry and does not count."""
+    optimizer = torch.optim.AdamW(module.parameters(), 1e-4)
+    times = []
+    for batch in batches:
+        start = time.process_time()
+        module._terms(module.model(batch["views"]), batch)["total"].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        times.append(time.process_time() - start)
+    return sum(times[1:]) / len(times[1:])
 
 
 def _paces() -> dict[tuple[str, str], float]:
@@ -175,7 +72,7 @@ def _paces() -> dict[tuple[str, str], float]:
 
 def steps(regime: str, arm: str, seconds: int) -> int:
     """Training steps of an arm in so many processor seconds."""
-    return round(seconds / _paces()[regime, arm.removesuffix("_aligned")])
+    return round(seconds / _paces()[REGIMES[regime].pace, arm.removesuffix("_aligned")])
 
 
 def train(options: argparse.Namespace) -> None:
@@ -188,7 +85,7 @@ def train(options: argparse.Namespace) -> None:
         if (folder / "results.json").exists():
             continue
         count = max(1, steps(regime, arm, seconds)) if seconds else 1
-        command = [sys.executable, "-m", "mvrecon.train", *settings(regime, arm)]
+        command = [sys.executable, "-m", "mvrecon.train", *settings(REGIMES[regime], arm)]
         command += [*paths(options.data), f"data.cache={options.runs / 'cases'}", f"seed={seed}"]
         command += [f"trainer.max_steps={count}", f"trainer.val_check_interval={min(count, 400)}"]
         command += [f"hydra.run.dir={folder}"]

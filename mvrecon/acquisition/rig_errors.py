@@ -45,9 +45,9 @@ class RigErrors:
 
     def wrong(self) -> Bool[Tensor, " m"]:
         """Which views are wrong in any way."""
-        right, wrong = RigErrors.none(len(self.gain)), torch.zeros(len(self.gain), dtype=torch.bool)
+        none, wrong = RigErrors.none(len(self.gain)), torch.zeros(len(self.gain), dtype=torch.bool)
         for field in fields(self):
-            off = getattr(self, field.name) != getattr(right, field.name)
+            off = getattr(self, field.name) != getattr(none, field.name)
             wrong |= off.reshape(len(off), -1).any(dim=1)
         return wrong
 

@@ -12,6 +12,7 @@ from mvrecon.config import conf_dir, plugin_conf_dirs
 from mvrecon.files.atomic import check_plain, new_folder
 from mvrecon.files.checks import shown
 from mvrecon.files.rank import world
+from mvrecon.files.runs import SETTINGS
 
 #: Hydra's own way to run the jobs of a sweep: one after the other, in this process.
 IN_TURN = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
@@ -78,7 +79,7 @@ def run_of(path: Path) -> Path | None:
     """The run folder that a path names or lies in; None: there is none, as the app will say."""
     path = path.expanduser().absolute()
     folders = (path, *path.parents[:3])
-    return next((folder for folder in folders if (folder / "config.yaml").is_file()), None)
+    return next((folder for folder in folders if (folder / SETTINGS).is_file()), None)
 
 
 def check_launcher(config: DictConfig) -> None:

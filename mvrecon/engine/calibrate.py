@@ -17,7 +17,7 @@ from mvrecon.cameras.field import resolution
 from mvrecon.cameras.misalignment import misaligned
 from mvrecon.engine.scan import Scan
 from mvrecon.engine.solve import bar
-from mvrecon.files.checks import check_memory
+from mvrecon.files.memory import check_memory
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 

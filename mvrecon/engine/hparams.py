@@ -10,8 +10,8 @@ from mvrecon.files.runs import leaves
 
 #: Settings of a run that make no difference to what comes out, or whose place is taken by `model`.
 SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "model")
-#: Figures of the table, and what they are called in the results.
-FIGURES = {"psnr": "psnr", "ssim": "ssim", "view_nrmse": "view_nrmse"}
+#: Figures of the table by their names in the results; costs, and theirs.
+FIGURES = ("psnr", "ssim", "view_nrmse")
 COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
 
 
@@ -27,7 +27,7 @@ def write(folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any]) -
     shared = {key: value for key, value in settings.items() if key not in SILENT}
     for label, model in methods(dict(settings)).items():
         row, board = table["methods"][label], Board(str(folder / label))
-        figures = {f"test/{name}": row[key]["mean"] for name, key in FIGURES.items()}
+        figures = {f"test/{name}": row[name]["mean"] for name in FIGURES}
         costs = {f"test/{name}": row[key] for name, key in COSTS.items() if row[key] is not None}
         options = {key: value for key, value in model.items() if key != "name"}
         named = {"method": label, "model": {"": model["name"], **options}}

@@ -60,8 +60,8 @@ class ReconstructionModule(L.LightningModule):
         self.save_hyperparameters(logger=False)
         self.projector = self._projector(0)
         self.model = MODELS.from_config(model, projector=self.projector)
-        own = OnRig(self.projector, self.model, geometry["projector"])
-        self._rigs = {0: own}  # no module: a checkpoint has the weights once
+        rig = OnRig(self.projector, self.model, geometry["projector"])
+        self._rigs = {0: rig}  # no module: a checkpoint has the weights once
         self.loss = ReconstructionLoss(data_range, **loss)
         self._finite = FiniteLoss(model["name"])
         self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
@@ -130,10 +130,10 @@ class ReconstructionModule(L.LightningModule):
         """Judge a batch by the loss and the figures of merit; hand the reconstruction on to the
         board.
         """
-        own = self._on_rig(batch)
-        out = own.model(batch["views"])
+        rig = self._on_rig(batch)
+        out = rig.model(batch["views"])
         terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
-        predicted = own.A(out.volume)
+        predicted = rig.A(out.volume)
         figures = [
             volume_metrics(volume, truth, inside, self.hparams["data_range"])
             | view_metrics(view, measured)

@@ -1,20 +1,18 @@
 """One of the other processes of a training: `python -m mvrecon.engine.other_process RUN`."""
 
-import logging
 import os
 import sys
 import threading
 from pathlib import Path
 
 from mvrecon.config.plugins import import_plugins
-from mvrecon.engine import fit, run_folder
+from mvrecon.engine import fit, progress, run_folder
 
 
 def main(folder: Path) -> None:
     """Train every method of a run beside its first process, and end when that one does."""
     threading.Thread(target=_end_with_the_first, daemon=True).start()
-    for part in ("pytorch", "fabric"):
-        logging.getLogger(f"lightning.{part}").setLevel(logging.WARNING)
+    progress.silence_lightning()
     settings = run_folder.read_settings(folder)
     import_plugins(settings["plugins"])
     fit.fit_all(settings, fit.build_data(settings), folder)

@@ -27,7 +27,7 @@ from mvrecon.files.rank import world
 STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
 #: Seconds that the first process has to end by itself after another one has died.
 GRACE = 60.0
-HERE = "127.0.0.1"
+LOOPBACK = "127.0.0.1"
 
 
 @contextmanager
@@ -48,7 +48,7 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
     if count == 1:
         yield
         return
-    shared = {"MASTER_ADDR": HERE, "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(count)}
+    shared = {"MASTER_ADDR": LOOPBACK, "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(count)}
     shared["OMP_NUM_THREADS"] = str(max(1, torch.get_num_threads() // count))
     environments = [shared | {"RANK": str(r), "LOCAL_RANK": str(r)} for r in range(count)]
     others = [_start(folder, environment) for environment in environments[1:]]
@@ -145,5 +145,5 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 def _free_port() -> int:
     with socket.socket() as probe:
-        probe.bind((HERE, 0))
+        probe.bind((LOOPBACK, 0))
         return probe.getsockname()[1]

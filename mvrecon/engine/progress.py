@@ -1,5 +1,6 @@
 """Progress on the terminal."""
 
+import logging
 from typing import Any
 
 import lightning.pytorch as L
@@ -14,6 +15,12 @@ from rich.progress import (
 )
 
 SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
+
+
+def silence_lightning() -> None:
+    """Leave Lightning's own lines about devices and seeds out; its warnings stay."""
+    for part in ("pytorch", "fabric"):
+        logging.getLogger(f"lightning.{part}").setLevel(logging.WARNING)
 
 
 class StepProgress(ProgressBar):

@@ -31,5 +31,5 @@ def blocks(model: nn.Module) -> Iterator[nn.Module]:
     """
     inner = [block for child in model.children() for block in blocks(child)]
     torchs = type(model).__module__.startswith("torch.")
-    own = not torchs and any(isinstance(module, CONVOLUTIONS) for module in model.modules())
-    yield from inner or ([model] if own else [])
+    convolves = not torchs and any(isinstance(module, CONVOLUTIONS) for module in model.modules())
+    yield from inner or ([model] if convolves else [])

@@ -14,7 +14,7 @@ from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import Corrected
 from mvrecon.data.volume_files import read_volume
-from mvrecon.files.checks import check_memory
+from mvrecon.files.memory import check_memory
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.operator import LinearOperator, Projector, Scaled

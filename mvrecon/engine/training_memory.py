@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.files.checks import memory_at_hand
+from mvrecon.files.memory import memory_at_hand
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import MODELS, PROJECTORS
 
@@ -75,12 +75,12 @@ def step_bytes(module: ReconstructionModule, batch_size: int, edge: int = EDGE) 
 
 def _kept(model: torch.nn.Module, views: Tensor) -> int:
     """Bytes that a model keeps for the gradient of one case, besides its weights."""
-    own = {tensor.untyped_storage().data_ptr() for tensor in model.state_dict().values()}
+    weights = {tensor.untyped_storage().data_ptr() for tensor in model.state_dict().values()}
     sizes: dict[int, int] = {}
 
     def pack(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
-        if storage.data_ptr() not in own:
+        if storage.data_ptr() not in weights:
             sizes[storage.data_ptr()] = storage.nbytes()
         return tensor
 

@@ -1,8 +1,6 @@
-"""Check files from elsewhere before use: size, text, names, memory needed."""
+"""Check files from elsewhere before use: size, text, names."""
 
-import os
 import reprlib
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -132,49 +130,3 @@ def check_file(path: Path, expected: str) -> None:
 def shown(value: Any) -> str:
     """A value from a file, short enough for a message."""
     return reprlib.repr(value)
-
-
-def check_memory(needed: int, what: str) -> None:
-    """Raise an error if more bytes are needed than are free; a gibibyte or less is not checked.
-
-    Raises:
-        ValueError: more bytes than are at hand, with both in GiB.
-    """
-    if needed > 2**30 and (room := memory_at_hand()) is not None and needed > room:
-        raise ValueError(
-            f"{what} needs {needed / 2**30:,.1f} GiB of memory; {room / 2**30:,.1f} GiB are at hand"
-        )
-
-
-def memory_at_hand() -> int | None:
-    """Free memory for this process in bytes, within the limits set for it; None: not known."""
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    rooms = [*_free(), *_left_in_group()]
-    soft = resource.getrlimit(resource.RLIMIT_AS)[0]
-    statm = Path("/proc/self/statm")
-    if soft != resource.RLIM_INFINITY and statm.exists():
-        rooms.append(soft - int(statm.read_text().split()[0]) * resource.getpagesize())
-    return max(0, min(rooms)) if rooms else None
-
-
-def _free() -> Iterator[int]:
-    meminfo = Path("/proc/meminfo")
-    if meminfo.exists():
-        lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
-        yield sum(
-            int(lines[key].split()[0]) * 1024
-            for key in ("MemAvailable", "SwapFree")
-            if key in lines
-        )
-    else:  # macOS does not say what is free
-        yield os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
-def _left_in_group() -> Iterator[int]:
-    """Free memory in bytes within the limit of the container (Linux, cgroup v2)."""
-    most, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
-    if most.exists() and used.exists() and (text := most.read_text().strip()) != "max":
-        yield int(text) - int(used.read_text())

@@ -1,6 +1,8 @@
-"""Peak memory of this process."""
+"""Memory of this process: its peak, and what is free."""
 
+import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 try:
@@ -8,8 +10,10 @@ try:
 except ImportError:  # Windows has no such module
     resource = None
 
-#: Linux: sizes of this process; and the file that a 5 starts its highest size anew by (proc(5)).
+#: Linux (proc(5)): sizes of this process; the file that a 5 starts its highest size anew by; what
+#: is free.
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+FREE = Path("/proc/meminfo")
 
 
 def peak() -> int | None:
@@ -28,16 +32,56 @@ def restarted_peak() -> int | None:
     """
     try:
         CLEAR.write_text("5")
-        return _size("VmRSS")
+        return _sizes(STATUS)["VmRSS"]
     except (OSError, KeyError):
         return None
 
 
 def peak_since(start: int | None) -> int | None:
     """The most memory above `start` since then, in bytes; None if `start` is."""
-    return None if start is None else max(0, _size("VmHWM") - start)
+    return None if start is None else max(0, _sizes(STATUS)["VmHWM"] - start)
 
 
-def _size(name: str) -> int:
-    lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines() if ":" in line)
-    return int(lines[name].split()[0]) * 1024
+def check_memory(needed: int, what: str) -> None:
+    """Raise an error if more bytes are needed than are free; a gibibyte or less is not checked.
+
+    Raises:
+        ValueError: more bytes than are at hand, with both in GiB.
+    """
+    if needed > 2**30 and (room := memory_at_hand()) is not None and needed > room:
+        raise ValueError(
+            f"{what} needs {needed / 2**30:,.1f} GiB of memory; {room / 2**30:,.1f} GiB are at hand"
+        )
+
+
+def memory_at_hand() -> int | None:
+    """Free memory for this process in bytes, within the limits set for it; None: not known."""
+    if resource is None:
+        return None
+    rooms = [*_free(), *_left_in_group()]
+    soft = resource.getrlimit(resource.RLIMIT_AS)[0]
+    statm = Path("/proc/self/statm")
+    if soft != resource.RLIM_INFINITY and statm.exists():
+        rooms.append(soft - int(statm.read_text().split()[0]) * resource.getpagesize())
+    return max(0, min(rooms)) if rooms else None
+
+
+def _free() -> Iterator[int]:
+    if FREE.exists():
+        sizes = _sizes(FREE)
+        yield sizes["MemAvailable"] + sizes.get("SwapFree", 0)
+    else:  # macOS does not say what is free
+        yield os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def _left_in_group() -> Iterator[int]:
+    """Free memory in bytes within the limit of the container (Linux, cgroup v2)."""
+    most, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
+    if most.exists() and used.exists() and (text := most.read_text().strip()) != "max":
+        yield int(text) - int(used.read_text())
+
+
+def _sizes(path: Path) -> dict[str, int]:
+    """Sizes in bytes by name, of a file of /proc whose lines are `name: number kB`."""
+    lines = (line.split() for line in path.read_text().splitlines() if line.endswith(" kB"))
+    return {name.rstrip(":"): int(number) * 1024 for name, number, _ in lines}

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.files.checks import check_memory
+from mvrecon.files.memory import check_memory
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.rigid import check_rotation
 

@@ -98,13 +98,15 @@ class PoissonLikelihood:
 
     def _summed(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
         shapes = self.selection.range_shape, self.views.range_shape
-        own, ones = (torch.ones(1, 1, *s, dtype=dtype, device=self.counts.device) for s in shapes)
+        chosen, ones = (
+            torch.ones(1, 1, *s, dtype=dtype, device=self.counts.device) for s in shapes
+        )
         if self.selection is self.views:
-            return self.bins.T(own)
+            return self.bins.T(chosen)
         # a list of rays rounds otherwise than whole views, and MLEM divides what a list explains by
         # this
-        rest = ones - self.views(self.selection.T(own))
-        return self.bins.T(own) + self.A.subset(self.views).T(rest)
+        rest = ones - self.views(self.selection.T(chosen))
+        return self.bins.T(chosen) + self.A.subset(self.views).T(rest)
 
     def expected(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
         """ybar, the counts to be expected in the bins that are computed.

@@ -132,9 +132,9 @@ def supported(method: Callable[..., Tensor], A: LinearOperator, options: Common)
         ValueError: a support that is no mask of the volume's shape.
     """
     parameters = inspect.signature(method).parameters.values()
-    own, common = {p.name for p in parameters}, Common.__annotations__
+    specific, common = {p.name for p in parameters}, Common.__annotations__
     for option in set(options) - set(common):
-        known = (own - {"common"}) | set(common)
+        known = (specific - {"common"}) | set(common)
         raise TypeError(f"{method.__name__} has no option {option!r}{hint(option, known)}")
     support = options.get("support")
     if support is None:
@@ -196,14 +196,14 @@ class Watch:
         """
         if self.monitor is None:
             return False
-        own = residual()
+        of_volume = residual()
         if self.residual is not None:
-            own = (own + beta * self.residual) / (1 + beta)
-        self.residual = own
+            of_volume = (of_volume + beta * self.residual) / (1 + beta)
+        self.residual = of_volume
         if number == 0:
             return False
-        objective = None if self.objective is None else self.objective(volume, own)
-        verdict = self.monitor(Iterate(number, volume, own, gap, objective))
+        objective = None if self.objective is None else self.objective(volume, of_volume)
+        verdict = self.monitor(Iterate(number, volume, of_volume, gap, objective))
         return self._ended(verdict, volume) if isinstance(verdict, Tensor) else bool(verdict)
 
     def result(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:

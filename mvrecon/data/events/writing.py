@@ -3,13 +3,11 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import h5py
-import torch
 from rich.console import Console
 from rich.progress import track
 from torch.utils.data import DataLoader, Dataset
@@ -19,6 +17,7 @@ from mvrecon.data.events.making import EventMaker
 from mvrecon.data.events.shards import Header, fill, header_of, verify, write_shard
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import Refused, shown, text_of
+from mvrecon.kernels.threads import in_one_order
 
 #: The file of the shards' SHA-256 digests, as `sha256sum --check` reads it.
 SUMS = "SHA256SUMS"
@@ -55,7 +54,7 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
     if missing:
         check_room(folder, maker, sum(len(maker.settings.indices(k)) for k in missing))
     jobs = _Jobs(maker, header, [(k, paths[k]) for k in missing])
-    with _one_thread():
+    with in_one_order():  # one thread of torch, as in worker processes: the bits are theirs
         made = DataLoader(jobs, batch_size=None, num_workers=maker.settings.workers)
         console = Console(stderr=True)
         for name, digest in track(made, "Events", len(missing), transient=True, console=console):
@@ -147,16 +146,3 @@ def _sums(folder: Path) -> dict[str, str]:
 def _write_sums(folder: Path, sums: Mapping[str, str]) -> None:
     with written_whole(folder / SUMS) as part:
         part.write_text("".join(f"{sums[name]}  {name}\n" for name in sorted(sums)))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Context in which torch computes in one thread, as in worker processes: the order of sums, and
-    so every bit, is theirs.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

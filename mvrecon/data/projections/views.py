@@ -20,7 +20,8 @@ from mvrecon.data.projections.corrections import Fields, fields, integrals, tran
 from mvrecon.data.projections.opening import field_beside, open_projections
 from mvrecon.data.projections.region import Region
 from mvrecon.data.projections.stack import PIXELS, ProjectionStack
-from mvrecon.files.checks import Refused, check_memory
+from mvrecon.files.checks import Refused
+from mvrecon.files.memory import check_memory
 
 if TYPE_CHECKING:
     from mvrecon.data.projections.measured import Measured

@@ -1,0 +1,145 @@
+"""Arms and regimes of the study: what differs between the models, and between their views."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+BASE = (
+    "experiment=open_kbp_cross_view",
+    "~compare.world_rounds",
+    "~compare.world_unet",
+    "scene.vary=exact",
+    "data.sizes.train=648",
+    "callbacks=quiet",
+    "logger=csv",
+)
+NARROW = "rounds=[{resolution: full, widths: [16,32,64], cameras: null}]"
+HALF = "{resolution: half, widths: [32,48,64]"
+CAMERAS = "cameras: {name: rays2d}"
+
+#: What differs between the models.
+ARMS = {
+    "cross_view": ("model=cross_view",),
+    "no_opinions": ("model=cross_view", "model.rounds.0.opinions=null"),
+    "one_round": (
+        "model=cross_view",
+        f"model.rounds=[{{resolution: full, widths: [16,32,64], {CAMERAS}}}]",
+    ),
+    "three_rounds": (
+        "model=cross_view",
+        f"model.rounds=[{HALF}, {CAMERAS}}}, {HALF}}}, {{resolution: full, widths: [16,32,64]}}]",
+    ),
+    "world_rounds": ("model=world_rounds",),
+    "world_unet": ("model=world_unet", f"model.{NARROW}"),
+}
+ALIGNED = {
+    "cross_view_aligned": ("model=corrected", "model@model.model=cross_view"),
+    "world_unet_aligned": (
+        "model=corrected",
+        "model@model.model=world_unet",
+        f"model.model.{NARROW}",
+    ),
+}
+CLASSICAL = {
+    "sirt": ("model=sirt", "model.iterations=25"),
+    "sirt_aligned": ("model=corrected", "model@model.model=sirt", "model.model.iterations=25"),
+    "tv": (
+        "model=classical",
+        "reconstructor@model.reconstructor=fista_tv",
+        "model.reconstructor.weight=1e-4",
+    ),
+    "tv_aligned": (
+        "model=corrected",
+        "model@model.model=classical",
+        "reconstructor@model.model.reconstructor=fista_tv",
+        "model.model.reconstructor.weight=1e-4",
+    ),
+}
+
+
+class Regime(NamedTuple):
+    """What differs between the views of the regimes.
+
+    Args:
+        views: overrides of rig and acquisition.
+        support: that the networks work in; a hull of views that err can cut into the object.
+        pace: the regime whose training steps take as long.
+        options: of every network.
+    """
+
+    views: tuple[str, ...] = ()
+    support: str = "hull"
+    pace: str = "clean"
+    options: tuple[str, ...] = ()
+
+
+def _disturbed(options: str) -> Regime:
+    return Regime((f"acquisition={{disturbed: {{{options}}}}}",), "none", "rig")
+
+
+def _fine(regime: Regime, size: int, name: str) -> Regime:
+    """A regime on the patients' own grid: `size` voxels an edge, networks in the box of the hull.
+    Three of the four views that must agree on an empty brick may be wrong.
+    """
+    part, pixels = 32 / size, 3 * size // 2
+    spacing = [16 * part, 10 * part, 12 * part]
+    return Regime(
+        (
+            *regime.views,
+            f"grid={{size: [{size},{size},{size}], spacing: {spacing}}}",
+            f"camera.detector={{pixels: {pixels}, pixel_mm: [{18 * part},{20 * part}]}}",
+            "data.batch_size=1",
+        ),
+        "hull",
+        name,
+        ("crop=true", *(() if regime.support == "hull" else ("noise={witnesses: 4}",))),
+    )
+
+
+RIG = _disturbed("views: 3, shift_px: 1.0, gain: 0.05")
+REGIMES = {
+    "clean": Regime(),
+    "photons_1e4": Regime(("acquisition=photons", "acquisition.photons=1e4")),
+    "photons_1e3": Regime(("acquisition=photons", "acquisition.photons=1e3"), "none", "rig"),
+    "rig": RIG,
+    "rig_one": _disturbed("views: 1, shift_px: 1.0, gain: 0.05"),
+    "rig_all": _disturbed("views: 8, shift_px: 1.0, gain: 0.05"),
+    "tilt": _disturbed("views: 3, tilt_deg: 5.0"),
+    "motion": _disturbed("views: 3, motion_mm: 15.0"),
+    "lost": _disturbed("views: 1, lost: 1"),
+    "saturated": _disturbed("views: 3, saturated: 0.2"),
+    "truncated": _disturbed("views: 1, truncated: 0.25"),
+    "views_2": Regime(("camera.n_views=2",), pace="views_2"),
+    "views_3": Regime(("camera.n_views=3",), pace="views_3"),
+    "views_4": Regime(("camera.n_views=4",), pace="views_4"),
+    "views_16": Regime(("camera.n_views=16",), pace="views_16"),
+    "pixels_half": Regime(
+        ("camera.detector.pixels=[96,96]", "camera.detector.pixel_mm=[9.0,10.0]"),
+        pace="pixels_half",
+    ),
+    "pixels_third": Regime(
+        ("camera.detector.pixels=[144,144]", "camera.detector.pixel_mm=[6.0,6.6667]"),
+        pace="pixels_third",
+    ),
+    "clean_64": _fine(Regime(), 64, "clean_64"),
+    "rig_64": _fine(RIG, 64, "rig_64"),
+    "clean_128": _fine(Regime(), 128, "clean_128"),
+    "rig_128": _fine(RIG, 128, "rig_128"),
+}
+
+
+def settings(regime: Regime, arm: str) -> list[str]:
+    """The overrides of an arm in a regime."""
+    options = [*BASE, *(ARMS | ALIGNED | CLASSICAL)[arm], *regime.views]
+    if arm not in ARMS:  # options of the experiment's own model, which these have not
+        options += ["~model.support", "~model.precision"]
+    if arm in CLASSICAL:
+        return options
+    inside = "model.model" if arm in ALIGNED else "model"
+    own = (f"support={regime.support}", "precision=auto", *regime.options)
+    return [*options, *(f"{inside}.{option}" for option in own)]
+
+
+def paths(data: Path) -> list[str]:
+    """The overrides that say where the patients lie."""
+    files = ("scene.path", "openkbp_train.h5"), ("test_scene.path", "openkbp_val.h5")
+    return [f"{key}={data / name}" for key, name in files]
