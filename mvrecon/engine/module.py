@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mvrecon.data.rigs import camera_of
 from mvrecon.engine.finite import FiniteLoss
+from mvrecon.engine.graph import GraphedLoss
 from mvrecon.engine.means import Means
 from mvrecon.engine.on_rig import OnRig, with_weights_of
 from mvrecon.engine.quality import quality_of
@@ -64,6 +65,8 @@ class ReconstructionModule(L.LightningModule):
         self._rigs = {0: rig}  # no module: a checkpoint has the weights once
         self.loss = ReconstructionLoss(data_range, **loss)
         self._finite = FiniteLoss(model["name"])
+        #: What computes the loss and its gradients in training instead of `terms`; none for those.
+        self.graph: GraphedLoss | None = None
         self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
 
     def forward(self, views: Tensor) -> Reconstruction:
@@ -92,7 +95,7 @@ class ReconstructionModule(L.LightningModule):
             FloatingPointError: a loss that is not finite, of this step or on a GPU of one since the
                 last that was logged.
         """
-        terms = self.terms(batch)
+        terms = self.terms(batch) if self.graph is None else self.graph(batch)
         self._finite.add(self.global_step, terms, max(1, self.trainer.log_every_n_steps))
         for name, value in terms.items():
             self.log(
@@ -104,13 +107,19 @@ class ReconstructionModule(L.LightningModule):
             )
         return terms["total"]
 
+    def as_graph(self) -> None:
+        """Train with a CUDA graph from now on; see `GraphedLoss`."""
+        self.graph = GraphedLoss(self.terms, [p for p in self.parameters() if p.requires_grad])
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check the losses that have not been checked yet: no bad weights take the place of good
         ones.
         """
         self._finite.look()
 
-    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
         """A batch on the device; the number of its rig, which the host asks for, stays."""
         moved = super().transfer_batch_to_device(batch, device, dataloader_idx)
         return {**moved, "rig": batch["rig"]} if "rig" in batch else moved
