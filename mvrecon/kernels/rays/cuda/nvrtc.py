@@ -30,6 +30,9 @@ def library() -> Any:
     problem: OSError | None = None
     for name in [*map(str, paths), f"libnvrtc.so.{wanted}" if wanted else "libnvrtc.so"]:
         try:
+            # NVRTC opens its own headers by their bare name, which nobody else finds in a wheel
+            for headers in Path(name).parent.glob("libnvrtc-builtins.so.*"):
+                ctypes.CDLL(str(headers))
             return ctypes.CDLL(name)
         except OSError as error:
             problem = problem or error
