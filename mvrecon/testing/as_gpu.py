@@ -43,10 +43,10 @@ class OnGpu(Tensor):
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore
     values: Tensor
-    device = property(lambda self: GPU)
-    is_cuda = property(lambda self: True)
-    is_cpu = property(lambda self: False)
-    is_meta = property(lambda self: False)
+    device = property(lambda self: GPU)  # pyright: ignore[reportAssignmentType]
+    is_cuda = property(lambda self: True)  # pyright: ignore[reportAssignmentType]
+    is_cpu = property(lambda self: False)  # pyright: ignore[reportAssignmentType]
+    is_meta = property(lambda self: False)  # pyright: ignore[reportAssignmentType]
 
     @staticmethod
     def __new__(cls, values: Tensor) -> "OnGpu":
@@ -107,7 +107,7 @@ class AsGpu:
         """A module as if moved to the GPU; the counts begin anew."""
         module._apply(on_gpu)
         if hasattr(module, "_device"):  # a LightningModule
-            module._device = GPU
+            module._device = GPU  # pyright: ignore[reportArgumentType]
         self.waits.clear()
         self.launches.clear()
         return module
