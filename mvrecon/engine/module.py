@@ -96,7 +96,8 @@ class ReconstructionModule(L.LightningModule):
                 last that was logged.
         """
         terms = self.terms(batch) if self.graph is None else self.graph(batch)
-        self._finite.add(self.global_step, terms, max(1, self.trainer.log_every_n_steps))
+        together = max(1, self.trainer.log_every_n_steps)  # pyright: ignore[reportAttributeAccessIssue]
+        self._finite.add(self.global_step, terms, together)
         for name, value in terms.items():
             self.log(
                 f"loss/{name}",

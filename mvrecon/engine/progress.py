@@ -60,7 +60,7 @@ class StepProgress(ProgressBar):
             return
         task, step = self._lines.task_ids[0], trainer.global_step
         self._lines.update(task, completed=step)
-        if step % max(1, trainer.log_every_n_steps) == 0:
+        if step % max(1, trainer.log_every_n_steps) == 0:  # pyright: ignore[reportAttributeAccessIssue]
             shown = "  ".join(
                 f"{SHORT.get(name, name)} {value:.4g}"
                 for name, value in trainer.progress_bar_metrics.items()
