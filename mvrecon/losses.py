@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, avg_pool3d, gaussian_nll_loss
+from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.models.output import Reconstruction
 
@@ -151,10 +151,11 @@ class ReconstructionLoss(nn.Module):
         variance = (out.sigma / self.data_range).square()
         if out.support is not None:  # outside it all is zero by definition, the error's size too
             variance = torch.where(out.support, variance, 1.0)
-        surprise = gaussian_nll_loss(
-            volume.detach(), truth, variance, eps=VARIANCE, reduction="none"
-        )
-        return mean_where(surprise, out.support)
+        # not torch's own loss, which asks whether a variance is negative, and waits for the answer;
+        # as there, the least variance has the gradient of the one that it stands for
+        variance = variance + (variance.clamp_min(VARIANCE) - variance).detach()
+        error = volume.detach() - truth
+        return mean_where((variance.log() + error.square() / variance) / 2, out.support)
 
     def _rounds(self, out: Reconstruction, truth: Tensor) -> Float[Tensor, ""]:
         errors = [

@@ -17,10 +17,8 @@ RUN = {
     "operators": ["--out", "OUT"],
     "learn": ["--out", "OUT", "--train", "a.h5", "--test", "b.h5"],
 }
-#: Where there is a GPU, or a build of torch for one, scripts would measure.
-COMMANDS = ({} if torch.cuda.is_available() else RUN) | (
-    {} if torch.version.cuda else {"waits": []}
-)
+#: Where there is a GPU, scripts would measure.
+COMMANDS = {} if torch.cuda.is_available() else RUN
 #: Imports every script, then runs each command as a shell would; what each of them ended with.
 CODE = """
 import importlib, json, runpy, sys
@@ -80,9 +78,3 @@ def test_a_script_without_a_gpu_says_so(name: str, ends: Ends):
     """Before it makes anything."""
     assert f"{name}.py needs a GPU, and torch" in str(ends.codes[name])
     assert not ends.out.exists()
-
-
-@pytest.mark.skipif(torch.version.cuda is not None, reason="a build of torch with CUDA")
-def test_waits_are_counted_by_a_build_with_cuda_alone(ends: Ends):
-    message = str(ends.codes["waits"])
-    assert "waits.py needs a build of torch with CUDA, got torch" in message

@@ -56,7 +56,7 @@ def _seconds_a_step(module: ReconstructionModule, batches: Iterable[dict]) -> fl
     times = []
     for batch in batches:
         start = time.process_time()
-        module._terms(module.model(batch["views"]), batch)["total"].backward()
+        module.terms(batch)["total"].backward()
         optimizer.step()
         optimizer.zero_grad()
         times.append(time.process_time() - start)

@@ -166,7 +166,7 @@ def pace(options: argparse.Namespace) -> None:
         optimizer = torch.optim.AdamW(module.parameters(), 1e-4)
         for _ in range(5):
             start = time.process_time()
-            module._terms(module.model(batch["views"]), batch)["total"].backward()
+            module.terms(batch)["total"].backward()
             optimizer.step()
             optimizer.zero_grad()
             times.append(time.process_time() - start)

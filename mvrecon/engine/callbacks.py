@@ -79,9 +79,9 @@ class Clock(L.Callback):
         speed = count * trainer.world_size / step
         figures = {"step_ms": 1e3 * step, "volumes_per_s": speed, "seconds": self.seconds}
         figures |= peak_megabytes()
-        pl_module.log_dict(
-            {f"time/{name}": value for name, value in figures.items()}, batch_size=count
-        )
+        # as tensors in main memory: Lightning would copy plain numbers to a GPU, and wait for it
+        logged = {f"time/{name}": torch.tensor(value) for name, value in figures.items()}
+        pl_module.log_dict(logged, batch_size=count)
 
 
 class Confined(L.Callback):

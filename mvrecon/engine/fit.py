@@ -13,6 +13,7 @@ from mvrecon.config.targets import instantiate
 from mvrecon.data.module import SceneData
 from mvrecon.engine.callbacks import Clock, Confined
 from mvrecon.engine.checkpoints import finished, unfinished
+from mvrecon.engine.graph import check_graph
 from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
 from mvrecon.engine.processes import Environment
@@ -109,7 +110,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
 
     Raises:
         FloatingPointError: a loss that is not finite.
-        ValueError: a step that does not fit into memory.
+        ValueError: a step that does not fit into memory, or of which no CUDA graph can be made.
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
         SystemExit: SIGTERM came; the checkpoint of that step is written.
     """
@@ -121,6 +122,9 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
         return
+    if settings["trainer"].get("graph"):
+        check_graph(settings["trainer"], models[method], settings["data"])
+        module.as_graph()
     accelerator = settings["trainer"].get("accelerator", "auto")
     needed = check_training(module, data.loading.batch_size, accelerator)
     if needed is not None:
@@ -175,7 +179,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     callbacks += [LearningRateMonitor("step")] if loggers else []  # it refuses to be without
     options = {
         "enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks),
-        **settings["trainer"],
+        **{name: value for name, value in settings["trainer"].items() if name != "graph"},
     }
     fixed = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
     plugins: list[Any] = [DurableCheckpoints(folder)]

@@ -4,9 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import lightning.pytorch as L
+import torch
 from torch import Tensor
 
 from mvrecon.data.rigs import camera_of
+from mvrecon.engine.finite import FiniteLoss
+from mvrecon.engine.graph import GraphedLoss
 from mvrecon.engine.means import Means
 from mvrecon.engine.on_case import CaseAttenuation, OnCases, OwnAttenuation, on_cases, plain
 from mvrecon.engine.on_rig import OnRig, with_weights_of
@@ -65,6 +68,9 @@ class ReconstructionModule(L.LightningModule):
         own = OnRig(self.projector, self.model, geometry["projector"], model)
         self._rigs = {0: own}  # no module: a checkpoint has the weights once
         self.loss = ReconstructionLoss(data_range, **loss)
+        self._finite = FiniteLoss(model["name"])
+        #: What computes the loss and its gradients in training instead of `terms`; none for those.
+        self.graph: GraphedLoss | None = None
         self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
 
     def forward(self, views: Tensor, **case: Tensor) -> Reconstruction:
@@ -96,7 +102,8 @@ class ReconstructionModule(L.LightningModule):
             A, options = self._projector(rig), self.hparams["model"]
             model = with_weights_of(self.model, options, plain(A))
             self._rigs[rig] = OnRig(A, model, self.hparams["geometry"]["projector"], options)
-        return self._rigs[rig].ready(self.device, self.training)
+        # its own moves with the module
+        return self._rigs[rig].ready(self.device, self.training) if rig else self._rigs[rig]
 
     def on(self, batch: dict[str, Any]) -> OnRig | OnCases:
         """The model on the rig of a batch, by the operators of its cases where these differ."""
@@ -106,18 +113,12 @@ class ReconstructionModule(L.LightningModule):
         """The loss of one batch.
 
         Raises:
-            FloatingPointError: a loss that is not finite.
+            FloatingPointError: a loss that is not finite, of this step or on a GPU of one since the
+                last that was logged.
         """
-        own = self.on(batch)
-        terms = self._terms(own, own.model(batch["views"]), batch)
-        if not terms["total"].isfinite():
-            shown = ", ".join(f"{name} {value.item():.4g}" for name, value in terms.items())
-            raise FloatingPointError(
-                f"The loss of {self.hparams['model']['name']} is not finite at step "
-                f"{self.global_step}: {shown}. "
-                "Lower optimizer.lr, set trainer.gradient_clip_val, or look for bad values in the "
-                "data"
-            )
+        terms = self.terms(batch) if self.graph is None else self.graph(batch)
+        together = max(1, self.trainer.log_every_n_steps)  # pyright: ignore[reportAttributeAccessIssue]
+        self._finite.add(self.global_step, terms, together)
         for name, value in terms.items():
             self.log(
                 f"loss/{name}",
@@ -127,6 +128,28 @@ class ReconstructionModule(L.LightningModule):
                 sync_dist=True,
             )
         return terms["total"]
+
+    def as_graph(self) -> None:
+        """Train with a CUDA graph from now on; see `GraphedLoss`."""
+        self.graph = GraphedLoss(self.terms, [p for p in self.parameters() if p.requires_grad])
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Check the losses that have not been checked yet: no bad weights take the place of good
+        ones.
+        """
+        self._finite.look()
+
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
+        """A batch on the device; the number of its rig, which the host asks for, stays."""
+        moved = super().transfer_batch_to_device(batch, device, dataloader_idx)
+        return {**moved, "rig": batch["rig"]} if "rig" in batch else moved
+
+    def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """The terms of the loss of a batch."""
+        own = self.on(batch)
+        return self._terms(own, own.model(batch["views"]), batch)
 
     def _terms(
         self, own: OnRig | OnCases, out: Reconstruction, batch: dict[str, Any]

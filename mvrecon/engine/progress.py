@@ -55,15 +55,17 @@ class StepProgress(ProgressBar):
         self._lines.start()
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        """Move on by a step."""
-        if self._lines is not None:
+        """Move on by a step; figures at the steps that are logged, since a GPU is waited for."""
+        if self._lines is None:
+            return
+        task, step = self._lines.task_ids[0], trainer.global_step
+        self._lines.update(task, completed=step)
+        if step % max(1, trainer.log_every_n_steps) == 0:  # pyright: ignore[reportAttributeAccessIssue]
             shown = "  ".join(
                 f"{SHORT.get(name, name)} {value:.4g}"
                 for name, value in trainer.progress_bar_metrics.items()
             )
-            self._lines.update(
-                self._lines.task_ids[0], completed=trainer.global_step, figures=shown
-            )
+            self._lines.update(task, figures=shown)
 
     def on_train_end(self, *_: Any) -> None:
         """Stop the line; it stays visible."""

@@ -117,7 +117,8 @@ def places(
     Samples behind the plane of a source do not count; their place means nothing.
     """
     rows = spread_map(maps, shape)
-    under = rows[..., [ACROSS, ACROSS, DEPTH]]
+    # one by one: a list of indices would have to be copied to a GPU
+    under = torch.stack([rows[..., k] for k in (ACROSS, ACROSS, DEPTH)], dim=-1)
     counts = (under > 0).all(dim=-1)
     return rows[..., NUMERATORS] / torch.where(counts[..., None], under, 1.0), counts
 

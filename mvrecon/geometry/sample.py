@@ -6,6 +6,7 @@ tensor), integer at voxel centres. Outside the outermost centres the values fade
 voxel.
 """
 
+from collections.abc import Sequence
 from itertools import product
 
 import torch
@@ -14,11 +15,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 
+def filled(values: Sequence[float], like: Tensor) -> Float[Tensor, " n"]:
+    """Some numbers as a tensor of another one's device and type, written there: a GPU need not be
+    waited for, as it would for a copy.
+    """
+    return torch.stack([like.new_full((), value) for value in values])
+
+
 def normalised(index: Float[Tensor, "*n 3"], shape: tuple[int, int, int]) -> Float[Tensor, "*n 3"]:
     """Voxel indices as `grid_sample` wants them; points that are not finite or far outside land
     safely outside.
     """
-    sizes = torch.tensor(shape[::-1], dtype=index.dtype, device=index.device)
+    sizes = filled(shape[::-1], index)
     scaled = (2 * index + 1) / sizes - 1
     return torch.where(scaled.isfinite(), scaled, 4.0).clamp(-4.0, 4.0)
 
@@ -44,12 +52,12 @@ def gathered(
     """What `grid_sample` gives, whose derivative on a GPU adds up in no fixed order; that of
     `gather` can.
     """
-    sizes = torch.tensor(volume.shape[:1:-1], device=points.device)
-    places = ((points + 1) * sizes - 1) / 2
+    places = ((points + 1) * filled(volume.shape[:1:-1], points) - 1) / 2
     low, flat = places.detach().floor(), volume.flatten(2)
+    sizes = filled(volume.shape[:1:-1], low).long()
     values = volume.new_zeros(*volume.shape[:2], *points.shape[1:4])
     for corner in product((0, 1), repeat=3):
-        at = (low + low.new_tensor(corner)).long()
+        at = (low + filled(corner, low)).long()
         inside = ((at >= 0) & (at < sizes)).all(dim=-1)
         x, y, z = at.where(inside[..., None], 0).unbind(dim=-1)
         index = (

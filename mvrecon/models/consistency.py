@@ -237,5 +237,10 @@ def typical_chord(grid: Grid) -> float:
 
 
 def anything(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:
-    """One where views show anything, zero where they show nothing: f(0) = 0."""
-    return views.flatten(1).any(dim=1).to(views.dtype).reshape(-1, 1, 1, 1, 1)
+    """One where views show anything, zero where they show nothing: f(0) = 0. NaN where a value is
+    not finite, which `check_finite` does not tell of a GPU's views.
+    """
+    values = views.flatten(1)
+    shown = values.any(dim=1).to(views.dtype)
+    finite = values.isfinite().all(dim=1)
+    return torch.where(finite, shown, torch.nan).reshape(-1, 1, 1, 1, 1)

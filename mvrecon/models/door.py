@@ -15,8 +15,8 @@ def admitted(views: Tensor, cameras: Cameras, weights: Tensor) -> Float[Tensor, 
 
     Raises:
         ValueError: a wrong rank, size or device, more than one channel, no sample, values that are
-            no floating point or not finite; weights of half precision, which the operators have not
-            (`torch.autocast` is for that).
+            no floating point or, in main memory, not finite; weights of half precision, which the
+            operators have not (`torch.autocast` is for that).
     """
     if weights.dtype not in (torch.float32, torch.float64):
         raise ValueError(
@@ -30,5 +30,5 @@ def admitted(views: Tensor, cameras: Cameras, weights: Tensor) -> Float[Tensor, 
             f"{tuple(views.shape)}"
         )
     check_floating(views, "views")
-    check_finite(views)
+    check_finite(views, on_gpu=False)  # see `consistency.anything`
     return views.to(weights.dtype)

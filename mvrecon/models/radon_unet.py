@@ -19,7 +19,7 @@ from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.pixel_aligned import at_voxels
+from mvrecon.models.pixel_aligned import KnownImages, at_voxels
 from mvrecon.models.sparse_view.filtered import Geometry as Slices
 from mvrecon.models.sparse_view.filtered import filtered, in_full_precision
 from mvrecon.projectors.operator import Projector
@@ -93,6 +93,7 @@ class RadonUNet(nn.Module):
         self.corrected_cameras = rig[list(range(angles // 2))]
         self.radon = Radon(grid, self.corrected_cameras)
         self.cropping = Cropping(projector, Options())
+        self._images = KnownImages(cameras)
         self.start = checked_start(start)
         self.filter: Filter = filter
         self.chord = typical_chord(grid)
@@ -122,7 +123,8 @@ class RadonUNet(nn.Module):
     ) -> Float[Tensor, "b 1 a z s"]:
         """Ideal projections over half a circle, in the unit of the volume times mm."""
         means = (geometry.row * views).transpose(1, 2)
-        lifted = at_voxels(means, self.cropping.cameras, geometry.A.grid).squeeze(2)
+        images = self._images.of(geometry.A.grid, means.device)
+        lifted = at_voxels(means, images).squeeze(2)
         residual = MAGNIFIED * geometry.residual(start, views)
         features = self.net(torch.cat([start, residual, lifted], dim=1))
         added, others = features.tensor_split([1], dim=1)

@@ -50,10 +50,10 @@ def check_floating(tensor: Tensor, what: str) -> None:
 
 
 def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
-    """Check the shape of measured views, and that all values are finite.
+    """Check the shape of measured views, and in main memory that all values are finite.
 
     Raises:
         ValueError: a wrong rank or size, or values that are not finite.
     """
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
-    check_finite(views)
+    check_finite(views, on_gpu=False)

@@ -2,8 +2,9 @@
 projection of its centre.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -57,12 +58,36 @@ def backproject(
     if weight not in ("none", "distance"):
         raise ValueError(f"Unknown weight {weight!r}. Known: none, distance")
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
-    maps = image_maps(cameras, grid).to(views.device)
-    values = wide(views).flatten(0, 1)
+    images = Images(image_maps(cameras, grid).to(views.device), cameras.ray_extent, grid.shape)
+    return looked(views, images, weight == "distance", backend)
+
+
+class Images(NamedTuple):
+    """Where every voxel of a grid is seen in the views of a rig.
+
+    Args:
+        maps: of `image_maps`, on the views' device.
+        ray_extent: the part of a ray that counts, of the rig.
+        shape: of the grid, (z, y, x).
+    """
+
+    maps: Float[Tensor, "m 4 2 3"]
+    ray_extent: Sequence[float]
+    shape: Sequence[int]
+
+
+def looked(
+    views: Float[Tensor, "b c m v u"], images: Images, weighted: bool, backend: str = "auto"
+) -> Float[Tensor, "b c d h w"]:
+    """`backproject` by images that are known, which a GPU does not wait for."""
     chosen, _ = kernels_for(views, backend, "look", differences)
     kernels = voxel_reference if chosen == "reference" else voxel_ops
     volumes = kernels.look(
-        values, maps, list(cameras.ray_extent), weight == "distance", list(grid.shape)
+        wide(views).flatten(0, 1),
+        images.maps,
+        list(images.ray_extent),
+        weighted,
+        list(images.shape),
     )
     return volumes.unflatten(0, views.shape[:2])
 

@@ -112,7 +112,7 @@ def posed(
     """
     within = supported(method, A, options)
     _check(views, "views", A.range_shape, A.device)
-    check_finite(views)
+    check_finite(views, on_gpu=False)
     views, support, start = wide(views), options.get("support"), options.get("start")
     if start is None:
         start = views.new_zeros(*views.shape[:2], *A.domain_shape)

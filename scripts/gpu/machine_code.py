@@ -1,16 +1,16 @@
-"""What the kernels of the CUDA back end are made of: registers, spills, instructions, float64 ones
-among them, and those of the innermost loops. Needs no GPU.
+"""What the kernels of the CUDA back end are made of: registers, local memory, instructions, float64
+ones among them, and those of the innermost loops. Needs no GPU.
 
-    pip install nvidia-cuda-nvrtc nvidia-cuda-nvcc nvidia-cuda-nvdisasm
+    pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm       # extra `dev` has both on Linux
     python scripts/gpu/machine_code.py [--capability 90]
 """
 
 import argparse
 import re
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
@@ -20,27 +20,54 @@ from mvrecon.kernels.rays.trace import METHODS
 
 KERNELS = ("store", "project", "record", "gather", "scatter", "vary")
 STORED = ((torch.float32, 1), (torch.float32, 4), (torch.bfloat16, 4))
-DOUBLE, LOAD = r"\bD(?:FMA|MUL|ADD|SETP)\b|F64", r"\bLDG\b"
+#: Patterns of instructions.
+DOUBLE, LOAD = r"\bD(?:FMA|MUL|ADD|SETP)\b|F64|64H", r"\bLDG\b"
+LOCAL, CALL, ATOMIC = r"\b(?:LDL|STL)\b", r"\bCALL\b", r"\b(?:ATOM|ATOMG|REDG?)\b"
 
 
-def tool(name: str) -> str:
-    """The path of a program out of NVIDIA's wheels."""
-    paths = [path for root in nvrtc.roots() for path in root.rglob(name) if path.is_file()]
+class Kernel(NamedTuple):
+    """The machine code of a kernel.
+
+    Args:
+        registers: of a thread.
+        instructions: all.
+        loops: those of each innermost loop.
+    """
+
+    registers: int
+    instructions: list[str]
+    loops: list[list[str]]
+
+
+def disassembler() -> Path:
+    """NVIDIA's disassembler, out of its wheel.
+
+    Raises:
+        OSError: it is not installed.
+    """
+    paths = [path for root in nvrtc.roots() for path in root.rglob("nvdisasm") if path.is_file()]
     if not paths:
-        sys.exit(f"machine_code.py needs {name}: pip install nvidia-cuda-nvcc nvidia-cuda-nvdisasm")
-    paths[0].chmod(0o755)
-    return str(paths[0])
+        raise OSError("nvdisasm is not installed: pip install nvidia-cuda-nvdisasm")
+    return paths[0]
 
 
-def assembled(variant: Variant, capability: int, folder: Path) -> tuple[str, str]:
-    """The messages of the assembler, and the machine code as text."""
-    ptx, cubin = folder / "rays.ptx", folder / "rays.cubin"
-    text = nvrtc.build(text_of({"": variant}), f"compute_{capability}")
-    ptx.write_bytes(text.rstrip(b"\0"))
-    command = [tool("ptxas"), "-v", "-arch", f"sm_{capability}", str(ptx), "-o", str(cubin)]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
-    shown = subprocess.run([tool("nvdisasm"), "-c", str(cubin)], capture_output=True, check=True)
-    return said, shown.stdout.decode()
+def compiled(variant: Variant, capability: int) -> dict[str, Kernel]:
+    """The kernels of a variant by name.
+
+    Raises:
+        OSError: no NVRTC, or no disassembler.
+    """
+    tool = disassembler()
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "rays.cubin"
+        file.write_bytes(nvrtc.build(text_of({"": variant}), f"sm_{capability}"))
+        shown = subprocess.run([str(tool), str(file)], capture_output=True, check=True).stdout
+    text = shown.decode()
+    counts = re.findall(r"REGCOUNT.*?index@\((\w+)\).*?\.word\s+(0x\w+)", text, re.S)
+    registers = {name: int(number, 16) for name, number in counts}
+    parts = re.split(r"\.section\s+\.text\.(\w+)", text)[1:]
+    bodies = zip(parts[::2], parts[1::2], strict=True)
+    return {name: Kernel(registers[name], *loops(body)) for name, body in bodies}
 
 
 def loops(body: str) -> tuple[list[str], list[list[str]]]:
@@ -65,24 +92,15 @@ def count(pattern: str, instructions: list[str]) -> int:
     return sum(bool(re.search(pattern, one)) for one in instructions)
 
 
-def rows(variant: Variant, capability: int, folder: Path) -> list[str]:
-    """A line of a table for each kernel."""
-    said, shown = assembled(variant, capability, folder)
-    pattern = r"entry function '(\w+)'.*?(\d+) bytes spill stores.*?Used (\d+) registers"
-    used = {name: (registers, spilt) for name, spilt, registers in re.findall(pattern, said, re.S)}
-    parts = re.split(r"\.section\s+\.text\.(\w+)", shown)[1:]
-    lines = []
-    for name, body in zip(parts[::2], parts[1::2], strict=True):
-        if name in KERNELS:
-            every, inner = loops(body)
-            steps = "; ".join(
-                f"{len(loop)} ({count(DOUBLE, loop)} float64, {count(LOAD, loop)} loads)"
-                for loop in inner
-            )
-            registers, spilt = used[name]
-            numbers = f"{registers} | {spilt} | {len(every)} | {count(DOUBLE, every)}"
-            lines.append(f"| {name} | {numbers} | {steps} |")
-    return lines
+def row(name: str, kernel: Kernel) -> str:
+    """A kernel's line of a table."""
+    code = kernel.instructions
+    steps = "; ".join(
+        f"{len(loop)} ({count(DOUBLE, loop)} float64, {count(LOAD, loop)} loads)"
+        for loop in kernel.loops
+    )
+    numbers = f"{kernel.registers} | {count(LOCAL, code)} | {len(code)} | {count(DOUBLE, code)}"
+    return f"| {name} | {numbers} | {steps} |"
 
 
 def main() -> None:
@@ -90,14 +108,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--capability", type=int, default=90)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        for method, number in METHODS.items():
-            for stored, together in STORED:
-                print(f"\n{method}, {stored}, {together} volumes a ray\n")
-                print("| kernel | registers | bytes spilt | instructions | float64 | inner loops |")
-                print("|---|---:|---:|---:|---:|---|")
-                variant = Variant(torch.float32, stored, together, number)
-                print("\n".join(rows(variant, options.capability, Path(folder))), flush=True)
+    for method, number in METHODS.items():
+        for stored, together in STORED:
+            print(f"\n{method}, {stored}, {together} volumes a ray\n")
+            print("| kernel | registers | local memory | instructions | float64 | inner loops |")
+            print("|---|---:|---:|---:|---:|---|")
+            variant = Variant(torch.float32, stored, together, number)
+            kernels = compiled(variant, options.capability)
+            print("\n".join(row(name, kernels[name]) for name in KERNELS), flush=True)
 
 
 if __name__ == "__main__":

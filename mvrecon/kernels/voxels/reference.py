@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.lattice import spread_map
-from mvrecon.geometry.sample import normalised, sample
+from mvrecon.geometry.sample import filled, normalised, sample
 
 
 def look(
@@ -29,7 +29,7 @@ def look(
         shape: voxels (d, h, w).
     """
     total = views.new_zeros(len(views), *shape)
-    centre = maps.new_tensor([(size - 1) / 2 for size in views.shape[:1:-1]])
+    centre = filled([(size - 1) / 2 for size in views.shape[:1:-1]], maps)
     for view, lines in zip(views.unbind(1), maps, strict=True):
         *top, under, fraction = spread_map(lines, (shape[0], shape[1], shape[2])).unbind(dim=-1)
         counts = (under > 0) & (fraction > window[0]) & (fraction < window[1])

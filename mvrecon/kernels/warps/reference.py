@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.lattice import places
-from mvrecon.geometry.sample import normalised, sample
+from mvrecon.geometry.sample import filled, normalised, sample
 
 
 def normalised_places(
@@ -17,7 +17,7 @@ def normalised_places(
     count lie outside.
     """
     place, counts = places(maps, (shape[0], shape[1], shape[2]))
-    centre = place.new_tensor([(size - 1) / 2 for size in source[::-1]])
+    centre = filled([(size - 1) / 2 for size in source[::-1]], place)
     points = normalised(place + centre, (source[0], source[1], source[2]))
     return torch.where(counts[..., None], points, 4.0)
 

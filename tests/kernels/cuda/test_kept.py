@@ -70,3 +70,15 @@ def test_the_same_kernels_are_compiled_once_and_read_afterwards(host, monkeypatc
     kernels_of.cache_clear()
     monkeypatch.setattr(nvrtc, "build", lambda *_: pytest.fail("it is on disk"))
     assert kernels_of(variant, device).keys() == first.keys() and host.modules == 2
+
+
+def test_nvrtc_s_own_headers_are_loaded_before_it(tmp_path, monkeypatch):
+    """NVRTC asks for them by their bare name, and a wheel's folder is not looked through."""
+    folder, opened = tmp_path / "nvidia" / "cu13" / "lib", []
+    folder.mkdir(parents=True)
+    for name in ("libnvrtc.so.13", "libnvrtc-builtins.so.13.0"):
+        (folder / name).touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(nvrtc.ctypes, "CDLL", lambda path: opened.append(path) or path)
+    assert nvrtc.library.__wrapped__() == str(folder / "libnvrtc.so.13")
+    assert opened == [str(folder / "libnvrtc-builtins.so.13.0"), str(folder / "libnvrtc.so.13")]

@@ -64,11 +64,12 @@ def load(machine_code: bytes, names: Sequence[str], device: torch.device) -> dic
         RuntimeError: the driver does not take it, being older than the compiler, say.
     """
     driver, module = library(), c_void_p()
-    _enter(device)
+    before = _enter(device)
     _check(driver.cuModuleLoadData(byref(module), c_char_p(machine_code)))
     functions = {name: c_void_p() for name in names}
     for name, function in functions.items():
         _check(driver.cuModuleGetFunction(byref(function), module, name.encode()))
+    _leave(before)
     return functions
 
 
@@ -86,17 +87,28 @@ def launch(function: c_void_p, scene: Packed, across: int, down: int, device: to
     stream = c_void_p(stream_of(device))
     code = driver.cuLaunchKernel(function, *grid, stream, arguments, None)
     if code in NO_CONTEXT:
-        _enter(device)
+        before = _enter(device)
         code = driver.cuLaunchKernel(function, *grid, stream, arguments, None)
+        _leave(before)
     _check(code)
 
 
-def _enter(device: torch.device) -> None:
-    """Make the device's context, which torch uses, that of the calling thread."""
-    driver, handle, context = library(), c_int(), c_void_p()
+def _enter(device: torch.device) -> c_void_p:
+    """Make the device's context, which torch uses, that of the calling thread; the one before."""
+    driver, handle, context, before = library(), c_int(), c_void_p(), c_void_p()
+    _check(driver.cuCtxGetCurrent(byref(before)))
     _check(driver.cuDeviceGet(byref(handle), device.index or 0))
     _check(driver.cuDevicePrimaryCtxRetain(byref(context), handle))
     _check(driver.cuCtxSetCurrent(context))
+    return before
+
+
+def _leave(before: c_void_p) -> None:
+    """Go back to a context, or torch would take the other device for its current one; a thread that
+    had none stays.
+    """
+    if before.value:
+        _check(library().cuCtxSetCurrent(before))
 
 
 def _check(code: int) -> None:

@@ -28,9 +28,12 @@ def library() -> Any:
     # two may be installed: the one that torch was built for
     paths.sort(key=lambda path: (path.suffix[1:] == wanted, path.suffix), reverse=True)
     problem: OSError | None = None
-    for name in [*map(str, paths), f"libnvrtc.so.{wanted}" if wanted else "libnvrtc.so"]:
+    for path in [*paths, Path(f"libnvrtc.so.{wanted}" if wanted else "libnvrtc.so")]:
         try:
-            return ctypes.CDLL(name)
+            # of a wheel, whose folder is not looked through when NVRTC opens its own headers
+            for headers in path.parent.glob("libnvrtc-builtins.so.*") if path in paths else ():
+                ctypes.CDLL(str(headers))
+            return ctypes.CDLL(str(path))
         except OSError as error:
             problem = problem or error
     raise OSError(f"NVRTC, CUDA's compiler, cannot be loaded: {problem}")

@@ -24,6 +24,8 @@ from mvrecon.kernels.rays.trace import numbered
 SHARE = 1 / 16
 #: Threads of a pose gradient, so that a small view is split over blocks.
 THREADS = 2**18
+#: Bytes of an occupancy's code in front of its box.
+BOX = 3 * torch.int32.itemsize
 #: Detector rows and columns that a block takes.
 TILE = (WARP, BLOCK // WARP)
 
@@ -49,28 +51,30 @@ class Call:
         detector: Sequence[int],
         method: str,
     ):
-        number, samples = numbered(method)
-        self.device = values.device
-        self.real = torch.promote_types(values.dtype, torch.float32)
-        self.together = 1 if len(values) == 1 else TOGETHER
-        variant, self.method = Variant(self.real, values.dtype, self.together, number), number
-        self.kernels = kernels_of(variant, values.device)
-        self.groups, box = -(-len(values) // self.together), occupancy.box
+        # what costs Python a microsecond is asked for once, here and below
+        count, n_views, box = values.shape[0], lines.shape[0], occupancy.box
+        self.device, dtype = values.device, values.dtype
+        self.method, samples = numbered(method)
+        self.real = torch.float64 if dtype == torch.float64 else torch.float32
+        self.together = 1 if count == 1 else TOGETHER
+        self.groups = -(-count // self.together)
+        variant = Variant(self.real, dtype, self.together, self.method)
+        self.kernels = kernels_of(variant, self.device)
         maps = lines.detach().double().contiguous()
-        self.flags = self.new(1 + len(lines), dtype=torch.int32, zero=True)
-        self.tensors = [maps, self.flags]
-        self.scene = Scene().put(
-            lines=maps,
-            flags=self.flags,
+        flags = self.new(1 + n_views, dtype=torch.int32, zero=True)
+        self.tensors = [maps, flags]
+        self.scene = Scene(
+            lines=maps.data_ptr(),
+            flags=flags.data_ptr(),
             window=(float(window[0]), float(window[1])),
             sizes=occupancy.shape[::-1],
             corner=box.low[::-1],
             part=box.shape[::-1],
-            n_views=len(lines),
+            n_views=n_views,
             rows=int(detector[0]),
             columns=int(detector[1]),
             maps=lines.shape[3],
-            n_volumes=len(values),
+            n_volumes=count,
             samples=samples,
         )
 
@@ -96,16 +100,15 @@ class Call:
         scene = self.scene
         ends = zip(scene.corner, scene.part, scene.sizes, strict=True)
         # with a voxel more on either side, and a border of one before and two behind
-        sizes = [min(low + count + 1, n) - max(low - 1, 0) + 3 for low, count, n in ends]
-        runs = max(
-            -(-sizes[0] // RUN) * sizes[1] * sizes[2], sizes[0] * -(-sizes[1] // RUN) * sizes[2]
-        )
-        cells = math.prod(sizes) * self.together * self.groups
-        stores = self.new(2, cells, dtype=volume.dtype)
-        box = None if occupied is None else occupied[3:9]
-        self.tensors += [volume, stores, *([] if box is None else [box])]
-        self.scene.put(volumes=volume, stores=stores, occupied=box)
-        self.start("survey", self.scene.n_views)
+        w, h, d = (min(low + count + 1, n) - max(low - 1, 0) + 3 for low, count, n in ends)
+        runs = max(-(-w // RUN) * h * d, w * -(-h // RUN) * d)
+        stores = self.new(2, w * h * d * self.together * self.groups, dtype=volume.dtype)
+        self.tensors += [volume, stores]
+        scene.volumes, scene.stores = volume.data_ptr(), stores.data_ptr()
+        if occupied is not None:
+            self.tensors.append(occupied)
+            scene.occupied = occupied.data_ptr() + BOX
+        self.start("survey", scene.n_views)
         self.start("store", runs, 2 * self.groups)
 
 
@@ -126,9 +129,9 @@ def project(
     """
     x = stored(volume)
     call = Call(x, lines, window, occupancy, detector, method)
-    views = call.new(len(x), len(lines), *detector)
+    views = call.new(x.shape[0], lines.shape[0], *detector)
     call.read(x, occupied)
-    call.scene.put(views=views)
+    call.scene.views = views.data_ptr()
     call.over_rays("project")
     return views
 
@@ -239,5 +242,5 @@ def occupied_code(volume: Float[Tensor, "n d h w"]) -> Tensor:
 
 def stored(volume: Tensor) -> Tensor:
     """Volumes as the kernels read them: half precision as such."""
-    x = volume.detach()
+    x = volume.detach() if volume.requires_grad else volume
     return (x if x.dtype in NAMES else wide(x)).contiguous()

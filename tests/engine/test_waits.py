@@ -1,0 +1,204 @@
+"""What a training step waits for on a GPU: nothing, counted by a stand-in for one."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mvrecon.engine.callbacks import Clock
+from mvrecon.engine.finite import FiniteLoss
+from mvrecon.engine.module import ReconstructionModule
+from mvrecon.parts import MODELS
+from mvrecon.testing.as_gpu import GPU, AsGpu, OnGpu, on_gpu
+
+DETECTOR = {"pixels": [12, 12], "pixel_mm": 5.0}
+CONE = {"name": "circular", "n_views": 3, "sid": 100.0, "sdd": 200.0, "detector": DETECTOR}
+PARALLEL = {"name": "parallel", "n_views": 4, "detector": {"pixels": [12, 20], "pixel_mm": 2.0}}
+#: Models of filtered back-projection, and how often they filter in a forward pass.
+FILTERING = {"fbp_unet": 1, "sinogram_unet": 1, "dual_domain": 1, "itnet": 5}
+#: Copies to the device in a filtered back-projection: filter, weights of pixels, images of voxels.
+COPIES = 3
+#: What is left to wait for in a step: filtering, angles where views are completed, and SIRT's
+#: weights of a rig that is its own mirror image, once a reconstruction.
+LEFT = {
+    **{name: COPIES * times for name, times in FILTERING.items()},
+    "sinogram_unet": 2 * COPIES + 1,
+    "dual_domain": 2 * COPIES + 1,
+    "sirt": 8,
+    "classical": 8,
+}
+#: Their first step moves an operator, or the images of voxels, to the device.
+MOVING = ("dif_net", "svct", "sinogram_unet", "dual_domain")
+#: Models of which no step can go without waits: views are aligned on the host.
+WAITING_MODELS = ("corrected",)
+LOSS = {"edges": 0.1, "opinions_gain": 1e-3, "cross_view": 0.1, "corrected_views": 1.0}
+#: Kept as long as the tests: modules refer to it weakly.
+TRAINER = SimpleNamespace(log_every_n_steps=10, global_step=1, current_epoch=0)
+
+
+def module_of(name: str, **options) -> tuple[ReconstructionModule, dict]:
+    """A model in training, and a batch for it."""
+    flat = name in FILTERING
+    geometry = {
+        "grid": {"size": [12, 12, 12], "spacing": 2.0},
+        "camera": PARALLEL if flat else CONE,
+        "projector": {"name": "radon" if flat else "drr"},
+    }
+    if name in ("single_pass", "mean_fusion"):
+        options = {"head": {"name": "softmax_depth"}, **options}
+    torch.manual_seed(0)
+    module = ReconstructionModule(geometry, {"name": name, **options}, LOSS, {"name": "adamw"}, 1.0)
+    module.trainer, module.log = TRAINER, lambda *_, **__: None
+    x = torch.zeros(1, 1, 12, 12, 12)
+    x[..., 4:8, 3:8, 5:9] = 1
+    with torch.no_grad():
+        batch = {"views": module.projector(x), "volume": x, "inside": x > 0.5}
+    return module.train(), batch
+
+
+def stepped(module: ReconstructionModule, batch: dict, times: int = 1) -> AsGpu:
+    """The last of some steps of training on the stand-in, as Lightning does them; of a model
+    without weights a forward pass.
+    """
+    with AsGpu() as gpu:
+        gpu.put(module)
+        batch = {name: on_gpu(value) for name, value in batch.items()}
+        weights = [p for p in module.parameters() if p.requires_grad]
+        optimizer = torch.optim.AdamW(weights) if weights else None
+        for _ in range(times):
+            gpu.waits.clear()
+            if optimizer is None:
+                module.model(batch["views"])
+                continue
+            module.training_step(batch, 0).backward()
+            torch.nn.utils.clip_grad_norm_(weights, 1.0)
+            optimizer.step()
+            optimizer.zero_grad()
+    return gpu
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS.names() if name not in WAITING_MODELS])
+def test_a_training_step_waits_for_nothing(name):
+    """What is left is copied to the device; it is known how often."""
+    module, batch = module_of(name)
+    gpu = stepped(module, batch, times=2 if name in MOVING else 1)
+    assert gpu.waits.total() == LEFT.get(name, 0), dict(gpu.waits)
+
+
+def test_a_step_with_uncertainty_waits_for_nothing_and_learns():
+    module, batch = module_of("cross_view", uncertainty=True)
+    before = [p.clone() for p in module.parameters()]
+    gpu = stepped(module, batch)
+    assert not gpu.waits and gpu.launches["project"] > 10 and gpu.launches["backproject"] > 10
+    after = [p.values for p in module.parameters()]
+    assert sum(not torch.equal(a, b) for a, b in zip(before, after, strict=True)) > 10
+
+
+def test_a_hull_waits_and_says_where():
+    """Its places are data; so no graph is made of it (`trainer.graph`)."""
+    module, batch = module_of("cross_view", support="hull")
+    places = {place.partition("/")[0] for place, _ in stepped(module, batch).waits}
+    assert places <= {"visual_hull", "geometry", "cameras"} and "visual_hull" in places
+
+
+def test_the_stand_in_has_the_numbers_and_derivatives_of_main_memory():
+    torch.manual_seed(0)
+    weights, x = torch.randn(4, 3, requires_grad=True), torch.randn(5, 4)
+    loss = (x @ weights).relu().square().sum()
+    loss.backward()
+    with AsGpu() as gpu:
+        moved = torch.nn.Parameter(OnGpu(weights.detach().clone()))
+        again = (on_gpu(x) @ moved).relu().square().sum()
+        again.backward()
+        assert moved.grad is not None and moved.grad.device.type == "cuda"
+        assert torch.equal(moved.grad.values, weights.grad) and not gpu.waits
+        assert again.item() == loss.item() and gpu.waits.total() == 1
+
+
+WAITING = {
+    "item": lambda x: x.sum().item(),
+    "bool": lambda x: bool((x > 0).any()),
+    "tolist": lambda x: x.tolist(),
+    "cpu": lambda x: x.cpu(),
+    "nonzero": lambda x: x.nonzero(),
+    "a mask": lambda x: x[x > 0],
+    "a list of indices": lambda x: x[[0, 1]],
+    "indices of main memory": lambda x: x[torch.tensor([0, 1])],
+    "a tensor of numbers": lambda x: torch.tensor([1.0], device=x.device),
+    "new_tensor": lambda x: x.new_tensor([1.0]),
+    "to the device": lambda x: torch.zeros(3).to(x.device),
+    "copy_": lambda x: x.copy_(torch.zeros(3)),
+}
+
+
+@pytest.mark.parametrize("what", WAITING)
+def test_the_stand_in_sees_what_waits(what):
+    with AsGpu() as gpu:
+        WAITING[what](OnGpu(torch.ones(3)))
+    assert gpu.waits.total() == 1
+
+
+def test_the_stand_in_refuses_tensors_of_two_memories():
+    with AsGpu(), pytest.raises(RuntimeError, match="on cuda:0 and in main memory"):
+        OnGpu(torch.ones(3)) + torch.ones(3)
+    with AsGpu() as gpu:  # a number is no tensor of either
+        assert (OnGpu(torch.ones(3)) + torch.tensor(1.0)).values.sum() == 6
+        assert not gpu.waits
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", ["cross_view", "dif_net", "fbp_unet", "primal_dual"])
+def test_views_that_are_not_finite_make_no_number_on_a_gpu(name):
+    """Views on a GPU that are not finite, for which nobody waits, give a volume of NaN, never a
+    number.
+    """
+    module, batch = module_of(name)
+    batch["views"][0, 0, 1, 4, 5] = float("inf")
+    with torch.no_grad(), AsGpu() as gpu:
+        gpu.put(module)
+        volume = module.model(on_gpu(batch["views"])).volume
+    assert volume.values.isnan().all()
+
+
+@pytest.mark.door
+def test_a_bad_loss_on_a_gpu_is_refused_with_its_step():
+    """A loss on a GPU that is not finite ends the training by the next logged step, and before a
+    checkpoint is written.
+    """
+    good, bad = ({"edges": torch.tensor(1.0), "total": torch.tensor(v)} for v in (2.0, torch.nan))
+    with AsGpu() as gpu:
+        losses = FiniteLoss("a_model")
+        for step, terms in enumerate([good, bad, good]):
+            losses.add(step, {name: on_gpu(x) for name, x in terms.items()}, 4)
+        assert not gpu.waits
+        with pytest.raises(FloatingPointError, match="a_model is not finite at step 1: edges 1, "):
+            losses.look()
+        losses.look()  # the others have been checked
+        for step in range(4):
+            losses.add(step, {name: on_gpu(x) for name, x in good.items()}, 4)
+        assert gpu.waits.total() == 2
+    with pytest.raises(FloatingPointError, match="at step 7"):
+        FiniteLoss("a_model").add(7, bad, 100)  # in main memory at once
+
+
+def test_what_is_logged_beside_the_loss_stays_in_main_memory():
+    """Lightning would copy plain numbers to the device, and wait."""
+    logged = {}
+    module = SimpleNamespace(log_dict=lambda values, batch_size: logged.update(values))
+    Clock().on_train_batch_end(
+        SimpleNamespace(world_size=1), module, None, {"views": torch.zeros(2)}, 0
+    )
+    assert logged and all(value.is_cpu for value in logged.values())
+
+
+def test_the_number_of_a_batch_s_rig_stays_on_the_host(monkeypatch):
+    import lightning.pytorch as L
+
+    monkeypatch.setattr(
+        L.LightningModule,
+        "transfer_batch_to_device",
+        lambda self, batch, device, index: {name: on_gpu(x) for name, x in batch.items()},
+    )
+    module, batch = module_of("geometry_free")
+    moved = module.transfer_batch_to_device({**batch, "rig": torch.tensor([0])}, GPU, 0)
+    assert isinstance(moved["views"], OnGpu) and moved["rig"].is_cpu
