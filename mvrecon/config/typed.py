@@ -9,7 +9,7 @@ from typing import Any
 from mvrecon.files.checks import shown
 from mvrecon.parts import REGISTRIES
 from mvrecon.registry import check_options, hint
-from mvrecon.signatures import Option, describe, parts_in
+from mvrecon.signatures import Option, describe, options_of_grid, parts_in
 
 #: What a value of a plain type may be; a whole number serves as a float.
 PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
@@ -17,7 +17,7 @@ PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
 
 def check_parts(settings: Mapping[str, Any]) -> None:
     """Check every part that the settings name against its source: the name, the options, and the
-    values whose type is plain.
+    values whose type is plain; those of the grid, too.
 
     A name or an option that the modules of `plugins` may bring is left to them.
 
@@ -25,6 +25,10 @@ def check_parts(settings: Mapping[str, Any]) -> None:
         LookupError: an unknown name.
         TypeError: an option that a part does not have, or a value of another type.
     """
+    grid = settings.get("grid")
+    known = options_of_grid() if isinstance(grid, Mapping) else {}
+    for key in known.keys() & dict(grid or {}).keys():
+        _check_type(f"grid.{key}", grid[key], known[key])
     for path, kind, node in parts_in(settings):
         registry, name = REGISTRIES[kind], node["name"]
         if _later(name):
