@@ -105,7 +105,7 @@ grid = mv.Grid.centred(12, spacing=4.0)
 A = PROJECTORS.build(
     "my_blur",
     grid=grid,
-    cameras=mv.circular(3, 200.0, 400.0, {"pixels": [14, 14], "pixel_mm": 8.0}),
+    cameras=mv.circular(3, 200.0, 400.0, {"pixels": [15, 15], "pixel_mm": 8.0}),
 )
 check_head("my_head", Frusta.of(grid, A.cameras, depth=12))
 model = MODELS.build("single_pass", projector=A, head={"name": "my_head"})

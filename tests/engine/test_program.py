@@ -62,7 +62,6 @@ def test_a_program_in_a_file_has_the_volumes_of_its_method(tmp_path: Path):
             mv.save_program(run, tmp_path / path, batch=batch)
 
 
-@pytest.mark.door
 def test_a_method_that_looks_at_its_views_is_not_exported():
     """A method whose steps depend on its views' values is not exported: the error says why."""
     module = method("model=world_unet", "model.support=hull")
