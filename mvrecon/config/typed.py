@@ -25,10 +25,9 @@ def check_parts(settings: Mapping[str, Any]) -> None:
         LookupError: an unknown name.
         TypeError: an option that a part does not have, or a value of another type.
     """
-    grid = settings.get("grid")
-    known = options_of_grid() if isinstance(grid, Mapping) else {}
-    for key in known.keys() & dict(grid or {}).keys():
-        _check_type(f"grid.{key}", grid[key], known[key])
+    if isinstance(grid := settings.get("grid"), Mapping):
+        for key, option in options_of_grid().items():
+            _check_type(f"grid.{key}", grid.get(key, "???"), option)
     for path, kind, node in parts_in(settings):
         registry, name = REGISTRIES[kind], node["name"]
         if _later(name):
