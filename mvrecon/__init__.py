@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mvrecon.cameras.rigs import parallel as parallel
     from mvrecon.data.volume_files import read_volume as read_volume
     from mvrecon.data.volume_files import save_volume as save_volume
+    from mvrecon.engine.program import save_program as save_program
     from mvrecon.engine.trained import load as load
     from mvrecon.engine.trained import save_weights as save_weights
     from mvrecon.geometry.grid import Grid as Grid
@@ -82,6 +83,7 @@ _DOOR = {
     "random_rig": "mvrecon.cameras.random_rigs:random_rig",
     "read_volume": "mvrecon.data.volume_files:read_volume",
     "reconstructed": "mvrecon.reconstruct.by_name:reconstructed",
+    "save_program": "mvrecon.engine.program:save_program",
     "save_volume": "mvrecon.data.volume_files:save_volume",
     "save_weights": "mvrecon.engine.trained:save_weights",
     "sirt": "mvrecon.reconstruct.iterative:sirt",

@@ -1,7 +1,6 @@
 """`mvrecon-compare`: finished runs, or the runs of a sweep, in one table."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from rich.console import Console
 
 from mvrecon.comparison import pareto, tables
 from mvrecon.comparison.rows import FIGURES, Row, read
+from mvrecon.config.errors import one_line
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.runs import RESULTS
 from mvrecon.registry import hint
@@ -86,11 +86,8 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `mvrecon-compare`."""
     options = parser().parse_args(arguments)
-    try:
-        table = compare(options.runs, options.reference, options.figure, options.out)
-    except (OSError, LookupError, ValueError) as error:
-        sys.exit(f"mvrecon-compare: {error}")
-    show(table)
+    with one_line("mvrecon-compare"):
+        show(compare(options.runs, options.reference, options.figure, options.out))
 
 
 def _reference(rows: Sequence[Row], label: str | None) -> Row:

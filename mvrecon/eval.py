@@ -10,7 +10,8 @@ from omegaconf import DictConfig
 
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
-from mvrecon.files.runs import EVALUATION
+from mvrecon.files.places import of_weights
+from mvrecon.files.runs import EVALUATION, folder_of_run
 
 
 def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -34,7 +35,7 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.engine import checkpoints, evaluation, export, fit, run_folder
 
     device = evaluation.device_of(options["device"])
-    run = checkpoints.run_folder(options["checkpoint"])
+    run = folder_of_run(options["checkpoint"])
     described = (label for label, model in options["compare"].items() if model)
     if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
         raise ValueError(
@@ -97,11 +98,13 @@ def over(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 def task(config: DictConfig) -> None:
     """One run of the app; returns nothing that a sweeper could choose by: these are test scenes."""
+    settings = to_plain(config)
+    folder_of_run(of_weights(settings["checkpoint"]))  # before torch is imported, which takes long
     from mvrecon.engine.report import show
     from mvrecon.engine.run_folder import anchored
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    table = evaluate(anchored(to_plain(config)), folder)
+    table = evaluate(anchored(settings), folder)
     show(table, folder)
 
 

@@ -83,6 +83,13 @@ def definition(module: str, name: str) -> tuple[str, Definition]:
     raise ImportError(f"{module} defines no class or function {name!r}")
 
 
+def options_of_grid() -> Mapping[str, Option]:
+    """The options of the setting `grid`, those of `Grid.centred`."""
+    module, node = definition("mvrecon.geometry.grid", "Grid")
+    made = next(m for m in node.body if isinstance(m, ast.FunctionDef) and m.name == "centred")
+    return _arguments(made, _texts(ast.get_docstring(made) or ""))[0]
+
+
 def parts_in(
     settings: Mapping[str, Any], path: str = ""
 ) -> Iterator[tuple[str, str, Mapping[str, Any]]]:

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
 from mvrecon.files.rank import rank
-from mvrecon.files.runs import RESULTS, read_results
+from mvrecon.files.runs import RESULTS, folder_of_run, read_results
 
 
 def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
@@ -68,13 +68,13 @@ def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
         ValueError: other options were given, which a resumed run could not honour.
         FileNotFoundError: no run folder is there.
     """
-    from mvrecon.engine import checkpoints, run_folder
+    from mvrecon.engine import run_folder
 
     if others:
         raise ValueError(
             f"resume goes on with the run's own settings; but got also {' '.join(others)}"
         )
-    run = checkpoints.run_folder(folder)
+    run = folder_of_run(folder)
     return run_folder.read_settings(run), run
 
 

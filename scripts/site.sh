@@ -6,6 +6,6 @@ bash scripts/setup.sh docs
 
 bin=.venv/bin
 if [ -d .venv/Scripts ]; then bin=.venv/Scripts; fi
-"$bin/python" scripts/site_pages.py build/pages
+"$bin/python" -m scripts.site_pages build/pages
 "$bin/zensical" build --clean --strict
 echo "Open build/site/index.html in a browser, or: $bin/python -m http.server --directory build/site"

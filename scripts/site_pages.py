@@ -1,8 +1,9 @@
-"""Lays out the pages of the documentation's site: python scripts/site_pages.py OUT_FOLDER
+"""Lays out the pages of the documentation's site: python -m scripts.site_pages OUT_FOLDER
 
 The site is made of the same files that a reader of the repository sees, in the same folders, so
 that their links are right in both. What is added: a link to a folder becomes one to its README.md,
 the files that pages link to are copied beside them, and api.md is written from the front door.
+A tutorial's script becomes a page with what it prints and draws, and a notebook.
 """
 
 import re
@@ -11,8 +12,10 @@ import sys
 from pathlib import Path
 
 import mvrecon
+from scripts import tutorials
 
 ROOT = Path(__file__).parents[1]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 #: A Markdown link with its target, without its anchor.
 LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)(?=[)#])")
 
@@ -22,13 +25,18 @@ def pages(config: str) -> list[str]:
     return [page for page in re.findall(r"[\w./-]+\.md$", config, re.M) if page != "api.md"]
 
 
-def lay_out(page: str, out: Path) -> None:
+def lay_out(page: str, out: Path, run: bool = True) -> None:
     """Copy a page and the files that it links to into the folder `out`, at the same paths."""
 
     def target(link: re.Match[str]) -> str:
-        path = (ROOT / page).parent / link[1]
+        path = ((ROOT / page).parent / link[1]).resolve()
+        if path in TUTORIALS:
+            return f"{link[1].removesuffix('.py')}.md"
         return f"{link[1].rstrip('/')}/README.md" if path.is_dir() else link[1]
 
+    script = (ROOT / page).with_suffix(".py")
+    if script in TUTORIALS:
+        return _tutorial(script, (out / page).parent, run)
     text = LINK.sub(target, (ROOT / page).read_text(encoding="utf-8"))
     files = {((ROOT / page).parent / link).resolve() for link in LINK.findall(text)}
     for file in sorted(f for f in files if f.suffix != ".md" and f.is_relative_to(ROOT)):
@@ -39,6 +47,14 @@ def lay_out(page: str, out: Path) -> None:
     (out / page).write_text(text, encoding="utf-8")
 
 
+def _tutorial(script: Path, folder: Path, run: bool) -> None:
+    """A tutorial's page and notebook; without `run` nothing of it is executed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{script.stem}.ipynb").write_text(tutorials.notebook(script), encoding="utf-8")
+    text = f"{tutorials.page(script, folder, run)}\n[As a notebook]({script.stem}.ipynb)\n"
+    (folder / f"{script.stem}.md").write_text(text, encoding="utf-8")
+
+
 def api(names: dict[str, str]) -> str:
     """The page of the front door: each name with the docstring of what it stands for."""
     lines = ["# Functions and classes", "", "What `mv` has after `import mvrecon as mv`, by name."]
@@ -47,11 +63,13 @@ def api(names: dict[str, str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(out: Path) -> None:
-    """Write all pages of mkdocs.yml into the folder `out`, which is emptied first."""
+def main(out: Path, run: bool = True) -> None:
+    """Write all pages of mkdocs.yml into the folder `out`, which is emptied first; with `run`, the
+    tutorials with what they print and draw.
+    """
     shutil.rmtree(out, ignore_errors=True)
     for page in pages((ROOT / "mkdocs.yml").read_text(encoding="utf-8")):
-        lay_out(page, out)
+        lay_out(page, out, run)
     (out / "api.md").write_text(api(mvrecon._DOOR), encoding="utf-8")
 
 

@@ -2,13 +2,14 @@
 
 import ast
 import re
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
-from mvrecon import warmup
+from mvrecon import compare, warmup
 from mvrecon.config import conf_dir, launch
 from mvrecon.config.plugins import check_plugins, import_plugins, names
 from mvrecon.config.typed import check_parts, fits
@@ -18,6 +19,7 @@ MISTAKES = {
     "camera.view=4": r"There is no setting 'camera.view'; did you mean 'n_views'\?",
     "model=crossview": r"model has no choice 'crossview'; did you mean 'cross_view'\?",
     "camera.n_views=abc": r"camera.n_views: expected int, got 'abc' \(number of cameras",
+    "grid.spacing=x": r"grid.spacing: expected float \| Sequence\[float\], got 'x' \(.*mm",
     "projector.name=dr": r"projector.name: no projector is 'dr'; did you mean 'drr'\?",
     "+projector.metod=joseph": r"'metod'; did you mean 'method'\?",
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
@@ -146,3 +148,22 @@ def test_the_app_without_options_refuses_one_before_it_compiles(monkeypatch, cap
     with pytest.raises(SystemExit):
         warmup.main(["--all"])
     assert "unrecognized arguments: --all" in capsys.readouterr().err
+
+
+def test_a_run_that_is_not_there_is_an_error_in_one_line(tmp_path: Path, monkeypatch, capsys):
+    """Of mvrecon-compare, and of mvrecon-eval before torch is imported."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    with pytest.raises(SystemExit) as stop:
+        compare.main([str(tmp_path / "nowhere")])
+    text = capsys.readouterr().err
+    assert stop.value.code == 1 and text.count("\n") == 1
+    assert text.startswith("mvrecon-compare: FileNotFoundError: ")
+    call = (
+        "import atexit, sys, mvrecon.eval as app; sys.argv = ['eval', 'checkpoint=nowhere'];"
+        "atexit.register(lambda: print('torch' in sys.modules)); app.main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", call], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1 and done.stdout == "False\n"
+    assert re.fullmatch(r"mvrecon-eval: FileNotFoundError: No checkpoint .*nowhere\n", done.stderr)

@@ -1,11 +1,13 @@
 """Checks of measured views."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 
 def check_finite(views: Float[Tensor, "b c m v u"], on_gpu: bool = True) -> None:
-    """Refuse measured views with NaN or infinite values.
+    """Refuse measured views with NaN or infinite values; an exported program (`torch.export`),
+    which cannot raise by values, goes without the check.
 
     Args:
         views: measured.
@@ -15,7 +17,7 @@ def check_finite(views: Float[Tensor, "b c m v u"], on_gpu: bool = True) -> None
     Raises:
         ValueError: values that are not finite.
     """
-    if not on_gpu and not views.is_cpu:
+    if torch.compiler.is_exporting() or not (on_gpu or views.is_cpu):
         return
     if not views.isfinite().all():
         bad = int((~views.isfinite()).sum())

@@ -47,6 +47,7 @@ class Settings(Measurement):
     callbacks: Any = None
     logger: Any = None
     device: str = "auto"
+    init_from: str | None = None
     resume: str | None = None
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from mvrecon.files.checks import shown
 from mvrecon.parts import REGISTRIES
 from mvrecon.registry import check_options, hint
-from mvrecon.signatures import Option, describe, parts_in
+from mvrecon.signatures import Option, describe, options_of_grid, parts_in
 
 #: What a value of a plain type may be; a whole number serves as a float.
 PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
@@ -17,7 +17,7 @@ PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
 
 def check_parts(settings: Mapping[str, Any]) -> None:
     """Check every part that the settings name against its source: the name, the options, and the
-    values whose type is plain.
+    values whose type is plain; those of the grid, too.
 
     A name or an option that the modules of `plugins` may bring is left to them.
 
@@ -25,6 +25,9 @@ def check_parts(settings: Mapping[str, Any]) -> None:
         LookupError: an unknown name.
         TypeError: an option that a part does not have, or a value of another type.
     """
+    if isinstance(grid := settings.get("grid"), Mapping):
+        for key, option in options_of_grid().items():
+            _check_type(f"grid.{key}", grid.get(key, "???"), option)
     for path, kind, node in parts_in(settings):
         registry, name = REGISTRIES[kind], node["name"]
         if _later(name):
@@ -33,16 +36,20 @@ def check_parts(settings: Mapping[str, Any]) -> None:
             if settings.get("plugins"):
                 continue
             raise LookupError(f"{path}.name: no {kind} is {name!r}{hint(name, registry.names())}")
-        part = describe(kind, name)
-        if part.error:
-            continue  # whoever builds it says what is wrong
         options = {key: value for key, value in node.items() if key != "name"}
         if path == "model" or path.rpartition(".")[0] == "compare":
             _check_assumed(path, options.pop("assume", None), settings.get("projector"))
-        if not part.catch_all:
-            check_options(f"{path} (the {kind} {name!r})", options, part.options)
-        for key, value in options.items():
-            _check_type(f"{path}.{key}", value, part.options.get(key, Option()))
+        _check_options(path, kind, name, options)
+
+
+def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) -> None:
+    part = describe(kind, name)
+    if part.error:
+        return  # whoever builds it says what is wrong
+    if not part.catch_all:
+        check_options(f"{path} (the {kind} {name!r})", options, part.options)
+    for key, value in options.items():
+        _check_type(f"{path}.{key}", value, part.options.get(key, Option()))
 
 
 def _check_assumed(path: str, assumed: Any, projector: Mapping[str, Any] | None) -> None:

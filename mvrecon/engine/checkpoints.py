@@ -1,6 +1,5 @@
 """Paths of the checkpoints in a run folder, and loading a trained method from one."""
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,9 +13,7 @@ from mvrecon.engine.checkpoint_check import check_archive, check_known, check_se
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.storage import read
 from mvrecon.engine.trained_reconstructor import model_on
-from mvrecon.files.atomic import check_plain
 from mvrecon.files.checks import blaming, plain_name
-from mvrecon.files.runs import SETTINGS
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 
@@ -81,25 +78,6 @@ def finished(folder: Path, method: str) -> Path:
 def unfinished(folder: Path, method: str) -> Path:
     """The last checkpoint of a method in training."""
     return folder / "checkpoints" / plain_name(method, "a method") / "last.ckpt"
-
-
-def run_folder(path: str | Path) -> Path:
-    """The run folder that a path names: itself, its `checkpoints` folder, or a checkpoint in it.
-
-    Raises:
-        FileNotFoundError: the path is not there, or no run folder is around it.
-        PermissionError: anything but files and folders is in the run folder.
-    """
-    path = Path(os.path.abspath(Path(path).expanduser()))  # links in it are not followed yet
-    if not path.exists():
-        raise FileNotFoundError(f"No checkpoint or run folder is at {path}")
-    for folder in (path, *path.parents[:3]):
-        if (folder / SETTINGS).is_file():
-            check_plain(folder)
-            return folder.resolve()
-    raise FileNotFoundError(
-        f"Expected a checkpoint in a run folder (one with {SETTINGS}), got {path}"
-    )
 
 
 def load(path: Path) -> Trained:

@@ -14,41 +14,20 @@ from mvrecon.data.module import SceneData
 from mvrecon.engine.callbacks import Clock, Confined
 from mvrecon.engine.checkpoints import finished, unfinished
 from mvrecon.engine.graph import check_graph
+from mvrecon.engine.labels import methods
 from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
+from mvrecon.engine.on_case import OwnAttenuation
 from mvrecon.engine.processes import Environment
 from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
+from mvrecon.engine.trained import begin_from
 from mvrecon.engine.training_memory import check_training
-from mvrecon.files.checks import plain_name
 from mvrecon.files.rank import rank, world
 from mvrecon.kernels.threads import in_one_order
 
 #: The logger whose files are read by TensorBoard.
 BOARD = f"{Board.__module__}.{Board.__qualname__}"
-
-
-def methods(settings: Settings) -> dict[str, Settings]:
-    """The models of a run's result table by label: the main one first, then those of `compare` that
-    are not null.
-
-    Raises:
-        ValueError: the main model's label is taken twice, or a label is no plain name: files are
-            called by it. "truth" is refused: its file is the truth's own.
-    """
-    main = settings["model"]
-    others = {label: model for label, model in settings["compare"].items() if model}
-    if main["name"] in others:
-        raise ValueError(
-            f"compare holds {main['name']!r}, which is the main model's own label; give it another"
-        )
-    labelled = {main["name"]: main, **others}
-    # whatever the case: some file systems do not tell it
-    if taken := [label for label in labelled if str(label).casefold() == "truth"]:
-        raise ValueError(
-            f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another label"
-        )
-    return {plain_name(label, "a method"): model for label, model in labelled.items()}
 
 
 def build_data(settings: Settings) -> SceneData:
@@ -106,11 +85,13 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
 
     Goes on from the method's last checkpoint where there is one, and on the CPU ends with the same
     bits as a run that never broke off on as many threads; with `trainer.deterministic`, on any
-    number. Every method starts from the same seed and sees the same scenes in the same order.
+    number. Every method starts from the same seed and sees the same scenes in the same order; the
+    main one with the weights of `init_from`, a run or a file, where that is given.
 
     Raises:
         FloatingPointError: a loss that is not finite.
-        ValueError: a step that does not fit into memory, or of which no CUDA graph can be made.
+        ValueError: a step that does not fit into memory, or of which no CUDA graph can be made;
+            weights of `init_from` that are not this method's.
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
         SystemExit: SIGTERM came; the checkpoint of that step is written.
     """
@@ -123,17 +104,22 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     if not trainable(module):
         return
     if settings["trainer"].get("graph"):
-        check_graph(settings["trainer"], models[method], settings["data"])
+        own = isinstance(module.projector, OwnAttenuation)
+        check_graph(settings["trainer"], models[method], settings["data"], own)
         module.as_graph()
     accelerator = settings["trainer"].get("accelerator", "auto")
     needed = check_training(module, data.loading.batch_size, accelerator)
     if needed is not None:
         _tell(f"{method}: a step keeps about {needed / 2**30:.2f} GiB")
+    begun = last.exists() or previous(last).exists()
+    weights = settings.get("init_from")
+    if weights and not begun and method == next(iter(models)):
+        begin_from(weights, module)
+        _tell(f"{method}: beginning with the weights of {weights}")
     L.seed_everything(
         settings["seed"], workers=True, verbose=False
     )  # initial weights have used up random numbers
     trainer = build_trainer(settings, folder, method)
-    begun = last.exists() or previous(last).exists()
     step = read_newest(last)["global_step"] if begun else 0
     if begun:
         _tell(f"{method}: going on from step {step}")

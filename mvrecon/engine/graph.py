@@ -30,7 +30,10 @@ Capture = Callable[[Callable[[], Pass]], tuple[Callable[[], None], Pass]]
 
 
 def check_graph(
-    trainer: Mapping[str, Any], model: Mapping[str, Any], data: Mapping[str, Any]
+    trainer: Mapping[str, Any],
+    model: Mapping[str, Any],
+    data: Mapping[str, Any],
+    own_operators: bool = False,
 ) -> None:
     """Refuse a training of which no CUDA graph can be made.
 
@@ -38,10 +41,11 @@ def check_graph(
         trainer: settings of the trainer.
         model: name and options of the model.
         data: settings of the data.
+        own_operators: whether each case has an operator of its own.
 
     Raises:
-        ValueError: no GPU, several of them, scaled losses, several rigs, or a model whose sizes
-            depend on its views.
+        ValueError: no GPU, several of them, scaled losses, several rigs, cases with
+            operators of their own, or a model whose sizes depend on its views.
     """
     support, precision = model.get("support") or "none", str(trainer.get("precision", "32-true"))
     gpu = trainer.get("accelerator", "auto") != "cpu" and torch.cuda.is_available()
@@ -50,6 +54,7 @@ def check_graph(
         f"one device, got trainer.devices={trainer.get('devices')}": trainer.get("devices", 1) != 1,
         f"gradients that are not scaled, got trainer.precision={precision}": precision[:2] == "16",
         f"one rig, got data.rigs={data.get('rigs')}": bool(data.get("rigs")),
+        "one operator for all cases, got a projector.mu of each case": own_operators,
         "sizes that do not depend on views, got model.crop=true": bool(model.get("crop")),
         f"sizes that do not depend on views, got model.support={support}": support != "none",
         "a model that does not align views on the host, got corrected": model["name"]

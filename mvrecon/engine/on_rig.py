@@ -1,5 +1,6 @@
 """One model on several rigs: the same weights, another geometry."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -67,11 +68,7 @@ def with_weights_of(model: nn.Module, options: dict[str, Any], A: Projector) -> 
     with torch.random.fork_rng(devices=[]):  # initial weights that nobody uses
         other = MODELS.from_config(options, projector=A)
     weights, own = model.state_dict(keep_vars=True), other.state_dict()
-    if differing := [
-        name
-        for name in {**weights, **own}
-        if name not in own or name not in weights or own[name].shape != weights[name].shape
-    ]:
+    if differing := differences(weights, own):
         raise ValueError(
             f"Expected weights that fit any rig, got {len(differing)} of {options['name']!r} that "
             f"do not fit {len(A.cameras)} cameras of {tuple(A.cameras.shape)} pixels and "
@@ -82,3 +79,12 @@ def with_weights_of(model: nn.Module, options: dict[str, Any], A: Projector) -> 
         owner, _, last = name.rpartition(".")
         setattr(other.get_submodule(owner), last, tensor)
     return other
+
+
+def differences(weights: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> list[str]:
+    """Names of the weights that only one of two models has, or whose shapes differ."""
+    return [
+        name
+        for name in {**weights, **own}
+        if name not in own or name not in weights or own[name].shape != weights[name].shape
+    ]

@@ -26,7 +26,7 @@ from mvrecon.files.runs import RESULTS, SETTINGS, VERSIONS
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 #: Settings whose text is a file or a folder.
-PLACES = ("path", "dark", "flat", "like", "out", "checkpoint")
+PLACES = ("path", "dark", "flat", "like", "out", "checkpoint", "init_from")
 DIGESTS, RIG = "digests.json", "rig.json"
 #: Results of a run; a folder that has one of them but no file of settings is refused.
 WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
@@ -205,7 +205,8 @@ def _absolute(key: str, path: Any) -> Any:
         return anchored(path)
     if not isinstance(path, str):
         return path
-    return str(of_weights(path) if key == "checkpoint" else Path(path).expanduser().absolute())
+    trained = key in ("checkpoint", "init_from")
+    return str(of_weights(path) if trained else Path(path).expanduser().absolute())
 
 
 def _finite(value: Any) -> Any:

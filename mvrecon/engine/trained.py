@@ -5,10 +5,13 @@ from pathlib import Path
 from mvrecon.config.plugins import import_plugins
 from mvrecon.engine import checkpoints, weights_file
 from mvrecon.engine.checkpoints import Trained
-from mvrecon.engine.fit import methods
+from mvrecon.engine.labels import methods
+from mvrecon.engine.module import ReconstructionModule
+from mvrecon.engine.on_rig import differences
 from mvrecon.engine.run_folder import read_settings
 from mvrecon.engine.weights_file import ENDING
 from mvrecon.files.places import of_weights, shipped_weights
+from mvrecon.files.runs import folder_of_run
 from mvrecon.registry import hint
 
 
@@ -36,7 +39,7 @@ def load(path: str | Path, method: str | None = None) -> Trained:
         raise FileNotFoundError(
             f"No checkpoint or run folder is at {path}{hint(path.name, shipped_weights())}"
         )
-    folder = checkpoints.run_folder(path)
+    folder = folder_of_run(path)
     settings = read_settings(folder)
     labels = list(methods(settings))
     if method is not None and method not in labels:
@@ -58,3 +61,25 @@ def save_weights(run: str | Path, path: str | Path, method: str | None = None) -
         ValueError: another ending; what `load` raises.
     """
     return weights_file.write(path, load(run, method))
+
+
+def begin_from(path: str | Path, module: ReconstructionModule) -> None:
+    """Give a method the weights of a trained one, to go on learning on other data, another rig or
+    grid; the optimiser and the schedule begin anew.
+
+    Args:
+        path: as that of `load`: a run (its main method), a checkpoint or a file of weights.
+        module: the method, of the same model.
+
+    Raises:
+        ValueError: weights of another model, or which belong to another rig or grid; what `load`
+            raises.
+    """
+    weights, own = load(path).module.model.state_dict(), module.model.state_dict()
+    if differing := differences(weights, own):
+        raise ValueError(
+            f"init_from={path}: expected weights of the same model, of whatever rig and grid; got "
+            f"{len(differing)} that are not those of {module.hparams['model']['name']!r}, "
+            f"{differing[0]} among them"
+        )
+    module.model.load_state_dict(weights)

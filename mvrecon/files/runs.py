@@ -1,13 +1,34 @@
 """Files of a run folder by name; its settings one by one, and its table of results."""
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from mvrecon.files.atomic import check_plain
 from mvrecon.files.checks import Refused, blaming, shown, text_of
 
 SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
+
+
+def folder_of_run(path: str | Path) -> Path:
+    """The run folder that a path names: itself, its `checkpoints` folder, or a checkpoint in it.
+
+    Raises:
+        FileNotFoundError: the path is not there, or no run folder is around it.
+        PermissionError: anything but files and folders is in the run folder.
+    """
+    path = Path(os.path.abspath(Path(path).expanduser()))  # links in it are not followed yet
+    if not path.exists():
+        raise FileNotFoundError(f"No checkpoint or run folder is at {path}")
+    for folder in (path, *path.parents[:3]):
+        if (folder / SETTINGS).is_file():
+            check_plain(folder)
+            return folder.resolve()
+    raise FileNotFoundError(
+        f"Expected a checkpoint in a run folder (one with {SETTINGS}), got {path}"
+    )
 
 
 def read_results(folder: Path) -> dict[str, Any]:

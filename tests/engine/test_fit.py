@@ -8,6 +8,7 @@ import torch
 from mvrecon.config import compose
 from mvrecon.engine import checkpoints, fit
 from mvrecon.engine.module import ReconstructionModule
+from mvrecon.files.runs import folder_of_run
 
 PLAIN = (dict, list, tuple, str, int, float, bool, type(None), torch.Tensor)
 
@@ -160,10 +161,8 @@ def test_a_run_folder_is_found_from_anything_in_it(tmp_path):
     (tmp_path / "run" / "config.yaml").write_text("name: run\n")
     file = tmp_path / "run" / "checkpoints" / "a.ckpt"
     file.touch()
-    assert {checkpoints.run_folder(p) for p in (file, file.parent, tmp_path / "run")} == {
-        tmp_path / "run"
-    }
+    assert {folder_of_run(p) for p in (file, file.parent, tmp_path / "run")} == {tmp_path / "run"}
     with pytest.raises(FileNotFoundError, match="No checkpoint or run folder is at .*nowhere"):
-        checkpoints.run_folder(tmp_path / "nowhere")
+        folder_of_run(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match="with config.yaml"):
-        checkpoints.run_folder(tmp_path)
+        folder_of_run(tmp_path)

@@ -94,6 +94,8 @@ def test_what_no_graph_can_hold_is_refused(what, monkeypatch):
     trainer, model, data, words = REFUSED[what]
     with pytest.raises(ValueError, match=f"trainer.graph=true needs .*{words}; trainer.graph=f"):
         check_graph({**TRAINER, **trainer}, {**MODEL, **model}, {**DATA, **data})
+    with pytest.raises(ValueError, match="one operator for all cases"):
+        check_graph(TRAINER, MODEL, DATA, own_operators=True)
 
 
 def test_a_run_on_a_cpu_says_that_it_has_no_graph(tmp_path):

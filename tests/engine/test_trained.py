@@ -7,6 +7,7 @@ import torch
 import yaml
 
 import mvrecon as mv
+from mvrecon.config import compose
 from mvrecon.engine import checkpoints, fit
 from tests.engine.runs import trained_for_a_step
 
@@ -14,7 +15,8 @@ from tests.engine.runs import trained_for_a_step
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A run of one step; its other method, SIRT, learns nothing and has no checkpoint."""
-    return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view")
+    place = tmp_path_factory.mktemp("run")
+    return trained_for_a_step(place, "cross_view", options=["callbacks=best", "~callbacks.board"])
 
 
 def test_a_run_folder_and_its_checkpoint_are_one_method(run: Path):
@@ -63,3 +65,35 @@ def test_a_run_of_an_older_version_keeps_its_grid(run: Path, tmp_path: Path):
     settings["grid"] = {"shape": [4, 6, 8], "spacing": spacing}
     with pytest.raises(ValueError, match=r"expected size=\(8, 6, 4\)"):
         fit.build_data(settings)
+
+
+def test_a_method_begins_with_the_weights_of_another_on_any_rig(run: Path, tmp_path, monkeypatch):
+    """`init_from`, once; a run that goes on has weights of its own. Another model's are refused."""
+    options = ("experiment=smoke", "camera.n_views=5", f"init_from={run}", "seed=7")
+    settings, weights = compose(*options), mv.load(run).module.model.state_dict()
+    begun: list[dict[str, torch.Tensor]] = []
+
+    class Trainer:
+        loggers, is_global_zero = (), False
+        save_checkpoint = staticmethod(lambda path: None)
+
+        def fit(self, module, **_):
+            begun.append(module.model.state_dict())
+
+    monkeypatch.setattr(fit, "build_trainer", lambda *_: Trainer())
+    fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
+    assert all(torch.equal(begun[0][name], value) for name, value in weights.items())
+    other = compose(*options, "model=backprojection_unet")
+    with pytest.raises(ValueError, match="weights of the same model.*'backprojection_unet'"):
+        fit.fit("backprojection_unet", other, fit.build_data(other), tmp_path)
+
+
+def test_the_checkpoint_of_the_best_validation_is_kept(run: Path):
+    """By `val/psnr`; of one validation it is the last step's."""
+    best, last = mv.load(run / "best" / "best.ckpt"), mv.load(run)
+    assert best.steps == last.steps == 1
+    weights = last.module.state_dict()
+    assert all(torch.equal(weights[k], v) for k, v in best.module.state_dict().items())
+    state = torch.load(run / "best" / "best.ckpt")["callbacks"]
+    (kept,) = (value for key, value in state.items() if key.startswith("ModelCheckpoint"))
+    assert kept["monitor"] == "val/psnr" and kept["best_model_score"] > 0

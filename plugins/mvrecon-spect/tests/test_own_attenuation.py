@@ -58,7 +58,6 @@ def batch_of(name: str) -> dict:
 def test_an_experiment_takes_a_step_and_judges_every_method(name: str):
     data, settings = data_of(name), settings_of(name)
     module, batch = module_of(name, "cross_view"), next(iter(data.train_dataloader()))
-    own = module.on(batch)
     module.terms(batch)["total"].backward()
     slopes = [p.grad for p in module.parameters() if p.grad is not None]
     assert any(slope.any() for slope in slopes) and all(s.isfinite().all() for s in slopes)

@@ -24,6 +24,7 @@ BEAMS: tuple[tuple[bool, Extent], ...] = ((False, "segment"), (True, "segment"),
 CLAIMS = {
     "matched": "its adjoint is not the transpose of its forward",
     "local": "a number that is none is seen beyond the rays that meet it",
+    "pixelwise": "a pixel's value depends on its neighbours', too, as where a detector blurs",
     "bits": "its rays are rounded, so that sums which are exact in floating point are not to the "
     "last bit",
 }

@@ -8,6 +8,7 @@ import torch
 from mvrecon.cameras.rigs import circular
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.drr import Drr
+from mvrecon.projectors.operator import Wrapped
 from mvrecon_bench.stresses import plan
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import subject_of
@@ -108,3 +109,44 @@ def test_a_plugin_is_left_out_of_what_it_refuses_or_says_it_is_not_and_mvrecon_i
     assert judged("fussy", "sums, multiples and nothing")["verdict"] == "pass"
     monkeypatch.setattr(Fussy, "__module__", "mvrecon.fussy")
     assert judged("fussy", case)["verdict"] == FAIL
+
+
+class Blurring(Wrapped):
+    """Line integrals that a detector blurs along its rows, a quarter of each pixel to either
+    side, with its adjoint.
+    """
+
+    pixelwise = False
+
+    def __init__(self, grid, cameras):
+        super().__init__(Drr(grid, cameras))
+
+    def forward(self, x):
+        return self._blurred(self.A(x))
+
+    def adjoint(self, y):
+        return self.A.T(self._blurred(y.float() if y.dtype.itemsize < 4 else y))
+
+    @staticmethod
+    def _blurred(y):
+        left, right = torch.zeros_like(y), torch.zeros_like(y)
+        left[..., 1:], right[..., :-1] = y[..., :-1], y[..., 1:]
+        return 0.25 * left + 0.5 * y + 0.25 * right
+
+
+class Unsaid(Blurring):
+    """The same, without a word of it."""
+
+    pixelwise = True
+
+
+def test_a_projector_that_blurs_keeps_the_plan_if_it_says_so(monkeypatch):
+    """Without the word it fails where a detector is taken apart, and at a letter's edges."""
+    monkeypatch.setitem(PROJECTORS._parts, "blurring", Blurring)
+    monkeypatch.setitem(PROJECTORS._parts, "unsaid", Unsaid)
+    apart = {"a large detector", "a detector that cuts the volume, in tiles"}
+    apart |= {"the letter F from six sides, each way up"}
+    for name, expected in (("blurring", LEFT_OUT), ("unsaid", FAIL)):
+        subject = subject_of("projector", name, {}, "cpu", torch.float64)
+        cases = [case for case, _ in plan.jobs([subject], (8, 20, 28)) if case.name in apart]
+        assert [judge(case, subject)["verdict"] for case in cases] == [expected] * 3

@@ -175,6 +175,7 @@ def letter(subject: ProjectorSubject) -> float:
     """The letter F in a volume, seen from all six sides, each way up: how many pixels do not show
     it upright.
     """
+    subject.need("pixelwise")
     violations = 0.0
     for right, down in itertools.permutations(torch.cat([torch.eye(3), -torch.eye(3)]).double(), 2):
         if (right * down).any():

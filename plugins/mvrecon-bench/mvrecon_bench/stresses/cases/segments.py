@@ -67,6 +67,7 @@ def inside(subject: ProjectorSubject, source: bool, pixel: bool) -> float:
 
 def tiled(subject: ProjectorSubject) -> float:
     """A detector that cuts the volume, seen whole, and in tiles of 1, 7 and 64 pixels."""
+    subject.need("pixelwise")
     grid = Grid.centred((16, 16, 16), 1.0, (3.0, -2.0, 4.0))
     rig = _cut(
         subject.rig(

@@ -140,6 +140,7 @@ def many_cameras(subject: ProjectorSubject) -> float:
 
 def large_detector(subject: ProjectorSubject) -> float:
     """One camera of 200 x 190 pixels: as bands of its rows, each a detector of its own."""
+    subject.need("pixelwise")
     rig = subject.rig(
         detector={"pixels": [200, 190], "pixel_mm": 0.09, "offset_mm": [0.04, -0.03]}, n_views=1
     )

@@ -1,0 +1,69 @@
+"""A trained method as a program of torch.export."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import mvrecon as mv
+from mvrecon.config import compose
+from mvrecon.engine import weights_file
+from mvrecon.engine.checkpoints import Trained
+from mvrecon.engine.module import ReconstructionModule
+from mvrecon.engine.program import exported
+from mvrecon.projectors import torch_ops
+
+#: Short, since each step of SIRT is written into the program.
+SHORT = ("model.start=2", "model.consistency=1", "grid.size=[16,16,16]")
+RIG = ("camera.n_views=3", "camera.detector.pixels=24", "camera.detector.pixel_mm=11")
+
+
+def method(*options: str) -> ReconstructionModule:
+    """A method with weights that are none of a start's, so that every layer takes part."""
+    settings = compose(*options, *SHORT, *RIG)
+    geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
+    torch.manual_seed(0)
+    module = ReconstructionModule(
+        geometry, settings["model"], settings["loss"], settings["optimizer"], data_range=1.0
+    ).eval()
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter += 0.05 * torch.randn_like(parameter)
+    return module
+
+
+def views_of(module: ReconstructionModule) -> torch.Tensor:
+    return module.projector(torch.rand(1, 1, *module.projector.grid.shape))
+
+
+def test_a_program_has_the_volumes_of_the_cross_view_model():
+    module = method("model=cross_view")
+    program = exported(module.model, torch.ones_like(views_of(module)))
+    called = {str(node.target) for node in program.graph.nodes if node.op == "call_function"}
+    assert {"mvrecon.project.default", "mvrecon.backproject.default"} <= called
+    views = views_of(module)
+    with torch.no_grad():
+        expected = module(views).volume
+        assert (program.module()(views) - expected).abs().max() <= 1e-6 * expected.max()
+        assert expected.max() > 0
+
+
+def test_a_program_in_a_file_has_the_volumes_of_its_method(tmp_path: Path):
+    assert torch_ops.ops is not None  # all of them are known to torch from here on
+    module = method("model=world_unet")
+    run = weights_file.write(tmp_path / "a.safetensors", Trained(module, seconds=0.0, steps=0))
+    program = torch.export.load(mv.save_program(run, tmp_path / "a.pt2"))
+    views = views_of(module)
+    expected = mv.load(run)(views)
+    with torch.no_grad():
+        assert (program.module()(views) - expected).abs().max() <= 1e-6 * expected.max()
+    for path, batch, why in (("a.onnx", 1, ".pt2"), ("b.pt2", 0, "at least one")):
+        with pytest.raises(ValueError, match=why):
+            mv.save_program(run, tmp_path / path, batch=batch)
+
+
+def test_a_method_that_looks_at_its_views_is_not_exported():
+    """A method whose steps depend on its views' values is not exported: the error says why."""
+    module = method("model=world_unet", "model.support=hull")
+    with pytest.raises(ValueError, match="no fixed sequence of steps.*support=none"):
+        exported(module.model, torch.ones_like(views_of(module)))

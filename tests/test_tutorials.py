@@ -1,0 +1,45 @@
+"""The tutorials run as they stand, and become pages and notebooks."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from mvrecon.parts import REGISTRIES
+from scripts import site_pages, tutorials
+
+
+@pytest.fixture
+def as_before(monkeypatch: pytest.MonkeyPatch):
+    """What a tutorial registers, imports and puts on Python's path is gone after it."""
+    for registry in REGISTRIES.values():
+        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield
+    for module in [name for name in sys.modules if name.partition(".")[0] == "my_plugin"]:
+        del sys.modules[module]
+
+
+@pytest.mark.parametrize("script", site_pages.TUTORIALS, ids=lambda script: script.stem)
+def test_a_tutorial_runs_and_shows_what_it_printed_and_drew(
+    script: Path, tmp_path: Path, as_before: None
+):
+    text = tutorials.page(script, tmp_path)
+    assert text.startswith("# ") and "```text\n" in text
+    shown = set(re.findall(r"!\[.*\]\((.*)\)", text))
+    assert shown == {file.name for file in tmp_path.iterdir()}
+    assert shown or script.stem == "own_plugin"
+
+
+def test_a_notebook_has_the_cells_of_its_script():
+    """Joined again, they are the script; the first is its title."""
+    script = site_pages.TUTORIALS[0]
+    cells = json.loads(tutorials.notebook(script))["cells"]
+    assert {cell["cell_type"] for cell in cells} == {"markdown", "code"}
+    assert len({cell["id"] for cell in cells}) == len(cells)
+    assert cells[0]["source"][0].startswith("# ")
+    code = "".join("".join(c["source"]) for c in cells if c["cell_type"] == "code")
+    words = [line for line in script.read_text().splitlines() if not line.startswith("#")]
+    assert code.split() == " ".join(words).split()
