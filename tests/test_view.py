@@ -47,7 +47,7 @@ def test_a_marker_is_where_nifti_says_in_every_picture(marked):
         cube = (index + 0.5) / values.shape[::-1] - 0.5
         world = np.asarray(picture.model_matrix).reshape(4, 4) @ [*cube, 1]
         np.testing.assert_allclose(world[:3], place, atol=1e-3)
-    letters = {o.text: np.array(o.position) for o in plot.objects if o.type == "Text"}
+    letters = {o.text: np.array(o.position) for o in plot.objects if o.type == "TextureText"}
     assert letters["R"][0] > letters["L"][0] and letters["A"][1] > letters["P"][1]
     assert letters["H"][2] > letters["F"][2]
     assert {"view 0", "cameras", "rays", "grid"} <= {o.name for o in plot.objects}

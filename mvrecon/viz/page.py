@@ -28,9 +28,8 @@ VOXELS = {"slices": 2**24, "mip": 2**21, "volume": 2**21}
 #: Magnitudes that are kept as 16-bit floating-point numbers, to three digits.
 HALF = (1e-2, 6e4)
 TITLE = re.compile("<title>.*?</title>")
-#: Colour behind all; text without a box and without TeX.
+#: Colour behind all.
 BACKGROUND = 0x202024
-PLAIN = {"label_box": False, "is_html": True, "group": "directions"}
 #: What the page may do: run its own program; nothing is loaded from elsewhere.
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:; "
@@ -144,7 +143,7 @@ def _camera(points: Float[Tensor, "n 3"], grid: Grid) -> list[float]:
     """Where the page looks from (front, right, above), what at (the grid's middle), and what is
     up.
     """
-    reach = 1.7 * (points - grid.centre).norm(dim=1).max()
+    reach = 2.2 * (points - grid.centre).norm(dim=1).max()
     eye = grid.centre + reach * torch.tensor([0.45, 0.8, 0.4], dtype=torch.float64)
     return [*eye.tolist(), *grid.centre.tolist(), 0.0, 0.0, 1.0]
 
@@ -171,8 +170,8 @@ def _add_letters(plot: Any, k3d: Any, grid: Grid) -> None:
         for letter, end, step in ((first, low, -reach), (last, high, reach)):
             place = (low + high) / 2
             place[axis] = end[axis] + step
-            plot += k3d.text(
-                letter, position=place.tolist(), color=0xFFD200, reference_point="cc", **PLAIN
+            plot += k3d.texture_text(
+                letter, position=place.tolist(), color=0xFFD200, size=reach.item(), name=letter
             )
 
 
