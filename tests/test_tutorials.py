@@ -40,6 +40,6 @@ def test_a_notebook_has_the_cells_of_its_script():
     assert {cell["cell_type"] for cell in cells} == {"markdown", "code"}
     assert len({cell["id"] for cell in cells}) == len(cells)
     assert cells[0]["source"][0].startswith("# ")
-    code = "".join("".join(c["source"]) for c in cells if c["cell_type"] == "code")
+    code = "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "code")
     words = [line for line in script.read_text().splitlines() if not line.startswith("#")]
     assert code.split() == " ".join(words).split()

@@ -112,8 +112,8 @@ def test_a_plugin_is_left_out_of_what_it_refuses_or_says_it_is_not_and_mvrecon_i
 
 
 class Blurring(Wrapped):
-    """Line integrals that a detector blurs along its rows, a quarter of each pixel to either
-    side, with its adjoint.
+    """Line integrals that a detector blurs along its columns, a quarter of each pixel upwards and
+    downwards, with its adjoint.
     """
 
     pixelwise = False
@@ -129,9 +129,9 @@ class Blurring(Wrapped):
 
     @staticmethod
     def _blurred(y):
-        left, right = torch.zeros_like(y), torch.zeros_like(y)
-        left[..., 1:], right[..., :-1] = y[..., :-1], y[..., 1:]
-        return 0.25 * left + 0.5 * y + 0.25 * right
+        above, below = torch.zeros_like(y), torch.zeros_like(y)
+        above[..., 1:, :], below[..., :-1, :] = y[..., :-1, :], y[..., 1:, :]
+        return 0.25 * above + 0.5 * y + 0.25 * below
 
 
 class Unsaid(Blurring):
