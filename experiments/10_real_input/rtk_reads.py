@@ -20,7 +20,7 @@ from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import read_volume
 from mvrecon.engine.export import save_png
 from mvrecon.geometry.grid import Grid
-from mvrecon.viz import montage
+from mvrecon.viz import review
 
 #: The detector's pixels in mm, and the grey values of the scan's dark and flat field.
 PIXEL, DARK, FLAT = 4.0, 100.0, 50_000.0
@@ -95,7 +95,7 @@ def main(scan: Path, volumes: Path, folder: Path) -> None:
         table.writerows(rows)
     shown.pop("fdk_floor", None)
     shown = {"fdk": shown.pop("fdk"), "RTK's fdk": peer, **shown}
-    picture = montage.planes(truth, shown, WHITE, grid.spacing)
+    picture = review.planes(review.Case("", grid, WHITE), truth, shown)
     save_png(folder / "planes.png", picture)
 
 
