@@ -10,7 +10,7 @@ import torch
 import mvrecon as mv
 from mvrecon.engine.export import save_png
 from mvrecon.parts import SCENES
-from mvrecon.viz import montage
+from mvrecon.viz import montage, review
 
 grid = mv.Grid.centred(size=(32, 32, 24), spacing=4.0)  # voxels and mm along (x, y, z)
 cameras = mv.circular(12, 400.0, 800.0, {"pixels": [40, 48], "pixel_mm": 6.0})  # mm
@@ -88,6 +88,5 @@ print(f"{B.skipped.fractions['voxels']:.1%} of the voxels were read")
 # %%
 volume = mv.sirt(A, y, iterations=60, momentum=True)
 print(f"residual {(A(volume) - y).norm() / y.norm():.2%}")
-save_png(
-    "planes.png", montage.planes(x[0, 0], {"SIRT": volume[0, 0]}, float(x.max()), grid.spacing)
-)
+case = review.Case("SIRT", grid, float(x.max()), "1/mm")
+save_png("planes.png", review.planes(case, x[0, 0], {"SIRT": volume[0, 0]}))

@@ -15,7 +15,7 @@ from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.engine.export import save_png
 from mvrecon.parts import SCENES
-from mvrecon.viz import montage
+from mvrecon.viz import montage, review
 from mvrecon.viz.rig import save_picture
 
 geometry = {
@@ -68,9 +68,8 @@ few = mv.reconstructed(views[None, None, ::6], cameras[::6], grid, method="fista
 residual = mv.Drr(grid, cameras)(volume)[0, 0] - views
 print(f"view NRMSE of fdk: {residual.norm() / views.norm():.2%}")
 assert residual.norm() < 0.1 * views.norm()  # with a wrong sign it is several times as much
-save_png(
-    "planes.png", montage.planes(patient, {"FDK": volume[0, 0], "TV, 10 views": few[0, 0]}, 0.03)
-)
+shown = {"FDK": volume[0, 0], "TV, 10 views": few[0, 0]}
+save_png("planes.png", review.planes(review.Case("patient", grid, 0.03, "1/mm"), patient, shown))
 mv.save_volume("volume.nii.gz", volume[0, 0], grid)  # opens in any viewer, where the patient is
 
 # %% [markdown]

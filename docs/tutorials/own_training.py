@@ -11,7 +11,7 @@ import mvrecon as mv
 from mvrecon.engine.export import save_png
 from mvrecon.metrics import volume_metrics
 from mvrecon.parts import MODELS, SCENES
-from mvrecon.viz import montage
+from mvrecon.viz import review
 
 torch.manual_seed(0)
 grid = mv.Grid.centred(16, spacing=8.0)
@@ -70,7 +70,8 @@ for name, volume in volumes.items():
     psnr = volume_metrics(volume[0], truth[0], inside, scene.data_range)["psnr"]
     print(f"{name}: {float(psnr):.1f} dB")
 shown = {name: volume[0, 0] for name, volume in volumes.items()}
-save_png("planes.png", montage.planes(truth[0, 0], shown, scene.data_range, grid.spacing))
+case = review.Case("unseen", grid, scene.data_range, scene.unit)
+save_png("planes.png", review.planes(case, truth[0, 0], shown))
 
 # %% [markdown]
 # ## What to keep

@@ -27,7 +27,8 @@ def check_parts(settings: Mapping[str, Any]) -> None:
     """
     if isinstance(grid := settings.get("grid"), Mapping):
         for key, option in options_of_grid().items():
-            _check_type(f"grid.{key}", grid.get(key, "???"), option)
+            if (value := grid.get(key)) is not None:  # null: chosen by the app
+                _check_type(f"grid.{key}", value, option)
     for path, kind, node in parts_in(settings):
         registry, name = REGISTRIES[kind], node["name"]
         if _later(name):

@@ -24,11 +24,12 @@ LEFT = {
     **{name: COPIES * times for name, times in FILTERING.items()},
     "sinogram_unet": 2 * COPIES + 1,
     "dual_domain": 2 * COPIES + 1,
+    "radon_unet": COPIES,
     "sirt": 8,
     "classical": 8,
 }
 #: Their first step moves an operator, or the images of voxels, to the device.
-MOVING = ("dif_net", "svct", "sinogram_unet", "dual_domain")
+MOVING = ("dif_net", "svct", "sinogram_unet", "dual_domain", "radon_unet")
 #: Models of which no step can go without waits: views are aligned on the host.
 WAITING_MODELS = ("corrected",)
 LOSS = {"edges": 0.1, "opinions_gain": 1e-3, "cross_view": 0.1, "corrected_views": 1.0}

@@ -82,7 +82,7 @@ def test_both_networks_learn_from_projections_alone_and_end_to_end(weights):
     for parameter in model.parameters():
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=torch_seed)
     truth = torch.rand(1, 1, *A.grid.shape)
-    radon = OnRig(A, model, {"name": "drr"}).corrected
+    radon = OnRig(A, model, {"name": "drr"}, {"name": "radon_unet"}).corrected
     assert type(radon) is Radon
     loss = ReconstructionLoss(1.0, **weights)
     batch = {"volume": truth, "views": A(truth), "true_views": radon(truth)}

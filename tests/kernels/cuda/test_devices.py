@@ -58,7 +58,7 @@ def test_launches_go_to_the_tensors_device_and_torch_s_stream_there(current, aft
     monkeypatch.setattr(
         torch.cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=7 + device.index)
     )
-    project = driver.load(b"", SECOND)["project"]
+    project = driver.load(b"", ["project"], SECOND)["project"]
     assert stub.current == after
     stub.current = current
     for _ in range(2):
