@@ -195,6 +195,13 @@ class SceneData(L.LightningDataModule):
 
     predict_dataloader = test_dataloader
 
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
+        """A batch on the device; the number of its rig, which the host asks for, stays."""
+        moved = super().transfer_batch_to_device(batch, device, dataloader_idx)
+        return {**moved, "rig": batch["rig"]} if "rig" in batch else moved
+
     def _loader(
         self, part: str, order: EpochOrder | range | None = None
     ) -> DataLoader[dict[str, Any]]:

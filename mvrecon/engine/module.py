@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import lightning.pytorch as L
-import torch
 from torch import Tensor
 
 from mvrecon.data.rigs import camera_of
@@ -138,13 +137,6 @@ class ReconstructionModule(L.LightningModule):
         ones.
         """
         self._finite.look()
-
-    def transfer_batch_to_device(
-        self, batch: Any, device: torch.device, dataloader_idx: int
-    ) -> Any:
-        """A batch on the device; the number of its rig, which the host asks for, stays."""
-        moved = super().transfer_batch_to_device(batch, device, dataloader_idx)
-        return {**moved, "rig": batch["rig"]} if "rig" in batch else moved
 
     def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """The terms of the loss of a batch."""

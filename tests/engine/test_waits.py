@@ -5,8 +5,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from mvrecon.config import compose
 from mvrecon.engine.callbacks import Clock
 from mvrecon.engine.finite import FiniteLoss
+from mvrecon.engine.fit import build_data
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.parts import MODELS
 from mvrecon.testing.as_gpu import GPU, AsGpu, OnGpu, on_gpu
@@ -196,10 +198,10 @@ def test_the_number_of_a_batch_s_rig_stays_on_the_host(monkeypatch):
     import lightning.pytorch as L
 
     monkeypatch.setattr(
-        L.LightningModule,
+        L.LightningDataModule,
         "transfer_batch_to_device",
         lambda self, batch, device, index: {name: on_gpu(x) for name, x in batch.items()},
     )
-    module, batch = module_of("geometry_free")
-    moved = module.transfer_batch_to_device({**batch, "rig": torch.tensor([0])}, GPU, 0)
+    data, (_, batch) = build_data(compose("experiment=smoke")), module_of("geometry_free")
+    moved = data.transfer_batch_to_device({**batch, "rig": torch.tensor([0])}, GPU, 0)
     assert isinstance(moved["views"], OnGpu) and moved["rig"].is_cpu
