@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mvrecon.cameras.camera import Cameras
 from mvrecon.config import compose
 from mvrecon.data.dataset import SceneDataset
-from mvrecon.engine import callbacks, fit
+from mvrecon.engine import fit
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.train import train
@@ -107,7 +107,7 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
         )
     build = MODELS.build
     monkeypatch.setattr(
-        callbacks.MODELS,
+        MODELS,
         "build",
         lambda name, **options: built.append(name) or build(name, **options),
     )

@@ -57,7 +57,10 @@ def offences(file: Path) -> list[str]:
 
 
 def test_no_code_runs_data():
-    assert {str(f.relative_to(ROOT)): found for f in CODE if (found := offences(f))} == {}
+    """The project's own tutorials, which are code, are run cell by cell, and nothing else."""
+    offending = {str(f.relative_to(ROOT)): lines for f in CODE if (lines := offences(f))}
+    assert [line.split()[-1] for line in offending.pop("scripts/tutorials.py")] == ["exec"]
+    assert offending == {}
 
 
 @pytest.mark.parametrize(

@@ -277,7 +277,6 @@ def test_totals_are_drawn_between_their_ends():
         ({"acquisition": {}}, "acquisition.counts or events.totals"),
         ({"acquisition": {"photons": 10.0}, "events": {"count": 1, "totals": [1, 2]}}, "photons"),
         ({"acquisition": {"counts": 1e3, "noise": 1.0}}, "electronic noise"),
-        ({"grid": {"size": [4, 4, 4], "spacing": [1, 2, 1]}}, "square voxels"),
         ({"projector": None}, "projector for events.backprojection"),
     ],
 )
