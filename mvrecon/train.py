@@ -41,7 +41,7 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     import_plugins(settings["plugins"])
     from mvrecon.engine import board, evaluation, fit, processes, progress, run_folder
 
-    progress.silence_lightning()
+    progress.silence_libraries()
     # Lightning's own use of torch, of which no user can be rid
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))

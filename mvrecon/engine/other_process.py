@@ -12,7 +12,7 @@ from mvrecon.engine import fit, progress, run_folder
 def main(folder: Path) -> None:
     """Train every method of a run beside its first process, and end when that one does."""
     threading.Thread(target=_end_with_the_first, daemon=True).start()
-    progress.silence_lightning()
+    progress.silence_libraries()
     settings = run_folder.read_settings(folder)
     import_plugins(settings["plugins"])
     fit.fit_all(settings, fit.build_data(settings), folder)

@@ -17,10 +17,10 @@ from rich.progress import (
 SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
 
 
-def silence_lightning() -> None:
-    """Leave Lightning's own lines about devices and seeds out; its warnings stay."""
-    for part in ("pytorch", "fabric"):
-        logging.getLogger(f"lightning.{part}").setLevel(logging.WARNING)
+def silence_libraries() -> None:
+    """Leave libraries' own lines about devices, seeds and fonts out; their warnings stay."""
+    for library in ("lightning.pytorch", "lightning.fabric", "matplotlib"):
+        logging.getLogger(library).setLevel(logging.WARNING)
 
 
 class StepProgress(ProgressBar):
