@@ -135,8 +135,8 @@ def settings(regime: Regime, arm: str) -> list[str]:
     if arm in CLASSICAL:
         return options
     inside = "model.model" if arm in ALIGNED else "model"
-    own = (f"support={regime.support}", "precision=auto", *regime.options)
-    return [*options, *(f"{inside}.{option}" for option in own)]
+    network = (f"support={regime.support}", "precision=auto", *regime.options)
+    return [*options, *(f"{inside}.{option}" for option in network)]
 
 
 def paths(data: Path) -> list[str]:

@@ -12,7 +12,7 @@ from mvrecon.config import conf_dir, plugin_conf_dirs
 from mvrecon.files.atomic import check_plain, new_folder
 from mvrecon.files.checks import shown
 from mvrecon.files.rank import world
-from mvrecon.files.runs import SETTINGS
+from mvrecon.files.runs import run_around
 
 #: Hydra's own way to run the jobs of a sweep: one after the other, in this process.
 IN_TURN = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
@@ -68,18 +68,11 @@ class OwnFolder(Callback):
                 overrides.append(f"++{name}={_quoted(value)}")  # a sweep's jobs are composed anew
 
     def _folder(self, config: DictConfig, key: str) -> Path:
-        run = run_of(Path(config.resume)) if config.get("resume") else None
-        if run is None:
+        run = run_around(config.resume) if config.get("resume") else None
+        if run is None:  # the app will say so
             return new_folder(OmegaConf.select(config, key))
         check_plain(run)  # before Hydra opens a log in it
         return run
-
-
-def run_of(path: Path) -> Path | None:
-    """The run folder that a path names or lies in; None: there is none, as the app will say."""
-    path = path.expanduser().absolute()
-    folders = (path, *path.parents[:3])
-    return next((folder for folder in folders if (folder / SETTINGS).is_file()), None)
 
 
 def check_launcher(config: DictConfig) -> None:

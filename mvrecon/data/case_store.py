@@ -15,13 +15,11 @@ from mvrecon.data.storage import dataset_in
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import Refused, blaming
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.sample import Sample, Scene
+from mvrecon.scenes.sample import MAPS, Sample, Scene
 
 #: Raised where what a scene, a projector or a file of this store is has changed: older files are
 #: not read.
 VERSION = 1
-#: Maps of attenuation that a case may have.
-MAPS = ("mu", "mu_measured")
 
 
 class CaseStore:

@@ -13,7 +13,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.files.rank import rank
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import case_numbers, generator, mixed
-from mvrecon.scenes.sample import Sample, Scene, Thin
+from mvrecon.scenes.sample import MAPS, Sample, Scene, Thin
 from mvrecon.visual_hull.support import warn_of_gaps
 
 TENSORS = ("views", "volume", "inside")
@@ -88,8 +88,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
         made = {key: getattr(sample, key) for key in TENSORS}
-        maps = {"mu": sample.mu, "mu_measured": sample.mu_measured}
-        made |= {key: mu for key, mu in maps.items() if mu is not None}
+        made |= {key: mu for key in MAPS if (mu := getattr(sample, key)) is not None}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
                 raise ValueError(

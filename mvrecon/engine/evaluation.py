@@ -122,10 +122,11 @@ def results(
     for label, method in trained.items():
         known = data.digests("test", rig=not elsewhere)
         digests.compare(known, method.digests, finished(folder, label))
-    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    rigs = {label: method.module.own for label, method in trained.items()}
+    A = _operator(settings, () if elsewhere else rigs.values())
     models = {
-        label: _elsewhere(settings, method) if elsewhere else method.module.own
-        for label, method in trained.items()
+        label: _elsewhere(settings, rig, A) if elsewhere and trained[label].steps else rig
+        for label, rig in rigs.items()
     }
     names: list[str] = []
     truths: list[str] = []
@@ -170,13 +171,21 @@ def validation_psnr(
     return mean_and_spread([score["psnr"] for score in scores[label]])["mean"]
 
 
-def _elsewhere(settings: Settings, method: Trained) -> OnRig:
-    """A method's model on another rig and grid; one without training is made for them already."""
-    own = method.module.own
-    if not method.steps:
-        return own
-    A = build_projector(settings["grid"], settings["camera"], own.projector)
-    return OnRig(A, with_weights_of(own.model, own.options, plain(A)), own.projector, own.options)
+def _operator(settings: Settings, rigs: Iterable[OnRig]) -> Projector:
+    """The operator of the test scenes: that of a method where one has it, with its geometry, or a
+    new one.
+    """
+    for rig in rigs:
+        if rig.projector == settings["projector"]:
+            return rig.A
+    return build_projector(settings["grid"], settings["camera"], settings["projector"])
+
+
+def _elsewhere(settings: Settings, rig: OnRig, A: Projector) -> OnRig:
+    """A trained model on another rig and grid, by `A` unless it takes the projector for another."""
+    if rig.projector != settings["projector"]:
+        A = build_projector(settings["grid"], settings["camera"], rig.projector)
+    return OnRig(A, with_weights_of(rig.model, rig.options, plain(A)), rig.projector, rig.options)
 
 
 def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:

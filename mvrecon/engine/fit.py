@@ -104,8 +104,8 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     if not trainable(module):
         return
     if settings["trainer"].get("graph"):
-        own = isinstance(module.projector, OwnAttenuation)
-        check_graph(settings["trainer"], models[method], settings["data"], own)
+        own_operators = isinstance(module.projector, OwnAttenuation)
+        check_graph(settings["trainer"], models[method], settings["data"], own_operators)
         module.as_graph()
     accelerator = settings["trainer"].get("accelerator", "auto")
     needed = check_training(module, data.loading.batch_size, accelerator)

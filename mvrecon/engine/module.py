@@ -31,10 +31,10 @@ def build_projector(
     """The projector of a grid (options of `Grid.centred`) and a rig (name and options); where its
     mu is that of each case, `OwnAttenuation`.
     """
-    rig, own = CAMERAS.from_config(camera), CaseAttenuation.of(projector)
-    settings = dict(projector) if own is None else {**projector, "mu": None}
+    rig, attenuation = CAMERAS.from_config(camera), CaseAttenuation.of(projector)
+    settings = dict(projector) if attenuation is None else {**projector, "mu": None}
     A = PROJECTORS.from_config(settings, grid=Grid.centred(**grid), cameras=rig)
-    return A if own is None else OwnAttenuation(A, projector, own)
+    return A if attenuation is None else OwnAttenuation(A, projector, attenuation)
 
 
 class ReconstructionModule(L.LightningModule):
@@ -64,8 +64,8 @@ class ReconstructionModule(L.LightningModule):
         self.save_hyperparameters(logger=False)
         self.projector = self._projector(0)
         self.model = MODELS.from_config(model, projector=plain(self.projector))
-        own = OnRig(self.projector, self.model, geometry["projector"], model)
-        self._rigs = {0: own}  # no module: a checkpoint has the weights once
+        rig = OnRig(self.projector, self.model, geometry["projector"], model)
+        self._rigs = {0: rig}  # no module: a checkpoint has the weights once
         self.loss = ReconstructionLoss(data_range, **loss)
         self._finite = FiniteLoss(model["name"])
         #: What computes the loss and its gradients in training instead of `terms`; none for those.
@@ -140,25 +140,25 @@ class ReconstructionModule(L.LightningModule):
 
     def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """The terms of the loss of a batch."""
-        own = self.on(batch)
-        return self._terms(own, own.model(batch["views"]), batch)
+        rig = self.on(batch)
+        return self._terms(rig, rig.model(batch["views"]), batch)
 
     def _terms(
-        self, own: OnRig | OnCases, out: Reconstruction, batch: dict[str, Any]
+        self, rig: OnRig | OnCases, out: Reconstruction, batch: dict[str, Any]
     ) -> dict[str, Tensor]:
         """The loss, with the truth's own views where views are corrected towards them."""
         if self.loss.compares_views(out):
-            batch = {**batch, "true_views": own.corrected(batch["volume"])}
+            batch = {**batch, "true_views": rig.corrected(batch["volume"])}
         return self.loss(out, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
         """Judge a batch by the loss and the figures of merit; hand the reconstruction on to the
         board.
         """
-        own = self.on(batch)
-        out = own.model(batch["views"])
-        terms = {f"loss_{name}": value for name, value in self._terms(own, out, batch).items()}
-        predicted = own.A(out.volume)
+        rig = self.on(batch)
+        out = rig.model(batch["views"])
+        terms = {f"loss_{name}": value for name, value in self._terms(rig, out, batch).items()}
+        predicted = rig.A(out.volume)
         figures = [
             volume_metrics(volume, truth, inside, self.hparams["data_range"])
             | view_metrics(view, measured)

@@ -84,14 +84,14 @@ class OwnAttenuation(Wrapped):
     Args:
         A: the same without attenuation; it gives the grid, the rig and the sizes.
         options: name and options of the projector.
-        own: what its option `mu` says.
+        attenuation: what its option `mu` says.
     """
 
     A: Projector
 
-    def __init__(self, A: Projector, options: Mapping[str, Any], own: CaseAttenuation):
+    def __init__(self, A: Projector, options: Mapping[str, Any], attenuation: CaseAttenuation):
         super().__init__(A)
-        self.options, self.own = dict(options), own
+        self.options, self.attenuation = dict(options), attenuation
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Refused: which case?"""
@@ -101,23 +101,16 @@ class OwnAttenuation(Wrapped):
         """Refused, as `forward`."""
         return self.forward(y)
 
-    def settings_of(self, batch: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-        """Name and options of the projector of each case, one after the other.
+    def of_cases(self, batch: Mapping[str, Any]) -> Iterator[tuple[Projector, dict[str, Any]]]:
+        """The projector of each case of a batch, one after the other, with its name and options.
 
         Raises:
             ValueError: cases without the map.
         """
-        return ({**self.options, "mu": mu} for mu in self.own.maps_of(batch, self.grid))
-
-    def of_cases(self, batch: Mapping[str, Any]) -> Iterator[Projector]:
-        """The projector of each case of a batch, one after the other.
-
-        Raises:
-            ValueError: cases without the map.
-        """
-        for settings in self.settings_of(batch):
+        for mu in self.attenuation.maps_of(batch, self.grid):
+            settings = {**self.options, "mu": mu}
             A = PROJECTORS.from_config(settings, grid=self.grid, cameras=self.cameras)
-            yield A.to(self.device)
+            yield A.to(self.device), settings
 
 
 @dataclass(eq=False)
@@ -150,18 +143,18 @@ class OnCases:
         return joined(self._each(lambda one, y: one.by(name, y), views))
 
 
-def on_cases(own: OnRig, batch: Mapping[str, Any]) -> OnRig | OnCases:
+def on_cases(rig: OnRig, batch: Mapping[str, Any]) -> OnRig | OnCases:
     """A model for a batch: on its rig, or where the operator is each case's own, on those.
 
     Raises:
         ValueError: cases without the map.
     """
-    if not isinstance(own.A, OwnAttenuation):
-        return own
-    training, cases = own.model.training, []
-    for A, settings in zip(own.A.of_cases(batch), own.A.settings_of(batch), strict=True):
-        model = with_weights_of(own.model, own.options, A).to(A.device).train(training)
-        cases.append(OnRig(A, model, settings, own.options))
+    if not isinstance(rig.A, OwnAttenuation):
+        return rig
+    training, cases = rig.model.training, []
+    for A, settings in rig.A.of_cases(batch):
+        model = with_weights_of(rig.model, rig.options, A).to(A.device).train(training)
+        cases.append(OnRig(A, model, settings, rig.options))
     return OnCases(cases)
 
 
@@ -179,7 +172,7 @@ def projected(
     if not isinstance(A, OwnAttenuation):
         return A(volumes)
     pairs = zip(A.of_cases(batch), volumes.split(1), strict=True)
-    return torch.cat([one(volume) for one, volume in pairs])
+    return torch.cat([one(volume) for (one, _), volume in pairs])
 
 
 def plain(A: Projector) -> Projector:

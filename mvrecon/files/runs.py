@@ -19,16 +19,24 @@ def folder_of_run(path: str | Path) -> Path:
         FileNotFoundError: the path is not there, or no run folder is around it.
         PermissionError: anything but files and folders is in the run folder.
     """
+    if not Path(path).expanduser().exists():
+        raise FileNotFoundError(f"No checkpoint or run folder is at {os.path.abspath(path)}")
+    folder = run_around(path)
+    if folder is None:
+        raise FileNotFoundError(
+            f"Expected a checkpoint in a run folder (one with {SETTINGS}), got {path}"
+        )
+    check_plain(folder)
+    return folder.resolve()
+
+
+def run_around(path: str | Path) -> Path | None:
+    """The folder with a run's settings that a path names or lies in, three levels deep at most;
+    None: there is none.
+    """
     path = Path(os.path.abspath(Path(path).expanduser()))  # links in it are not followed yet
-    if not path.exists():
-        raise FileNotFoundError(f"No checkpoint or run folder is at {path}")
-    for folder in (path, *path.parents[:3]):
-        if (folder / SETTINGS).is_file():
-            check_plain(folder)
-            return folder.resolve()
-    raise FileNotFoundError(
-        f"Expected a checkpoint in a run folder (one with {SETTINGS}), got {path}"
-    )
+    folders = (path, *path.parents[:3])
+    return next((folder for folder in folders if (folder / SETTINGS).is_file()), None)
 
 
 def read_results(folder: Path) -> dict[str, Any]:

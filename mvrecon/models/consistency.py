@@ -133,8 +133,8 @@ def em_change(
     # a ray of nothing explains no counts, and all its voxels are zero
     possible = reached & (expected > 0)
     ratio = torch.where(possible, measured / torch.where(possible, expected, 1), 0)
-    seen = geometry.column > 0
-    return volume * torch.where(seen, geometry.column * geometry.A.T(ratio) - 1, 0)
+    crossed = geometry.column > 0
+    return volume * torch.where(crossed, geometry.column * geometry.A.T(ratio) - 1, 0)
 
 
 @torch.no_grad()

@@ -23,6 +23,10 @@ class Rays(Protocol):
         ...
 
 
+#: The maps of attenuation that a sample may have.
+MAPS = ("mu", "mu_measured")
+
+
 @dataclass(frozen=True, eq=False)
 class Sample:
     """One case.

@@ -47,8 +47,8 @@ def _judge(
     counts = bricks_along(shape, int(edge))
     places = torch.ones(counts, dtype=torch.bool).nonzero()
     parts = []
-    for some in places.split(max(1, AT_ONCE // max(1, tables.shape[0] * tables.shape[1]))):
-        bricks = Bricks.at(some, int(edge), shape)
+    for part in places.split(max(1, AT_ONCE // max(1, tables.shape[0] * tables.shape[1]))):
+        bricks = Bricks.at(part, int(edge), shape)
         empty, dark = proofs(tables, footprints_of(prints, detector, shape, bricks, reach))
         parts.append((empty < enough) & (~dark | bool(keep_unseen)))
     return torch.cat(parts, dim=1).unflatten(1, counts)

@@ -121,9 +121,9 @@ def usual_window(volume: Float[Tensor, "d h w"]) -> tuple[float, float]:
     """The 1st and the 99.9th percentile of the values, of at most a million of them; of a constant
     volume, its value and one more.
     """
-    some = volume.detach().cpu().float().flatten()
-    some = some[:: max(1, some.numel() // 10**6)].numpy()
-    low, high = (float(v) for v in np.percentile(some, (1.0, 99.9)))
+    values = volume.detach().cpu().float().flatten()
+    sample = values[:: max(1, values.numel() // 10**6)].numpy()
+    low, high = (float(v) for v in np.percentile(sample, (1.0, 99.9)))
     return (low, high) if low < high else (low, low + 1.0)
 
 

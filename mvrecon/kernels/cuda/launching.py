@@ -31,14 +31,23 @@ def blocks(threads: int) -> int:
     """Blocks for so many threads.
 
     Raises:
-        ValueError: more than a kernel counts.
+        ValueError: as `check_count`.
+    """
+    check_count(threads)
+    return -(-threads // BLOCK)
+
+
+def check_count(threads: int) -> None:
+    """Refuse more voxels, samples or pixels than a kernel counts.
+
+    Raises:
+        ValueError: there are more.
     """
     if threads > MOST:
         raise ValueError(
             f"Expected at most {MOST} voxels, samples or pixels on a GPU, got {threads}; "
             f"backend 'reference' takes more"
         )
-    return -(-threads // BLOCK)
 
 
 def numbers_of(maps: Tensor) -> Tensor:

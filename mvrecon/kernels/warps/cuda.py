@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.cuda.field import Field
-from mvrecon.kernels.cuda.launching import blocks, numbers_of, start
+from mvrecon.kernels.cuda.launching import blocks, check_count, numbers_of, start
 from mvrecon.kernels.cuda.sources import MAP, PLANES, Part
 from mvrecon.kernels.rays.cuda.sources import BLOCK, WARP
 
@@ -57,7 +57,7 @@ def warp_back(
     inverse = torch.empty(maps.shape, dtype=torch.float32, device=y.device)
     field = _field(numbers, items, channels, shape, y.shape[4:])
     field.put(origin=y, result=volumes, inverse=inverse, blocks=blocks(math.prod(shape)))
-    blocks(math.prod(y.shape[4:]))
+    check_count(math.prod(y.shape[4:]))
     part = Part("warp", y.dtype)
     start(part, "invert", field, y, blocks(sources * kinds))
     start(part, "warp_back", field, y, sources * field.blocks, items * -(-channels // PLANES))
