@@ -1,12 +1,11 @@
 """Puts the table of a run into a CSV file: python scripts/collect.py RUN_FOLDER OUT.csv"""
 
 import argparse
-import csv
 import json
 from pathlib import Path
 from typing import Any
 
-from mvrecon.files.atomic import written_whole
+from mvrecon.files.tables import write_rows
 
 FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside", "view_nrmse")
 
@@ -36,10 +35,7 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="CSV file to write")
     given = parser.parse_args()
     table = rows(json.loads((given.run / "results.json").read_text(encoding="utf-8")))
-    with written_whole(given.out) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, table[0].keys(), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(table)
+    write_rows(given.out, table)
 
 
 if __name__ == "__main__":

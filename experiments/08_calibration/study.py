@@ -5,7 +5,6 @@ experiments/08_calibration/results.csv`
 """
 
 import argparse
-import csv
 from functools import partial
 
 import torch
@@ -16,6 +15,7 @@ from mvrecon.calibration.markers import from_markers
 from mvrecon.calibration.unknowns import without_motion
 from mvrecon.cameras.misalignment import Misalignment, misaligned, perturbed
 from mvrecon.cameras.rigs import circular
+from mvrecon.files.tables import write_rows
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.projectors.drr import Drr
 from mvrecon.scenes.shepp_logan import shepp_logan
@@ -122,10 +122,7 @@ def main():
     for row in (*from_balls(8), *from_views(options.size, options.views)):
         rows.append({**row, "error": f"{float(row['error']):.2g}"})
         print(rows[-1], flush=True)
-    with open(options.out, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(options.out, rows)
 
 
 if __name__ == "__main__":

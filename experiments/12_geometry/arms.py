@@ -15,15 +15,13 @@ BASE = (
 NARROW = "rounds=[{resolution: full, widths: [16,32,64], cameras: null}]"
 HALF = "{resolution: half, widths: [32,48,64]"
 CAMERAS = "cameras: {name: rays2d}"
+ONE = f"rounds=[{{resolution: full, widths: [16,32,64], {CAMERAS}}}]"
 
 #: What differs between the models.
 ARMS = {
     "cross_view": ("model=cross_view",),
     "no_opinions": ("model=cross_view", "model.rounds.0.opinions=null"),
-    "one_round": (
-        "model=cross_view",
-        f"model.rounds=[{{resolution: full, widths: [16,32,64], {CAMERAS}}}]",
-    ),
+    "one_round": ("model=cross_view", f"model.{ONE}"),
     "three_rounds": (
         "model=cross_view",
         f"model.rounds=[{HALF}, {CAMERAS}}}, {HALF}}}, {{resolution: full, widths: [16,32,64]}}]",
@@ -33,6 +31,11 @@ ARMS = {
 }
 ALIGNED = {
     "cross_view_aligned": ("model=corrected", "model@model.model=cross_view"),
+    "one_round_aligned": (
+        "model=corrected",
+        "model@model.model=cross_view",
+        f"model.model.{ONE}",
+    ),
     "world_unet_aligned": (
         "model=corrected",
         "model@model.model=world_unet",

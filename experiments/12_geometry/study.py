@@ -25,6 +25,7 @@ from arms import ALIGNED, ARMS, CLASSICAL, REGIMES, paths, settings
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_data, build_module
 from mvrecon.engine.module import ReconstructionModule
+from mvrecon.files.tables import write_rows
 
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
@@ -44,10 +45,9 @@ def pace(options: argparse.Namespace) -> None:
         data.setup("fit")
         module = build_module(run, run["model"], data.data_range)
         rows[regime, arm] = _seconds_a_step(module, data.train_dataloader())
-        with open(PACE, "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(("regime", "arm", "seconds_per_step"))
-            writer.writerows((*key, f"{value:.3f}") for key, value in rows.items())
+        names = ("regime", "arm", "seconds_per_step")
+        lines = ((*key, f"{value:.3f}") for key, value in rows.items())
+        write_rows(PACE, [dict(zip(names, line, strict=True)) for line in lines])
 
 
 def _seconds_a_step(module: ReconstructionModule, batches: Iterable[dict]) -> float:
@@ -168,10 +168,7 @@ def table(options: argparse.Namespace) -> None:
     """Write the rows of all runs, their paired differences, and the curves."""
     rows = collected(options.runs)
     for name, lines in (("results.csv", rows), ("paired.csv", paired(rows))):
-        with open(HERE / name, "w", newline="") as file:
-            writer = csv.DictWriter(file, list(lines[0]))
-            writer.writeheader()
-            writer.writerows(lines)
+        write_rows(HERE / name, lines)
     curves(rows, HERE / "curves.png")
 
 

@@ -4,7 +4,6 @@ variance: mlem, osem, bsrem and tv_map on counts of DC-SPECT's 80 ideal pinholes
 python experiments/14_counts/recovery.py OUT_FOLDER
 """
 
-import csv
 import math
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
+from mvrecon.files.tables import write_rows
 from mvrecon.scenes.derenzo import derenzo
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
@@ -125,14 +125,6 @@ def spreads(A: Spect, draws: int = 20) -> list[dict]:
     return rows
 
 
-def save(file: Path, rows: list[dict]) -> None:
-    """Write rows as CSV."""
-    with file.open("w", newline="") as out:
-        table = csv.DictWriter(out, rows[0].keys(), lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-
-
 def draw(rows: list[dict], file: Path) -> None:
     """Recovery over variability of two spheres, and what each method minimises."""
     import matplotlib
@@ -162,10 +154,10 @@ def main(out: Path) -> None:
     A = Spect(GRID, mv.dcspect80(pixels=[32, 32]), diameter_mm=2.3)
     rows: list[dict] = []
     contrasts(A, rows)
-    save(out / "recovery.csv", rows)
+    write_rows(out / "recovery.csv", rows)
     draw(rows, out / "recovery.png")
-    save(out / "resolved.csv", resolved(A))
-    save(out / "spreads.csv", spreads(A))
+    write_rows(out / "resolved.csv", resolved(A))
+    write_rows(out / "spreads.csv", spreads(A))
 
 
 if __name__ == "__main__":

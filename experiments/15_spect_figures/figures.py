@@ -9,10 +9,11 @@ import sys
 from pathlib import Path
 
 import torch
-from geometry import HOLE, ball, counts_of, geometry, save
+from geometry import HOLE, ball, counts_of, geometry
 
 import mvrecon as mv
 from mvrecon.engine.export import save_png
+from mvrecon.files.tables import write_rows
 from mvrecon.scenes.derenzo import derenzo
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon.viz.montage import enlarged, radiographs, tiled
@@ -55,7 +56,7 @@ def bias(out: Path) -> None:
             )
 
         mv.osem(A, counts, 6, SUBSETS, monitor=watch)
-    save(out / "bias.csv", rows)
+    write_rows(out / "bias.csv", rows)
 
 
 def edges(out: Path) -> None:
@@ -68,7 +69,7 @@ def edges(out: Path) -> None:
         A = Spect(GRID, cameras, HOLE, **options)
         x = mv.osem(A, views, 8, SUBSETS, background=1e-6)[0, 0]
         rows += transfer(x, name)
-    save(out / "mtf.csv", rows)
+    write_rows(out / "mtf.csv", rows)
 
 
 def transfer(x: torch.Tensor, blur: str) -> list[dict]:
@@ -111,7 +112,7 @@ def wells(out: Path) -> None:
 
         A = Spect(GRID, cameras, HOLE, **options)
         mv.osem(A, counts, 8, SUBSETS, background=1e-3, monitor=watch)
-        save(out / "wells.csv", rows)
+        write_rows(out / "wells.csv", rows)
 
 
 def sectors(x: torch.Tensor, blur: str, iteration: int) -> list[dict]:

@@ -2,7 +2,6 @@
 of images, the attenuated integral of a ball.
 """
 
-import csv
 import math
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.cameras.field import sees
+from mvrecon.files.tables import write_rows
 from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
@@ -23,8 +23,10 @@ MU, HOLE = 0.01536, 2.3  # water at 140.5 keV in 1/mm; mm
 def geometry(out: Path) -> None:
     """What follows from places and sizes alone, and the picture of the rig."""
     central, convergence = attenuation()
-    save(out / "convergence.csv", convergence)
-    save(out / "numbers.csv", [inverse_square(), *sensitivities(), *field(), *widths(), central])
+    write_rows(out / "convergence.csv", convergence)
+    write_rows(
+        out / "numbers.csv", [inverse_square(), *sensitivities(), *field(), *widths(), central]
+    )
     save_picture(out / "rig.png", mv.dcspect80(pixels=32), mv.Grid.centred(64, spacing=2.0))
 
 
@@ -153,11 +155,3 @@ def row(
         "expected": f"{float(expected):.4g}",
         "measured": f"{float(measured):.4g}",
     }
-
-
-def save(file: Path, rows: list[dict]) -> None:
-    """Write rows as CSV."""
-    with file.open("w", newline="") as out:
-        table = csv.DictWriter(out, rows[0].keys(), lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)

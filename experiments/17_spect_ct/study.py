@@ -3,7 +3,6 @@
 python experiments/17_spect_ct/study.py OUT_FOLDER
 """
 
-import csv
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import torch
 import mvrecon as mv
 from mvrecon.data.attenuation import attenuation, hounsfield, tissue_at
 from mvrecon.data.resample import resample
+from mvrecon.files.tables import write_rows
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.ventricle import ventricle
@@ -130,7 +130,7 @@ def measure(out: Path) -> None:
                     "nrmse": f"{error:.4f}",
                 }
             )
-        save(out / "results.csv", rows)
+        write_rows(out / "results.csv", rows)
         if draw == 0:
             draw_planes(out / "planes.png", {"truth": truth, **volumes}, true, estimated)
 
@@ -153,14 +153,6 @@ def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.
         axis.set_title(name.replace("activity: ", ""), fontsize=9)
         axis.axis("off")
     figure.savefig(file, dpi=80)
-
-
-def save(file: Path, rows: list[dict]) -> None:
-    """Write rows as CSV."""
-    with file.open("w", newline="") as out:
-        table = csv.DictWriter(out, rows[0].keys(), lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
 
 
 if __name__ == "__main__":

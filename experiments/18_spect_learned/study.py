@@ -22,52 +22,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from arms import ARMS, BASE, HEIGHT, MAIN, RADIUS, SUBSETS, WELLS
 
 import mvrecon as mv
 from mvrecon.config import compose
 from mvrecon.data.module import TEST, SceneData
 from mvrecon.engine.fit import build_data, build_module
+from mvrecon.files.tables import write_rows
 from mvrecon.metrics import nrmse, volume_metrics
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 
 HERE = Path(__file__).parent
-WELLS, RADIUS, HEIGHT = (16, 14, 12, 10, 8, 6), 60.0, 72.0
-BASE = (
-    "projector=spect",
-    "camera=dcspect80",
-    "camera.pixels=32",
-    "camera.columns=[1,6,11,16]",  # of each of the four rows: 16 pinholes
-    "grid.spacing=5.0",
-    "scene=derenzo",
-    f"scene.well_diameters={list(WELLS)}",
-    f"scene.radius_mm={RADIUS}",
-    f"scene.height_mm={HEIGHT}",
-    "scene.fill=null",
-    "acquisition=counts",
-    "acquisition.closed_form=false",
-    "optimizer.lr=2e-3",
-    "+optimizer.betas=[0.9,0.98]",
-    "callbacks=quiet",
-    "logger=csv",
-)
-SUBSETS = 4  # the root of the number of cameras, with which networks start, too
-START = "model.start={name: osem, iterations: 5, background: 1e-3}"
-EM = "model.consistency={steps: 3, noise: poisson, rule: em, background: 1e-3}"
-NARROW = "model.rounds=[{resolution: full, widths: [16,32,64], cameras: null}]"
-RADON = ("model=radon_unet", "model.angles=128", START)
-MEAN = ("model=mean_fusion", "model.opinion.binning=4", START, EM)
-
-#: What differs between the networks.
-ARMS = {
-    "radon_unet": (*RADON, "loss.volume=0"),
-    "radon_unet_end": (*RADON, "loss.corrected_views=0"),
-    "world_unet": ("model=world_unet_counts", NARROW),
-    "world_unet_squares": ("model=world_unet", NARROW),
-    "mean_fusion": MEAN,
-    "mean_fusion_own": (*MEAN, "model.opinion.shared=false"),
-    "cross_view": ("model=cross_view_counts",),
-}
-MAIN = tuple(name for name in ARMS if name != "mean_fusion_own")
 WEIGHTS = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1)
 ITERATIONS = 12
 
@@ -127,7 +92,7 @@ def tune(options: argparse.Namespace) -> None:
             how = {"total": total, "method": trial.name, "weight": "", **trial.options}
             for number, error in enumerate(errors(A, trial, known), 1):
                 rows.append(how | {"iterations": number, "nrmse": f"{error:.5f}"})
-    _save(HERE / "tuned.csv", rows)
+    write_rows(HERE / "tuned.csv", rows)
 
 
 def errors(A: Any, method: Classical, known: dict[str, Any]) -> list[float]:
@@ -171,7 +136,7 @@ def pace(options: argparse.Namespace) -> None:
             optimizer.zero_grad()
             times.append(time.process_time() - start)
         rows[arm] = f"{min(times[1:]):.3f}"
-    _save(HERE / "pace.csv", [{"arm": k, "seconds_per_step": v} for k, v in rows.items()])
+    write_rows(HERE / "pace.csv", [{"arm": k, "seconds_per_step": v} for k, v in rows.items()])
 
 
 def train(options: argparse.Namespace) -> None:
@@ -235,7 +200,7 @@ def table(options: argparse.Namespace) -> None:
             row = {"total": total, "method": name, "seconds": seconds, "seed": seed}
             rows.append(row | figures(volumes, data, known))
             pictures[total][name] = volumes[0, 0]
-    _save(HERE / "results.csv", rows)
+    write_rows(HERE / "results.csv", rows)
     draw(pictures, HERE / "volumes.png")
 
 
@@ -270,13 +235,6 @@ def _rows(path: Path) -> list[dict[str, Any]]:
         return []
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
-
-
-def _save(path: Path, rows: list[dict[str, Any]]) -> None:
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def main() -> None:

@@ -3,7 +3,6 @@
 python experiments/19_spect_defect/study.py OUT_FOLDER
 """
 
-import csv
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 
 import mvrecon as mv
+from mvrecon.files.tables import write_rows
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.scenes.cardiac import RandomCardiac
 from mvrecon_spect.metrics.contrast import contrast_to_noise, count_bias, defect_contrast
@@ -88,7 +88,7 @@ def measure(out: Path) -> None:
                     maps[f"{label}, {total:.0e}"] = polar_map(x, GRID, case.axis, 45.0)
                 names = {"counts": f"{total:.0e}", "draw": draw, "method": label}
                 rows.append(names | figures(x, case))
-                save(out / "results.csv", rows)
+                write_rows(out / "results.csv", rows)
     draw_maps(out / "polar_maps.png", maps)
 
 
@@ -119,14 +119,6 @@ def draw_maps(file: Path, maps: dict[str, torch.Tensor]) -> None:
         axis.set_title(name, fontsize=8)
         axis.axis("off")
     figure.savefig(file, dpi=60)
-
-
-def save(file: Path, rows: list[dict]) -> None:
-    """Write rows as CSV."""
-    with file.open("w", newline="") as out:
-        table = csv.DictWriter(out, rows[0].keys(), lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,6 @@ from mvrecon.config import conf_dir
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import EARLIER, ReconstructionLoss
 from mvrecon.models.cross_view.model import CrossView
-from mvrecon.models.cross_view.sampling import RaySamples
-from mvrecon.models.cross_view.views import Binned, means
-from mvrecon.models.frusta import Frusta
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.reconstruct.iterative import sirt
@@ -209,31 +206,12 @@ def test_a_few_steps_teach_the_cameras_what_the_grid_would_have_measured():
     assert errors[-1] < 0.5 * errors[0]
 
 
-def test_samples_along_rays_are_those_of_the_frusta():
-    grid, cameras = small_rig()
-    samples, frusta = RaySamples(grid, cameras, 5), Frusta.of(grid, cameras, 5)
-    volumes = torch.rand(2, 3, *grid.shape)
-    assert torch.equal(samples(volumes), frusta.to_frusta(volumes[:, None]))
-    assert samples.double().maps.dtype == samples.half().maps.dtype == torch.float64
-
-
 @pytest.mark.parametrize(("pixels", "edge"), [(12, 3), (8, 3), (2, 2)])
 def test_pixels_are_joined_on_a_detector_that_has_as_many(pixels, edge):
     projector = small_projector(pixels=pixels)
     model = stirred(projector)
     assert model.rounds[0].cameras.binning == edge
     assert model(projector(blob(projector))).volume.isfinite().all()
-
-
-def test_a_cell_beyond_the_detector_is_where_its_pixels_would_be():
-    """So a cell is in the same place as that of a detector which the cells fill."""
-    whole = Binned.of(small_projector(pixels=12), 3).cameras
-    grid, cameras = small_rig(pixels=12)
-    less = PROJECTORS.build("drr", grid=grid, cameras=cameras.cropped((0, 11), (0, 10)))
-    assert torch.equal(Binned.of(less, 3).cameras.rays()[1], whole.rays()[1])
-    views = torch.rand(1, 1, 4, 11, 10)
-    expected = views[..., 9:11, 9:].mean(dim=(-2, -1))
-    assert torch.allclose(means(views, 3)[..., -1, -1], expected)
 
 
 def test_weights_come_back_from_a_file():

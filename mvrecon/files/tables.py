@@ -1,0 +1,20 @@
+"""Tables of figures as CSV files."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mvrecon.files.atomic import written_whole
+
+
+def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a CSV file, whole or not at all; the names of the first row are its header.
+
+    Raises:
+        ValueError: a row with a name that the first does not have.
+    """
+    with written_whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

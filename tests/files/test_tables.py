@@ -1,0 +1,20 @@
+"""Tables of figures as CSV files."""
+
+import csv
+
+import pytest
+
+from mvrecon.files.tables import write_rows
+
+
+def test_rows_come_back_and_a_failed_write_leaves_the_earlier_file(tmp_path):
+    path = tmp_path / "rows.csv"
+    write_rows(path, [{"method": "sirt", "psnr": 31.5}, {"method": "a, b", "psnr": ""}])
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert rows == [{"method": "sirt", "psnr": "31.5"}, {"method": "a, b", "psnr": ""}]
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="other"):
+        write_rows(path, [{"method": "sirt"}, {"other": 1}])
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["rows.csv"]
