@@ -11,8 +11,8 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoint_check import check_archive, check_known, check_settings
 from mvrecon.engine.module import ReconstructionModule
+from mvrecon.engine.on_rig import model_on
 from mvrecon.engine.storage import read
-from mvrecon.engine.trained_reconstructor import model_on
 from mvrecon.files.checks import blaming, plain_name
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS

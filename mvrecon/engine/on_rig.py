@@ -53,6 +53,24 @@ class OnRig:
         return self
 
 
+def model_on(A: Projector, module: nn.Module, source: str) -> nn.Module:
+    """The model of a trained module with its weights on another operator, ready to reconstruct.
+
+    Args:
+        A: the operator, of any rig and grid that the model's weights fit.
+        module: as `load` gives it.
+        source: where it came from, for the message.
+
+    Raises:
+        ValueError: weights that fit the rig and the grid of the training alone.
+    """
+    try:
+        model = with_weights_of(module.model, module.hparams["model"], A)  # type: ignore[arg-type, index]
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
+    return model.to(A.device).eval()
+
+
 def with_weights_of(model: nn.Module, options: dict[str, Any], A: Projector) -> nn.Module:
     """A model of the same options for another operator, whose weights are the very tensors of the
     first: what one learns, both have learned.
@@ -67,8 +85,8 @@ def with_weights_of(model: nn.Module, options: dict[str, Any], A: Projector) -> 
     """
     with torch.random.fork_rng(devices=[]):  # initial weights that nobody uses
         other = MODELS.from_config(options, projector=A)
-    weights, own = model.state_dict(keep_vars=True), other.state_dict()
-    if differing := differences(weights, own):
+    weights = model.state_dict(keep_vars=True)
+    if differing := differences(weights, other.state_dict()):
         raise ValueError(
             f"Expected weights that fit any rig, got {len(differing)} of {options['name']!r} that "
             f"do not fit {len(A.cameras)} cameras of {tuple(A.cameras.shape)} pixels and "
@@ -81,10 +99,10 @@ def with_weights_of(model: nn.Module, options: dict[str, Any], A: Projector) -> 
     return other
 
 
-def differences(weights: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> list[str]:
+def differences(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> list[str]:
     """Names of the weights that only one of two models has, or whose shapes differ."""
     return [
         name
-        for name in {**weights, **own}
-        if name not in own or name not in weights or own[name].shape != weights[name].shape
+        for name in {**one, **other}
+        if name not in one or name not in other or one[name].shape != other[name].shape
     ]

@@ -75,8 +75,8 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
         ValueError: weights of another model, or which belong to another rig or grid; what `load`
             raises.
     """
-    weights, own = load(path).module.model.state_dict(), module.model.state_dict()
-    if differing := differences(weights, own):
+    weights = load(path).module.model.state_dict()
+    if differing := differences(weights, module.model.state_dict()):
         raise ValueError(
             f"init_from={path}: expected weights of the same model, of whatever rig and grid; got "
             f"{len(differing)} that are not those of {module.hparams['model']['name']!r}, "

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mvrecon.data import digests
 from mvrecon.engine.on_case import plain
-from mvrecon.engine.on_rig import with_weights_of
+from mvrecon.engine.on_rig import model_on
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
 
@@ -62,24 +62,6 @@ def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple
     for difference in _differences(A, plain(module.projector), many):
         warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=3)
     return model_on(A, module, checkpoint), module.hparams["data_range"]
-
-
-def model_on(A: Projector, module: nn.Module, checkpoint: str) -> nn.Module:
-    """The model of a trained module with its weights on another operator, ready to reconstruct.
-
-    Args:
-        A: the operator, of any rig and grid that the model's weights fit.
-        module: as `load` gives it.
-        checkpoint: where it came from, for the message.
-
-    Raises:
-        ValueError: weights that fit the rig and the grid of the training alone.
-    """
-    try:
-        model = with_weights_of(module.model, module.hparams["model"], A)  # type: ignore[arg-type, index]
-    except ValueError as error:
-        raise ValueError(f"{checkpoint}: {error}") from error
-    return model.to(A.device).eval()
 
 
 def _differences(A: Projector, other: Projector, many: bool) -> list[str]:
