@@ -12,6 +12,7 @@ import mvrecon as mv
 from mvrecon.cameras.field import check_rig_sees
 from mvrecon.cameras.formats import tigre
 from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.engine.export import save_png
 from mvrecon.parts import SCENES
@@ -52,7 +53,7 @@ assert check_rig_sees(cameras, grid).all()
 save_picture("rig.png", cameras, grid)
 
 views = (
-    Measured(path="scan").open().whole().views.flip(-2)
+    MeasuredViews.of(Measured(path="scan")).whole().views.flip(-2)
 )  # [m v u], line integrals: -ln((I - D) / (F - D))
 print(f"{len(views)} views, line integrals up to {views.max():.2f}")
 save_png("views.png", montage.gallery(views[:4]))

@@ -13,7 +13,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.field import auto_grid, check_rig_sees
 from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import Corrected
+from mvrecon.data.projections.views import Corrected, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.files.checks import Refused
 from mvrecon.files.memory import check_memory
@@ -94,7 +94,7 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     """
     flipped = settings["views"]["flip_rows"] or flips_rows(settings["camera"])
     views = {**settings["views"], "flip_rows": flipped}
-    measured = Measured(**views).open()
+    measured = MeasuredViews.of(Measured(**views))
     rig = CAMERAS.from_config(_with_pixels(settings["camera"], measured.stack.shape))
     cameras = measured.cameras(rig)
     grid = _grid(settings["grid"], cameras)

@@ -1,16 +1,16 @@
-"""Measured views: their files, and how grey values become line integrals."""
+"""Options of measured views: their files, and how grey values become line integrals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import Literal, get_args
 
-from mvrecon.data.projections.opening import open_projections
-from mvrecon.data.projections.views import Field, Kind, MeasuredViews
+Kind = Literal["integrals", "intensities"]
+Field = str | float | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """Options of measured views, read by `open`.
+    """Options of measured views, which `MeasuredViews.of` opens.
 
     Args:
         path: a folder of TIFF, PNG or DICOM images, or a file: views.h5, TIFF, .npy, .mha, .mhd,
@@ -66,16 +66,3 @@ class Measured:
             )
         if self.saturation is not None and not self.saturation > 0:
             raise ValueError(f"Expected a positive saturation, got {self.saturation}")
-
-    def open(self) -> MeasuredViews:
-        """The views, read view by view.
-
-        Warns:
-            UserWarning: dead pixels, with their number.
-
-        Raises:
-            FileNotFoundError, ImportError: see `open_projections`.
-            Refused: see there; a kind that does not fit, no flat field, a field of another size or
-                not above the dark one.
-        """
-        return MeasuredViews(self, open_projections(self.path, self.pattern, self.gaps))

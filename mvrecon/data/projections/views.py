@@ -9,7 +9,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,17 +16,12 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.data.projections.corrections import Fields, fields, integrals, transmission
+from mvrecon.data.projections.measured import Field, Kind, Measured
 from mvrecon.data.projections.opening import field_beside, open_projections
 from mvrecon.data.projections.region import Region
 from mvrecon.data.projections.stack import PIXELS, ProjectionStack
 from mvrecon.files.checks import Refused
 from mvrecon.files.memory import check_memory
-
-if TYPE_CHECKING:
-    from mvrecon.data.projections.measured import Measured
-
-Kind = Literal["integrals", "intensities"]
-Field = str | float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +49,7 @@ class MeasuredViews:
         stack: as they are on disk.
     """
 
-    def __init__(self, options: "Measured", stack: ProjectionStack):
+    def __init__(self, options: Measured, stack: ProjectionStack):
         self.options, self.stack = options, stack
         self.region = Region.of(stack.shape, options.rows, options.columns, options.binning)
         self.kind: Kind = _kind(options, stack)
@@ -63,6 +57,20 @@ class MeasuredViews:
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
             self._warn_of_dead(self.fields)
+
+    @classmethod
+    def of(cls, options: Measured) -> "MeasuredViews":
+        """The views in files, read view by view.
+
+        Warns:
+            UserWarning: dead pixels, with their number.
+
+        Raises:
+            FileNotFoundError, ImportError: see `open_projections`.
+            Refused: see there; a kind that does not fit, no flat field, a field of another size or
+                not above the dark one.
+        """
+        return cls(options, open_projections(options.path, options.pattern, options.gaps))
 
     @cached_property
     def fields(self) -> Fields:
@@ -225,7 +233,7 @@ class MeasuredViews:
             )
 
 
-def _kind(options: "Measured", stack: ProjectionStack) -> Kind:
+def _kind(options: Measured, stack: ProjectionStack) -> Kind:
     whole = stack.dtype.kind != "f"
     if options.kind == "integrals" and whole:
         raise Refused(

@@ -13,6 +13,7 @@ from mvrecon import registry
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.config import compose
 from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS
@@ -172,7 +173,7 @@ def test_the_files_are_a_scan_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
         EntryPoint("camera.stir_pinhole", "mvrecon_spect.files.stir:stir_pinhole", registry.GROUP),
     )
     monkeypatch.setattr(registry, "installed", lambda: points)
-    views = Measured(path=str(tmp_path / "counts.hs")).open()
+    views = MeasuredViews.of(Measured(path=str(tmp_path / "counts.hs")))
     assert torch.equal(views.whole().views, scan().counts[0, 0])
     path, detector, collimator = files(tmp_path)
     rig = CAMERAS.build(
