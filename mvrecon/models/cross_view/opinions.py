@@ -20,12 +20,9 @@ from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
 
-#: Channels of the weighting network's scales.
-WIDTHS = (8, 16)
-
 
 class Fused(NamedTuple):
-    """Opinions and what they come to, at the resolution of the round.
+    """Opinions and what they come to, at their resolution.
 
     Args:
         opinions: of each camera, relative to the content's scale.
@@ -51,12 +48,12 @@ class Opinions(nn.Module):
     rounding; heads whose `keeps_views` is true). The change goes to the world by inverse
     projection, the mean of all others' changes comes back along the rays (leave-one-out), and what
     of the camera's view they do not explain is evidence for the weights. Of each camera all this
-    is at the round's resolution: with cells of 8 voxels an eighth of a volume.
+    is in cells: with cells of 8 voxels an eighth of a volume.
 
     Args:
         projector: its grid and its rig.
         options: of the opinions.
-        edge: voxels of the round's cells along each axis.
+        edge: voxels of a cell along each axis.
         binning: detector pixels joined along each axis.
         depths: bins along a ray.
         precision: of the convolutions.
@@ -79,7 +76,8 @@ class Opinions(nn.Module):
         self.weighting: PlainUNet | None = None
         if options.weighted:
             inputs = 5 + options.learned
-            self.weighting = PlainUNet(3, inputs, 1, WIDTHS, zero=1, precision=precision)
+            self.weighting = PlainUNet(3, inputs, 1, options.widths, zero=1, precision=precision)
+            self.at_once = max(1, edge**3 // options.widths[0])
             self.weighting.last.bias = None  # one number for all cameras weighs none
 
     def forward(
@@ -157,7 +155,15 @@ class Opinions(nn.Module):
         evidence: Float[Tensor, "b m c d h w"],
         confidence: Float[Tensor, "b m #k d h w"],
     ) -> Float[Tensor, "b m 1 d h w"]:
-        """One logit for each voxel and camera, camera by camera: fewer features are held."""
+        """One logit for each voxel and camera; of so many cameras at once that their features are
+        no more than one volume.
+        """
         assert self.weighting is not None
-        logits = torch.stack([self.weighting(one) for one in evidence.unbind(1)], dim=1)
+        logits = torch.cat(
+            [
+                self.weighting(some.flatten(0, 1)).unflatten(0, some.shape[:2])
+                for some in evidence.split(self.at_once, dim=1)
+            ],
+            dim=1,
+        )
         return logits + confidence.sum(dim=2, keepdim=True)

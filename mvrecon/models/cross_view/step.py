@@ -11,7 +11,7 @@ from mvrecon.geometry.box import Box, placed
 from mvrecon.models.cross_view.cells import from_cells, padded, to_cells, trimmed
 from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence
 from mvrecon.models.cross_view.opinions import Fused, Opinions
-from mvrecon.models.cross_view.settings import OpinionOptions, RoundOptions
+from mvrecon.models.cross_view.settings import RoundOptions
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import CAMERA_NETWORKS
@@ -80,30 +80,27 @@ class Round(nn.Module):
         self.corrects = options.corrects
         self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
-        self.opinions = self._opinions(projector, options, precision, self.cameras)
-        cells, extra = self.edge**3, 0
-        if options.opinions is not None:
-            extra = 2 + OpinionOptions.of(options.opinions).handed
+        self.opinions: Opinions | None = None
+        self.entry: nn.Conv3d | None = None
+        cells, extra, self.scale = self.edge**3, 0, options.scale
+        if options.judged is not None:
+            edge, binning, depths = (
+                self.edge << self.scale,
+                self.cameras.binning,
+                self.cameras.depths,
+            )
+            self.opinions = Opinions(projector, options.judged, edge, binning, depths, precision)
+            extra = 2 + options.judged.handed
+        beside = 0 if self.scale else extra
         self.world = PlainUNet(
-            3, 4 * cells + extra, 2 * cells, options.widths, zero=cells, precision=precision
+            3, 4 * cells + beside, 2 * cells, options.widths, zero=cells, precision=precision
         )
-        if extra:  # before training a round with opinions is the round without
+        # before training a round with opinions is the round without
+        if self.scale:
+            self.entry = nn.Conv3d(extra, options.widths[self.scale], 1, bias=False)
+            nn.init.zeros_(self.entry.weight)
+        elif extra:
             nn.init.zeros_(self.world.first.weight[:, -extra:])
-
-    @staticmethod
-    def _opinions(
-        projector: Projector, options: RoundOptions, precision: Precision, network: Any
-    ) -> Opinions | None:
-        if options.opinions is None:
-            return None
-        return Opinions(
-            projector,
-            OpinionOptions.of(options.opinions),
-            options.edge,
-            network.binning,
-            network.depths,
-            precision,
-        )
 
     def forward(self, measured: Measured, state: State) -> State:
         """The state after the round."""
@@ -167,7 +164,8 @@ class Round(nn.Module):
             return self._answer(evidence, extra)
         volumes = []
         for i, box in enumerate(measured.boxes):
-            cells = [slice(s.start // self.edge, -(-s.stop // self.edge)) for s in box.slices]
+            edge = self.edge << self.scale
+            cells = [slice(s.start // edge, -(-s.stop // edge)) for s in box.slices]
             part = [one[i : i + 1, :, *cells] for one in extra]
             answer = self._answer(evidence[i : i + 1, :, *box.slices], part)
             volumes.append(placed(torch.cat(answer, dim=1), box, x.shape[2:]))
@@ -181,10 +179,13 @@ class Round(nn.Module):
 
         Args:
             evidence: volumes.
-            extra: more evidence, in cells already.
+            extra: what opinions come to, in their cells already.
         """
         cells = to_cells(padded(evidence, self.edge), self.edge)
-        answer = self.world(torch.cat([cells, *extra], dim=1) if extra else cells)
+        if self.entry is not None:
+            answer = self.world(cells, {self.scale: self.entry(*extra)})
+        else:
+            answer = self.world(torch.cat([cells, *extra], dim=1) if extra else cells)
         volumes = trimmed(from_cells(answer, self.edge), evidence.shape[2:])
         learned, memory = volumes.split(1, dim=1)
         return learned, memory
