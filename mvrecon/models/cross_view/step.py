@@ -56,6 +56,9 @@ class Measured(NamedTuple):
 class Round(nn.Module):
     """Round of the model: x + H (change + step C A^T R (y + trust e - A x)), in the unit of x.
 
+    What opinions come to is evidence for the network in the world: further channels where they have
+    the round's resolution, else features that are added at the scale that has their voxels.
+
     Args:
         projector: its grid and its rig.
         options: of this round.
@@ -80,18 +83,10 @@ class Round(nn.Module):
         self.corrects = options.corrects
         self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
-        self.opinions: Opinions | None = None
-        self.entry: nn.Conv3d | None = None
-        cells, extra, self.scale = self.edge**3, 0, options.scale
-        if options.judged is not None:
-            edge, binning, depths = (
-                self.edge << self.scale,
-                self.cameras.binning,
-                self.cameras.depths,
-            )
-            self.opinions = Opinions(projector, options.judged, edge, binning, depths, precision)
-            extra = 2 + options.judged.handed
-        beside = 0 if self.scale else extra
+        self.scale, self.entry = options.scale, None
+        self.opinions = self._opinions(projector, options, precision, self.cameras)
+        extra = 0 if options.judged is None else 2 + options.judged.handed
+        cells, beside = self.edge**3, 0 if self.scale else extra
         self.world = PlainUNet(
             3, 4 * cells + beside, 2 * cells, options.widths, zero=cells, precision=precision
         )
@@ -101,6 +96,21 @@ class Round(nn.Module):
             nn.init.zeros_(self.entry.weight)
         elif extra:
             nn.init.zeros_(self.world.first.weight[:, -extra:])
+
+    @staticmethod
+    def _opinions(
+        projector: Projector, options: RoundOptions, precision: Precision, network: Any
+    ) -> Opinions | None:
+        if options.judged is None:
+            return None
+        return Opinions(
+            projector,
+            options.judged,
+            options.edge << options.scale,
+            network.binning,
+            network.depths,
+            precision,
+        )
 
     def forward(self, measured: Measured, state: State) -> State:
         """The state after the round."""
