@@ -21,6 +21,10 @@ from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
 
 
+#: Density by which an empty voxel counts along a ray, relative to the content's scale.
+LEAST = 0.01
+
+
 class Fused(NamedTuple):
     """Opinions and what they come to, at their resolution.
 
@@ -32,6 +36,7 @@ class Fused(NamedTuple):
             pixels.
         evidence: for the network in the world: the fused change, the deviation over the cameras,
             and the fused features.
+        counts: how much each ray counts, in cells of pixels; none where all count as one.
     """
 
     opinions: Float[Tensor, "b m 1 d h w"]
@@ -39,6 +44,7 @@ class Fused(NamedTuple):
     weights: Float[Tensor, "b m 1 d h w"]
     expected: Float[Tensor, "b 1 m r s"]
     evidence: Float[Tensor, "b e d h w"]
+    counts: Float[Tensor, "b 1 m r s"] | None = None
 
 
 class Opinions(nn.Module):
@@ -70,6 +76,7 @@ class Opinions(nn.Module):
     ):
         super().__init__()
         self.edge, self.binning, self.learned = edge, binning, options.learned
+        self.counted = options.counted
         cameras = Binned.of(projector, binning).cameras
         self.inside = FixedFrusta(projector.grid.coarsened(edge), cameras, depths)
         self.head = HEADS.from_config(options.head)
@@ -120,7 +127,22 @@ class Opinions(nn.Module):
         average, features = fused.split([1, fused.shape[1] - 1], dim=1)
         small = MAGNIFIED * torch.cat([average, deviation(spread)[:, 0]], dim=1)
         evidence = torch.cat([small, features], dim=1)
-        return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence)
+        counts = self._counts(x, weights) if self.counted else None
+        return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, counts)
+
+    def _counts(
+        self, x: Float[Tensor, "b 1 e i x"], weights: Float[Tensor, "b m 1 e i x"]
+    ) -> Float[Tensor, "b 1 m r s"]:
+        """The mean along each ray of its camera's weight, relative to that of equal weights; a
+        voxel counts by its density.
+        """
+        frusta = self.inside.frusta
+        density = (x.detach().clamp_min(0) + LEAST)[:, None] * frusta.visible
+        relative = weights * frusta.visible.sum(dim=0)
+        both = frusta.to_frusta(torch.cat([density * relative, density], dim=2))
+        own, equal = both.sum(dim=3).unbind(2)
+        seen = equal > 0
+        return torch.where(seen, own / torch.where(seen, equal, 1), 1)[:, None]
 
     def _cells(
         self, volume: Float[Tensor, "b 1 d h w"], largest: bool = False

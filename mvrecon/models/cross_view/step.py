@@ -13,6 +13,7 @@ from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence
 from mvrecon.models.cross_view.opinions import Fused, Opinions
 from mvrecon.models.cross_view.settings import RoundOptions
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
+from mvrecon.models.cross_view.views import pixels
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import CAMERA_NETWORKS
 from mvrecon.projectors.operator import Projector
@@ -28,6 +29,8 @@ class State(NamedTuple):
             before any camera has.
         camera_memory: of the cameras' networks.
         fused: the last opinions of cameras.
+        counts: how much the residual of each ray counts, by the opinions; none where all count as
+            one.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -35,6 +38,12 @@ class State(NamedTuple):
     correction: Float[Tensor, "b 1 m v u"] | None = None
     camera_memory: Float[Tensor, "b m k r s"] | None = None
     fused: Fused | None = None
+    counts: Float[Tensor, "b 1 m v u"] | None = None
+
+
+def _counted(state: State, residual: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 m v u"]:
+    """Residual views, as much of each ray as it counts."""
+    return residual if state.counts is None else state.counts * residual
 
 
 class Measured(NamedTuple):
@@ -84,6 +93,7 @@ class Round(nn.Module):
         self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
         self.scale, self.entry = options.scale, None
+        self.counted = options.judged is not None and options.judged.counted
         self.opinions = self._opinions(projector, options, precision, self.cameras)
         extra = 0 if options.judged is None else 2 + options.judged.handed
         cells, beside = self.edge**3, 0 if self.scale else extra
@@ -118,17 +128,22 @@ class Round(nn.Module):
         residual = views - geometry.A(x)
         if state.correction is not None:
             residual = residual + self._views(measured, state.correction)
-        change = geometry.back(residual)
+        change = geometry.back(_counted(state, residual))
         extra: list[Tensor] = []
         if self.cameras is not None:
             state, answer = self._asked(measured, state, residual, change)
             if answer.correction is not None:
-                change = change + geometry.back(self._views(measured, answer.correction))
+                residual = residual + self._views(measured, answer.correction)
             if self.opinions is not None:
                 if state.correction is not None:
                     views = views + self._views(measured, state.correction)
                 fused = self.opinions(x, views, answer.placed, geometry.mask)
                 state, extra = state._replace(fused=fused), [fused.evidence]
+                if fused.counts is not None:
+                    counts = pixels(fused.counts, self.opinions.binning, views)
+                    state = state._replace(counts=counts)
+            if answer.correction is not None or self.counted:
+                change = geometry.back(_counted(state, residual))
         learned, memory = self._world(measured, state, change, extra)
         x = x + geometry.within(learned + self.step * change)
         return state._replace(volume=x, memory=memory)

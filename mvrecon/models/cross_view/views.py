@@ -70,3 +70,10 @@ def means(views: Float[Tensor, "b 1 m v u"], edge: int) -> Float[Tensor, "b 1 m 
         return views
     pooled = F.avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
     return pooled.unflatten(0, views.shape[:3])
+
+
+def pixels(
+    cells: Float[Tensor, "b 1 m r s"], edge: int, like: Float[Tensor, "b 1 m v u"]
+) -> Float[Tensor, "b 1 m v u"]:
+    """The value of each pixel's cell, for views in the size of `like`."""
+    return trimmed(F.interpolate(cells.flatten(1, 2), scale_factor=float(edge)), like.shape[-2:])[:, None]
