@@ -20,7 +20,6 @@ from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
 
-
 #: Density by which an empty voxel counts along a ray, relative to the content's scale.
 LEAST = 0.01
 
@@ -36,7 +35,7 @@ class Fused(NamedTuple):
             pixels.
         evidence: for the network in the world: the fused change, the deviation over the cameras,
             and the fused features.
-        counts: how much each ray counts, in cells of pixels; none where all count as one.
+        ray_weights: of the residual, in cells of pixels; none where all rays count as one.
     """
 
     opinions: Float[Tensor, "b m 1 d h w"]
@@ -44,7 +43,7 @@ class Fused(NamedTuple):
     weights: Float[Tensor, "b m 1 d h w"]
     expected: Float[Tensor, "b 1 m r s"]
     evidence: Float[Tensor, "b e d h w"]
-    counts: Float[Tensor, "b 1 m r s"] | None = None
+    ray_weights: Float[Tensor, "b 1 m r s"] | None = None
 
 
 class Opinions(nn.Module):
@@ -76,7 +75,7 @@ class Opinions(nn.Module):
     ):
         super().__init__()
         self.edge, self.binning, self.learned = edge, binning, options.learned
-        self.counted = options.counted
+        self.weigh_rays = options.weigh_rays
         cameras = Binned.of(projector, binning).cameras
         self.inside = FixedFrusta(projector.grid.coarsened(edge), cameras, depths)
         self.head = HEADS.from_config(options.head)
@@ -127,10 +126,10 @@ class Opinions(nn.Module):
         average, features = fused.split([1, fused.shape[1] - 1], dim=1)
         small = MAGNIFIED * torch.cat([average, deviation(spread)[:, 0]], dim=1)
         evidence = torch.cat([small, features], dim=1)
-        counts = self._counts(x, weights) if self.counted else None
-        return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, counts)
+        rays = self._ray_weights(x, weights) if self.weigh_rays else None
+        return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)
 
-    def _counts(
+    def _ray_weights(
         self, x: Float[Tensor, "b 1 e i x"], weights: Float[Tensor, "b m 1 e i x"]
     ) -> Float[Tensor, "b 1 m r s"]:
         """The mean along each ray of its camera's weight, relative to that of equal weights; a

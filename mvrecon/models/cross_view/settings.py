@@ -51,7 +51,7 @@ class OpinionOptions(Checked):
         features: channels that a camera hands to the network in the world besides its density.
         fusion: "weighted" by a network over the cameras, or the plain "mean".
         widths: channels of each scale of that network, the finest first.
-        counted: whether each ray's residual counts as much as its camera along it.
+        weigh_rays: whether the residual of each ray counts by the weight of its camera along it.
         prior: "learned": the cameras' network moves the density of x along the rays; "uniform": no
             network, all depths equally likely.
 
@@ -67,7 +67,7 @@ class OpinionOptions(Checked):
     features: int = 4
     fusion: Literal["weighted", "mean"] = "weighted"
     widths: Sequence[int] = (8, 16)
-    counted: bool = False
+    weigh_rays: bool = False
     prior: Literal["learned", "uniform"] = "learned"
 
     def __post_init__(self) -> None:

@@ -29,8 +29,7 @@ class State(NamedTuple):
             before any camera has.
         camera_memory: of the cameras' networks.
         fused: the last opinions of cameras.
-        counts: how much the residual of each ray counts, by the opinions; none where all count as
-            one.
+        ray_weights: of the residual, by the opinions; none where all rays count as one.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -38,12 +37,12 @@ class State(NamedTuple):
     correction: Float[Tensor, "b 1 m v u"] | None = None
     camera_memory: Float[Tensor, "b m k r s"] | None = None
     fused: Fused | None = None
-    counts: Float[Tensor, "b 1 m v u"] | None = None
+    ray_weights: Float[Tensor, "b 1 m v u"] | None = None
 
 
-def _counted(state: State, residual: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 m v u"]:
-    """Residual views, as much of each ray as it counts."""
-    return residual if state.counts is None else state.counts * residual
+def _weighed(state: State, residual: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 m v u"]:
+    """Residual views, each ray by its weight."""
+    return residual if state.ray_weights is None else state.ray_weights * residual
 
 
 class Measured(NamedTuple):
@@ -93,7 +92,7 @@ class Round(nn.Module):
         self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
         self.scale, self.entry = options.scale, None
-        self.counted = options.judged is not None and options.judged.counted
+        self.weigh_rays = options.judged is not None and options.judged.weigh_rays
         self.opinions = self._opinions(projector, options, precision, self.cameras)
         extra = 0 if options.judged is None else 2 + options.judged.handed
         cells, beside = self.edge**3, 0 if self.scale else extra
@@ -128,7 +127,7 @@ class Round(nn.Module):
         residual = views - geometry.A(x)
         if state.correction is not None:
             residual = residual + self._views(measured, state.correction)
-        change = geometry.back(_counted(state, residual))
+        change = geometry.back(_weighed(state, residual))
         extra: list[Tensor] = []
         if self.cameras is not None:
             state, answer = self._asked(measured, state, residual, change)
@@ -139,11 +138,11 @@ class Round(nn.Module):
                     views = views + self._views(measured, state.correction)
                 fused = self.opinions(x, views, answer.placed, geometry.mask)
                 state, extra = state._replace(fused=fused), [fused.evidence]
-                if fused.counts is not None:
-                    counts = pixels(fused.counts, self.opinions.binning, views)
-                    state = state._replace(counts=counts)
-            if answer.correction is not None or self.counted:
-                change = geometry.back(_counted(state, residual))
+                if fused.ray_weights is not None:
+                    weights = pixels(fused.ray_weights, self.opinions.binning, views)
+                    state = state._replace(ray_weights=weights)
+            if answer.correction is not None or self.weigh_rays:
+                change = geometry.back(_weighed(state, residual))
         learned, memory = self._world(measured, state, change, extra)
         x = x + geometry.within(learned + self.step * change)
         return state._replace(volume=x, memory=memory)

@@ -76,4 +76,6 @@ def pixels(
     cells: Float[Tensor, "b 1 m r s"], edge: int, like: Float[Tensor, "b 1 m v u"]
 ) -> Float[Tensor, "b 1 m v u"]:
     """The value of each pixel's cell, for views in the size of `like`."""
-    return trimmed(F.interpolate(cells.flatten(1, 2), scale_factor=float(edge)), like.shape[-2:])[:, None]
+    return trimmed(F.interpolate(cells.flatten(1, 2), scale_factor=float(edge)), like.shape[-2:])[
+        :, None
+    ]

@@ -14,7 +14,9 @@ from mvrecon.models.cross_view.evidence import Evidence
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.cross_view.rays2d import Rays2d
 from mvrecon.models.cross_view.settings import ROUNDS, OpinionOptions, RoundOptions
+from mvrecon.models.cross_view.step import Measured, State
 from mvrecon.models.cross_view.views import means
+from mvrecon.models.geometry import whole_geometry
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.testing import check_model
@@ -48,6 +50,7 @@ CHOICES = {
     "frustum3d": rounds(FRUSTA),
     "frustum3d, one each": rounds({**FRUSTA, "shared": False}),
     "coarse": alone({"resolution": "quarter", "widths": [4]}),
+    "rays": alone({"resolution": "half", "widths": [4], "weigh_rays": True}),
     "coarse, mean": alone({"resolution": "quarter", "fusion": "mean"}),
     "coarse, frustum3d": alone({"resolution": "half", "features": 0}, FRUSTA),
     "frustum3d, placed": rounds({**FRUSTA, "correct": False}, opinions={}),
@@ -128,6 +131,40 @@ def test_before_training_opinions_at_a_coarser_scale_change_nothing():
     plain.load_state_dict({**weights, **last})
     assert torch.allclose(model(views).volume, plain(views).volume, rtol=1e-5, atol=1e-7)
     assert not torch.allclose(before, plain(views).volume, rtol=1e-2)
+
+
+@torch.no_grad()
+def test_rays_count_as_their_camera_and_equally_before_training():
+    projector = small_projector()
+    views, volume = projector(blob(projector)), blob(projector)
+    torch.manual_seed(0)
+    model = CrossView(projector, CHOICES["rays"])
+    opinions, out = model.rounds[0].opinions, model(views)
+    opinions.weigh_rays = model.rounds[0].weigh_rays = False
+    assert torch.allclose(model(views).volume, out.volume, rtol=1e-5, atol=1e-7)
+    x, visible = opinions._cells(volume), opinions.inside.frusta.visible.float()
+    visible[0] = 0
+    weights = visible / visible.sum(dim=0).clamp_min(1)
+    rays = opinions._ray_weights(x, weights[None])
+    assert rays.shape == (1, 1, 4, 4, 4) and not rays[:, :, 0].any()
+    assert rays[:, :, 1:].min() >= 1 - 1e-5 and rays.max() == pytest.approx(4 / 3)
+
+
+@torch.no_grad()
+def test_a_view_whose_rays_count_nothing_changes_no_volume(monkeypatch):
+    """In a round before training, where networks change nothing."""
+    projector = small_projector()
+    (one,) = CrossView(projector, CHOICES["rays"]).rounds
+    weights = torch.ones(1, 1, 4, 4, 4)
+    weights[:, :, 1] = 0
+    monkeypatch.setattr(one.opinions, "_ray_weights", lambda *_: weights)
+    geometry, x = whole_geometry(projector), blob(projector)
+    chord, views = 1 / geometry.row.clamp_min(1e-3), 1.1 * projector(x)
+    state, other = State(x, torch.zeros_like(x)), views.clone()
+    other[:, :, 1] *= 2
+    expected = one(Measured(geometry, views, chord), state).volume
+    assert torch.equal(one(Measured(geometry, other, chord), state).volume, expected)
+    assert not torch.allclose(expected, x, rtol=1e-2)
 
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
@@ -216,7 +253,7 @@ def _evidence(projector, network):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("choice", ["weighted", "coarse", "frustum3d, placed"])
+@pytest.mark.parametrize("choice", ["weighted", "rays", "frustum3d, placed"])
 def test_weights_belong_to_their_camera_whatever_the_order(choice):
     grid, cameras = small_rig()
     order = torch.tensor([2, 0, 3, 1])
