@@ -13,7 +13,7 @@ from mvrecon.models.cross_view.evidence import MAGNIFIED
 from mvrecon.models.cross_view.sampling import FixedFrusta
 from mvrecon.models.cross_view.settings import OpinionOptions
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
-from mvrecon.models.cross_view.views import Binned, means
+from mvrecon.models.cross_view.views import Binned, means, pixels
 from mvrecon.models.networks import halved
 from mvrecon.models.pooling import deviation, leave_one_out, pooled
 from mvrecon.models.weighting import fuse
@@ -35,7 +35,7 @@ class Fused(NamedTuple):
             pixels.
         evidence: for the network in the world: the fused change, the deviation over the cameras,
             and the fused features.
-        ray_weights: of the residual, in cells of pixels; none where all rays count as one.
+        ray_weights: how much the residual of each ray counts; none where all count as one.
     """
 
     opinions: Float[Tensor, "b m 1 d h w"]
@@ -43,7 +43,7 @@ class Fused(NamedTuple):
     weights: Float[Tensor, "b m 1 d h w"]
     expected: Float[Tensor, "b 1 m r s"]
     evidence: Float[Tensor, "b e d h w"]
-    ray_weights: Float[Tensor, "b 1 m r s"] | None = None
+    ray_weights: Float[Tensor, "b 1 m v u"] | None = None
 
 
 class Opinions(nn.Module):
@@ -126,7 +126,9 @@ class Opinions(nn.Module):
         average, features = fused.split([1, fused.shape[1] - 1], dim=1)
         small = MAGNIFIED * torch.cat([average, deviation(spread)[:, 0]], dim=1)
         evidence = torch.cat([small, features], dim=1)
-        rays = self._ray_weights(x, weights) if self.weigh_rays else None
+        rays = None
+        if self.weigh_rays:
+            rays = pixels(self._ray_weights(x, weights), self.binning, views)
         return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)
 
     def _ray_weights(

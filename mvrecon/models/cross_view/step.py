@@ -13,7 +13,6 @@ from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence
 from mvrecon.models.cross_view.opinions import Fused, Opinions
 from mvrecon.models.cross_view.settings import RoundOptions
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
-from mvrecon.models.cross_view.views import pixels
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import CAMERA_NETWORKS
 from mvrecon.projectors.operator import Projector
@@ -29,7 +28,6 @@ class State(NamedTuple):
             before any camera has.
         camera_memory: of the cameras' networks.
         fused: the last opinions of cameras.
-        ray_weights: of the residual, by the opinions; none where all rays count as one.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -37,7 +35,11 @@ class State(NamedTuple):
     correction: Float[Tensor, "b 1 m v u"] | None = None
     camera_memory: Float[Tensor, "b m k r s"] | None = None
     fused: Fused | None = None
-    ray_weights: Float[Tensor, "b 1 m v u"] | None = None
+
+    @property
+    def ray_weights(self) -> Float[Tensor, "b 1 m v u"] | None:
+        """How much the residual of each ray counts; none where all count as one."""
+        return None if self.fused is None else self.fused.ray_weights
 
 
 def _weighed(state: State, residual: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 m v u"]:
@@ -92,7 +94,6 @@ class Round(nn.Module):
         self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
         self.scale, self.entry = options.scale, None
-        self.weigh_rays = options.judged is not None and options.judged.weigh_rays
         self.opinions = self._opinions(projector, options, precision, self.cameras)
         extra = 0 if options.judged is None else 2 + options.judged.handed
         cells, beside = self.edge**3, 0 if self.scale else extra
@@ -138,11 +139,7 @@ class Round(nn.Module):
                     views = views + self._views(measured, state.correction)
                 fused = self.opinions(x, views, answer.placed, geometry.mask)
                 state, extra = state._replace(fused=fused), [fused.evidence]
-                if fused.ray_weights is not None:
-                    weights = pixels(fused.ray_weights, self.opinions.binning, views)
-                    state = state._replace(ray_weights=weights)
-            if answer.correction is not None or self.weigh_rays:
-                change = geometry.back(_weighed(state, residual))
+            change = geometry.back(_weighed(state, residual))
         learned, memory = self._world(measured, state, change, extra)
         x = x + geometry.within(learned + self.step * change)
         return state._replace(volume=x, memory=memory)

@@ -140,7 +140,7 @@ def test_rays_count_as_their_camera_and_equally_before_training():
     torch.manual_seed(0)
     model = CrossView(projector, CHOICES["rays"])
     opinions, out = model.rounds[0].opinions, model(views)
-    opinions.weigh_rays = model.rounds[0].weigh_rays = False
+    opinions.weigh_rays = False
     assert torch.allclose(model(views).volume, out.volume, rtol=1e-5, atol=1e-7)
     x, visible = opinions._cells(volume), opinions.inside.frusta.visible.float()
     visible[0] = 0
