@@ -205,9 +205,12 @@ class Computing(Checked):
             raise ValueError(f"Expected the precision float32 or auto, got {self.precision!r}")
 
 
-#: Cameras correct, place and weigh at a quarter of the resolution; a network in the world at full
-#: resolution, with a second correction of the views.
+#: Cameras correct at full resolution, place and weigh at a quarter of it.
 ROUNDS: tuple[Mapping[str, Any], ...] = (
-    {"resolution": "quarter", "widths": (8,), "cameras": {"name": "rays2d"}, "opinions": {}},
-    {"resolution": "full", "widths": (16, 32, 64), "cameras": {"name": "rays2d"}},
+    {
+        "resolution": "full",
+        "widths": (16, 32, 64),
+        "cameras": {"name": "rays2d"},
+        "opinions": {"resolution": "quarter", "widths": (8,), "weigh_rays": True},
+    },
 )

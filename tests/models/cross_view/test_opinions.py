@@ -1,6 +1,7 @@
 """Opinions within a round: what is exact, what depends on what, and what their loss teaches."""
 
 import inspect
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.cross_view.evidence import Evidence
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.cross_view.rays2d import Rays2d
-from mvrecon.models.cross_view.settings import ROUNDS, OpinionOptions, RoundOptions
+from mvrecon.models.cross_view.settings import ROUNDS, RoundOptions
 from mvrecon.models.cross_view.step import Measured, State
 from mvrecon.models.cross_view.views import means
 from mvrecon.models.geometry import whole_geometry
@@ -92,7 +93,9 @@ def test_the_preset_is_the_default():
         for option in ("widths", "depths", "binning", "memory"):
             own = one.network[option]
             assert (tuple(own) if isinstance(own, list) else own) == plain[option].default
-    assert OpinionOptions.of(options["rounds"][0]["opinions"]) == OpinionOptions()
+        own, usual = one.judged, other.judged
+        assert (*own.widths,) == (*usual.widths,)
+        assert replace(own, widths=usual.widths) == usual
 
 
 def test_before_training_a_round_with_opinions_is_the_round_without():
