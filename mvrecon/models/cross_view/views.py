@@ -76,6 +76,6 @@ def pixels(
     cells: Float[Tensor, "b 1 m r s"], edge: int, like: Float[Tensor, "b 1 m v u"]
 ) -> Float[Tensor, "b 1 m v u"]:
     """The value of each pixel's cell, for views in the size of `like`."""
-    return trimmed(F.interpolate(cells.flatten(1, 2), scale_factor=float(edge)), like.shape[-2:])[
-        :, None
-    ]
+    values = cells.flatten(0, 2)[:, None].expand(-1, edge**2, -1, -1)
+    views = trimmed(from_cells(values, edge), like.shape[-2:])
+    return views[:, 0].unflatten(0, cells.shape[:3])
