@@ -30,8 +30,8 @@ from mvrecon.files.tables import write_rows
 
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
-#: What arms are compared with, by the beginnings of their names.
-AGAINST = ("world", "one_round")
+#: What arms are compared with.
+AGAINST = ("one_round", "world_rounds", "world_unet", "world_unet_aligned")
 
 
 def pace(options: argparse.Namespace) -> None:
@@ -136,7 +136,7 @@ def paired(rows: list[dict]) -> list[dict]:
     pairs = []
     for one, other in product(rows, rows):
         same = all(one[key] == other[key] for key in ("regime", "seconds", "seed"))
-        if not same or one["arm"] == other["arm"] or not other["arm"].startswith(AGAINST):
+        if not same or one["arm"] == other["arm"] or other["arm"] not in AGAINST:
             continue
         a, b = (torch.tensor([float(v) for v in r["patients"].split()]) for r in (one, other))
         difference = a - b
