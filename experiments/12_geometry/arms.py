@@ -15,13 +15,17 @@ BASE = (
 NARROW = "rounds=[{resolution: full, widths: [16,32,64], cameras: null}]"
 HALF = "{resolution: half, widths: [32,48,64]"
 CAMERAS = "cameras: {name: rays2d}"
-ONE = f"rounds=[{{resolution: full, widths: [16,32,64], {CAMERAS}}}]"
+FULL = f"{{resolution: full, widths: [16,32,64], {CAMERAS}}}"
+ONE = f"rounds=[{FULL}]"
+QUARTER = f"{{resolution: quarter, widths: [8], {CAMERAS}"
 
 #: What differs between the models.
 ARMS = {
     "cross_view": ("model=cross_view",),
-    "no_opinions": ("model=cross_view", "model.rounds.0.opinions=null"),
+    "equal_rays": ("model=cross_view", "model.rounds.0.opinions.weigh_rays=false"),
     "one_round": ("model=cross_view", f"model.{ONE}"),
+    "two_rounds": ("model=cross_view", f"model.rounds=[{QUARTER}, opinions: {{}}}}, {FULL}]"),
+    "no_opinions": ("model=cross_view", f"model.rounds=[{QUARTER}}}, {FULL}]"),
     "three_rounds": (
         "model=cross_view",
         f"model.rounds=[{HALF}, {CAMERAS}}}, {HALF}}}, {{resolution: full, widths: [16,32,64]}}]",

@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
+from statistics import median
 
 import torch
 from arms import ALIGNED, ARMS, CLASSICAL, REGIMES, paths, settings
@@ -29,11 +30,14 @@ from mvrecon.files.tables import write_rows
 
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
+#: What arms are compared with.
+AGAINST = ("one_round", "world_rounds", "world_unet", "world_unet_aligned")
 
 
 def pace(options: argparse.Namespace) -> None:
-    """Measure the processor seconds of a training step of each arm in each regime that was asked
-    for, the mean over real cases; alignment is not in it, since it is computed once a case.
+    """Measure the processor seconds of a batch's reconstruction and of a training step of each arm
+    in each regime that was asked for, medians over real cases; alignment is not in it, since it is
+    computed once a case.
     """
     torch.set_num_threads(1)
     rows = _paces()
@@ -44,35 +48,42 @@ def pace(options: argparse.Namespace) -> None:
         data.prepare_data()
         data.setup("fit")
         module = build_module(run, run["model"], data.data_range)
-        rows[regime, arm] = _seconds_a_step(module, data.train_dataloader())
-        names = ("regime", "arm", "seconds_per_step")
-        lines = ((*key, f"{value:.3f}") for key, value in rows.items())
-        write_rows(PACE, [dict(zip(names, line, strict=True)) for line in lines])
+        seconds = _seconds(module, data.train_dataloader())
+        rows[regime, arm] = {name: f"{value:.3f}" for name, value in seconds.items()}
+        keyed = ((dict(zip(("regime", "arm"), key, strict=True)), rows[key]) for key in rows)
+        write_rows(PACE, [key | values for key, values in keyed])
 
 
-def _seconds_a_step(module: ReconstructionModule, batches: Iterable[dict]) -> float:
-    """Mean processor time of a training step; the first makes the geometry and does not count."""
+def _seconds(module: ReconstructionModule, batches: Iterable[dict]) -> dict[str, float]:
+    """Median processor time of a training step and of a reconstruction; the first of either makes
+    the geometry and does not count."""
     optimizer = torch.optim.AdamW(module.parameters(), 1e-4)
-    times = []
+    steps, forward = [], []
     for batch in batches:
         start = time.process_time()
         module.terms(batch)["total"].backward()
         optimizer.step()
         optimizer.zero_grad()
-        times.append(time.process_time() - start)
-    return sum(times[1:]) / len(times[1:])
+        steps.append(time.process_time() - start)
+        start = time.process_time()
+        with torch.inference_mode():
+            module.model(batch["views"])
+        forward.append(time.process_time() - start)
+    return {"seconds_per_step": median(steps[1:]), "seconds_forward": median(forward[1:])}
 
 
-def _paces() -> dict[tuple[str, str], float]:
+def _paces() -> dict[tuple[str, str], dict[str, str]]:
+    """Of each regime and arm, the measured seconds by their names."""
     if not PACE.exists():
         return {}
     with open(PACE, newline="") as file:
-        return {(r["regime"], r["arm"]): float(r["seconds_per_step"]) for r in csv.DictReader(file)}
+        return {(row.pop("regime"), row.pop("arm")): row for row in csv.DictReader(file)}
 
 
 def steps(regime: str, arm: str, seconds: int) -> int:
     """Training steps of an arm in so many processor seconds."""
-    return round(seconds / _paces()[REGIMES[regime].pace, arm.removesuffix("_aligned")])
+    paces = _paces()[REGIMES[regime].pace, arm.removesuffix("_aligned")]
+    return round(seconds / float(paces["seconds_per_step"]))
 
 
 def train(options: argparse.Namespace) -> None:
@@ -119,11 +130,13 @@ def collected(runs: Path) -> list[dict]:
 
 
 def paired(rows: list[dict]) -> list[dict]:
-    """Each arm less each world arm of the same regime, length and seed, patient by patient."""
+    """Each arm less each world arm, and less `one_round`, of the same regime, length and seed,
+    patient by patient.
+    """
     pairs = []
     for one, other in product(rows, rows):
         same = all(one[key] == other[key] for key in ("regime", "seconds", "seed"))
-        if not same or one["arm"] == other["arm"] or not other["arm"].startswith("world"):
+        if not same or one["arm"] == other["arm"] or other["arm"] not in AGAINST:
             continue
         a, b = (torch.tensor([float(v) for v in r["patients"].split()]) for r in (one, other))
         difference = a - b

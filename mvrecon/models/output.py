@@ -14,8 +14,8 @@ class Reconstruction:
 
     Args:
         volume: in the unit of (views / mm).
-        opinions: each camera's own volume; like `visible` and `weights` in cells of 2 x 2 x 2
-            voxels where a model in rounds works at half the resolution.
+        opinions: each camera's own volume; like `visible` and `weights` in cells of 2 x 2 x 2 or
+            4 x 4 x 4 voxels where they have half or a quarter of the resolution.
         visible: which voxels each camera's frustum holds.
         weights: how much each camera counts at each voxel; they sum to one over the cameras that
             see it.

@@ -106,7 +106,10 @@ class CrossView(nn.Module):
                 corrected.append((y + chord * state.correction) * scale)
         if state.correction is not None and self.trust is not None:
             y = y + self.trust * chord * state.correction
-        volume = self.consistency(geometry, state.volume, y).clamp_min(0)
+        trusted = geometry
+        if state.ray_weights is not None and not self.consistency.poisson:
+            trusted = replace(geometry, row=geometry.row * state.ray_weights)
+        volume = self.consistency(trusted, state.volume, y).clamp_min(0)
         sigma = None
         if self.uncertainty is not None:
             sigma = self.uncertainty(geometry, y, volume, (x0, before)) * scale

@@ -13,19 +13,19 @@ from mvrecon.models.cross_view.evidence import MAGNIFIED
 from mvrecon.models.cross_view.sampling import FixedFrusta
 from mvrecon.models.cross_view.settings import OpinionOptions
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
-from mvrecon.models.cross_view.views import Binned, means
+from mvrecon.models.cross_view.views import Binned, means, pixels
 from mvrecon.models.networks import halved
 from mvrecon.models.pooling import deviation, leave_one_out, pooled
 from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
 
-#: Channels of the weighting network's scales.
-WIDTHS = (8, 16)
+#: Density by which an empty voxel counts along a ray, relative to the content's scale.
+LEAST = 0.01
 
 
 class Fused(NamedTuple):
-    """Opinions and what they come to, at the resolution of the round.
+    """Opinions and what they come to, at their resolution.
 
     Args:
         opinions: of each camera, relative to the content's scale.
@@ -35,6 +35,7 @@ class Fused(NamedTuple):
             pixels.
         evidence: for the network in the world: the fused change, the deviation over the cameras,
             and the fused features.
+        ray_weights: how much the residual of each ray counts; none where all count as one.
     """
 
     opinions: Float[Tensor, "b m 1 d h w"]
@@ -42,6 +43,7 @@ class Fused(NamedTuple):
     weights: Float[Tensor, "b m 1 d h w"]
     expected: Float[Tensor, "b 1 m r s"]
     evidence: Float[Tensor, "b e d h w"]
+    ray_weights: Float[Tensor, "b 1 m v u"] | None = None
 
 
 class Opinions(nn.Module):
@@ -51,12 +53,12 @@ class Opinions(nn.Module):
     rounding; heads whose `keeps_views` is true). The change goes to the world by inverse
     projection, the mean of all others' changes comes back along the rays (leave-one-out), and what
     of the camera's view they do not explain is evidence for the weights. Of each camera all this
-    is at the round's resolution: with cells of 8 voxels an eighth of a volume.
+    is in cells: with cells of 8 voxels an eighth of a volume.
 
     Args:
         projector: its grid and its rig.
         options: of the opinions.
-        edge: voxels of the round's cells along each axis.
+        edge: voxels of a cell along each axis.
         binning: detector pixels joined along each axis.
         depths: bins along a ray.
         precision: of the convolutions.
@@ -73,13 +75,15 @@ class Opinions(nn.Module):
     ):
         super().__init__()
         self.edge, self.binning, self.learned = edge, binning, options.learned
+        self.weigh_rays = options.weigh_rays
         cameras = Binned.of(projector, binning).cameras
         self.inside = FixedFrusta(projector.grid.coarsened(edge), cameras, depths)
         self.head = HEADS.from_config(options.head)
         self.weighting: PlainUNet | None = None
         if options.weighted:
             inputs = 5 + options.learned
-            self.weighting = PlainUNet(3, inputs, 1, WIDTHS, zero=1, precision=precision)
+            self.weighting = PlainUNet(3, inputs, 1, options.widths, zero=1, precision=precision)
+            self.at_once = max(1, edge**3 // options.widths[0])
             self.weighting.last.bias = None  # one number for all cameras weighs none
 
     def forward(
@@ -122,7 +126,24 @@ class Opinions(nn.Module):
         average, features = fused.split([1, fused.shape[1] - 1], dim=1)
         small = MAGNIFIED * torch.cat([average, deviation(spread)[:, 0]], dim=1)
         evidence = torch.cat([small, features], dim=1)
-        return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence)
+        rays = None
+        if self.weigh_rays:
+            rays = pixels(self._ray_weights(x, weights), self.binning, views)
+        return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)
+
+    def _ray_weights(
+        self, x: Float[Tensor, "b 1 e i x"], weights: Float[Tensor, "b m 1 e i x"]
+    ) -> Float[Tensor, "b 1 m r s"]:
+        """The mean along each ray of its camera's weight, relative to that of equal weights; a
+        voxel counts by its density.
+        """
+        frusta = self.inside.frusta
+        density = (x.detach().clamp_min(0) + LEAST)[:, None] * frusta.visible
+        relative = weights * frusta.visible.sum(dim=0)
+        both = frusta.to_frusta(torch.cat([density * relative, density], dim=2))
+        own, equal = both.sum(dim=3).unbind(2)
+        seen = equal > 0
+        return torch.where(seen, own / torch.where(seen, equal, 1), 1)[:, None]
 
     def _cells(
         self, volume: Float[Tensor, "b 1 d h w"], largest: bool = False
@@ -157,7 +178,15 @@ class Opinions(nn.Module):
         evidence: Float[Tensor, "b m c d h w"],
         confidence: Float[Tensor, "b m #k d h w"],
     ) -> Float[Tensor, "b m 1 d h w"]:
-        """One logit for each voxel and camera, camera by camera: fewer features are held."""
+        """One logit for each voxel and camera; of so many cameras at once that their features are
+        no more than one volume.
+        """
         assert self.weighting is not None
-        logits = torch.stack([self.weighting(one) for one in evidence.unbind(1)], dim=1)
+        logits = torch.cat(
+            [
+                self.weighting(some.flatten(0, 1)).unflatten(0, some.shape[:2])
+                for some in evidence.split(self.at_once, dim=1)
+            ],
+            dim=1,
+        )
         return logits + confidence.sum(dim=2, keepdim=True)

@@ -12,6 +12,18 @@ from mvrecon.registry import check_options
 EDGES = {"quarter": 4, "half": 2, "full": 1}
 
 
+def _check_resolution(what: str, resolution: str) -> None:
+    if resolution not in EDGES:
+        raise ValueError(
+            f"Expected the resolution of {what} as {', '.join(EDGES)}, got {resolution!r}"
+        )
+
+
+def _check_widths(what: str, widths: Sequence[int]) -> None:
+    if not widths or min(widths) < 1:
+        raise ValueError(f"Expected the widths of {what} as positive numbers, got {widths}")
+
+
 class Checked:
     """Dataclass that is made from a mapping; `what` begins the message of an unknown option."""
 
@@ -33,28 +45,39 @@ class OpinionOptions(Checked):
     """How the opinions of a round are formed and compared.
 
     Args:
+        resolution: of each camera's volume and weights, "quarter", "half" or "full"; none for the
+            round's.
         head: `{name: ..., **options}`; from logits along a ray to the density there.
         features: channels that a camera hands to the network in the world besides its density.
         fusion: "weighted" by a network over the cameras, or the plain "mean".
+        widths: channels of each scale of that network, the finest first.
+        weigh_rays: whether the residual of each ray counts by the weight of its camera along it.
         prior: "learned": the cameras' network moves the density of x along the rays; "uniform": no
             network, all depths equally likely.
 
     Raises:
-        ValueError: an unknown fusion or prior, or less than no feature.
+        ValueError: an unknown resolution, fusion or prior, no scale, a width below 1, or less than
+            no feature.
     """
 
     what: ClassVar[str] = "The opinion of a round"
 
+    resolution: Literal["quarter", "half", "full"] | None = None
     head: Mapping[str, Any] = field(default_factory=lambda: {"name": "softmax_depth"})
     features: int = 4
     fusion: Literal["weighted", "mean"] = "weighted"
+    widths: Sequence[int] = (8, 16)
+    weigh_rays: bool = False
     prior: Literal["learned", "uniform"] = "learned"
 
     def __post_init__(self) -> None:
+        if self.resolution is not None:
+            _check_resolution("opinions", self.resolution)
         if self.fusion not in ("weighted", "mean"):
             raise ValueError(f"Expected the fusion weighted or mean, got {self.fusion!r}")
         if self.prior not in ("learned", "uniform"):
             raise ValueError(f"Expected the prior learned or uniform, got {self.prior!r}")
+        _check_widths("the network that weighs opinions", self.widths)
         if self.features < 0:
             raise ValueError(f"Expected features of at least 0, got {self.features}")
 
@@ -79,8 +102,8 @@ class RoundOptions(Checked):
     """One round's resolution, widths, cameras and opinions.
 
     Args:
-        resolution: of the network in the world and of opinions: "quarter", "half", cells of 64 or
-            of 8 voxels as its channels, or "full".
+        resolution: of the network in the world: "quarter", "half", cells of 64 or of 8 voxels as
+            its channels, or "full".
         widths: channels of each of its scales, the finest first.
         cameras: the cameras' network: `{name: ..., correct: true, shared: true, **options}`:
             whether it corrects the views, and is one for all cameras or one each; none for a
@@ -88,8 +111,8 @@ class RoundOptions(Checked):
         opinions: fields of `OpinionOptions`, for a round with cameras; none for none.
 
     Raises:
-        ValueError: an unknown resolution, no scale, a width below 1, opinions without cameras, or
-            cameras that have nothing to do.
+        ValueError: an unknown resolution, no scale, a width below 1, opinions without cameras or
+            of voxels that the network in the world has not, or cameras that have nothing to do.
     """
 
     what: ClassVar[str] = "A round"
@@ -100,16 +123,15 @@ class RoundOptions(Checked):
     opinions: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        if self.resolution not in EDGES:
-            raise ValueError(
-                f"Expected the resolution of a round as {', '.join(EDGES)}, got {self.resolution!r}"
-            )
-        if not self.widths or min(self.widths) < 1:
-            raise ValueError(
-                f"Expected the widths of a round as positive numbers, got {self.widths}"
-            )
+        _check_resolution("a round", self.resolution)
+        _check_widths("a round", self.widths)
         if self.cameras is None and self.opinions is not None:
             raise ValueError("Expected opinions in a round with cameras, got cameras: null")
+        if self.judged is not None and self.scale not in range(len(self.widths)):
+            raise ValueError(
+                "Expected opinions of the resolution of one of the scales of the round's network, "
+                f"got {self.judged.resolution} where {len(self.widths)} begin at {self.resolution}"
+            )
         if self.cameras is not None and not (self.corrects or self.task.logits):
             raise ValueError(
                 "Expected cameras that correct views or have opinions with a learned prior, got "
@@ -120,6 +142,19 @@ class RoundOptions(Checked):
     def edge(self) -> int:
         """Voxels of a cell along each axis."""
         return EDGES[self.resolution]
+
+    @property
+    def judged(self) -> OpinionOptions | None:
+        """The options of the opinions, where there are any."""
+        return None if self.opinions is None else OpinionOptions.of(self.opinions)
+
+    @property
+    def scale(self) -> int:
+        """Scale of the network in the world whose voxels opinions have: 0, the finest, where they
+        have the round's resolution.
+        """
+        own = self.judged.resolution if self.judged else None
+        return EDGES[own or self.resolution].bit_length() - self.edge.bit_length()
 
     @property
     def corrects(self) -> bool:
@@ -136,9 +171,9 @@ class RoundOptions(Checked):
     def task(self) -> Task:
         """What the round asks of its cameras' network."""
         shared = bool((self.cameras or {}).get("shared", True))
-        if self.opinions is None:
+        opinions = self.judged
+        if opinions is None:
             return Task(self.corrects, shared)
-        opinions = OpinionOptions.of(self.opinions)
         logits = 1 + opinions.weighted if opinions.learned else 0
         return Task(self.corrects, shared, logits, opinions.handed)
 
@@ -170,9 +205,12 @@ class Computing(Checked):
             raise ValueError(f"Expected the precision float32 or auto, got {self.precision!r}")
 
 
-#: Cameras correct, place and weigh at a quarter of the resolution; a network in the world at full
-#: resolution, with a second correction of the views.
+#: Cameras correct at full resolution, place and weigh at a quarter of it.
 ROUNDS: tuple[Mapping[str, Any], ...] = (
-    {"resolution": "quarter", "widths": (8,), "cameras": {"name": "rays2d"}, "opinions": {}},
-    {"resolution": "full", "widths": (16, 32, 64), "cameras": {"name": "rays2d"}},
+    {
+        "resolution": "full",
+        "widths": (16, 32, 64),
+        "cameras": {"name": "rays2d"},
+        "opinions": {"resolution": "quarter", "widths": (8,), "weigh_rays": True},
+    },
 )

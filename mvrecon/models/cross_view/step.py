@@ -11,7 +11,7 @@ from mvrecon.geometry.box import Box, placed
 from mvrecon.models.cross_view.cells import from_cells, padded, to_cells, trimmed
 from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence
 from mvrecon.models.cross_view.opinions import Fused, Opinions
-from mvrecon.models.cross_view.settings import OpinionOptions, RoundOptions
+from mvrecon.models.cross_view.settings import RoundOptions
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import CAMERA_NETWORKS
@@ -36,6 +36,16 @@ class State(NamedTuple):
     camera_memory: Float[Tensor, "b m k r s"] | None = None
     fused: Fused | None = None
 
+    @property
+    def ray_weights(self) -> Float[Tensor, "b 1 m v u"] | None:
+        """How much the residual of each ray counts; none where all count as one."""
+        return None if self.fused is None else self.fused.ray_weights
+
+
+def _weighed(state: State, residual: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 m v u"]:
+    """Residual views, each ray by its weight."""
+    return residual if state.ray_weights is None else state.ray_weights * residual
+
 
 class Measured(NamedTuple):
     """The views of a case and the geometry they belong to.
@@ -55,6 +65,9 @@ class Measured(NamedTuple):
 
 class Round(nn.Module):
     """Round of the model: x + H (change + step C A^T R (y + trust e - A x)), in the unit of x.
+
+    What opinions come to is evidence for the network in the world: further channels where they have
+    the round's resolution, else features that are added at the scale that has their voxels.
 
     Args:
         projector: its grid and its rig.
@@ -80,26 +93,30 @@ class Round(nn.Module):
         self.corrects = options.corrects
         self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
+        self.scale, self.entry = options.scale, None
         self.opinions = self._opinions(projector, options, precision, self.cameras)
-        cells, extra = self.edge**3, 0
-        if options.opinions is not None:
-            extra = 2 + OpinionOptions.of(options.opinions).handed
+        extra = 0 if options.judged is None else 2 + options.judged.handed
+        cells, beside = self.edge**3, 0 if self.scale else extra
         self.world = PlainUNet(
-            3, 4 * cells + extra, 2 * cells, options.widths, zero=cells, precision=precision
+            3, 4 * cells + beside, 2 * cells, options.widths, zero=cells, precision=precision
         )
-        if extra:  # before training a round with opinions is the round without
+        # before training a round with opinions is the round without
+        if self.scale:
+            self.entry = nn.Conv3d(extra, options.widths[self.scale], 1, bias=False)
+            nn.init.zeros_(self.entry.weight)
+        elif extra:
             nn.init.zeros_(self.world.first.weight[:, -extra:])
 
     @staticmethod
     def _opinions(
         projector: Projector, options: RoundOptions, precision: Precision, network: Any
     ) -> Opinions | None:
-        if options.opinions is None:
+        if options.judged is None:
             return None
         return Opinions(
             projector,
-            OpinionOptions.of(options.opinions),
-            options.edge,
+            options.judged,
+            options.edge << options.scale,
             network.binning,
             network.depths,
             precision,
@@ -111,17 +128,18 @@ class Round(nn.Module):
         residual = views - geometry.A(x)
         if state.correction is not None:
             residual = residual + self._views(measured, state.correction)
-        change = geometry.back(residual)
+        change = geometry.back(_weighed(state, residual))
         extra: list[Tensor] = []
         if self.cameras is not None:
             state, answer = self._asked(measured, state, residual, change)
             if answer.correction is not None:
-                change = change + geometry.back(self._views(measured, answer.correction))
+                residual = residual + self._views(measured, answer.correction)
             if self.opinions is not None:
                 if state.correction is not None:
                     views = views + self._views(measured, state.correction)
                 fused = self.opinions(x, views, answer.placed, geometry.mask)
                 state, extra = state._replace(fused=fused), [fused.evidence]
+            change = geometry.back(_weighed(state, residual))
         learned, memory = self._world(measured, state, change, extra)
         x = x + geometry.within(learned + self.step * change)
         return state._replace(volume=x, memory=memory)
@@ -167,7 +185,8 @@ class Round(nn.Module):
             return self._answer(evidence, extra)
         volumes = []
         for i, box in enumerate(measured.boxes):
-            cells = [slice(s.start // self.edge, -(-s.stop // self.edge)) for s in box.slices]
+            edge = self.edge << self.scale
+            cells = [slice(s.start // edge, -(-s.stop // edge)) for s in box.slices]
             part = [one[i : i + 1, :, *cells] for one in extra]
             answer = self._answer(evidence[i : i + 1, :, *box.slices], part)
             volumes.append(placed(torch.cat(answer, dim=1), box, x.shape[2:]))
@@ -181,10 +200,13 @@ class Round(nn.Module):
 
         Args:
             evidence: volumes.
-            extra: more evidence, in cells already.
+            extra: what opinions come to, in their cells already.
         """
         cells = to_cells(padded(evidence, self.edge), self.edge)
-        answer = self.world(torch.cat([cells, *extra], dim=1) if extra else cells)
+        if self.entry is not None:
+            answer = self.world(cells, {self.scale: self.entry(*extra)})
+        else:
+            answer = self.world(torch.cat([cells, *extra], dim=1) if extra else cells)
         volumes = trimmed(from_cells(answer, self.edge), evidence.shape[2:])
         learned, memory = volumes.split(1, dim=1)
         return learned, memory

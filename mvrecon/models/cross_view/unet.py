@@ -1,6 +1,6 @@
 """A U-Net without normalisation, on images or volumes: densities keep their values."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from typing import Literal
@@ -63,20 +63,34 @@ class PlainUNet(nn.Module):
         if self.last.bias is not None:
             nn.init.zeros_(self.last.bias)
 
-    def forward(self, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
+    def forward(
+        self, x: Float[Tensor, "n i *d"], coarse: Mapping[int, Tensor] | None = None
+    ) -> Float[Tensor, "n o *d"]:
+        """Images or volumes of the size of x.
+
+        Args:
+            x: images or volumes.
+            coarse: features to add on the way down, by the scale that they belong to, 0 the finest:
+                of its channels, and of pixels or voxels 2^scale times as large as those of x.
+        """
+        coarse = {
+            level: padded(part, self.multiple >> level) for level, part in (coarse or {}).items()
+        }
         whole = padded(x, self.multiple)
         if x.ndim == 5:  # three quarters of the time of the default order, on a CPU
             whole = whole.contiguous(memory_format=torch.channels_last_3d)
         with arithmetic(self.precision, x):
-            answer = self._answer(whole)
+            answer = self._answer(whole, coarse)
         return trimmed(answer, x.shape[2:]).to(x.dtype)
 
-    def _answer(self, x: Tensor) -> Tensor:
+    def _answer(self, x: Tensor, coarse: Mapping[int, Tensor]) -> Tensor:
         x, skips = spread(self.first, x), []
         for level, block in enumerate(self.down):
             if level:
                 skips.append(x)
                 x = self.coarser[level - 1](x)
+            if level in coarse:
+                x = x + coarse[level].to(x.dtype)
             x = block(x)
         for level in reversed(range(len(self.up))):
             x = self.up[level](self.finer[level](x) + skips[level])

@@ -70,3 +70,12 @@ def means(views: Float[Tensor, "b 1 m v u"], edge: int) -> Float[Tensor, "b 1 m 
         return views
     pooled = F.avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
     return pooled.unflatten(0, views.shape[:3])
+
+
+def pixels(
+    cells: Float[Tensor, "b 1 m r s"], edge: int, like: Float[Tensor, "b 1 m v u"]
+) -> Float[Tensor, "b 1 m v u"]:
+    """The value of each pixel's cell, for views in the size of `like`."""
+    values = cells.flatten(0, 2)[:, None].expand(-1, edge**2, -1, -1)
+    views = trimmed(from_cells(values, edge), like.shape[-2:])
+    return views[:, 0].unflatten(0, cells.shape[:3])

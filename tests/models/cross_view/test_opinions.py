@@ -1,6 +1,7 @@
 """Opinions within a round: what is exact, what depends on what, and what their loss teaches."""
 
 import inspect
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,8 +14,10 @@ from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.cross_view.evidence import Evidence
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.cross_view.rays2d import Rays2d
-from mvrecon.models.cross_view.settings import ROUNDS, OpinionOptions, RoundOptions
+from mvrecon.models.cross_view.settings import ROUNDS, RoundOptions
+from mvrecon.models.cross_view.step import Measured, State
 from mvrecon.models.cross_view.views import means
+from mvrecon.models.geometry import whole_geometry
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.testing import check_model
@@ -30,6 +33,12 @@ def rounds(cameras=RAYS, **options) -> list:
     return [{"widths": [4, 6], "cameras": cameras, **options}, WORLD]
 
 
+def alone(opinions: dict | None, cameras=RAYS) -> list:
+    """One round at full resolution, whose network has voxels of a quarter of it, too."""
+    widths = [4, 6, 8]
+    return [{"resolution": "full", "widths": widths, "cameras": cameras, "opinions": opinions}]
+
+
 CHOICES = {
     "weighted": rounds(opinions={"features": 2}),
     "mean": rounds(opinions={"fusion": "mean"}),
@@ -41,6 +50,10 @@ CHOICES = {
     "one each": rounds({**RAYS, "shared": False}, opinions={}),
     "frustum3d": rounds(FRUSTA),
     "frustum3d, one each": rounds({**FRUSTA, "shared": False}),
+    "coarse": alone({"resolution": "quarter", "widths": [4]}),
+    "rays": alone({"resolution": "half", "widths": [4], "weigh_rays": True}),
+    "coarse, mean": alone({"resolution": "quarter", "fusion": "mean"}),
+    "coarse, frustum3d": alone({"resolution": "half", "features": 0}, FRUSTA),
     "frustum3d, placed": rounds({**FRUSTA, "correct": False}, opinions={}),
 }
 
@@ -66,6 +79,7 @@ def test_a_hull_of_odd_sizes_and_a_grid_of_one_slice_keep_the_contract():
     grid = Grid.centred(size=(11, 9, 1), spacing=2.0)
     projector = PROJECTORS.build("drr", grid=grid, cameras=cameras)
     check_model("cross_view", projector, rounds=CHOICES["weighted"], support="hull")
+    check_model("cross_view", projector, rounds=CHOICES["coarse"], support="hull")
     check_model("cross_view", projector, rounds=CHOICES["frustum3d"])
 
 
@@ -79,7 +93,9 @@ def test_the_preset_is_the_default():
         for option in ("widths", "depths", "binning", "memory"):
             own = one.network[option]
             assert (tuple(own) if isinstance(own, list) else own) == plain[option].default
-    assert OpinionOptions.of(options["rounds"][0]["opinions"]) == OpinionOptions()
+        own, usual = one.judged, other.judged
+        assert (*own.widths,) == (*usual.widths,)
+        assert replace(own, widths=usual.widths) == usual
 
 
 def test_before_training_a_round_with_opinions_is_the_round_without():
@@ -103,6 +119,84 @@ def test_before_training_a_round_with_opinions_is_the_round_without():
     assert torch.allclose(model(views).volume, plain(views).volume, rtol=1e-5, atol=1e-7)
 
 
+def test_before_training_opinions_at_a_coarser_scale_change_nothing():
+    projector = small_projector()
+    views = projector(blob(projector))
+    model, plain = stirred(projector, "coarse"), CrossView(projector, alone(None))
+    entry = model.rounds[0].entry.weight
+    assert CrossView(projector, CHOICES["coarse"]).rounds[0].entry.weight.eq(0).all()
+    before = model(views).volume
+    torch.nn.init.zeros_(entry)
+    own = model.state_dict()
+    last = {name: own[name] for name in own if "rounds.0.cameras.unet.last" in name}
+    last = {name: torch.cat([value[:9], value[-8:]]) for name, value in last.items()}
+    weights = {name: own[name] for name in plain.state_dict()}
+    plain.load_state_dict({**weights, **last})
+    assert torch.allclose(model(views).volume, plain(views).volume, rtol=1e-5, atol=1e-7)
+    assert not torch.allclose(before, plain(views).volume, rtol=1e-2)
+
+
+@torch.no_grad()
+def test_rays_count_as_their_camera_and_equally_before_training():
+    projector = small_projector()
+    views, volume = projector(blob(projector)), blob(projector)
+    torch.manual_seed(0)
+    model = CrossView(projector, CHOICES["rays"])
+    opinions, out = model.rounds[0].opinions, model(views)
+    opinions.weigh_rays = False
+    assert torch.allclose(model(views).volume, out.volume, rtol=1e-5, atol=1e-7)
+    x, visible = opinions._cells(volume), opinions.inside.frusta.visible.float()
+    visible[0] = 0
+    weights = visible / visible.sum(dim=0).clamp_min(1)
+    rays = opinions._ray_weights(x, weights[None])
+    assert rays.shape == (1, 1, 4, 4, 4) and not rays[:, :, 0].any()
+    assert rays[:, :, 1:].min() >= 1 - 1e-5 and rays.max() == pytest.approx(4 / 3)
+
+
+@torch.no_grad()
+def test_a_view_whose_rays_count_nothing_changes_no_volume(monkeypatch):
+    """In a round before training, where networks change nothing."""
+    projector = small_projector()
+    (one,) = CrossView(projector, CHOICES["rays"]).rounds
+    weights = torch.ones(1, 1, 4, 4, 4)
+    weights[:, :, 1] = 0
+    monkeypatch.setattr(one.opinions, "_ray_weights", lambda *_: weights)
+    geometry, x = whole_geometry(projector), blob(projector)
+    chord, views = 1 / geometry.row.clamp_min(1e-3), 1.1 * projector(x)
+    state, other = State(x, torch.zeros_like(x)), views.clone()
+    other[:, :, 1] *= 2
+    expected = one(Measured(geometry, views, chord), state).volume
+    assert torch.equal(one(Measured(geometry, other, chord), state).volume, expected)
+    assert not torch.allclose(expected, x, rtol=1e-2)
+
+
+@pytest.mark.filterwarnings("ignore:Rays are up to")
+@torch.no_grad()
+def test_a_crop_takes_the_opinions_of_its_own_voxels():
+    """A network in the world that looks at opinions alone gives inside the box what it gives on
+    the whole grid."""
+    projector = small_projector(size=32, pixels=32)
+    volume = torch.zeros(1, 1, 32, 32, 32)
+    volume[:, :, 20:24, 13:17, 12:18] = 1.0
+    torch.manual_seed(2)
+    model = CrossView(projector, CHOICES["coarse"], support="hull", crop=True).eval()
+    world, entry = model.rounds[0].world, model.rounds[0].entry.weight
+    for parameter in model.parameters():
+        parameter += 0.1 * torch.randn_like(parameter)
+    for block in (*world.down, *world.up):
+        block.second.weight.zero_()
+    world.first.weight.zero_()
+    entry.normal_(std=10.0)
+    views, shapes = projector(volume), []
+    world.register_forward_hook(lambda net, args, out: shapes.append(out.shape[2:].numel()))
+    cropped, model.crop = model(views).volume, False
+    whole = model(views).volume
+    assert shapes[0] < shapes[1] == 32**3
+    assert (cropped - whole).abs().max() < 1e-5 * whole.abs().max()
+    entry.zero_()
+    assert (model(views).volume - whole).abs().max() > 1e-2 * whole.abs().max()
+
+
 def test_choices_at_their_defaults_change_no_bit_of_a_round_without_opinions():
     projector = small_projector()
     views = projector(blob(projector))
@@ -116,9 +210,10 @@ def test_choices_at_their_defaults_change_no_bit_of_a_round_without_opinions():
     assert torch.equal(models[0](views).volume, models[1](views).volume)
 
 
-def test_in_its_frustum_every_camera_meets_its_own_view_whatever_the_network_says():
+@pytest.mark.parametrize("choice", ["weighted", "coarse"])
+def test_in_its_frustum_every_camera_meets_its_own_view_whatever_the_network_says(choice):
     projector = small_projector()
-    opinions = stirred(projector).rounds[0].opinions
+    opinions = stirred(projector, choice).rounds[0].opinions
     frusta = opinions.inside.frusta
     measured = means(projector(blob(projector)), 3)
     placed = 3 * torch.randn(1, 4, 4, 4, 4, 4)
@@ -129,9 +224,10 @@ def test_in_its_frustum_every_camera_meets_its_own_view_whatever_the_network_say
     assert rays.any() and torch.allclose(met[rays], measured[:, 0][rays], rtol=1e-5, atol=1e-5)
 
 
-def test_what_the_others_predict_of_a_view_does_not_depend_on_it():
+@pytest.mark.parametrize("choice", ["weighted", "coarse"])
+def test_what_the_others_predict_of_a_view_does_not_depend_on_it(choice):
     projector = small_projector()
-    opinions = stirred(projector).rounds[0].opinions
+    opinions = stirred(projector, choice).rounds[0].opinions
     volume = blob(projector)
     views = projector(volume).requires_grad_()
     placed = torch.randn(1, 4, 4, 4, 4, 4)
@@ -160,7 +256,7 @@ def _evidence(projector, network):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("choice", ["weighted", "frustum3d, placed"])
+@pytest.mark.parametrize("choice", ["weighted", "rays", "frustum3d, placed"])
 def test_weights_belong_to_their_camera_whatever_the_order(choice):
     grid, cameras = small_rig()
     order = torch.tensor([2, 0, 3, 1])
@@ -265,6 +361,26 @@ def test_with_a_loss_of_their_own_opinions_leave_the_start_and_differ():
             {"cameras": {"name": "rays2d"}, "opinions": {"prior": "flat"}},
             ValueError,
             "learned or uniform, got 'flat'",
+        ),
+        (
+            {"cameras": {"name": "rays2d"}, "opinions": {"resolution": "double"}},
+            ValueError,
+            "resolution of opinions as quarter, half, full, got 'double'",
+        ),
+        (
+            {"cameras": {"name": "rays2d"}, "opinions": {"resolution": "full"}},
+            ValueError,
+            "one of the scales of the round's network, got full where 3 begin at half",
+        ),
+        (
+            {"widths": [4], "cameras": {"name": "rays2d"}, "opinions": {"resolution": "quarter"}},
+            ValueError,
+            "one of the scales of the round's network, got quarter where 1 begin at half",
+        ),
+        (
+            {"cameras": {"name": "rays2d"}, "opinions": {"widths": [0]}},
+            ValueError,
+            "network that weighs opinions as positive numbers",
         ),
         (
             {"cameras": {"name": "rays2d"}, "opinions": {"feature": 3}},

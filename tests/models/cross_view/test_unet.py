@@ -27,6 +27,19 @@ def test_a_block_of_no_weights_leaves_its_input():
     assert torch.equal(block(x), x)
 
 
+def test_coarse_features_belong_to_the_voxels_of_their_cells():
+    """Without blocks a voxel depends on its own cell of 4 x 4 x 4 voxels alone, also where cells
+    stand beyond the volume."""
+    torch.manual_seed(0)
+    network = PlainUNet(3, 1, 1, (4, 6, 8))
+    for block in (*network.down, *network.up):
+        torch.nn.init.zeros_(block.second.weight)
+    coarse = torch.rand(1, 8, 3, 3, 3, requires_grad=True)
+    answer = network(torch.rand(1, 1, 9, 10, 11), {2: coarse})
+    (gradient,) = torch.autograd.grad(answer[0, 0, 3, 4, 10], coarse)
+    assert (gradient != 0).any(dim=1).nonzero().tolist() == [[0, 0, 1, 2]]
+
+
 def test_without_normalisation_an_offset_of_the_input_is_not_lost():
     """The answer to a brighter volume is another one; group normalisation would hide most of it."""
     torch.manual_seed(0)
