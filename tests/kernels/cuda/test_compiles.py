@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mvrecon.kernels.rays.cuda import nvrtc
-from mvrecon.kernels.rays.cuda.sources import KERNELS, Variant
+from mvrecon.kernels.rays.cuda.sources import KERNELS, Variant, text_of
 from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR
 
 SCRIPT = Path(__file__).parents[3] / "scripts" / "gpu" / "machine_code.py"
@@ -46,7 +46,7 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
     explicit rays alone. Before the loops a few numbers may be put aside: on sm_80 `gather` of four
     bfloat16 volumes does, and set-up in float64.
     """
-    kernels, count = machine_code.compiled(variant, capability), machine_code.count
+    kernels, count = machine_code.compiled(text_of({"": variant}), capability), machine_code.count
     assert kernels.keys() == set(KERNELS)
     for name, kernel in kernels.items():
         assert kernel.registers <= MOST, (name, kernel.registers)

@@ -19,13 +19,15 @@ PRECISIONS = [(torch.float64, 3, 1e-11), (torch.float32, 9, 3e-6)]
 
 
 def compared(maps: torch.Tensor, of, to, dtype: torch.dtype, channels: int) -> dict[str, float]:
-    """The differences of the three operators to the reference, for two items."""
+    """The differences of the three operators, of numbers stored as `dtype`, to the reference, for
+    two items.
+    """
     torch.manual_seed(0)
     x = torch.randn(2, len(maps), channels, *of, dtype=dtype)
     moving, wide = maps.clone().requires_grad_(), x.double().requires_grad_()
     values = reference.warp(wide, moving, list(to))
     y = torch.randn(values.shape, dtype=dtype)
-    volumes, change = torch.autograd.grad((values * y).sum(), (wide, moving))
+    volumes, change = torch.autograd.grad((values * y.double()).sum(), (wide, moving))
     return {
         "warp": difference(cuda.warp(x, maps, list(to)), values),
         "back": difference(cuda.warp_back(y, maps, list(of)), volumes),
@@ -53,7 +55,10 @@ def test_warps_their_transpose_and_derivative_are_those_of_the_reference(
         assert max(errors.values()) < bound, errors
 
 
-@pytest.mark.parametrize(("dtype", "channels", "bound"), PRECISIONS)
+HALVES = [(torch.float16, 9, 3e-6), (torch.bfloat16, 2, 3e-6)]
+
+
+@pytest.mark.parametrize(("dtype", "channels", "bound"), PRECISIONS + HALVES)
 def test_maps_that_have_no_inverse_are_transposed_too(dtype, channels, bound, host):
     """Homographies, maps whose rows grow each in its own way, and one that shows a single plane."""
     maps = lifted_maps(generic(3))
