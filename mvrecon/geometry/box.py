@@ -6,6 +6,7 @@ last voxel.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Int, Shaped
@@ -42,7 +43,7 @@ class Box:
         """The box of a row of `bounds`."""
         return cls(three(numbers[:3]), three(numbers[3:]))
 
-    @property
+    @cached_property
     def shape(self) -> Three:
         """Voxels along (z, y, x)."""
         return three([max(0, high - low) for low, high in zip(self.low, self.high, strict=True)])
