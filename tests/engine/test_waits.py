@@ -27,8 +27,8 @@ LEFT = {
     "sinogram_unet": 2 * COPIES + 1,
     "dual_domain": 2 * COPIES + 1,
     "radon_unet": COPIES,
-    "sirt": 8,
-    "classical": 8,
+    "sirt": 6,
+    "classical": 6,
 }
 #: Their first step moves an operator, or the images of voxels, to the device.
 MOVING = ("dif_net", "svct", "sinogram_unet", "dual_domain", "radon_unet")
