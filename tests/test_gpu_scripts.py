@@ -1,5 +1,6 @@
 """The scripts for measuring on a GPU: they import, and say what they need."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -17,12 +18,19 @@ RUN = {
     "operators": ["--out", "OUT"],
     "learn": ["--out", "OUT", "--train", "a.h5", "--test", "b.h5"],
 }
+#: The same on a stand-in for a GPU, as small as can be: every line of the scripts that needs one.
+SMALL = {
+    "check": ["--n", "8", "--modes"],
+    "models": ["--n", "12", "--models", "cross_view", "--variants", "model.support=hull"],
+    "operators": ["--cases", "12:2:12", "--volumes", "1"],
+    "learn": "--n 16 --views 3 --cases 3 --val 1 --tests 1 --steps 2 --profile 1 --batch 1".split(),
+}
 #: Where there is a GPU, scripts would measure.
 COMMANDS = {} if torch.cuda.is_available() else RUN
 #: Imports every script, then runs each command as a shell would; what each of them ended with.
 CODE = """
-import importlib, json, runpy, sys
-names, commands, ends = *map(json.loads, sys.argv[1:]), {}
+import contextlib, importlib, io, json, runpy, sys
+names, commands, dry, ends = *map(json.loads, sys.argv[1:]), {}
 sys.path.insert(0, "scripts/gpu")
 for name in names:
     importlib.import_module(name)
@@ -32,13 +40,17 @@ for name, words in commands.items():
         runpy.run_path(sys.argv[0], run_name="__main__")
     except SystemExit as end:
         ends[name] = end.code
+for name, words in dry.items():
+    sys.argv = [f"scripts/gpu/{name}.py", *words]
+    with contextlib.redirect_stdout(io.StringIO()):
+        runpy.run_path(sys.argv[0], run_name="__main__")
 sys.exit(json.dumps(ends))
 """
 
 
 class Ends(NamedTuple):
     """What a process that ran the scripts printed, how each ended, and the folder that they were
-    to make.
+    to make; those that ran on the stand-in made "dry" beside it.
     """
 
     printed: str
@@ -54,7 +66,10 @@ def ends(tmp_path_factory: pytest.TempPathFactory) -> Ends:
         name: [str(out) if word == "OUT" else word for word in words]
         for name, words in COMMANDS.items()
     }
-    texts = json.dumps([script.stem for script in SCRIPTS]), json.dumps(commands)
+    there = ["--out", str(out.with_name("dry")), "--device", "dry"]
+    dry = {name: [*there, *words] for name, words in SMALL.items()} if commands else {}
+    names = [script.stem for script in SCRIPTS]
+    texts = [json.dumps(argument) for argument in (names, commands, dry)]
     done = subprocess.run(
         [sys.executable, "-c", CODE, *texts],
         cwd=ROOT,
@@ -78,3 +93,28 @@ def test_a_script_without_a_gpu_says_so(name: str, ends: Ends):
     """Before it makes anything."""
     assert f"{name}.py needs a GPU, and torch" in str(ends.codes[name])
     assert not ends.out.exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_every_script_runs_to_its_end_on_a_stand_in(ends: Ends):
+    """No part of it fails but what needs CUDA's driver, or a program that is not installed."""
+    out = ends.out.with_name("dry")
+    facts = {
+        path.stem: json.loads(path.read_text())
+        for path in (out / "check.json", out / "models.json", *out.glob("learn_*.json"))
+    }
+    failed = [
+        (script, what, value)
+        for script, results in facts.items()
+        for what, value in results.items()
+        if str(value).startswith(("FAILED", "no time left"))
+    ]
+    assert len(facts) == 3 and not failed
+    (learned,) = (results for script, results in facts.items() if script.startswith("learn_"))
+    assert {"profile", "ms per step", "figures"} <= learned.keys()
+    with open(out / "operators.csv") as file:
+        rows = {row["program"]: row for row in csv.DictReader(file)}
+    for program in ("mvrecon joseph", "mvrecon siddon skip=off"):
+        assert not rows[program]["note"]
+        assert all(rows[program][f"{what}_ms"] for what in ("forward", "adjoint", "pose"))
+    assert "CUDA's driver cannot be loaded" in rows["mvrecon joseph scatter"]["note"]

@@ -6,9 +6,10 @@ last voxel.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Shaped
+from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 Three = tuple[int, int, int]
@@ -35,15 +36,14 @@ class Box:
     def around(cls, mask: Bool[Tensor, "*n d h w"]) -> "Box":
         """The least box that holds every true voxel of any of the masks; empty for none."""
         mask = mask.flatten(0, -4).any(dim=0) if mask.ndim > 3 else mask
-        lines = mask.any(dim=2).any(dim=1), mask.any(dim=2).any(dim=0), mask.any(dim=1).any(dim=0)
-        indices = [line.nonzero()[:, 0].tolist() for line in lines]
-        if not indices[0]:
-            return cls((0, 0, 0), (0, 0, 0))
-        return cls(
-            three([along[0] for along in indices]), three([along[-1] + 1 for along in indices])
-        )
+        return cls.of(bounds(mask[None])[0].tolist())
 
-    @property
+    @classmethod
+    def of(cls, numbers: Sequence[int]) -> "Box":
+        """The box of a row of `bounds`."""
+        return cls(three(numbers[:3]), three(numbers[3:]))
+
+    @cached_property
     def shape(self) -> Three:
         """Voxels along (z, y, x)."""
         return three([max(0, high - low) for low, high in zip(self.low, self.high, strict=True)])
@@ -102,6 +102,17 @@ class Box:
         low = [min(pair) for pair in zip(self.low, other.low, strict=True)]
         high = [max(pair) for pair in zip(self.high, other.high, strict=True)]
         return Box(three(low), three(high))
+
+
+def bounds(masks: Bool[Tensor, "b d h w"]) -> Int[Tensor, "b 6"]:
+    """The least boxes around masks, each as its `low` and `high`, on the masks' device; zeros for
+    none.
+    """
+    columns = masks.any(dim=3)
+    lines = columns.any(dim=2), columns.any(dim=1), masks.any(dim=1).any(dim=1)
+    low = [line.int().argmax(dim=1) for line in lines]  # the first of the greatest
+    high = [line.shape[1] - line.flip(1).int().argmax(dim=1) for line in lines]
+    return torch.stack(low + high, dim=1) * lines[0].any(dim=1, keepdim=True)
 
 
 def placed(

@@ -10,7 +10,6 @@ mask of ones gives the plain steps.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import torch
 import torch.nn.functional as F
@@ -73,10 +72,9 @@ def voxels_of(mask: Bool[Tensor, "n 1 d h w"]) -> Voxels:
     active = bricks.any(dim=-1).any(dim=-1).any(dim=-1).nonzero()  # [q 4]
     voxels = bricks[tuple(active.unbind(dim=1))].flatten(1)  # [q 128]
     brick, inner = voxels.nonzero().unbind(dim=1)
-    index = torch.stack(torch.unravel_index(inner, BRICK), dim=1) + active[
-        brick, 1:
-    ] * active.new_tensor(BRICK)
-    sample, (z, y, x) = active[brick, 0], index.unbind(dim=1)
+    sample, *corner = active[brick].unbind(dim=1)
+    steps = zip(corner, BRICK, places_of(inner, BRICK), strict=True)
+    z, y, x = (first * edge + step for first, edge, step in steps)
     row = torch.full((n, *[size + 2 for size in padded.shape[1:]]), len(z), device=mask.device)
     row[sample, z + 1, y + 1, x + 1] = torch.arange(len(z), device=mask.device)
     return Voxels(
@@ -87,6 +85,17 @@ def voxels_of(mask: Bool[Tensor, "n 1 d h w"]) -> Voxels:
         around=_bricks(row, 2)[tuple(active.unbind(dim=1))],
         own=brick * voxels.shape[1] + inner,
     )
+
+
+def places_of(index: Int[Tensor, " k"], shape: Sequence[int]) -> list[Int[Tensor, " k"]]:
+    """The index along each axis of a flat one; `torch.unravel_index` copies the shape to a GPU, and
+    waits.
+    """
+    places = []
+    for size in reversed(shape):
+        places.append(index % size)
+        index = index // size
+    return places[::-1]
 
 
 def _bricks(volumes: Shaped[Tensor, "n d h w"], more: int) -> Shaped[Tensor, "n z y x a e i"]:
@@ -156,15 +165,16 @@ def halved(x: Float[Tensor, "k c"], fine: Voxels, coarse: Voxels) -> Float[Tenso
 
 def doubled(x: Float[Tensor, "l c"], coarse: Voxels, fine: Voxels) -> Float[Tensor, "k c"]:
     """Trilinear interpolation between the coarse voxels that are in the mask."""
-    sample, *places = torch.unravel_index(fine.place, fine.shape)
+    sample, *places = places_of(fine.place, fine.shape)
     first, side = (
         sample,
         torch.zeros_like(sample),
     )  # of the eight around a voxel; where it lies between them
     for place, size in zip(places, coarse.row.shape[1:], strict=True):
         first, side = first * size + (place + 1) // 2, side * 2 + place % 2
-    corners = torch.tensor(list(product((0, 1), repeat=3)), device=x.device)
-    steps = corners @ corners.new_tensor(coarse.row.stride()[1:])
+    sides = places_of(torch.arange(8, device=x.device), (2, 2, 2))
+    corners = torch.stack(sides, dim=1)
+    steps = sum(one * stride for one, stride in zip(sides, coarse.row.stride()[1:], strict=True))
     near = coarse.row.flatten().index_select(0, (first[:, None] + steps).flatten()).view(-1, 8)
     shares = (
         torch.where(corners[:, None] == corners, 0.25, 0.75).prod(dim=-1).to(x)

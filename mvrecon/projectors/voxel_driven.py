@@ -80,10 +80,11 @@ def looked(
     views: Float[Tensor, "b c m v u"], images: Images, weighted: bool, backend: str = "auto"
 ) -> Float[Tensor, "b c d h w"]:
     """`backproject` by images that are known, which a GPU does not wait for."""
-    chosen, _ = kernels_for(views, backend, "look", differences)
+    values = wide(views)
+    chosen, _ = kernels_for(values, backend, "look", differences)
     kernels = voxel_reference if chosen == "reference" else voxel_ops
     volumes = kernels.look(
-        wide(views).flatten(0, 1),
+        values.flatten(0, 1),
         images.maps,
         list(images.ray_extent),
         weighted,

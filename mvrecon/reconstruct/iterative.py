@@ -36,8 +36,8 @@ def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> SirtW
         if mirror is None:
             rows = A(ones)
             return SirtWeights(inverse_sums(rows), inverse_sums(A.T(torch.ones_like(rows))))
+        selection = ViewSelection(A.range_shape, mirror.share.nonzero()[:, 0].tolist())
         share = mirror.share.to(ones)[:, None, None]
-        selection = ViewSelection(A.range_shape, share.flatten().nonzero()[:, 0].tolist())
         half = A.subset(selection)
         rows = share * selection.T(half(ones))
         columns = half.T(selection(share.expand_as(rows)))

@@ -31,6 +31,8 @@ WAITING = {
     *("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "bincount"),
     *("_unique", "_unique2", "unique_dim", "unique_consecutive", "linalg_inv_ex", "histc"),
 }
+#: Products, which a GPU has of floating numbers alone.
+PRODUCTS = {"mm", "mv", "bmm", "dot", "addmm", "addmv", "baddbmm"}
 #: Operators that launch nothing.
 NOTHING = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "detach"}
 COPIED = "copied from main memory"
@@ -136,6 +138,8 @@ class _Operators(TorchDispatchMode):
         host = [tuple(x.shape) for x in tensors if not isinstance(x, OnGpu) and x.ndim]
         if device and host and name not in MIXED:
             raise RuntimeError(f"{func}: tensors on cuda:0 and in main memory, {host}")
+        if device and name in PRODUCTS and not tensors[0].is_floating_point():
+            raise RuntimeError(f"{func}: a GPU has none of {tensors[0].dtype}")
         if device:
             self._count_waits(name, args)
         wanted = kwargs.get("device")
@@ -146,7 +150,7 @@ class _Operators(TorchDispatchMode):
             options = {**options, "device": torch.device("cpu")}
         result = func(*plain, **options)
         stays = _is_gpu(wanted) if wanted is not None else device
-        if name == "_local_scalar_dense" or not stays:
+        if result is None or name == "_local_scalar_dense" or not stays:
             return result
         if name not in NOTHING and not func.is_view:
             self.gpu.launches[name] += 1
@@ -181,6 +185,8 @@ class _Calls(TorchFunctionMode):
         kwargs, name = kwargs or {}, getattr(func, "__name__", "").strip("_")
         if args and isinstance(args[0], OnGpu) and name in self.ANSWERS:
             return self.ANSWERS[name](self, func, *args, **kwargs)
+        if name == "to":
+            args, kwargs = tree_map(_numbered, (args, kwargs))
         if name in ("tensor", "as_tensor") and _is_gpu(kwargs.get("device")):
             source, dtype = args[0], kwargs.get("dtype")
             if not isinstance(source, OnGpu):
@@ -213,6 +219,11 @@ class _Calls(TorchFunctionMode):
     def _cuda(self, func: Any, tensor: OnGpu, *_: Any, **__: Any) -> Any:
         return tensor
 
+    def _unravel(self, func: Any, tensor: OnGpu, shape: Any) -> Any:
+        for _ in range(2):
+            self.gpu.wait(f"unravel_index, {COPIED}")
+        return tuple(map(OnGpu, func(tensor.values, shape)))
+
     def _index(self, func: Any, tensor: OnGpu, index: Any, *value: Any) -> Any:
         many = isinstance(index, tuple)
         moved = tuple(map(self._moved, index if many else (index,)))
@@ -232,6 +243,7 @@ class _Calls(TorchFunctionMode):
         "new_tensor": _new_tensor,
         "to": _to,
         "cuda": _cuda,
+        "unravel_index": _unravel,
         "getitem": _index,
         "setitem": _index,
     }
@@ -240,3 +252,8 @@ class _Calls(TorchFunctionMode):
 def _is_gpu(device: Any) -> bool:
     """Whether a device is named that the stand-in serves."""
     return device is not None and torch.device(device).type in ("cuda", "meta")
+
+
+def _numbered(x: Any) -> Any:
+    """ "cuda" with the number of the device, for which C++ would ask; anything else as it is."""
+    return GPU if isinstance(x, str | torch.device) and str(x) == "cuda" else x

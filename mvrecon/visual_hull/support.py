@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, bounds
 from mvrecon.geometry.grid import Grid
 from mvrecon.visual_hull.footprints import ray_gap
 from mvrecon.visual_hull.hull import expand, thin_witnesses, visual_hull
@@ -114,13 +115,17 @@ def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stackleve
 def _chosen(
     kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None
 ) -> Support:
-    whole, box = Box.whole(mask.shape[2:]), Box.around(mask) if mask.any() else middle
+    count = mask.sum(dtype=torch.int64).view(1)
+    # all numbers at once: for each the host would wait for a GPU
+    *ends, voxels = torch.cat([bounds(mask.flatten(0, 1).any(dim=0)[None])[0], count]).tolist()
+    whole, box = Box.whole(mask.shape[2:]), Box.of(ends)
+    box = box if box.size else middle
     fraction = box.size / whole.size
     if kind == "box":
         return Support(box, None, "box", fraction, evidence)
     if kind == "auto" and fraction >= WORTH:
         return Support(whole, None, "none", 1.0)
-    return Support(box, mask, "hull", int(mask.sum()) / mask.numel(), evidence)
+    return Support(box, mask, "hull", voxels / mask.numel(), evidence)
 
 
 def brick_edge(grid: Grid) -> int:

@@ -5,6 +5,7 @@ About 2 minutes.
 """
 
 import argparse
+import math
 import subprocess
 import sys
 import time
@@ -30,15 +31,16 @@ VECTORS = ("source", "origin", "u", "v")
 #: The self-check's verdict is kept for good: a first call in one of these modes must not spoil it.
 FIRST_CALLS = {
     "inference_mode": ("torch.inference_mode()", "A(x)"),
-    "bfloat16 autocast": ("torch.autocast('DEVICE', torch.bfloat16)", "A(x)"),
+    "bfloat16 autocast": ("torch.autocast(device, torch.bfloat16)", "A(x)"),
     "vmap": ("torch.no_grad()", "torch.func.vmap(A)(x[None])"),
 }
 FIRST_CALL = """
 import torch
 import mvrecon as mv
+device = "DEVICE"
 rig = mv.circular(2, 50.0, 75.0, {"pixels": [8, 8], "pixel_mm": 2.0})
-A = mv.Drr(mv.Grid.centred(8, spacing=1.0), rig).to("DEVICE")
-x = torch.rand(2, 1, 8, 8, 8, device="DEVICE")
+A = mv.Drr(mv.Grid.centred(8, spacing=1.0), rig).to(device)
+x = torch.rand(2, 1, 8, 8, 8, device=device)
 with MODE:
     CALL
 print(A.last_backend)
@@ -59,7 +61,7 @@ def versions() -> dict[str, str]:
 def machine() -> dict[str, Any]:
     """The GPU, and what it can do at most."""
     p = torch.cuda.get_device_properties(0)
-    x = torch.rand(2**28, device="cuda")
+    x = torch.rand(min(2**28, p.total_memory // 64), device="cuda")
     y = torch.empty_like(x)
     copy, _ = throughput(lambda: y.copy_(x), "cuda")
     _, small = throughput(lambda: y[:4].add_(1), "cuda", 0.02)
@@ -141,8 +143,9 @@ def pose_gradient(
     return {"relative": float((exact - other).norm() / exact.norm())}
 
 
-def first_call(mode: str, call: str, device: str) -> str:
+def first_call(name: str, device: str) -> str:
     """The back end that serves a new process whose first call is made in a mode."""
+    mode, call = FIRST_CALLS[name]
     code = FIRST_CALL.replace("MODE", mode).replace("CALL", call).replace("DEVICE", device)
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=90, check=False
@@ -191,7 +194,8 @@ def stream(A: RayTransform, x: torch.Tensor) -> bool:
     """Whether the kernels run on torch's current stream, not on the default one."""
     side, expected = torch.cuda.Stream(), A(x)
     torch.cuda.synchronize()
-    busy = torch.rand(6000, 6000, device="cuda")
+    edge = min(6000, math.isqrt(torch.cuda.get_device_properties(0).total_memory >> 10))
+    busy = torch.rand(edge, edge, device="cuda")
     with torch.cuda.stream(side):
         for _ in range(20):
             busy = busy @ busy * 1e-4
@@ -218,6 +222,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--n", type=int, default=48)
+    parser.add_argument("--modes", nargs="*", default=[*FIRST_CALLS], help="of first calls")
     options = parser.parse_args()
     device, n = on_device(options.device), options.n
     results = Results(options.out, "check")
@@ -239,8 +244,9 @@ def main() -> None:
         results.attempt(
             f"pose gradient {name}", lambda r=rig, y=y: pose_gradient(grid, r, x, y, device)
         )
-    for name, (mode, call) in FIRST_CALLS.items():
-        results.attempt(f"first call in {name}", lambda m=mode, c=call: first_call(m, c, device))
+    for name in options.modes:  # of them the stand-in serves none
+        place = "cpu" if options.device == "dry" else device
+        results.attempt(f"first call in {name}", lambda n=name, p=place: first_call(n, p))
     if device == "cuda":
         A, B = (build(grid, rigs(n)["cone"], skip=skip).to(device) for skip in ("auto", "off"))
         device_alone(results, A, B, x.to(device))

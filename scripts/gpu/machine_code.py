@@ -9,13 +9,15 @@ import argparse
 import re
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
+from mvrecon.kernels.cuda import sources as fields
 from mvrecon.kernels.rays.cuda import nvrtc
-from mvrecon.kernels.rays.cuda.sources import Variant, text_of
+from mvrecon.kernels.rays.cuda import sources as rays
 from mvrecon.kernels.rays.trace import METHODS
 
 KERNELS = ("store", "project", "record", "gather", "scatter", "vary")
@@ -51,8 +53,8 @@ def disassembler() -> Path:
     return paths[0]
 
 
-def compiled(variant: Variant, capability: int) -> dict[str, Kernel]:
-    """The kernels of a variant by name.
+def compiled(source: str, capability: int) -> dict[str, Kernel]:
+    """The kernels of a text in CUDA C++ by name.
 
     Raises:
         OSError: no NVRTC, or no disassembler.
@@ -60,7 +62,7 @@ def compiled(variant: Variant, capability: int) -> dict[str, Kernel]:
     tool = disassembler()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rays.cubin"
-        file.write_bytes(nvrtc.build(text_of({"": variant}), f"sm_{capability}"))
+        file.write_bytes(nvrtc.build(source, f"sm_{capability}"))
         shown = subprocess.run([str(tool), str(file)], capture_output=True, check=True).stdout
     text = shown.decode()
     counts = re.findall(r"REGCOUNT.*?index@\((\w+)\).*?\.word\s+(0x\w+)", text, re.S)
@@ -103,19 +105,29 @@ def row(name: str, kernel: Kernel) -> str:
     return f"| {name} | {numbers} | {steps} |"
 
 
+def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """What is compiled at once: its title, its text, and the kernels that are shown."""
+    single, half = torch.float32, torch.bfloat16
+    for method, number in METHODS.items():
+        for stored, together in STORED:
+            variant = rays.Variant(single, stored, together, number)
+            yield f"{method}, {stored}, {together} a ray", rays.text_of({"": variant}), KERNELS
+    for purpose, stored in (("warp", single), ("warp", half), ("look", single), ("hull", single)):
+        part = fields.Part(purpose, single, stored)
+        yield f"{purpose}, {stored}", fields.text_of({"": part}), fields.KERNELS[purpose]
+
+
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--capability", type=int, default=90)
     options = parser.parse_args()
-    for method, number in METHODS.items():
-        for stored, together in STORED:
-            print(f"\n{method}, {stored}, {together} volumes a ray\n")
-            print("| kernel | registers | local memory | instructions | float64 | inner loops |")
-            print("|---|---:|---:|---:|---:|---|")
-            variant = Variant(torch.float32, stored, together, number)
-            kernels = compiled(variant, options.capability)
-            print("\n".join(row(name, kernels[name]) for name in KERNELS), flush=True)
+    for title, source, names in texts():
+        print(f"\n{title}\n")
+        print("| kernel | registers | local memory | instructions | float64 | inner loops |")
+        print("|---|---:|---:|---:|---:|---|")
+        kernels = compiled(source, options.capability)
+        print("\n".join(row(name, kernels[name]) for name in names), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """What the scripts share: results that are written as they come, and times on either device."""
 
 import csv
+import faulthandler
 import json
 import statistics
 import sys
@@ -12,29 +13,48 @@ from typing import Any
 
 import torch
 
+#: Seconds after which a script begins nothing new, and those after which it is ended.
+SLICE, END = 500.0, 540.0
+
 
 def on_device(device: str) -> str:
-    """The device, if this machine has it.
+    """The device, if this machine has it; from now on the script's clock runs.
+
+    Args:
+        device: "cuda", "cpu", or "dry": a stand-in for "cuda", which needs none.
 
     Raises:
         SystemExit: "cuda" where torch sees no GPU.
     """
+    if device == "dry":
+        from dry import stand_in
+
+        stand_in()
+        device = "cuda"
     if device.startswith("cuda") and not torch.cuda.is_available():
         sys.exit(
             f"{Path(sys.argv[0]).name} needs a GPU, and torch {torch.__version__} sees none here; "
-            "--device cpu tries the script on the CPU, where its times mean nothing"
+            "--device dry tries the script on a stand-in, where its numbers mean nothing"
         )
+    faulthandler.dump_traceback_later(END, exit=True)
     return device
 
 
 class Results:
-    """Results that are on the disk after each: `<name>.json`, and `<name>.csv` for rows."""
+    """Results that are on the disk after each: `<name>.json`, and `<name>.csv` for rows; and the
+    script's clock.
+    """
 
     def __init__(self, folder: Path, name: str):
+        self.begun = time.perf_counter()
         folder.mkdir(parents=True, exist_ok=True)
         self.json, self.csv = folder / f"{name}.json", folder / f"{name}.csv"
         self.facts: dict[str, Any] = {}
         self.rows: list[dict[str, Any]] = []
+
+    def left(self) -> float:
+        """Seconds until nothing new is begun."""
+        return SLICE - (time.perf_counter() - self.begun)
 
     def add(self, what: str, value: Any) -> None:
         """Print and write one result."""
@@ -55,6 +75,9 @@ class Results:
 
     def attempt(self, what: str, measure: Callable[[], Any]) -> Any:
         """What `measure` returns; a failure is a result too, and the script goes on."""
+        if self.left() < 0:
+            self.add(what, "no time left")
+            return None
         try:
             value = measure()
         except Exception as error:

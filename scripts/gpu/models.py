@@ -22,12 +22,13 @@ VARIANTS = ("model.support=hull", "model.support=box", "model.refine_where=disag
 
 
 def built(model: str, n: int, device: str, extra: Sequence[str] = ()) -> ReconstructionModule:
-    """A model with fresh weights for 4 cameras of a small detector."""
+    """A model with fresh weights for 5 cameras of a small detector, all around."""
     pixels = 3 * n // 2
     settings = compose(
         f"model={model}",
         f"grid.size=[{n},{n},{n}]",
-        "camera.n_views=4",
+        "camera.n_views=5",
+        "camera.arc_degrees=360",
         f"camera.detector.pixels=[{pixels},{pixels}]",
         "camera.detector.pixel_mm=6.0",
         *extra,
@@ -50,7 +51,7 @@ def learns(model: str, n: int, device: str) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for precision in ("float32", "bfloat16"):
         with torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
-            loss = module.loss(module.model(views), batch)["total"]
+            loss = module.terms(batch)["total"]
         result[precision] = float(loss.detach())
         if loss.requires_grad:
             loss.backward()
@@ -97,12 +98,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--n", type=int, default=24)
+    parser.add_argument("--models", nargs="*", default=MODELS.names())
+    parser.add_argument("--variants", nargs="*", default=VARIANTS, help="of single_pass")
     options = parser.parse_args()
     device, n = on_device(options.device), options.n
     results = Results(options.out, "models")
-    for model in MODELS.names():
+    for model in options.models:
         results.attempt(model, lambda m=model: learns(m, n, device))
-    for extra in VARIANTS:
+    for extra in options.variants:
         results.attempt(f"single_pass {extra}", lambda e=extra: skips(e, n, device))
     if device == "cuda":
         results.attempt("torch.compile of backprojection_unet", lambda: compiled(n, device))

@@ -27,8 +27,8 @@ LEFT = {
     "sinogram_unet": 2 * COPIES + 1,
     "dual_domain": 2 * COPIES + 1,
     "radon_unet": COPIES,
-    "sirt": 8,
-    "classical": 8,
+    "sirt": 6,
+    "classical": 6,
 }
 #: Their first step moves an operator, or the images of voxels, to the device.
 MOVING = ("dif_net", "svct", "sinogram_unet", "dual_domain", "radon_unet")
@@ -97,11 +97,21 @@ def test_a_step_with_uncertainty_waits_for_nothing_and_learns():
     assert sum(not torch.equal(a, b) for a, b in zip(before, after, strict=True)) > 10
 
 
-def test_a_hull_waits_and_says_where():
-    """Its places are data; so no graph is made of it (`trainer.graph`)."""
-    module, batch = module_of("cross_view", support="hull")
-    places = {place.partition("/")[0] for place, _ in stepped(module, batch).waits}
-    assert places <= {"visual_hull", "geometry", "cameras"} and "visual_hull" in places
+@pytest.mark.parametrize(("options", "waits"), [({}, 4), ({"crop": True}, 5)], ids=str)
+def test_a_hull_waits_and_says_where(options, waits):
+    """Its places are data, so no graph is made of it (`trainer.graph`): whether views are finite,
+    numbers of footprints, the box of the hull, that of an operator, and of the networks.
+    """
+    module, batch = module_of("cross_view", support="hull", **options)
+    gpu = stepped(module, batch)
+    assert gpu.waits.total() == waits, dict(gpu.waits)
+    places = {place.partition("/")[0] for place, _ in gpu.waits}
+    assert places <= {"visual_hull", "geometry", "cameras", "models"} and "visual_hull" in places
+
+
+def test_the_stand_in_has_no_integer_product_as_a_gpu_has_none():
+    with AsGpu(), pytest.raises(RuntimeError, match="a GPU has none of torch.int64"):
+        OnGpu(torch.ones(2, 2).long()) @ OnGpu(torch.ones(2).long())
 
 
 def test_the_stand_in_has_the_numbers_and_derivatives_of_main_memory():

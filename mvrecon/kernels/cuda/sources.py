@@ -22,14 +22,18 @@ KERNELS = {
 
 
 class Part(NamedTuple):
-    """What is compiled at once: the kernels for one purpose, in one type of arithmetic."""
+    """What is compiled at once: the kernels for one purpose, in one type of arithmetic, and of what
+    they read where that may be another (warps).
+    """
 
     purpose: str
     real: torch.dtype
+    stored: torch.dtype | None = None
 
     def line(self, suffix: str) -> str:
         """The line that makes the kernels, whose names end so."""
-        return f"{self.purpose.upper()}_OF({suffix}, {NAMES[self.real]})\n"
+        types = f"{NAMES[self.real]}, {NAMES[self.stored or self.real]}"
+        return f"{self.purpose.upper()}_OF({suffix}, {types})\n"
 
 
 @cache

@@ -12,10 +12,18 @@ from torch import Tensor
 from mvrecon.kernels.cuda.field import Field
 from mvrecon.kernels.cuda.launching import blocks, check_count, numbers_of, start
 from mvrecon.kernels.cuda.sources import MAP, PLANES, Part
+from mvrecon.kernels.precision import arithmetic
 from mvrecon.kernels.rays.cuda.sources import BLOCK, WARP
 
 #: Threads of a derivative by the maps, so that a small warp is split over blocks.
 THREADS = 2**18
+
+
+def part_of(stored: Tensor) -> Part:
+    """The kernels that read a tensor as it is stored, half precision among it; they write in the
+    type of arithmetic.
+    """
+    return Part("warp", arithmetic(stored.dtype), stored.dtype)
 
 
 def _field(
@@ -36,14 +44,14 @@ def warp(
     volumes: Float[Tensor, "n s c d h w"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int]
 ) -> Float[Tensor, "n s k c d h w"]:
     """Volumes on other lattices; see `warps.reference.warp`."""
-    x, numbers = volumes.detach().contiguous(), numbers_of(maps)
+    x, numbers, part = volumes.detach().contiguous(), numbers_of(maps), part_of(volumes)
     items, sources, channels = x.shape[:3]
-    values = x.new_empty(items, sources, maps.shape[1], channels, *shape)
+    values = x.new_empty(items, sources, maps.shape[1], channels, *shape, dtype=part.real)
     field = _field(numbers, items, channels, x.shape[3:], shape)
     field.put(origin=x, result=values, blocks=blocks(math.prod(shape)))
     blocks(math.prod(x.shape[3:]))
     across = sources * maps.shape[1] * field.blocks
-    start(Part("warp", x.dtype), "warp", field, x, across, items * -(-channels // PLANES))
+    start(part, "warp", field, x, across, items * -(-channels // PLANES))
     return values
 
 
@@ -51,14 +59,13 @@ def warp_back(
     values: Float[Tensor, "n s k c d h w"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int]
 ) -> Float[Tensor, "n s c d h w"]:
     """The exact transpose of `warp`: every voxel finds its samples by the inverse maps."""
-    y, numbers = values.detach().contiguous(), numbers_of(maps)
+    y, numbers, part = values.detach().contiguous(), numbers_of(maps), part_of(values)
     items, sources, kinds, channels = y.shape[:4]
-    volumes = y.new_empty(items, sources, channels, *shape)
+    volumes = y.new_empty(items, sources, channels, *shape, dtype=part.real)
     inverse = torch.empty(maps.shape, dtype=torch.float32, device=y.device)
     field = _field(numbers, items, channels, shape, y.shape[4:])
     field.put(origin=y, result=volumes, inverse=inverse, blocks=blocks(math.prod(shape)))
     check_count(math.prod(y.shape[4:]))
-    part = Part("warp", y.dtype)
     start(part, "invert", field, y, blocks(sources * kinds))
     start(part, "warp_back", field, y, sources * field.blocks, items * -(-channels // PLANES))
     return volumes
@@ -70,11 +77,12 @@ def warp_vjp(
     maps: Float[Tensor, "s k 5 2 3"],
 ) -> Float[Tensor, "s k 5 2 3"]:
     """The derivative of <values, warp(volumes, maps)> by the maps; float64."""
-    x, y, numbers = volumes.detach().contiguous(), values.detach().contiguous(), numbers_of(maps)
+    x, numbers, part = volumes.detach().contiguous(), numbers_of(maps), part_of(volumes)
+    y = values.detach().to(part.real).contiguous()
     pairs = maps.shape[0] * maps.shape[1]
     field = _field(numbers, len(x), x.shape[2], x.shape[3:], y.shape[4:])
     count = min(blocks(math.prod(y.shape[4:])), max(1, THREADS // BLOCK // max(1, pairs)))
     sums = numbers.new_zeros(pairs, count * BLOCK // WARP, MAP)
     field.put(origin=x, by=y, result=sums, blocks=count)
-    start(Part("warp", x.dtype), "warp_vary", field, x, pairs * count)
+    start(part, "warp_vary", field, x, pairs * count)
     return sums.sum(dim=1).view(maps.shape)

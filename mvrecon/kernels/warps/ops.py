@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.kernels.derivatives import bent, curved, linear, transposed
+from mvrecon.kernels.precision import arithmetic, wide
 from mvrecon.kernels.warps import reference
 
 # numba is heavy, so the kernels are imported at their first call
@@ -23,7 +24,7 @@ def _warp(volumes: Tensor, maps: Tensor, shape: Sequence[int]) -> Tensor:
     """
     from mvrecon.kernels.warps import cpu
 
-    return cpu.warp(volumes, maps, shape)
+    return cpu.warp(wide(volumes), maps, shape)
 
 
 @torch.library.custom_op("mvrecon::warp_back", mutates_args=(), device_types="cpu")
@@ -31,7 +32,7 @@ def _warp_back(values: Tensor, maps: Tensor, shape: Sequence[int]) -> Tensor:
     """The exact transpose of `warp`: values [n s k c d h w] to volumes [n s c d h w]."""
     from mvrecon.kernels.warps import cpu
 
-    return cpu.warp_back(values, maps, shape)
+    return cpu.warp_back(wide(values), maps, shape)
 
 
 @torch.library.custom_op("mvrecon::warp_vjp", mutates_args=(), device_types="cpu")
@@ -39,7 +40,7 @@ def _warp_vjp(volumes: Tensor, values: Tensor, maps: Tensor) -> Tensor:
     """The derivative of <values, warp(volumes, maps)> by the maps [s k 5 2 3]."""
     from mvrecon.kernels.warps import cpu
 
-    return cpu.warp_vjp(volumes, values, maps)
+    return cpu.warp_vjp(wide(volumes), wide(values), maps)
 
 
 @_warp.register_kernel("cuda")
@@ -65,12 +66,14 @@ def _(volumes, values, maps):
 
 @_warp.register_fake
 def _(volumes, maps, shape):
-    return volumes.new_empty(*volumes.shape[:2], maps.shape[1], volumes.shape[2], *shape)
+    size = *volumes.shape[:2], maps.shape[1], volumes.shape[2], *shape
+    return volumes.new_empty(size, dtype=arithmetic(volumes.dtype))
 
 
 @_warp_back.register_fake
 def _(values, maps, shape):
-    return values.new_empty(*values.shape[:2], values.shape[3], *shape)
+    size = *values.shape[:2], values.shape[3], *shape
+    return values.new_empty(size, dtype=arithmetic(values.dtype))
 
 
 @_warp_vjp.register_fake
@@ -97,16 +100,18 @@ def _by_values(ctx, volumes):
 
 
 def _in_torch(volumes, maps, shape):
-    return lambda volumes, maps: reference.warp(volumes, maps, shape)
+    return lambda volumes, maps: reference.warp(wide(volumes), maps, shape)
 
 
 def _back_in_torch(values, maps, shape):
     of = values.shape
-    return transposed(_in_torch(None, maps, of[4:]), (*of[:2], of[3], *shape))
+    back = transposed(_in_torch(None, maps, of[4:]), (*of[:2], of[3], *shape))
+    return lambda values, maps: back(wide(values), maps)
 
 
 def _vjp_in_torch(volumes, values, maps):
-    return bent(_in_torch(volumes, maps, values.shape[4:]))
+    vjp = bent(_in_torch(volumes, maps, values.shape[4:]))
+    return lambda volumes, values, maps: vjp(volumes, wide(values), maps)
 
 
 warp = linear(_warp, _in_torch, _keep, _by_volumes)

@@ -4,11 +4,12 @@ frustum.
 
 from collections.abc import Sequence
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.backends import kernels_for
+from mvrecon.kernels.precision import wide
+from mvrecon.kernels.rays.cuda.selfcheck import STORED
 from mvrecon.kernels.warps import ops as warp_ops
 from mvrecon.kernels.warps import reference as warp_reference
 from mvrecon.kernels.warps.trial import differences
@@ -49,8 +50,8 @@ def warp(
             "Expected volumes [b s c d h w] and maps [s k 5 2 3] of the same s, "
             f"got {tuple(volumes.shape)} and {tuple(maps.shape)}"
         )
-    if volumes.dtype not in (torch.float32, torch.float64):
-        return warp(volumes.float(), maps, shape, backend).to(volumes.dtype)
     chosen, _ = kernels_for(volumes, backend, "warp", differences)
     kernels = warp_reference if chosen == "reference" else warp_ops
-    return kernels.warp(volumes, maps, list(shape))
+    # a GPU reads half precision as it is
+    x = volumes if chosen == "cuda" and volumes.dtype in STORED else wide(volumes)
+    return kernels.warp(x, maps, list(shape)).to(volumes.dtype)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, bounds
 from mvrecon.models.consistency import Consistency, Start, Steps, checked_start, normalised
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.cross_view.settings import ROUNDS, Computing, RoundOptions
@@ -156,5 +156,6 @@ def boxes_of(mask: Bool[Tensor, "b 1 d h w"]) -> list[Box]:
     none, the whole grid.
     """
     shape = mask.shape[2:]
-    boxes = [Box.around(sample).grown(MARGIN, shape).aligned(ALIGNED, shape) for sample in mask]
+    boxes = [Box.of(numbers) for numbers in bounds(mask[:, 0]).tolist()]
+    boxes = [box.grown(MARGIN, shape).aligned(ALIGNED, shape) for box in boxes]
     return [box if box.size else Box.whole(shape) for box in boxes]

@@ -11,6 +11,7 @@ import torch
 
 from mvrecon.kernels.cuda.field import Field
 from mvrecon.kernels.cuda.sources import Part, source
+from mvrecon.kernels.precision import arithmetic
 from mvrecon.kernels.rays.cuda import sources as rays
 from mvrecon.kernels.rays.cuda.scene import Packed, Scene
 from mvrecon.kernels.rays.cuda.sources import BLOCK, NAMES, Variant
@@ -24,9 +25,9 @@ VARIANTS = {
     for method in range(3)
 }
 PARTS = {
-    f"_{NAMES[real]}_{purpose}": Part(purpose, real)
-    for purpose, reals in {"warp": (F, D), "look": (F, D), "hull": (D,)}.items()
-    for real in reals
+    f"_{NAMES[stored]}_{purpose}": Part(purpose, arithmetic(stored), stored)
+    for purpose, types in {"warp": (F, D, H, B), "look": (F, D), "hull": (D,)}.items()
+    for stored in types
 }
 EVERY = {**VARIANTS, **PARTS}
 

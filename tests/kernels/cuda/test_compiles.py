@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from mvrecon.kernels.cuda.sources import KERNELS as FIELDS
+from mvrecon.kernels.cuda.sources import Part
+from mvrecon.kernels.cuda.sources import text_of as fields
 from mvrecon.kernels.rays.cuda import nvrtc
-from mvrecon.kernels.rays.cuda.sources import KERNELS, Variant
+from mvrecon.kernels.rays.cuda.sources import KERNELS, Variant, text_of
 from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR
 
 SCRIPT = Path(__file__).parents[3] / "scripts" / "gpu" / "machine_code.py"
@@ -46,7 +49,7 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
     explicit rays alone. Before the loops a few numbers may be put aside: on sm_80 `gather` of four
     bfloat16 volumes does, and set-up in float64.
     """
-    kernels, count = machine_code.compiled(variant, capability), machine_code.count
+    kernels, count = machine_code.compiled(text_of({"": variant}), capability), machine_code.count
     assert kernels.keys() == set(KERNELS)
     for name, kernel in kernels.items():
         assert kernel.registers <= MOST, (name, kernel.registers)
@@ -60,6 +63,18 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
             assert not count(machine_code.DOUBLE, step), name
             # sm_80 leaves the loop of `scatter` by a conditional CALL that never returns
             assert name == "scatter" or not count(machine_code.CALL, step), name
+
+
+@pytest.mark.parametrize("part", [Part("warp", F, B), Part("look", F)], ids=str)
+def test_warps_and_back_projection_keep_all_in_registers(part, machine_code):
+    """On Hopper; float64 in no loop of a warp's channels or candidates."""
+    kernels, count = machine_code.compiled(fields({"": part}), 90), machine_code.count
+    assert kernels.keys() == set(FIELDS[part.purpose])
+    for name, kernel in kernels.items():
+        assert kernel.registers <= MOST, (name, kernel.registers)
+        assert not count(machine_code.LOCAL + "|" + machine_code.ATOMIC, kernel.instructions), name
+    for name in kernels.keys() & {"warp", "warp_back"}:
+        assert kernels[name].loops and not count(machine_code.DOUBLE, kernels[name].loops[0]), name
 
 
 def test_a_mistake_is_an_error_with_the_compiler_s_words(machine_code):

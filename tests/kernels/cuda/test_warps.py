@@ -9,6 +9,8 @@ from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.kernels.warps import cuda, reference
+from mvrecon.kernels.warps.warp import warp
+from mvrecon.testing.as_gpu import AsGpu, on_gpu
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
 from tests.kernels.warps.scenes import OTHER, RIGS, SMALL, generic, lattices
@@ -19,13 +21,15 @@ PRECISIONS = [(torch.float64, 3, 1e-11), (torch.float32, 9, 3e-6)]
 
 
 def compared(maps: torch.Tensor, of, to, dtype: torch.dtype, channels: int) -> dict[str, float]:
-    """The differences of the three operators to the reference, for two items."""
+    """The differences of the three operators, of numbers stored as `dtype`, to the reference, for
+    two items.
+    """
     torch.manual_seed(0)
     x = torch.randn(2, len(maps), channels, *of, dtype=dtype)
     moving, wide = maps.clone().requires_grad_(), x.double().requires_grad_()
     values = reference.warp(wide, moving, list(to))
     y = torch.randn(values.shape, dtype=dtype)
-    volumes, change = torch.autograd.grad((values * y).sum(), (wide, moving))
+    volumes, change = torch.autograd.grad((values * y.double()).sum(), (wide, moving))
     return {
         "warp": difference(cuda.warp(x, maps, list(to)), values),
         "back": difference(cuda.warp_back(y, maps, list(of)), volumes),
@@ -53,7 +57,10 @@ def test_warps_their_transpose_and_derivative_are_those_of_the_reference(
         assert max(errors.values()) < bound, errors
 
 
-@pytest.mark.parametrize(("dtype", "channels", "bound"), PRECISIONS)
+HALVES = [(torch.float16, 9, 3e-6), (torch.bfloat16, 2, 3e-6)]
+
+
+@pytest.mark.parametrize(("dtype", "channels", "bound"), PRECISIONS + HALVES)
 def test_maps_that_have_no_inverse_are_transposed_too(dtype, channels, bound, host):
     """Homographies, maps whose rows grow each in its own way, and one that shows a single plane."""
     maps = lifted_maps(generic(3))
@@ -74,6 +81,19 @@ def test_a_warp_launches_one_kernel_and_waits_for_none(host):
     assert waits.names == []
     assert host.launches == ["warp", "invert", "warp_back", "warp_vary"]
     assert set(host.streams) == {7} and host.modules == 1
+
+
+def test_a_half_volume_on_a_gpu_is_read_as_it_is():
+    """No copy in float32 comes before the kernel; one in the volume's type behind it."""
+    maps = lifted_maps(generic())
+    x = torch.randn(2, 2, 3, *SMALL, dtype=torch.bfloat16)
+    with AsGpu() as gpu:
+        leaf = on_gpu(x).requires_grad_()
+        values = warp(leaf, on_gpu(maps), OTHER)
+        assert gpu.launches == {"warp": 1, "_to_copy": 1} and not gpu.waits
+        values.float().square().sum().backward()
+    assert values.dtype == leaf.grad.dtype == torch.bfloat16
+    assert torch.equal(values.values, warp(x, maps, OTHER))
 
 
 def test_what_is_beyond_a_volume_is_not_read_and_nothing_launches_nothing(host):

@@ -1,6 +1,6 @@
 // Kernels of a thread a voxel, sample or pixel: warps, images of voxels, footprints of bricks. The files of this folder are
 // read behind `rays/cuda/source/0_base.cu`, in the order of their names; `sources.py` adds a line for the kernels wanted.
-// R is the type of arithmetic and of storage. Places are formed in float64, and cast where they are small.
+// R is the type of arithmetic, S that of what is read where it may be half. Places are formed in float64, and cast where they are small.
 
 // All that a kernel is launched with; `field.py` has the same.
 struct Field {

@@ -42,10 +42,10 @@ template <class R> struct Cell {
     }
   }
   DEVICE R side(int n, int axis) const { return n >> axis & 1 ? part[axis] : 1 - part[axis]; }
-  DEVICE R voxel(const R* volume, int n) const { return at[n] < 0 ? (R)0 : volume[at[n]]; }
+  template <class S> DEVICE R voxel(const S* volume, int n) const { return at[n] < 0 ? (R)0 : (R)number(volume[at[n]]); }
 };
 
-template <class R> DEVICE void warp_samples(const Field& f) {
+template <class R, class S> DEVICE void warp_samples(const Field& f) {
   int pair = blockIdx.x / f.blocks, sample = blockIdx.x % f.blocks * BLOCK + threadIdx.x, samples = size_of(f.shape);
   if (sample >= samples) return;
   Part part(f, pair / f.kinds, pair % f.kinds);
@@ -53,7 +53,7 @@ template <class R> DEVICE void warp_samples(const Field& f) {
   R weight[8];
   UNROLL for (int n = 0; n < 8; n++) weight[n] = cell.side(n, 0) * cell.side(n, 1) * cell.side(n, 2);
   long long voxels = size_of(f.source);
-  const R* volume = (const R*)f.origin + part.volume * voxels;
+  const S* volume = (const S*)f.origin + part.volume * voxels;
   R* values = (R*)f.result + part.values * samples + sample;
   for (int c = 0; c < part.here; c++) {
     R sum = 0;
@@ -66,11 +66,11 @@ template <class R> DEVICE void warp_samples(const Field& f) {
 
 // The derivative of sum(by * warped) by the maps: sums [s k warps 30], a warp's each. A numerator t and a denominator w give
 // t / w, whose change is (dt - (t / w) dw) / w.
-template <class R> DEVICE void slopes_of(const Field& f, const Cell<R>& cell, int pair, int sample, R* slope) {
+template <class R, class S> DEVICE void slopes_of(const Field& f, const Cell<R>& cell, int pair, int sample, R* slope) {
   long long voxels = size_of(f.source), samples = size_of(f.shape);
   for (int n = 0; n < f.items; n++)
     for (int c = 0; c < f.channels; c++) {
-      const R* volume = (const R*)f.origin + (((long long)n * f.sources + pair / f.kinds) * f.channels + c) * voxels;
+      const S* volume = (const S*)f.origin + (((long long)n * f.sources + pair / f.kinds) * f.channels + c) * voxels;
       R by = ((const R*)f.by)[(((long long)n * f.sources * f.kinds + pair) * f.channels + c) * samples + sample];
       UNROLL for (int corner = 0; corner < 8; corner++) {
         R share = by * cell.voxel(volume, corner);
@@ -82,7 +82,7 @@ template <class R> DEVICE void slopes_of(const Field& f, const Cell<R>& cell, in
     }
 }
 
-template <class R> DEVICE void vary_maps(const Field& f) {
+template <class R, class S> DEVICE void vary_maps(const Field& f) {
   int pair = blockIdx.x / f.blocks, block = blockIdx.x % f.blocks, samples = size_of(f.shape);
   double* sums = (double*)f.result + (((long long)pair * f.blocks + block) * (BLOCK / WARP) + threadIdx.x / WARP) * MAP;
   for (int first = block * BLOCK; first < samples; first += f.blocks * BLOCK) {
@@ -90,7 +90,7 @@ template <class R> DEVICE void vary_maps(const Field& f) {
     Cell<R> cell(f, f.maps + (long long)pair * MAP, min(sample, samples - 1));
     R slope[3] = {0, 0, 0};
     bool counts = cell.counts && sample < samples;
-    if (counts) slopes_of(f, cell, pair, sample, slope);
+    if (counts) slopes_of<R, S>(f, cell, pair, sample, slope);
     double by[5] = {0, 0, 0, 0, 0};
     UNROLL for (int i = 0; i < 3; i++) {
       by[i] = counts ? slope[i] * cell.per[i] : 0;

@@ -109,7 +109,7 @@ template <class R> struct Along {
   DEVICE R at(int i) const { return one + (R)i * x; }
 };
 
-template <class R> DEVICE void add_samples(const Field& f, const Part& part, const int* voxel, R* total) {
+template <class R, class S> DEVICE void add_samples(const Field& f, const Part& part, const int* voxel, R* total) {
   const double* map = f.maps + (long long)part.pair * MAP;
   Samples s = samples_near(f, f.inverse + (long long)part.pair * MAP, voxel);
   double p[3], by[3];
@@ -120,32 +120,32 @@ template <class R> DEVICE void add_samples(const Field& f, const Part& part, con
   Near<R> x(map + X, map + ACROSS, by[0], p), y(map + Y, map + ACROSS, by[1], p), z(map + Z, map + DEPTH, by[2], p);
   Near<R> across(map + ACROSS, map, 0, p), depth(map + DEPTH, map, 0, p);
   int samples = size_of(f.shape);
-  const R* values = (const R*)f.origin + part.values * samples;
+  const S* values = (const S*)f.origin + part.values * samples;
   for (int k = s.low[2]; k <= s.high[2]; k++)
     for (int j = s.low[1]; j <= s.high[1]; j++) {
       int up = k - s.low[2], down = j - s.low[1];
       Along<R> xs(x, down, up), ys(y, down, up), zs(z, down, up), wide(across, down, up), deep(depth, down, up);
-      const R* row = values + (k * f.shape[1] + j) * f.shape[0];
+      const S* row = values + (k * f.shape[1] + j) * f.shape[0];
       for (int i = s.low[0]; i <= s.high[0]; i++) {
         int right = i - s.low[0];
         R w = wide.at(right), d = deep.at(right), per = inverse(w);
         R weight = hat(xs.at(right) * per) * hat(ys.at(right) * per) * hat(zs.at(right) * inverse(d));
         if (!(w > 0 && d > 0 && weight > 0)) continue;
-        const R* value = row + i;
+        const S* value = row + i;
         UNROLL for (int c = 0; c < PLANES; c++, value += samples)
-          if (c < part.here) total[c] += weight * *value;
+          if (c < part.here) total[c] += weight * (R)number(*value);
       }
     }
 }
 
 // Volumes [n s c d h w] from values [n s k c d h w]: blocks are of sources here, each with all of its maps.
-template <class R> DEVICE void gather_samples(const Field& f) {
+template <class R, class S> DEVICE void gather_samples(const Field& f) {
   int voxel[3], flat = blockIdx.x % f.blocks * BLOCK + threadIdx.x, voxels = size_of(f.source);
   if (flat >= voxels) return;
   unravel(f.source, flat, voxel);
   int source = blockIdx.x / f.blocks;
   R total[PLANES] = {};
-  for (int k = 0; k < f.kinds; k++) add_samples(f, Part(f, source, k), voxel, total);
+  for (int k = 0; k < f.kinds; k++) add_samples<R, S>(f, Part(f, source, k), voxel, total);
   Part part(f, source, 0);
   R* volume = (R*)f.result + part.volume * voxels + flat;
   UNROLL for (int c = 0; c < PLANES; c++)

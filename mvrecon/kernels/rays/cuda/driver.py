@@ -16,6 +16,8 @@ from mvrecon.kernels.rays.cuda.sources import BLOCK
 #: What the driver says where the calling thread has no context: none, or that of another device.
 NO_CONTEXT = (201, 400)
 OUT_OF_MEMORY = 2
+#: A kernel's arguments: the address of its structure.
+Arguments = c_void_p * 1
 
 
 @cache
@@ -73,8 +75,16 @@ def load(machine_code: bytes, names: Sequence[str], device: torch.device) -> dic
     return functions
 
 
-def launch(function: c_void_p, scene: Packed, across: int, down: int, device: torch.device) -> None:
-    """Start a kernel on `across` x `down` blocks, on torch's current stream.
+def launch(
+    function: c_void_p,
+    scene: Packed,
+    across: int,
+    down: int,
+    device: torch.device,
+    stream: int | None = None,
+) -> None:
+    """Start a kernel on `across` x `down` blocks, on a stream of the device: by default torch's
+    current one.
 
     Raises:
         RuntimeError: the driver refuses it.
@@ -82,13 +92,13 @@ def launch(function: c_void_p, scene: Packed, across: int, down: int, device: to
     """
     if not across or not down:
         return
-    driver, arguments = library(), (c_void_p * 1)(ctypes.addressof(scene))
+    driver, arguments = library(), Arguments(ctypes.addressof(scene))
     grid = across, down, 1, BLOCK, 1, 1, 0
-    stream = c_void_p(stream_of(device))
-    code = driver.cuLaunchKernel(function, *grid, stream, arguments, None)
+    queue = c_void_p(stream_of(device) if stream is None else stream)
+    code = driver.cuLaunchKernel(function, *grid, queue, arguments, None)
     if code in NO_CONTEXT:
         before = _enter(device)
-        code = driver.cuLaunchKernel(function, *grid, stream, arguments, None)
+        code = driver.cuLaunchKernel(function, *grid, queue, arguments, None)
         _leave(before)
     _check(code)
 

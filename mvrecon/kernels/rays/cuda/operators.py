@@ -7,6 +7,7 @@ by one alone spread with atomic additions, in no fixed order.
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
 from jaxtyping import Float
@@ -26,6 +27,8 @@ SHARE = 1 / 16
 THREADS = 2**18
 #: Bytes of an occupancy's code in front of its box.
 BOX = 3 * torch.int32.itemsize
+#: Bytes that a part of a tensor begins at a multiple of, as a tensor of its own does; of a frame.
+ALIGNED, FRAME = 256, 12 * torch.float32.itemsize
 #: Detector rows and columns that a block takes.
 TILE = (WARP, BLOCK // WARP)
 
@@ -60,6 +63,7 @@ class Call:
         self.groups = -(-count // self.together)
         variant = Variant(self.real, dtype, self.together, self.method)
         self.kernels = kernels_of(variant, self.device)
+        self.stream = driver.stream_of(self.device)
         maps = lines.detach().double().contiguous()
         flags = self.new(1 + n_views, dtype=torch.int32, zero=True)
         self.tensors = [maps, flags]
@@ -85,7 +89,8 @@ class Call:
 
     def start(self, name: str, threads: int, down: int = 1) -> None:
         """Launch a kernel with so many threads, and blocks downwards."""
-        driver.launch(self.kernels[name], self.scene, -(-threads // BLOCK), down, self.device)
+        across = -(-threads // BLOCK)
+        driver.launch(self.kernels[name], self.scene, across, down, self.device, self.stream)
 
     def over_rays(self, name: str) -> None:
         """Launch a kernel with a thread a ray, tile by tile, as `pixel_of` counts them."""
@@ -158,8 +163,8 @@ def backproject(
         return scatter(views, lines, window, occupancy, method)
     y = wide(views).contiguous()
     call = Call(y, lines, window, occupancy, views.shape[2:], method)
-    volume = call.new(len(y), *occupancy.box.shape, zero=not len(lines))
-    call.scene.put(views=y, results=volume)
+    volume = call.new(y.shape[0], *occupancy.box.shape, zero=not lines.shape[0])
+    call.scene.views, call.scene.results = y.data_ptr(), volume.data_ptr()
     _gather(call)
     return volume
 
@@ -184,14 +189,17 @@ def _gather(call: Call) -> None:
     a_pixel = (kept + call.groups * call.together) * call.real.itemsize + 1
     at_once = max(1, int(SHARE * driver.memory_of(call.device)) // max(1, a_pixel * pixels))
     count = min(at_once, n_views) * pixels
-    frames = call.new(n_views, 3, 4, dtype=torch.float32)
-    rays, values = call.new(count, kept), call.new(call.groups * count, call.together)
-    axes = call.new(count, dtype=torch.uint8)
-    scene.put(frames=frames, rays=rays, values=values, axes=axes)
+    size = call.real.itemsize
+    sizes = n_views * FRAME, count * kept * size, call.groups * count * call.together * size
+    # one tensor for all, since each costs Python a microsecond: frames, rays, values, axes
+    after = [0, *accumulate(-(-part // ALIGNED) * ALIGNED for part in sizes)]
+    room = call.new(after[-1] + count, dtype=torch.uint8)
+    first = room.data_ptr()
+    scene.frames, scene.rays, scene.values, scene.axes = (first + offset for offset in after)
     call.start("survey", n_views)
-    for first in range(0, n_views, at_once):
-        here = min(at_once, n_views - first)
-        scene.put(first_view=first, views_here=here)
+    for view in range(0, n_views, at_once):
+        here = min(at_once, n_views - view)
+        scene.first_view, scene.views_here = view, here
         call.start("record", here * pixels, call.groups)
         call.start("gather", math.prod(scene.part), call.groups)
 

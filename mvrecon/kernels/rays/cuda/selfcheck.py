@@ -76,7 +76,7 @@ def reason(
         place = torch.device(
             "cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0
         )
-    stored = dtype if dtype in (STORED if tried is None else STORED[:1]) else torch.float32
+    stored = dtype if dtype in STORED else torch.float32
     case = Case(str(place), method.partition(":")[0], stored, volumes > 1 and tried is None)
     with _lock:
         if case in _verdicts:
