@@ -12,6 +12,7 @@ from hydra._internal import utils
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
+from omegaconf import OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from mvrecon.registry import hint
@@ -27,6 +28,10 @@ FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 
 #: What OmegaConf adds to its messages for programmers.
 TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
+
+#: Groups whose part is an option of a model, and Hydra's words for a group that a run does not take.
+OF_MODELS = {"head", "network", "reconstructor"}
+UNMATCHED = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
 
 
 @contextmanager
@@ -82,11 +87,22 @@ def sentence(error: BaseException) -> str:
         known = {str(key) for key in parent or ()} - {"hydra"}
         if not known:  # as the camera of an evaluation, which is the run's
             return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
+        inside = [f"{part}.{cause.key}" for part in known if str(cause.key) in _keys(parent, part)]
+        if inside and cause.full_key == cause.key:
+            return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
+    if (part := UNMATCHED.match(str(error))) and part[1] in OF_MODELS:
+        return f"{part[1]!r} is a part of a model; to choose it: {part[1]}@model.{part[1]}=..."
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])
     return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
+
+
+def _keys(settings: Any, part: str) -> set[str]:
+    """The settings of a part, where it has any."""
+    inner = None if OmegaConf.is_missing(settings, part) else settings._get_node(part)
+    return set(map(str, inner)) if OmegaConf.is_dict(inner) else set()
 
 
 def _joined(texts: list[str]) -> str:
