@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import PurePosixPath
@@ -29,14 +30,15 @@ FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 #: What OmegaConf adds to its messages for programmers.
 TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 
-#: Groups whose part is an option of a model, and Hydra's words for a group that a run does not take.
+#: Groups whose part is an option of a model; Hydra's words for a group that a run does not take.
 OF_MODELS = {"head", "network", "reconstructor"}
 UNMATCHED = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
 
 
 @contextmanager
 def one_line(app: str) -> Iterator[None]:
-    """Context in which an error that a user can mend ends the process with one line and status 1.
+    """Context in which an error that a user can mend ends the process with one line and status 1,
+    and a warning is one line.
 
     Args:
         app: begins the line.
@@ -45,6 +47,10 @@ def one_line(app: str) -> Iterator[None]:
         SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
     """
     report, value = utils.run_and_report, JobReturn.return_value
+    shown = warnings.formatwarning
+    warnings.formatwarning = lambda message, category, *_: (
+        f"{app}: {category.__name__}: {message}\n"
+    )
     # Hydra's own print tracebacks, and a line more
     utils.run_and_report = lambda function: function()
     JobReturn.return_value = value.getter(_result)  # type: ignore[method-assign]
@@ -60,6 +66,7 @@ def one_line(app: str) -> Iterator[None]:
         raise SystemExit(1) from error
     finally:
         utils.run_and_report, JobReturn.return_value = report, value  # type: ignore[method-assign]
+        warnings.formatwarning = shown
 
 
 def _result(job: JobReturn) -> Any:

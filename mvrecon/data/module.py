@@ -129,8 +129,8 @@ class SceneData(L.LightningDataModule):
         first, last = n_test * self.shared, scene.length - self.sizes["val"]
         if last < first or (size and not {"train": last - first, "val": size, "test": first}[part]):
             raise ValueError(
-                f"{scene.length} case(s) of a file cannot be split: {first} to test (a fifth), the "
-                f"last {self.sizes['val']} to validate, {max(0, last - first)} to train; expected "
+                f"A scene with {scene.length} case(s) cannot be split: {first} to test (a fifth), "
+                f"the last {self.sizes['val']} to validate, {max(0, last - first)} to train; expected "
                 f"some for each that data.sizes asks for, such as data.sizes.val=1, or "
                 f"test_scene=volumes; data.overlap=true takes the same cases for all"
             )
