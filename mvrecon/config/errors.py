@@ -13,7 +13,7 @@ from hydra._internal import utils
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from mvrecon.registry import hint
@@ -109,7 +109,7 @@ def sentence(error: BaseException) -> str:
 def _keys(settings: Any, part: str) -> set[str]:
     """The settings of a part, where it has any."""
     inner = None if OmegaConf.is_missing(settings, part) else settings._get_node(part)
-    return set(map(str, inner)) if OmegaConf.is_dict(inner) else set()
+    return {str(key) for key in inner} if isinstance(inner, DictConfig) else set()
 
 
 def _joined(texts: list[str]) -> str:

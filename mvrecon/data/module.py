@@ -130,8 +130,8 @@ class SceneData(L.LightningDataModule):
         if last < first or (size and not {"train": last - first, "val": size, "test": first}[part]):
             raise ValueError(
                 f"A scene with {scene.length} case(s) cannot be split: {first} to test (a fifth), "
-                f"the last {self.sizes['val']} to validate, {max(0, last - first)} to train; expected "
-                f"some for each that data.sizes asks for, such as data.sizes.val=1, or "
+                f"the last {self.sizes['val']} to validate, {max(0, last - first)} to train; "
+                f"expected some for each that data.sizes asks for, such as data.sizes.val=1, or "
                 f"test_scene=volumes; data.overlap=true takes the same cases for all"
             )
         if part == "test":
