@@ -79,8 +79,8 @@ def reversed_nrmse(scan: Scan, device: str = "cpu") -> dict[str, float]:
     size = max(1, int(max(grid.spacing) / resolution(scan.cameras, grid.centre)))
     rows, columns = scan.cameras.shape
     joined = (min(size, rows), min(size, columns))
-    kept = [(0, count - count % n) for count, n in zip((rows, columns), joined, strict=True)]
-    region = Region.of((rows, columns), *kept, joined)
+    kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])
+    region = Region.of((rows, columns), kept[0], kept[1], joined)
     numbers = range(0, len(scan.cameras), math.ceil(len(scan.cameras) / VIEWS))
     A = Drr(grid, region.seen_by(scan.cameras[torch.tensor(numbers)])).to(device)
     parts = [_as_all(scan.measured.read(n, n + 1).views, region) for n in numbers]
