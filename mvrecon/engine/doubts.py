@@ -63,7 +63,8 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
     if view_nrmse > POOR and not words:
         words.append(
             f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); look at "
-            f"rig.png, and whether lengths are mm, the views whole and the grid large enough"
+            f"rig.png, and whether lengths are mm, the views whole, the grid large enough, and a "
+            f"network was trained for such views"
         )
     return words
 
