@@ -11,6 +11,8 @@ from mvrecon.config.plugins import import_plugins
 from mvrecon.files.runs import RESULTS, SETTINGS, VERSIONS
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from mvrecon.engine.scan import Scan
     from mvrecon.engine.solve import Outcome
     from mvrecon.geometry.grid import Grid
@@ -46,6 +48,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.cameras import files
     from mvrecon.data.volume_files import check_ending
     from mvrecon.engine import calibrate, correction, export, run_folder, scan, solve, wrong_cameras
+    from mvrecon.engine.doubts import doubts
     from mvrecon.engine.evaluation import device_of
     from mvrecon.viz import cameras, review, rig
 
@@ -77,6 +80,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         table = {
             **_row(settings, case, out),
             **outcome.row(),
+            **_values(volume, settings["unit"]),
+            "doubts": doubts(case, settings["reconstructor"]["name"], outcome.view_nrmse, device),
             "left_out": solve.left_out(case, settings, device) if settings["left_out"] else None,
             **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
         }
@@ -113,6 +118,17 @@ def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
     }
 
 
+def _values(volume: "Tensor", unit: str) -> dict[str, list[float]]:
+    """The 1st and the 99th percentile of a volume in the unit; of a large one, of one voxel in
+    some.
+    """
+    from mvrecon.data.attenuation import hounsfield
+
+    some = volume.flatten()[:: 1 + volume.numel() // 2**20].double()
+    ends = some.quantile(some.new_tensor([0.01, 0.99]))
+    return {"percentiles_1_99": (hounsfield(ends) if unit == "HU" else ends).tolist()}
+
+
 def beside(volume: Path, ending: str = ".cameras.json") -> Path:
     """The file beside a volume with its name and another ending, that of a calibrated rig; a rig
     that is there by another name stays.
@@ -124,6 +140,7 @@ def task(config: DictConfig) -> None:
     """One run of the app."""
     from rich.console import Console
 
+    from mvrecon.data.attenuation import WATER
     from mvrecon.engine.run_folder import anchored
     from mvrecon.engine.wrong_cameras import sentences
 
@@ -134,10 +151,14 @@ def task(config: DictConfig) -> None:
     console = Console(markup=False, highlight=False)
     if fit := table.get("calibration"):
         console.print(f"calibrate: {fit['words']}; {fit['cameras']}", soft_wrap=True)
+    low, high = table["percentiles_1_99"]
+    water = 0 if table["unit"] == "HU" else WATER
     console.print(
         f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
         f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
+        f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']} (water: {water})",
         *sentences(table.get("cameras")),
+        *(f"doubt: {words}" for words in table["doubts"]),
         sep="\n",
         soft_wrap=True,
     )

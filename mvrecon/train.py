@@ -44,6 +44,8 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     progress.silence_libraries()
     # Lightning's own use of torch, of which no user can be rid
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")
+    # what is logged are steps, of whatever epoch
+    warnings.filterwarnings("ignore", "The number of training batches")
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
     if rank() > 0:

@@ -25,6 +25,8 @@ MISTAKES = {
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
     "modle=sirt": r"There is no setting 'modle'; did you mean 'model'\?",
     "seed=x": r"Value 'x' of type 'str' could not be converted to Integer$",
+    "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
+    "head=density": r"'head' is a part of a model; to choose it: head@model.head=...",
     "+foo=1": r"does not use the setting 'foo'",
 }
 

@@ -2,6 +2,7 @@
 
 import importlib.util
 import inspect
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -45,6 +46,17 @@ KINDS = ["scene", "camera", "projector", "head", "network", "model", "reconstruc
 def test_a_part_of_the_project_passes_its_own_test(kind: str, project):
     _, tests = project
     getattr(tests, f"test_{kind}")()
+
+
+def test_the_commands_of_the_project_compose(project):
+    folder, _ = project
+    lines = (folder / "README.md").read_text().splitlines()
+    commands = [shlex.split(line) for line in lines if line.startswith("    mvrecon-train")]
+    assert {kind for kind in KINDS if any(f"{kind}={NAME}" in " ".join(c) for c in commands)} == {
+        *KINDS
+    }
+    for _, *overrides in commands:
+        compose(*overrides)
 
 
 def test_the_project_tests_every_part_and_option(project):

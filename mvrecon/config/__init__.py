@@ -20,7 +20,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from mvrecon.config.errors import one_line
+from mvrecon.config.errors import OF_MODELS, one_line
 from mvrecon.config.guard import guarded
 from mvrecon.config.plugins import check_plugins
 from mvrecon.config.schemas import SCHEMAS
@@ -29,8 +29,6 @@ from mvrecon.files.checks import shown, yaml_of
 from mvrecon.registry import installed, locate
 
 VERSION_BASE = "1.3"
-#: Groups whose part is an option of a model.
-OF_MODELS = {"head", "network", "reconstructor"}
 
 
 class PluginConf(SearchPathPlugin):
@@ -139,7 +137,7 @@ def help_text(config_name: str) -> str:
             choices.setdefault(file.parent.name, set()).add(file.stem)
     taken = groups_of(app_file(config_name))
     groups = "\n".join(
-        f"  {group:<12}{', '.join(sorted(names))}"
+        f"  {group:<14}{', '.join(sorted(names))}"
         for group, names in sorted(choices.items())
         if group in taken
     )

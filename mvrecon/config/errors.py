@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import PurePosixPath
@@ -12,6 +13,7 @@ from hydra._internal import utils
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from mvrecon.registry import hint
@@ -28,10 +30,15 @@ FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 #: What OmegaConf adds to its messages for programmers.
 TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 
+#: Groups whose part is an option of a model; Hydra's words for a group that a run does not take.
+OF_MODELS = {"head", "network", "reconstructor"}
+UNMATCHED = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
+
 
 @contextmanager
 def one_line(app: str) -> Iterator[None]:
-    """Context in which an error that a user can mend ends the process with one line and status 1.
+    """Context in which an error that a user can mend ends the process with one line and status 1,
+    and a warning is one line.
 
     Args:
         app: begins the line.
@@ -40,6 +47,10 @@ def one_line(app: str) -> Iterator[None]:
         SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
     """
     report, value = utils.run_and_report, JobReturn.return_value
+    shown = warnings.formatwarning
+    warnings.formatwarning = lambda message, category, *_: (
+        f"{app}: {category.__name__}: {message}\n"
+    )
     # Hydra's own print tracebacks, and a line more
     utils.run_and_report = lambda function: function()
     JobReturn.return_value = value.getter(_result)  # type: ignore[method-assign]
@@ -55,6 +66,7 @@ def one_line(app: str) -> Iterator[None]:
         raise SystemExit(1) from error
     finally:
         utils.run_and_report, JobReturn.return_value = report, value  # type: ignore[method-assign]
+        warnings.formatwarning = shown
 
 
 def _result(job: JobReturn) -> Any:
@@ -82,11 +94,22 @@ def sentence(error: BaseException) -> str:
         known = {str(key) for key in parent or ()} - {"hydra"}
         if not known:  # as the camera of an evaluation, which is the run's
             return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
+        inside = [f"{part}.{cause.key}" for part in known if str(cause.key) in _keys(parent, part)]
+        if inside and cause.full_key == cause.key:
+            return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
+    if (part := UNMATCHED.match(str(error))) and part[1] in OF_MODELS:
+        return f"{part[1]!r} is a part of a model; to choose it: {part[1]}@model.{part[1]}=..."
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])
     return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
+
+
+def _keys(settings: Any, part: str) -> set[str]:
+    """The settings of a part, where it has any."""
+    inner = None if OmegaConf.is_missing(settings, part) else settings._get_node(part)
+    return {str(key) for key in inner} if isinstance(inner, DictConfig) else set()
 
 
 def _joined(texts: list[str]) -> str:

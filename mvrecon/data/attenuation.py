@@ -23,6 +23,8 @@ WATER = 0.0192
 BONE = 0.0573
 #: Attenuation in 1/mm that no tissue or metal reaches at such energies: Hounsfield units do.
 DENSE = 20.0
+#: Hounsfield units over which the values of a patient spread at least, air and tissue.
+SPREAD = 10.0
 
 
 class Tissue(NamedTuple):
@@ -53,6 +55,19 @@ def physical(
             f"{DENSE:g}; are they HU?"
         )
     return attenuation(values, energy_kev) if stored == "HU" else values
+
+
+def check_spread(low: float, high: float) -> None:
+    """Check that the values of a volume, some of which differ, can be Hounsfield units.
+
+    Raises:
+        ValueError: they lie so near each other that all would become water.
+    """
+    if 0 < high - low < SPREAD:
+        raise ValueError(
+            f"has values from {low:.4g} to {high:.4g}, expected HU (air -1000, water 0); "
+            f"stored_unit=1/mm is for attenuation"
+        )
 
 
 def attenuation(hu: Float[Tensor, "*n"], energy_kev: float = 70.0) -> Float[Tensor, "*n"]:

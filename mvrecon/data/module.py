@@ -129,8 +129,10 @@ class SceneData(L.LightningDataModule):
         first, last = n_test * self.shared, scene.length - self.sizes["val"]
         if last < first or (size and not {"train": last - first, "val": size, "test": first}[part]):
             raise ValueError(
-                f"A scene with {scene.length} case(s) cannot be split into the sizes "
-                f"{self.sizes}; data.overlap=true takes the same cases for all"
+                f"A scene with {scene.length} case(s) cannot be split: {first} to test (a fifth), "
+                f"the last {self.sizes['val']} to validate, {max(0, last - first)} to train; "
+                f"expected some for each that data.sizes asks for, such as data.sizes.val=1, or "
+                f"test_scene=volumes; data.overlap=true takes the same cases for all"
             )
         if part == "test":
             return list(range(min(size, first)))

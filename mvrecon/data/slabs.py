@@ -1,5 +1,6 @@
 """A volume that is read slab by slab, so that memory holds one slab and not the volume."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -48,6 +49,18 @@ class Slabs:
     def mapped(self, change: Callable[[Float[Tensor, "d h w"]], Float[Tensor, "d h w"]]) -> "Slabs":
         """The volume with a function applied to every slab."""
         return replace(self, passes=lambda: ((first, change(slab)) for first, slab in self))
+
+    def watched(self, check: Callable[[float, float], None]) -> "Slabs":
+        """The volume whose least and greatest value a function gets at the end of every pass."""
+
+        def passes() -> Iterator[Slab]:
+            low, high = math.inf, -math.inf
+            for first, slab in self:
+                low, high = min(low, slab.min().item()), max(high, slab.max().item())
+                yield first, slab
+            check(low, high)
+
+        return replace(self, passes=passes)
 
     def whole(self) -> Float[Tensor, "d h w"]:
         """The whole volume in memory."""

@@ -6,7 +6,9 @@ alike.
 """
 
 import math
+import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, physical
+from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.nifti import ENDING, open_nifti
@@ -32,6 +34,8 @@ from mvrecon.scenes.sample import Sample
 #: Tissue begins at -400 HU where the patient is looked for, and at a quarter of water where voxels
 #: are judged.
 SKIN, TISSUE = 0.6 * WATER, 0.25 * WATER
+#: Of the grid: a patient that fills less is hardly in mm.
+TINY = 0.002
 #: Voxels of a finer grid where the scene chooses it, half a GiB: the same on every machine, as the
 #: cases are.
 FINE = 2**27
@@ -126,6 +130,12 @@ class FileScene(ABC):
         name, fine = self.finely(index, seed, grid)
         truth = F.avg_pool3d(fine[None], self.factor(grid))
         inside = enclosed(body(truth[0], self._above(TISSUE)))
+        if inside.float().mean() < TINY:
+            warnings.warn(
+                f"{self.path}: {name} fills {int(inside.sum())} of {inside.numel()} voxels of the "
+                f"grid; is the spacing in its file mm, and not cm?",
+                stacklevel=2,
+            )
         return Sample(self._views(fine, grid, cameras), truth, inside[None], name)
 
     def finer(
@@ -164,7 +174,9 @@ class FileScene(ABC):
                 f"varied ones"
             )
         name, hu, source = self.case(case)
-        mu = hu.mapped(lambda slab: self._physical(name, slab))
+        if self.stored == "HU":
+            hu = hu.watched(lambda *ends: self._named(name, check_spread, *ends))
+        mu = hu.mapped(lambda slab: self._named(name, physical, slab, self.stored))
         seed = self.seed_of(index, seed)
         rng = generator(seed, index) if turn else None
         if rng is not None and uniform(rng, 0, 1) < 0.5:
@@ -186,9 +198,10 @@ class FileScene(ABC):
             )
         return source.cropped(patient).centre
 
-    def _physical(self, name: str, values: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
+    def _named(self, name: str, step: Callable[..., Any], *values: Any) -> Any:
+        """What a step makes of a case's values; its error names file and case."""
         try:
-            return physical(values, self.stored)
+            return step(*values)
         except ValueError as error:
             raise ValueError(f"{self.path}: {name} {error}") from error
 

@@ -15,6 +15,7 @@ from mvrecon.calibration.from_data import Estimate, calibrated
 from mvrecon.calibration.unknowns import KINDS, unknowns
 from mvrecon.cameras.field import resolution
 from mvrecon.cameras.misalignment import misaligned
+from mvrecon.engine.coarse import coarse
 from mvrecon.engine.scan import Scan
 from mvrecon.engine.solve import bar
 from mvrecon.files.memory import check_memory
@@ -57,7 +58,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str = "cpu") -> tuple[Sca
     Raises:
         ValueError: as `calibrated`.
     """
-    grid = _coarse(scan.grid)
+    grid = coarse(scan.grid, COARSE)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)
 
@@ -115,23 +116,6 @@ def table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]:
         "gains": estimate.gains.tolist(),
         "residual": estimate.residual,
     }
-
-
-def _coarse(grid: Grid) -> Grid:
-    """The same box in voxels at most `COARSE` a side, about as long along all axes; the grid itself
-    where it is as coarse.
-    """
-    lengths = grid.affine.new_tensor(grid.spacing) * grid.affine.new_tensor(grid.size)
-    step = lengths.max() / COARSE
-    counts = [
-        min(n, math.ceil(mm / step - 1e-6))
-        for n, mm in zip(grid.size, lengths.tolist(), strict=True)
-    ]
-    ratio = grid.affine.new_tensor(grid.size) / grid.affine.new_tensor(counts)
-    affine = grid.affine.clone()
-    affine[:3, :3] *= ratio
-    affine[:3, 3] = grid.to_world((ratio - 1) / 2)
-    return Grid((counts[2], counts[1], counts[0]), affine)
 
 
 def _joined(scan: Scan, grid: Grid) -> int:

@@ -150,7 +150,8 @@ def remembered(last: Path) -> Iterator[None]:
             raise SystemExit(f"Stopped by Ctrl-C. {_kept(last)}") from stop
         raise
     except Exception as error:
-        error.add_note(_kept(last))
+        if last.exists() or previous(last).exists():
+            error.add_note(_kept(last))
         raise
 
 

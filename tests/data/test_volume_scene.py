@@ -44,6 +44,27 @@ def test_a_folder_of_volumes_has_a_case_for_each_file(folder, grid, cameras):
         assert torch.allclose(sample.views, expected.views, atol=1e-4)
 
 
+@pytest.mark.door
+def test_attenuation_that_is_taken_for_hu_is_refused(tmp_path, grid, cameras):
+    """Attenuation in 1/mm, all of which would be water as HU, is refused, with what to say."""
+    mu = attenuation(torch.from_numpy(head().astype("f4")))
+    save_volume(tmp_path / "mu.nii.gz", mu, Grid.centred(size=mu.shape[::-1], spacing=3.0))
+    path = str(tmp_path / "mu.nii.gz")
+    with pytest.raises(ValueError, match=r"mu has values from .* stored_unit=1/mm"):
+        Volumes(path=path).sample(0, 0, grid, cameras)
+    assert Volumes(path=path, stored_unit="1/mm").sample(0, 0, grid, cameras).volume.max() > 0
+
+
+@pytest.mark.door
+def test_a_patient_of_a_few_voxels_is_warned_of(tmp_path, grid, cameras):
+    """A patient who is a tenth as large, as with a spacing in cm, is warned of."""
+    hu = torch.from_numpy(head().astype("f4"))
+    small = Grid.centred(size=hu.shape[::-1], spacing=[step / 10 for step in SPACING[::-1]])
+    save_volume(tmp_path / "cm.nii.gz", hu, small)
+    with pytest.warns(UserWarning, match="voxels of the grid; is the spacing in its file mm"):
+        Volumes(path=str(tmp_path / "cm.nii.gz")).sample(0, 0, grid, cameras)
+
+
 def test_dicom_series_are_cases_by_their_folders(tmp_path):
     for name in ("p2", "p1"):
         written(tmp_path / name)

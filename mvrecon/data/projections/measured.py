@@ -33,6 +33,8 @@ class Measured:
             transmissions, as a larger pixel measures; of integrals where these are stored.
         flip_rows: reverse the rows of every view, before anything else: for a geometry file whose
             rows run the other way (its own option `flip_rows`).
+        flip_columns: reverse the columns of every view: for images that are mirrored, as where they
+            show the detector from behind.
         every: take the first view and every n-th after it.
         pattern: of the names of the images in a folder, such as "scan_*.tif"; None: all.
         gaps: allow names whose numbers are not in equal steps.
@@ -52,6 +54,7 @@ class Measured:
     columns: Sequence[int] | None = None
     binning: int | Sequence[int] = 1
     flip_rows: bool = False
+    flip_columns: bool = False
     every: int = 1
     pattern: str | None = None
     gaps: bool = False

@@ -104,8 +104,9 @@ class MeasuredViews:
         """
         if len(cameras) != self.stack.n_views:
             raise ValueError(
-                f"{self.options.path}: expected one camera for each of {self.stack.n_views} views, "
-                f"got {len(cameras)}"
+                f"{self.options.path}: expected one camera for each of {self.stack.n_views} views "
+                f"of {self.stack.shape} pixels (rows, columns), got {len(cameras)} cameras; is a "
+                f"view missing, or another axis than the first that of the views?"
             )
         return self.region.seen_by(cameras[:: self.options.every])
 
@@ -183,8 +184,9 @@ class MeasuredViews:
         return Corrected(views, mask, saturated, floored)
 
     def _kept(self, raw: Tensor) -> Tensor:
-        """The kept rows and columns of pixels on disk, the rows in the cameras' order."""
-        return self.region.cropped(raw.flip(-2) if self.options.flip_rows else raw)
+        """The kept rows and columns of pixels on disk, in the cameras' order."""
+        reversed_axes = {-2: self.options.flip_rows, -1: self.options.flip_columns}
+        return self.region.cropped(raw.flip([axis for axis, yes in reversed_axes.items() if yes]))
 
     def _field(self, name: str, value: Field) -> Float[Tensor, "v u"]:
         """A field in grey values: a number, the mean of images, or the folder's own."""
@@ -197,7 +199,7 @@ class MeasuredViews:
         if stack is None:
             raise Refused(
                 f"{where}: expected a flat field for intensities; give flat=<path or grey value>, "
-                f"or kind=integrals"
+                f"or kind=integrals (of a command, views.flat and views.kind)"
             )
         if stack.shape != self.stack.shape:
             raise Refused(
