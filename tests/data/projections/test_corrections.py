@@ -124,8 +124,8 @@ def test_the_settings_are_the_options(root):
 
 
 def test_mirrored_images_are_read_as_if_they_were_not(scan):
-    views = Measured(path=str(scan), columns=[1, 5]).open().whole().views
-    mirrored = Measured(path=str(scan), columns=[3, 7], flip_columns=True).open().whole().views
+    views = MeasuredViews.of(Measured(path=str(scan), columns=[1, 5])).whole().views
+    mirrored = MeasuredViews.of(Measured(path=str(scan), columns=[3, 7], flip_columns=True)).whole().views
     assert torch.equal(mirrored, views.flip(-1))
 
 
