@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from mvrecon.config.errors import one_line
 from mvrecon.config.guard import guarded
 from mvrecon.config.plugins import check_plugins
+from mvrecon.config.quiet import silence_libraries
 from mvrecon.config.schemas import SCHEMAS
 from mvrecon.config.typed import check_parts
 from mvrecon.files.checks import shown, yaml_of
@@ -103,6 +104,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     prepare_hydra()
+    silence_libraries()
     guard = guarded(conf_dir(), plugin_conf_dirs(), check_settings)
     with one_line(f"mvrecon-{config_name}"), guard:
         if any(argument.startswith("--e") for argument in arguments):
