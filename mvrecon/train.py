@@ -96,6 +96,7 @@ def task(config: DictConfig) -> float:
     sweepers: to choose by the test's scenes would spoil the test.
     """
     from mvrecon.engine import run_folder
+    from mvrecon.engine.progress import tell
     from mvrecon.engine.report import show
 
     settings = run_folder.anchored(to_plain(config))
@@ -110,6 +111,7 @@ def task(config: DictConfig) -> float:
     run_folder.check(folder, settings)
     finished = (folder / RESULTS).is_file()
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
+        tell(f"{folder.name}: its results are there already")
         return _score(read_results(folder))
     if table := train(settings, folder, HydraConfig.get().overrides.task):
         show(table, folder)

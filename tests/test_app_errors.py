@@ -187,11 +187,14 @@ def test_one_string_is_one_module():
     assert names("my_parts") == names(["my_parts"]) == ["my_parts"] and names(None) == []
 
 
-def test_an_option_of_the_run_s_camera_is_asked_for_with_a_plus(answer):
-    text = answer("checkpoint=x", "camera.n_views=6", app="eval")
-    assert text == (
-        "mvrecon-eval: 'camera.n_views' has no value here yet; to set it: +camera.n_views=...\n"
-    )
+def test_an_option_of_the_run_s_camera_is_set_without_more_ado(answer):
+    def show(config) -> None:
+        raise ValueError(f"{config.camera.n_views} {config.grid.spacing} {config.data.sizes.test}")
+
+    options = ("camera.n_views=6", "+grid.spacing=2", "data.sizes.test=1")
+    assert answer("checkpoint=x", *options, app="eval", task=show).endswith(": 6 2 1\n")
+    text = answer("checkpoint=x", "grid.spacin=6", app="eval")
+    assert "grid has no option 'spacin'; did you mean 'spacing'?" in text
 
 
 def test_the_app_without_options_refuses_one_before_it_compiles(monkeypatch, capsys):

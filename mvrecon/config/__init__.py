@@ -20,6 +20,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
+from mvrecon.config.arguments import with_options_added, with_paths_quoted
 from mvrecon.config.errors import one_line
 from mvrecon.config.guard import guarded
 from mvrecon.config.plugins import check_plugins
@@ -32,6 +33,8 @@ from mvrecon.registry import installed, locate
 VERSION_BASE = "1.3"
 #: Groups whose part is an option of a model.
 OF_MODELS = {"head", "network", "reconstructor"}
+#: Settings of an app that a run fills in, so that their options are not in the app's own file.
+OF_RUN = {"eval": ("acquisition", "camera", "data", "grid", "test_scene")}
 
 
 class PluginConf(SearchPathPlugin):
@@ -93,7 +96,9 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     Raises:
         SystemExit: an error, or Ctrl-C.
     """
-    arguments = sys.argv[1:]
+    sys.argv[1:] = arguments = with_options_added(
+        with_paths_quoted(sys.argv[1:]), OF_RUN.get(config_name, ())
+    )
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
         return

@@ -19,7 +19,7 @@ WRITTEN = {
         "pixel_mm": "PositiveFloat | Pair[PositiveFloat]",
         "offset_mm": "float | Pair[float]",
     },
-    "data": {"overlap": "bool"},
+    "data": {"overlap": "bool", "sizes": ""},
     "data.sizes": dict.fromkeys(("train", "val", "test"), "NonNegativeInt"),
     "optimizer": {
         "lr": "PositiveFloat",
@@ -39,6 +39,8 @@ WRITTEN = {
         "log_every_n_steps": "NonNegativeInt",
     },
 }
+#: Sections that have options of torch's and Lightning's besides.
+OPEN_ENDED = ("optimizer", "trainer")
 
 
 def check_parts(settings: Mapping[str, Any]) -> None:
@@ -68,7 +70,7 @@ def check_parts(settings: Mapping[str, Any]) -> None:
 
 
 def _check_sections(settings: Mapping[str, Any]) -> None:
-    """Check the values of the settings that are no parts, such as those of the grid."""
+    """Check the settings that are no parts, such as those of the grid."""
     known = {section: dict(options_of(section)) for section in SECTIONS}
     for section, types in WRITTEN.items():
         known.setdefault(section, {}).update({key: Option(type=t) for key, t in types.items()})
@@ -76,7 +78,11 @@ def _check_sections(settings: Mapping[str, Any]) -> None:
         node: Any = settings
         for key in section.split("."):
             node = node.get(key) if isinstance(node, Mapping) else None
-        for key, value in node.items() if isinstance(node, Mapping) else ():
+        if not isinstance(node, Mapping):
+            continue
+        if section not in OPEN_ENDED:
+            check_options(section, node, options)
+        for key, value in node.items():
             if value is not None or section != "grid":  # null: chosen by the app
                 _check_type(f"{section}.{key}", value, options.get(key, Option()))
 
