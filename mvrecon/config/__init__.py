@@ -183,7 +183,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
     prepare_hydra()
     guard = guarded(conf_dir(), plugin_conf_dirs())
     with guard, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
-        return to_plain(hydra.compose(config_name, list(overrides)))
+        added = with_options_added(overrides, OF_RUN.get(config_name, ()))
+        return to_plain(hydra.compose(config_name, added))
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:
