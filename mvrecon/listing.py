@@ -8,6 +8,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from mvrecon.config.values import in_words
 from mvrecon.new_plugin import new_plugin
 from mvrecon.parts import REGISTRIES
 from mvrecon.signatures import Option, Part, describe
@@ -36,7 +37,7 @@ def show(parts: Sequence[Part]) -> None:
 
 def _line(name: str, option: Option) -> str:
     """An option with its default, its type where it has none, and its text, with the unit."""
-    value = f"={option.default}" if option.default else f" ({option.type or 'needed'})"
+    value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
     return f"  {name}{value}  {option.text}".rstrip()
 
 

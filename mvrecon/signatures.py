@@ -14,11 +14,18 @@ from mvrecon.registry import installed, locate
 
 #: What the apps and the models pass in, no options.
 GIVEN = {
-    *("self", "grid", "cameras", "projector", "task"),
+    *("self", "cls", "grid", "cameras", "projector", "task"),
     *("inputs", "outputs", "A", "views", "counts"),
 }
 #: Kinds of the settings that are called otherwise.
 KINDS = {"test_scene": "scene"}
+#: Settings that are no parts, and what takes them.
+SECTIONS = {
+    "grid": "mvrecon.geometry.grid:Grid.centred",
+    "data": "mvrecon.data.loading:Loading",
+    "acquisition": "mvrecon.acquisition.settings:Acquisition",
+    "loss": "mvrecon.losses:Weights",
+}
 
 Definition = ast.ClassDef | ast.FunctionDef
 
@@ -83,10 +90,14 @@ def definition(module: str, name: str) -> tuple[str, Definition]:
     raise ImportError(f"{module} defines no class or function {name!r}")
 
 
-def options_of_grid() -> Mapping[str, Option]:
-    """The options of the setting `grid`, those of `Grid.centred`."""
-    module, node = definition("mvrecon.geometry.grid", "Grid")
-    made = next(m for m in node.body if isinstance(m, ast.FunctionDef) and m.name == "centred")
+def options_of(section: str) -> Mapping[str, Option]:
+    """The options of a setting that is no part, one of `SECTIONS`."""
+    module, _, name = SECTIONS[section].partition(":")
+    owner, _, method = name.partition(".")
+    module, node = definition(module, owner)
+    if not method:
+        return _options(module, node)[0]
+    made = next(m for m in node.body if isinstance(m, ast.FunctionDef) and m.name == method)
     return _arguments(made, _texts(ast.get_docstring(made) or ""))[0]
 
 

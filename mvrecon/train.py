@@ -5,7 +5,6 @@ Torch is imported inside the task, so that `--help` and typing mistakes are answ
 """
 
 import math
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,12 @@ from omegaconf import DictConfig
 
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
+from mvrecon.config.quiet import silence_libraries
 from mvrecon.files.rank import rank
 from mvrecon.files.runs import RESULTS, folder_of_run, read_results
+
+#: The one setting that a resumed run takes.
+STEPS = "trainer.max_steps"
 
 
 def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
@@ -38,14 +41,10 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
         ValueError: an unknown accelerator; the folder's run has other settings, another rig or
             other data.
     """
+    silence_libraries()  # again: a sweep's run may be in a process of its own
     import_plugins(settings["plugins"])
-    from mvrecon.engine import board, evaluation, fit, processes, progress, run_folder
+    from mvrecon.engine import board, evaluation, fit, processes, run_folder
 
-    progress.silence_libraries()
-    # Lightning's own use of torch, of which no user can be rid
-    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")
-    # what is logged are steps, of whatever epoch
-    warnings.filterwarnings("ignore", "The number of training batches")
     device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
     if rank() > 0:
@@ -63,21 +62,33 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     return table
 
 
-def resumed(folder: str, others: list[str]) -> tuple[dict[str, Any], Path]:
+def resumed(
+    folder: str, others: Sequence[str], steps: int | None = None
+) -> tuple[dict[str, Any], Path]:
     """Settings and folder of a run to resume.
 
+    Args:
+        folder: of the run, or a checkpoint in it.
+        others: further options of the command line.
+        steps: trainer.max_steps from now on, more than before; None: as before.
+
     Raises:
-        ValueError: other options were given, which a resumed run could not honour.
+        ValueError: other options were given, which a resumed run could not honour, or fewer steps
+            than the run has.
         FileNotFoundError: no run folder is there.
+        RuntimeError: a run with more steps from now on, in which another process is at work.
     """
     from mvrecon.engine import run_folder
+    from mvrecon.engine.lengthened import lengthened
 
     if others:
         raise ValueError(
-            f"resume goes on with the run's own settings; but got also {' '.join(others)}"
+            f"resume goes on with the run's own settings, with {STEPS}=... for more steps; but got "
+            f"also {' '.join(others)}"
         )
     run = folder_of_run(folder)
-    return run_folder.read_settings(run), run
+    settings = run_folder.read_settings(run)
+    return settings if steps is None else lengthened(settings, run, steps), run
 
 
 def task(config: DictConfig) -> float:
@@ -85,21 +96,22 @@ def task(config: DictConfig) -> float:
     sweepers: to choose by the test's scenes would spoil the test.
     """
     from mvrecon.engine import run_folder
+    from mvrecon.engine.progress import tell
     from mvrecon.engine.report import show
 
     settings = run_folder.anchored(to_plain(config))
     folder = Path(HydraConfig.get().runtime.output_dir)
     if settings["resume"]:
         import_plugins(settings["plugins"])
-        others = [
-            override
-            for override in HydraConfig.get().overrides.task
-            if not override.lstrip("+").startswith(("resume=", "plugins="))
-        ]
-        settings, folder = resumed(settings["resume"], others)
+        lines = HydraConfig.get().overrides.task
+        keys = {line: line.lstrip("+").partition("=")[0] for line in lines}
+        others = [line for line in lines if keys[line] not in ("resume", "plugins", STEPS)]
+        steps = settings["trainer"]["max_steps"] if STEPS in keys.values() else None
+        settings, folder = resumed(settings["resume"], others, steps)
     run_folder.check(folder, settings)
     finished = (folder / RESULTS).is_file()
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
+        tell(f"{folder.name}: its results are there already")
         return _score(read_results(folder))
     if table := train(settings, folder, HydraConfig.get().overrides.task):
         show(table, folder)

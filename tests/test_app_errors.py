@@ -7,19 +7,22 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
+from omegaconf import OmegaConf
 
 from mvrecon import compare, warmup
 from mvrecon.config import conf_dir, launch
 from mvrecon.config.plugins import check_plugins, import_plugins, names
-from mvrecon.config.typed import check_parts, fits
+from mvrecon.config.typed import check_parts
+from mvrecon.config.values import fits
 from mvrecon.parts import PROJECTORS
 
 MISTAKES = {
     "camera.view=4": r"There is no setting 'camera.view'; did you mean 'n_views'\?",
     "model=crossview": r"model has no choice 'crossview'; did you mean 'cross_view'\?",
-    "camera.n_views=abc": r"camera.n_views: expected int, got 'abc' \(number of cameras",
-    "grid.spacing=x": r"grid.spacing: expected float \| Sequence\[float\], got 'x' \(.*mm",
+    "camera.n_views=abc": r"camera.n_views: expected int > 0, got 'abc' \(number of cameras",
+    "grid.spacing=x": r"grid.spacing: expected float > 0 or \[float > 0, .*\], got 'x' \(.*mm",
+    "grid.size=[32,32]": r"grid.size: expected \[int > 0, int > 0, int > 0\] .*got \[32, 32\]",
+    "trainer.max_steps=-5": r"trainer.max_steps: expected int > 0 or -1, got -5$",
     "projector.name=dr": r"projector.name: no projector is 'dr'; did you mean 'drr'\?",
     "+projector.metod=joseph": r"'metod'; did you mean 'method'\?",
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
@@ -94,6 +97,12 @@ def test_an_error_of_the_task_is_one_line_and_a_fault_of_the_program_is_not(answ
         ("bool", [True], [1, "true"]),
         ("Literal['a', 'b']", ["a"], ["c", None]),
         ("Sequence[float] | None", [[1, 2.5], None], [["a"], 3]),
+        ("Literal['a'] | Literal[-1]", ["a", -1], ["-1", 1]),
+        ("PositiveInt", [1], [0, -1, 1.5, True]),
+        ("NonNegativeFloat", [0, 0.5, float("inf")], [-0.1, float("nan"), "0"]),
+        ("Pair[PositiveFloat]", [[1, 2.5]], [[1], [1, 0], [1, 2, 3], 1]),
+        ("tuple[int, str] | None", [[1, "a"], None], [[1], ["a", 1]]),
+        ("tuple[float, ...]", [[], [1, 2, 3]], [["a"]]),
         ("Whatever | int", ["anything"], []),
     ],
 )
@@ -103,10 +112,52 @@ def test_plain_types_are_told_apart(type: str, good: list, bad: list):
     assert not any(fits(value, tree) for value in bad)
 
 
+WRONG = {
+    "camera": [
+        {"n_views": 0},
+        {"sid": -400.0},
+        {"detector": {"pixels": 0}},
+        {"detector": {"pixels": [24, 24, 24]}},
+        {"detector": {"pixel_mm": [1.0, 0.0]}},
+    ],
+    "scene": [{"count": [3]}, {"field": -0.4}, {"sizes": [0.1, -0.4]}],
+    "grid": [{"spacing": -1}, {"centre": [0, 0]}],
+    "data": [{"batch_size": 0}, {"sizes": {"train": -1}}],
+    "acquisition": [{"photons": 0}],
+    "optimizer": [{"lr": -1e-3}, {"schedule": "cosinus"}],
+    "trainer": [{"devices": 0}, {"accumulate_grad_batches": 0}],
+    "loss": [{"volume": "much"}],
+}
+
+
+@pytest.mark.door
+def test_a_number_out_of_its_range_and_a_list_of_wrong_length_are_refused():
+    """A setting that must be positive, and is not, and a list of a wrong length are refused
+    before anything is computed; the message names the setting.
+    """
+    names = {"camera": "circular", "scene": "ellipsoids"}
+    for section, nodes in WRONG.items():
+        for node in nodes:
+            part = {"name": names[section], **node} if section in names else node
+            with pytest.raises(TypeError, match=rf"^{section}\.{next(iter(node))}.*: expected "):
+                check_parts({section: part})
+
+
 def test_every_choice_of_ours_fits_the_types_of_its_part():
-    for group in ("scene", "camera", "projector", "model"):
+    groups = (
+        "scene",
+        "camera",
+        "projector",
+        "model",
+        "data",
+        "acquisition",
+        "optimizer",
+        "trainer",
+    )
+    for group in groups:
         for file in sorted((conf_dir() / group).glob("*.yaml")):
-            part = yaml.safe_load(file.read_text())
+            part = OmegaConf.to_container(OmegaConf.load(file))
+            assert isinstance(part, dict)
             part.pop("defaults", None)
             check_parts({group: part})
 
@@ -138,11 +189,14 @@ def test_one_string_is_one_module():
     assert names("my_parts") == names(["my_parts"]) == ["my_parts"] and names(None) == []
 
 
-def test_an_option_of_the_run_s_camera_is_asked_for_with_a_plus(answer):
-    text = answer("checkpoint=x", "camera.n_views=6", app="eval")
-    assert text == (
-        "mvrecon-eval: 'camera.n_views' has no value here yet; to set it: +camera.n_views=...\n"
-    )
+def test_an_option_of_the_run_s_camera_is_set_without_more_ado(answer):
+    def show(config) -> None:
+        raise ValueError(f"{config.camera.n_views} {config.grid.spacing} {config.data.sizes.test}")
+
+    options = ("camera.n_views=6", "+grid.spacing=2", "data.sizes.test=1")
+    assert answer("checkpoint=x", *options, app="eval", task=show).endswith(": 6 2 1\n")
+    text = answer("checkpoint=x", "grid.spacin=6", app="eval")
+    assert "grid has no option 'spacin'; did you mean 'spacing'?" in text
 
 
 def test_the_app_without_options_refuses_one_before_it_compiles(monkeypatch, capsys):

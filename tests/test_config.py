@@ -13,10 +13,12 @@ import hydra
 import pytest
 import yaml
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
 from mvrecon import config
 from mvrecon.config import compose, conf_dir, help_text
+from mvrecon.config.arguments import with_paths_quoted
 from mvrecon.config.plugins import import_plugins
 from mvrecon.config.targets import instantiate
 from mvrecon.parts import NETWORKS
@@ -128,6 +130,20 @@ def test_a_reconstructor_is_chosen_on_the_command_line_with_its_own_options_alon
         choice = f"reconstructor@model.reconstructor={file.stem}"
         node = compose("model=classical", choice, *needed)["model"]["reconstructor"]
         assert node == {name: "x" if v == "???" else v for name, v in options.items()}
+
+
+@pytest.mark.door
+def test_a_path_is_one_value_whatever_signs_are_in_it(tmp_path: Path):
+    """The folder of a sweep's run, with = and commas in its name, and a folder with spaces or
+    quotes, is one value on the command line; what is no path is left as it is.
+    """
+    parser = OverridesParser.create()
+    for name in ("camera.n_views=4,model=sirt", "my scan (2)", "o'brien, {3}"):
+        (tmp_path / name).mkdir()
+        lines = with_paths_quoted([f"checkpoint={tmp_path / name}"])
+        assert parser.parse_overrides(lines)[0].value() == str(tmp_path / name)
+    for line in ("model=sirt,cross_view", "data.sizes={train: 3}", "--config-dir=a,b", "seed=3"):
+        assert with_paths_quoted([line]) == [line]
 
 
 @pytest.fixture

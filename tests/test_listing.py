@@ -38,7 +38,7 @@ def test_every_part_and_origin_is_printed_and_options_with_their_units(
     assert main([]) == 0
     text = capsys.readouterr().out
     assert "arc_degrees=180.0  the range of angles" in text
-    assert "sid (float)  mm from the source to the axis." in text
+    assert "sid (float > 0)  mm from the source to the axis." in text
     for kind, name in PARTS:
         assert name in text
         assert REGISTRIES[kind].origin(name) in text

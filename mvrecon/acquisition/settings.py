@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from mvrecon.acquisition.disturbances import Disturbance
+from mvrecon.quantities import NonNegativeFloat, PositiveFloat, PositiveInt
 from mvrecon.registry import check_options
 
 
@@ -42,13 +43,13 @@ class Acquisition:
             overexposed views.
     """
 
-    fine: int = 2
-    blur_mm: float = 0.0
-    scatter: float = 0.0
-    scatter_mm: float = 40.0
-    photons: float | None = None
-    counts: float | None = None
-    noise: float = 0.0
+    fine: PositiveInt = 2
+    blur_mm: NonNegativeFloat = 0.0
+    scatter: NonNegativeFloat = 0.0
+    scatter_mm: PositiveFloat = 40.0
+    photons: PositiveFloat | None = None
+    counts: PositiveFloat | None = None
+    noise: NonNegativeFloat = 0.0
     closed_form: bool = True
     disturbed: Disturbance | None = None
 

@@ -10,6 +10,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.detector import Detector
 from mvrecon.cameras.rigs import arc, circular, dome
 from mvrecon.geometry.rigid import look_at
+from mvrecon.quantities import NonNegativeInt, Pair, PositiveFloat, PositiveInt
 from mvrecon.scenes.analytic import generator, uniform
 
 #: Kinds of rig: a full circle, an arc, a dome about +z, directions at random.
@@ -21,13 +22,13 @@ UNEVEN = 0.2
 
 
 def random_rig(
-    n_views: Sequence[int],
-    sid: Sequence[float],
-    magnification: Sequence[float],
-    pixels: Sequence[int],
-    field_mm: Sequence[float],
+    n_views: Pair[PositiveInt],
+    sid: Pair[PositiveFloat],
+    magnification: Pair[PositiveFloat],
+    pixels: Pair[PositiveInt],
+    field_mm: Pair[PositiveFloat],
     paths: Sequence[str] = PATHS,
-    seed: int = 0,
+    seed: NonNegativeInt = 0,
 ) -> Cameras:
     """Cone beam cameras about the origin of the world in mm, on a path, at distances and with a
     detector that are drawn at random.

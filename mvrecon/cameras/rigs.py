@@ -14,12 +14,13 @@ import torch
 from mvrecon.cameras.camera import Cameras, Extent
 from mvrecon.cameras.detector import Detector
 from mvrecon.geometry.rigid import look_at
+from mvrecon.quantities import PositiveFloat, PositiveInt, Triple
 
 
 def circular(
-    n_views: int,
-    sid: float,
-    sdd: float,
+    n_views: PositiveInt,
+    sid: PositiveFloat,
+    sdd: PositiveFloat,
     detector: Mapping[str, Any],
     arc_degrees: float = 360.0,
     start_degrees: float = 0.0,
@@ -45,9 +46,9 @@ def circular(
 
 
 def arc(
-    n_views: int,
-    sid: float,
-    sdd: float,
+    n_views: PositiveInt,
+    sid: PositiveFloat,
+    sdd: PositiveFloat,
     detector: Mapping[str, Any],
     arc_degrees: float = 180.0,
     start_degrees: float = 0.0,
@@ -75,9 +76,9 @@ def arc(
 
 
 def parallel(
-    n_views: int,
+    n_views: PositiveInt,
     detector: Mapping[str, Any],
-    depth_mm: float = 1000.0,
+    depth_mm: PositiveFloat = 1000.0,
     arc_degrees: float = 180.0,
     start_degrees: float = 0.0,
     angles: Sequence[float] | None = None,
@@ -105,12 +106,12 @@ def parallel(
 
 
 def dome(
-    n_views: int,
-    radius: float,
-    focal: float,
-    aperture_degrees: float,
+    n_views: PositiveInt,
+    radius: PositiveFloat,
+    focal: PositiveFloat,
+    aperture_degrees: PositiveFloat,
     detector: Mapping[str, Any],
-    target: Sequence[float] = (0.0, 0.0, 0.0),
+    target: Triple[float] = (0.0, 0.0, 0.0),
     extent: Extent = "behind",
 ) -> Cameras:
     """Cameras evenly spread on the cap of a sphere about +z, all aimed at its centre (pinholes, by

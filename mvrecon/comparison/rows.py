@@ -13,6 +13,8 @@ from mvrecon.files.runs import EVALUATION, RESULTS, SETTINGS, leaves, read_resul
 FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
 #: Settings that say nothing of what is compared, and the most that make up a run's name.
 SILENT, NAMED = ("name", "resume", "plugins", "checkpoint", "save"), 4
+#: Characters of a value in a run's name, at most; values that are longer are numbered.
+LONG = 32
 
 
 @dataclass(frozen=True)
@@ -94,17 +96,32 @@ def _number(value: float | None) -> float:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Each run by the settings that differ, or by its folder where none does."""
+    """Each run as its sweep calls it; else by the settings that differ, or by its folder where none
+    does.
+    """
+    of_sweep = [folder.name for folder in folders]
+    if len(set(of_sweep)) == len(folders) > 1 and all("=" in name for name in of_sweep):
+        return of_sweep
     settings = [dict(_named(_settings(folder))) for folder in folders]
     keys = [key for key in dict.fromkeys(key for s in settings for key in s)]
     differing = [key for key in keys if len({repr(s.get(key)) for s in settings}) > 1]
     parts = {key.removesuffix(".name") for key in differing if key.endswith(".name")}
     telling = [key for key in differing if key.endswith(".name") or not _below(key, parts)]
+    texts = {key: _texts([s.get(key) for s in settings]) for key in telling[:NAMED]}
     return [
-        ", ".join(f"{key.removesuffix('.name')}={s[key]}" for key in telling[:NAMED] if key in s)
+        ", ".join(f"{key.removesuffix('.name')}={texts[key][k]}" for key in texts if key in s)
         or folder.name
-        for s, folder in zip(settings, folders, strict=True)
+        for k, (s, folder) in enumerate(zip(settings, folders, strict=True))
     ]
+
+
+def _texts(values: Sequence[Any]) -> list[str]:
+    """Values of one setting as texts; where one is too long for a name, all by their number."""
+    texts = [str(value) for value in values]
+    if max(map(len, texts)) <= LONG:
+        return texts
+    numbers = {text: f"#{k}" for k, text in enumerate(dict.fromkeys(texts), 1)}
+    return [numbers[text] for text in texts]
 
 
 def _below(key: str, parts: Iterable[str]) -> bool:

@@ -20,15 +20,19 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
+from mvrecon.config.arguments import with_options_added, with_paths_quoted
 from mvrecon.config.errors import OF_MODELS, one_line
 from mvrecon.config.guard import guarded
 from mvrecon.config.plugins import check_plugins
+from mvrecon.config.quiet import silence_libraries
 from mvrecon.config.schemas import SCHEMAS
 from mvrecon.config.typed import check_parts
 from mvrecon.files.checks import shown, yaml_of
 from mvrecon.registry import installed, locate
 
 VERSION_BASE = "1.3"
+#: Settings of an app that a run fills in, so that their options are not in the app's own file.
+OF_RUN = {"eval": ("acquisition", "camera", "data", "grid", "test_scene")}
 
 
 class PluginConf(SearchPathPlugin):
@@ -90,7 +94,9 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     Raises:
         SystemExit: an error, or Ctrl-C.
     """
-    arguments = sys.argv[1:]
+    sys.argv[1:] = arguments = with_options_added(
+        with_paths_quoted(sys.argv[1:]), OF_RUN.get(config_name, ())
+    )
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
         return
@@ -101,6 +107,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     prepare_hydra()
+    silence_libraries()
     guard = guarded(conf_dir(), plugin_conf_dirs(), check_settings)
     with one_line(f"mvrecon-{config_name}"), guard:
         if any(argument.startswith("--e") for argument in arguments):
@@ -174,7 +181,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
     prepare_hydra()
     guard = guarded(conf_dir(), plugin_conf_dirs())
     with guard, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
-        return to_plain(hydra.compose(config_name, list(overrides)))
+        added = with_options_added(overrides, OF_RUN.get(config_name, ()))
+        return to_plain(hydra.compose(config_name, added))
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """A new folder for every run and every sweep, made before Hydra writes."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from mvrecon.config import conf_dir, plugin_conf_dirs
+from mvrecon.config.arguments import quoted
 from mvrecon.files.atomic import check_plain, new_folder
 from mvrecon.files.checks import shown
 from mvrecon.files.rank import world
@@ -65,7 +65,7 @@ class OwnFolder(Callback):
         with read_write(config), open_dict(config):
             for name, value in changes.items():
                 OmegaConf.update(config, name, value)
-                overrides.append(f"++{name}={_quoted(value)}")  # a sweep's jobs are composed anew
+                overrides.append(f"++{name}={quoted(value)}")  # a sweep's jobs are composed anew
 
     def _folder(self, config: DictConfig, key: str) -> Path:
         run = run_around(config.resume) if config.get("resume") else None
@@ -93,10 +93,3 @@ def check_launcher(config: DictConfig) -> None:
             f"A sweep by {config.hydra.launcher._target_} composes its jobs in other processes, "
             f"where configs are not checked; expected no --config-dir, got {shown(foreign)}"
         )
-
-
-def _quoted(value: str | Sequence[str]) -> str:
-    """A value in the grammar of Hydra's command line."""
-    if not isinstance(value, str):
-        return f"[{','.join(map(_quoted, value))}]"
-    return "'" + value.replace("'", r"\'") + "'"

@@ -2,22 +2,51 @@
 imported.
 """
 
-import ast
 from collections.abc import Mapping
 from typing import Any
 
+from mvrecon.config.values import fits, in_words, parsed
 from mvrecon.files.checks import shown
 from mvrecon.parts import REGISTRIES
 from mvrecon.registry import check_options, hint
-from mvrecon.signatures import Option, describe, options_of_grid, parts_in
+from mvrecon.signatures import SECTIONS, Option, describe, options_of, parts_in
 
-#: What a value of a plain type may be; a whole number serves as a float.
-PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
+LENGTH = "PositiveInt | Literal[-1]"
+#: Types of settings that no signature of ours has.
+WRITTEN = {
+    "camera.detector": {
+        "pixels": "PositiveInt | Pair[PositiveInt] | None",
+        "pixel_mm": "PositiveFloat | Pair[PositiveFloat]",
+        "offset_mm": "float | Pair[float]",
+    },
+    "data": {"overlap": "bool", "sizes": ""},
+    "data.sizes": dict.fromkeys(("train", "val", "test"), "NonNegativeInt"),
+    "optimizer": {
+        "lr": "PositiveFloat",
+        "weight_decay": "NonNegativeFloat",
+        "momentum": "NonNegativeFloat",
+        "schedule": "Literal['cosine', 'one_cycle', 'constant']",
+        "warmup": "NonNegativeFloat",
+    },
+    "trainer": {
+        "max_steps": LENGTH,
+        "max_epochs": LENGTH,
+        "num_nodes": "PositiveInt",
+        "devices": "PositiveInt | Literal[-1] | str | Sequence[NonNegativeInt]",
+        "accumulate_grad_batches": "PositiveInt",
+        "gradient_clip_val": "NonNegativeFloat | None",
+        "val_check_interval": "PositiveInt | PositiveFloat | None",
+        "log_every_n_steps": "NonNegativeInt",
+    },
+}
+#: Sections that have options of torch's and Lightning's besides.
+OPEN_ENDED = ("optimizer", "trainer")
 
 
 def check_parts(settings: Mapping[str, Any]) -> None:
     """Check every part that the settings name against its source: the name, the options, and the
-    values whose type is plain; those of the grid, too.
+    values whose type, range and length are known; those of the grid, the data, the acquisition,
+    the loss, the optimiser and the trainer, too.
 
     A name or an option that the modules of `plugins` may bring is left to them.
 
@@ -25,10 +54,7 @@ def check_parts(settings: Mapping[str, Any]) -> None:
         LookupError: an unknown name.
         TypeError: an option that a part does not have, or a value of another type.
     """
-    if isinstance(grid := settings.get("grid"), Mapping):
-        for key, option in options_of_grid().items():
-            if (value := grid.get(key)) is not None:  # null: chosen by the app
-                _check_type(f"grid.{key}", value, option)
+    _check_sections(settings)
     for path, kind, node in parts_in(settings):
         registry, name = REGISTRIES[kind], node["name"]
         if _later(name):
@@ -41,6 +67,24 @@ def check_parts(settings: Mapping[str, Any]) -> None:
         if path == "model" or path.rpartition(".")[0] == "compare":
             _check_assumed(path, options.pop("assume", None), settings.get("projector"))
         _check_options(path, kind, name, options)
+
+
+def _check_sections(settings: Mapping[str, Any]) -> None:
+    """Check the settings that are no parts, such as those of the grid."""
+    known = {section: dict(options_of(section)) for section in SECTIONS}
+    for section, types in WRITTEN.items():
+        known.setdefault(section, {}).update({key: Option(type=t) for key, t in types.items()})
+    for section, options in known.items():
+        node: Any = settings
+        for key in section.split("."):
+            node = node.get(key) if isinstance(node, Mapping) else None
+        if not isinstance(node, Mapping):
+            continue
+        if section not in OPEN_ENDED:
+            check_options(section, node, options)
+        for key, value in node.items():
+            if value is not None or section != "grid":  # null: chosen by the app
+                _check_type(f"{section}.{key}", value, options.get(key, Option()))
 
 
 def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) -> None:
@@ -66,32 +110,13 @@ def _check_assumed(path: str, assumed: Any, projector: Mapping[str, Any] | None)
 
 
 def _check_type(path: str, value: Any, option: Option) -> None:
-    if (
-        option.type
-        and not _later(value)
-        and not fits(value, ast.parse(option.type, mode="eval").body)
-    ):
+    if not option.type or _later(value):
+        return
+    if not fits(value, parsed(option.type)):
         text = f" ({option.text})" if option.text else ""
-        raise TypeError(f"{path}: expected {option.type}, got {shown(value)}{text}")
+        raise TypeError(f"{path}: expected {in_words(option.type)}, got {shown(value)}{text}")
 
 
 def _later(value: Any) -> bool:
     """Whether a setting has its value from another one, or is not given yet."""
     return isinstance(value, str) and (value == "???" or "${" in value)
-
-
-def fits(value: Any, type: ast.expr) -> bool:
-    """Whether a plain value has a written type; True where the type is none of the plain ones."""
-    match type:
-        case ast.BinOp(left, ast.BitOr(), right):
-            return fits(value, left) or fits(value, right)
-        case ast.Constant(None):
-            return value is None
-        case ast.Name(name) if name in PLAIN:
-            # bool is a kind of int for Python, not for a reader
-            return isinstance(value, PLAIN[name]) and isinstance(value, bool) == (name == "bool")
-        case ast.Subscript(ast.Name("Literal"), ast.Tuple(names)):
-            return value in [ast.literal_eval(name) for name in names]
-        case ast.Subscript(ast.Name("Sequence" | "list"), item):
-            return isinstance(value, list) and all(fits(entry, item) for entry in value)
-    return True

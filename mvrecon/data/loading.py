@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from mvrecon.quantities import NonNegativeInt, PositiveInt
 from mvrecon.registry import check_options
 
 
@@ -23,10 +24,10 @@ class Loading:
         ValueError: a number that is too small.
     """
 
-    batch_size: int = 1
-    workers: int = 0
+    batch_size: PositiveInt = 1
+    workers: NonNegativeInt = 0
     cache: str | None = None
-    rigs: int = 0
+    rigs: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
         if self.batch_size < 1 or min(self.workers, self.rigs) < 0:

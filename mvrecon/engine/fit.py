@@ -7,7 +7,6 @@ from typing import Any
 
 import lightning.pytorch as L
 from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
-from rich.console import Console
 
 from mvrecon.config.targets import instantiate
 from mvrecon.data.module import SceneData
@@ -19,11 +18,12 @@ from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
 from mvrecon.engine.on_case import OwnAttenuation
 from mvrecon.engine.processes import Environment
+from mvrecon.engine.progress import StepProgress, tell
 from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
 from mvrecon.engine.trained import begin_from
 from mvrecon.engine.training_memory import check_training
-from mvrecon.files.rank import rank, world
+from mvrecon.files.rank import world
 from mvrecon.kernels.threads import in_one_order
 
 #: The logger whose files are read by TensorBoard.
@@ -98,7 +98,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     done, last = finished(folder, method), unfinished(folder, method)
     models = methods(settings)
     if done.exists():
-        return _tell(f"{method}: its training has ended already, in {done}")
+        return tell(f"{method}: its training has ended already, in {done}")
     L.seed_everything(settings["seed"], workers=True, verbose=False)
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
@@ -110,19 +110,19 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     accelerator = settings["trainer"].get("accelerator", "auto")
     needed = check_training(module, data.loading.batch_size, accelerator)
     if needed is not None:
-        _tell(f"{method}: a step keeps about {needed / 2**30:.2f} GiB")
+        tell(f"{method}: a step keeps about {needed / 2**30:.2f} GiB")
     begun = last.exists() or previous(last).exists()
     weights = settings.get("init_from")
     if weights and not begun and method == next(iter(models)):
         begin_from(weights, module)
-        _tell(f"{method}: beginning with the weights of {weights}")
+        tell(f"{method}: beginning with the weights of {weights}")
     L.seed_everything(
         settings["seed"], workers=True, verbose=False
     )  # initial weights have used up random numbers
     trainer = build_trainer(settings, folder, method)
     step = read_newest(last)["global_step"] if begun else 0
     if begun:
-        _tell(f"{method}: going on from step {step}")
+        tell(f"{method}: going on from step {step} of {settings['trainer']['max_steps']}")
     for logger in trainer.loggers:
         if isinstance(logger, Board | MetricsFile):
             logger.rewind(step)
@@ -133,12 +133,6 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         trainer.save_checkpoint(done)
     if trainer.is_global_zero:
         remove(last)
-
-
-def _tell(line: str) -> None:
-    Console(quiet=rank() > 0, stderr=True, markup=False, highlight=False).print(
-        line, soft_wrap=True
-    )
 
 
 def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
@@ -155,6 +149,9 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     callbacks: list[Any] = [
         instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
     ]
+    for callback in callbacks:
+        if isinstance(callback, StepProgress):
+            callback.label = method
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
     events = folder / method  # TensorBoard calls a run by its folder
     loggers = [

@@ -108,6 +108,16 @@ class ReconstructionModule(L.LightningModule):
         """The model on the rig of a batch, by the operators of its cases where these differ."""
         return on_cases(self._on_rig(batch), batch)
 
+    def on_train_start(self) -> None:
+        """Set the learning rate by the schedule: a training that was lengthened goes on with that
+        of its new length, any other with the rate of its checkpoint, to the last bit.
+        """
+        schedule: Any = self.lr_schedulers()
+        for group, highest, share in zip(
+            schedule.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True
+        ):
+            group["lr"] = highest * share(schedule.last_epoch)
+
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """The loss of one batch.
 

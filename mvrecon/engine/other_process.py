@@ -6,13 +6,14 @@ import threading
 from pathlib import Path
 
 from mvrecon.config.plugins import import_plugins
-from mvrecon.engine import fit, progress, run_folder
+from mvrecon.config.quiet import silence_libraries
+from mvrecon.engine import fit, run_folder
 
 
 def main(folder: Path) -> None:
     """Train every method of a run beside its first process, and end when that one does."""
     threading.Thread(target=_end_with_the_first, daemon=True).start()
-    progress.silence_libraries()
+    silence_libraries()
     settings = run_folder.read_settings(folder)
     import_plugins(settings["plugins"])
     fit.fit_all(settings, fit.build_data(settings), folder)

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from mvrecon.files.rank import world
 STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
 #: Seconds that the first process has to end by itself after another one has died.
 GRACE = 60.0
+#: Seconds in which a process that has died is known to be dead.
+MOMENT = 1.0
 LOOPBACK = "127.0.0.1"
 
 
@@ -56,7 +58,7 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
     for other in others:
         threading.Thread(target=_watch, args=(other, ended), daemon=True).start()
     try:
-        with _environment(environments[0]):
+        with _environment(environments[0]), lost(others):
             yield
         _leave()
         if failed := [r for r, other in enumerate(others, 1) if _exit_of(other)]:
@@ -67,6 +69,33 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
             other.kill()
             other.wait()
         _leave()
+
+
+@contextmanager
+def lost(others: Sequence[subprocess.Popen[bytes]]) -> Iterator[None]:
+    """Context in which the error of a connection that was lost says which other process has ended,
+    and how.
+
+    Raises:
+        RuntimeError: in place of the connection's; its notes stay.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        for other in others:
+            with suppress(subprocess.TimeoutExpired):
+                other.wait(MOMENT)
+        ends = [
+            f"process {rank} (exit status {other.returncode})"
+            for rank, other in enumerate(others, 1)
+            if other.poll()
+        ]
+        if not ends:
+            raise
+        told = RuntimeError(f"Before its end the training lost {', '.join(ends)}")
+        for note in getattr(error, "__notes__", ()):
+            told.add_note(note)
+        raise told from error
 
 
 class Environment(LightningEnvironment):

@@ -1,6 +1,7 @@
 """A trained method as a program of `torch.export`: its steps and weights, without its classes."""
 
 import io
+import warnings
 from pathlib import Path
 
 import torch
@@ -42,7 +43,9 @@ def exported(model: nn.Module, views: Float[Tensor, "b 1 m v u"]) -> ExportedPro
             from them, or which makes its filters or its geometry anew for each call.
     """
     try:
-        with torch.no_grad():
+        with torch.no_grad(), warnings.catch_warnings():
+            # an operator's last plan, which is no part of the program
+            warnings.filterwarnings("ignore", "The tensor attribute .* was assigned during export")
             return torch.export.export(Volume(model), (views,), strict=False)
     except RuntimeError as error:  # of many classes, all of them torch's
         why = str(error).strip().partition("\n")[0]

@@ -1,10 +1,10 @@
 """Progress on the terminal."""
 
-import logging
 from typing import Any
 
 import lightning.pytorch as L
 from lightning.pytorch.callbacks import ProgressBar
+from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -14,22 +14,29 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from mvrecon.files.rank import rank
+
 SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
 
 
-def silence_libraries() -> None:
-    """Leave libraries' own lines about devices, seeds and fonts out; their warnings stay."""
-    for library in ("lightning.pytorch", "lightning.fabric", "matplotlib"):
-        logging.getLogger(library).setLevel(logging.WARNING)
+def tell(line: str) -> None:
+    """Write a line about the training to the error stream; of several processes the first does."""
+    Console(quiet=rank() > 0, stderr=True, markup=False, highlight=False).print(
+        line, soft_wrap=True
+    )
 
 
 class StepProgress(ProgressBar):
     """One line for each method in training: steps, time taken and left, loss, PSNR of the last
     validation.
+
+    Args:
+        label: of the method in the run's table; "" before it is known.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, label: str = "") -> None:
         super().__init__()
+        self.label = label
         self._lines: Progress | None = None
         self._shown = True
 
@@ -50,8 +57,8 @@ class StepProgress(ProgressBar):
         self._lines = Progress(
             TextColumn("{task.description}"), BarColumn(16), MofNCompleteColumn(), *times, figures
         )
-        name, total = pl_module.hparams["model"]["name"], trainer.estimated_stepping_batches
-        self._lines.add_task(name, total=total, completed=trainer.global_step, figures="")
+        total = trainer.estimated_stepping_batches
+        self._lines.add_task(self.label, total=total, completed=trainer.global_step, figures="")
         self._lines.start()
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from mvrecon.files.memory import check_memory
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.rigid import check_rotation
+from mvrecon.quantities import PositiveFloat, PositiveInt, Triple
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +53,13 @@ class Grid:
     @classmethod
     def centred(
         cls,
-        n: int | Sequence[int] | None = None,
+        n: PositiveInt | Triple[PositiveInt] | None = None,
         /,
-        spacing: float | Sequence[float] = math.nan,  # every grid says its own
-        centre: Sequence[float] = (0.0, 0.0, 0.0),
+        spacing: PositiveFloat | Triple[PositiveFloat] = math.nan,  # every grid says its own
+        centre: Triple[float] = (0.0, 0.0, 0.0),
         *,
-        size: Sequence[int] | None = None,
-        shape: Sequence[int] | None = None,
+        size: Triple[PositiveInt] | None = None,
+        shape: Triple[PositiveInt] | None = None,
     ) -> "Grid":
         """An axis-aligned grid about a point, all in the order (x, y, z)::
 

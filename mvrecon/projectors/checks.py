@@ -17,7 +17,7 @@ def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device)
             f"Expected {what} as a tensor, got {type(tensor).__name__}; torch.as_tensor makes one "
             f"of an array"
         )
-    if tensor.ndim != 5 or tuple(tensor.shape[2:]) != tuple(sizes):
+    if tensor.ndim != 2 + len(sizes) or tuple(tensor.shape[2:]) != tuple(sizes):
         raise ValueError(
             f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}"
             + _cure(tensor, sizes)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import usual_subsets
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.cgls import check_not_negative
 from mvrecon.reconstruct.mlem import (
     admitted,
@@ -35,7 +36,7 @@ FLOOR = 1e-6
 def bsrem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
-    iterations: int = 20,
+    iterations: NonNegativeInt = 20,
     weight: float = 0.01,
     subsets: int | None = None,
     prior: Mapping[str, Any] | None = None,

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.problem import Common, Problem, Watch, posed, without_gradient
 
 #: N x of a penalty <x, N x>, for a volume x.
@@ -18,7 +19,7 @@ Penalty = Callable[[Tensor], Tensor]
 def cgls(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
-    iterations: int = 20,
+    iterations: NonNegativeInt = 20,
     damping: float = 0.0,
     tolerance: float = 0.0,
     **common: Unpack[Common],

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator, Scaled
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.cgls import check_not_negative
 from mvrecon.reconstruct.descent import descend
 from mvrecon.reconstruct.power import power_norm
@@ -28,7 +29,7 @@ FLOOR = 0.5
 def fista_tv(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
-    iterations: int = 100,
+    iterations: NonNegativeInt = 100,
     weight: float = 1e-5,
     inner: int = 20,
     preconditioned: bool = True,

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import ViewSelection
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.descent import descend
 from mvrecon.reconstruct.problem import Common, posed
 
@@ -62,7 +63,7 @@ def correction(
 def sirt(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
-    iterations: int = 50,
+    iterations: NonNegativeInt = 50,
     nonnegative: bool = True,
     momentum: bool = False,
     weights: SirtWeights | None = None,

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.poisson import PoissonLikelihood, negative_log_likelihood
 from mvrecon.reconstruct.problem import Common, Watch, check_start, supported, without_gradient
 
@@ -20,7 +21,7 @@ from mvrecon.reconstruct.problem import Common, Watch, check_start, supported, w
 def mlem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
-    iterations: int = 50,
+    iterations: NonNegativeInt = 50,
     background: float | Float[Tensor, "b c m v u"] = 0.0,
     subsets: int = 1,
     skip_zero_bins: bool = True,
@@ -101,7 +102,7 @@ def _step(
 def osem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
-    iterations: int = 10,
+    iterations: NonNegativeInt = 10,
     subsets: int | None = None,
     background: float | Float[Tensor, "b c m v u"] = 0.0,
     skip_zero_bins: bool = True,

@@ -20,6 +20,7 @@ from mvrecon.projectors.selection import (
     ordered_subsets,
     usual_subsets,
 )
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.iterative import inverse_sums
 from mvrecon.reconstruct.problem import Common, Problem, Watch, posed, without_gradient
 
@@ -39,7 +40,7 @@ class Subset(NamedTuple):
 def os_sart(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
-    iterations: int = 10,
+    iterations: NonNegativeInt = 10,
     subsets: int | None = None,
     relaxation: float = 1.0,
     reduction: float = 1.0,

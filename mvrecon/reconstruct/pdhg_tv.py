@@ -9,6 +9,7 @@ from torch import Tensor
 from mvrecon.kernels.differences.choice import differences_for
 from mvrecon.kernels.differences.shrinkage import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.cgls import check_not_negative
 from mvrecon.reconstruct.duality import Bound, PenalisedFit, closed
 from mvrecon.reconstruct.problem import Common, Problem, Watch, posed, without_gradient
@@ -26,7 +27,7 @@ EVERY = 10
 def pdhg_tv(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
-    iterations: int = 200,
+    iterations: NonNegativeInt = 200,
     weight: float = 1e-5,
     balance: float = 0.2,
     nonnegative: bool = True,

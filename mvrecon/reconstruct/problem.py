@@ -5,7 +5,7 @@ that looks at each iterate.
 import inspect
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, NamedTuple, ParamSpec, TypedDict
+from typing import NamedTuple, ParamSpec, TypedDict
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mvrecon.cameras.views import check_finite
 from mvrecon.kernels.precision import wide
+from mvrecon.projectors.checks import check
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.registry import hint
 
@@ -111,7 +112,7 @@ def posed(
             with values that are not finite; a support that is no mask of the volume's shape.
     """
     within = supported(method, A, options)
-    _check(views, "views", A.range_shape, A.device)
+    check(views, "views", A.range_shape, A.device)
     check_finite(views, on_gpu=False)
     views, support, start = wide(views), options.get("support"), options.get("start")
     if start is None:
@@ -151,7 +152,7 @@ def check_start(A: LinearOperator, start: Tensor, views: Tensor) -> None:
     Raises:
         ValueError: another shape, batch or device, or values that are not finite.
     """
-    _check(start, "start", A.domain_shape, A.device)
+    check(start, "start", A.domain_shape, A.device)
     if start.shape[:2] != views.shape[:2] or not start.isfinite().all():
         raise ValueError(
             f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
@@ -224,14 +225,3 @@ class Watch:
 
 def _of_samples(mask: Bool[Tensor, " b"]) -> Bool[Tensor, "b 1 1 1 1"]:
     return mask[:, None, None, None, None]
-
-
-def _check(tensor: Any, what: str, sizes: tuple[int, ...], device: torch.device) -> None:
-    if not isinstance(tensor, Tensor):
-        raise TypeError(f"Expected {what} as a tensor, got {type(tensor).__name__}")
-    if tensor.ndim != 2 + len(sizes) or tuple(tensor.shape[2:]) != tuple(sizes):
-        raise ValueError(
-            f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}"
-        )
-    if tensor.device != device:
-        raise ValueError(f"Expected {what} on {device}, where the operator is, got {tensor.device}")

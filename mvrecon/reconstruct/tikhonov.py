@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mvrecon.projectors.operator import LinearOperator
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.cgls import check_not_negative, conjugate_gradients
 from mvrecon.reconstruct.problem import Common, Problem, posed
 from mvrecon.reconstruct.total_variation import gradient, gradient_adjoint, voxel_steps
@@ -18,7 +19,7 @@ from mvrecon.reconstruct.weighted_fit import WeightedFit
 def tikhonov(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
-    iterations: int = 50,
+    iterations: NonNegativeInt = 50,
     weight: float = 1.0,
     penalty: Literal["gradient", "identity"] = "gradient",
     tolerance: float = 0.0,

@@ -12,6 +12,7 @@ from torch import Tensor
 from mvrecon.kernels.differences.choice import differences_for
 from mvrecon.kernels.differences.shrinkage import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
+from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.cgls import check_not_negative
 from mvrecon.reconstruct.mlem import admitted, likelihood_of_residual, unexplained, uniform
 from mvrecon.reconstruct.pdhg_tv import RELAXATION
@@ -24,7 +25,7 @@ from mvrecon.reconstruct.total_variation import total_variation, voxel_steps
 def tv_map(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
-    iterations: int = 200,
+    iterations: NonNegativeInt = 200,
     weight: float = 0.05,
     balance: float = 0.3,
     background: float | Float[Tensor, "b c m v u"] = 0.0,

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
+from mvrecon.quantities import PositiveFloat
 from mvrecon.scenes.sample import Rays, Sample
 from mvrecon.scenes.solids import Phantom
 from mvrecon.scenes.voxelise import voxelise
@@ -32,8 +33,8 @@ class AnalyticScene(ABC):
         ValueError: a field that is not in (0, 0.5], or a value that is not positive.
     """
 
-    field: float = 0.42
-    value: float = 1.0
+    field: PositiveFloat = 0.42
+    value: PositiveFloat = 1.0
     unit: str = "1/mm"
 
     kind: ClassVar[str]

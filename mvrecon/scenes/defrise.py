@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from mvrecon.geometry.grid import Grid
+from mvrecon.quantities import PositiveFloat, PositiveInt
 from mvrecon.scenes.analytic import AnalyticScene
 from mvrecon.scenes.solids import Phantom, Solids
 
@@ -62,11 +63,11 @@ class Defrise(AnalyticScene):
         ValueError: as `defrise`.
     """
 
-    discs: int = 7
-    radius_mm: float = 60.0
-    thickness_mm: float = 8.0
-    pitch_mm: float = 16.0
-    field: float = 0.5
+    discs: PositiveInt = 7
+    radius_mm: PositiveFloat = 60.0
+    thickness_mm: PositiveFloat = 8.0
+    pitch_mm: PositiveFloat = 16.0
+    field: PositiveFloat = 0.5
     unit: str = "activity"
     kind = "defrise"
     length = 1

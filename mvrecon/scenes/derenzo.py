@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_degrees, euler_rotation, random_in_ball, random_rotation
+from mvrecon.quantities import PositiveFloat
 from mvrecon.scenes.analytic import AnalyticScene, generator, uniform
 from mvrecon.scenes.solids import Phantom, Solids
 
@@ -135,12 +136,12 @@ class RandomDerenzo(AnalyticScene):
         ValueError: as `derenzo`; a fill that is not ascending in (0, 1].
     """
 
-    well_diameters: tuple[float, ...] = (8, 6, 5, 4, 3, 2)
-    radius_mm: float = 40.0
-    height_mm: float = 48.0
+    well_diameters: tuple[PositiveFloat, ...] = (8, 6, 5, 4, 3, 2)
+    radius_mm: PositiveFloat = 40.0
+    height_mm: PositiveFloat = 48.0
     background: float = 0.0
     fill: tuple[float, float] | None = (0.75, 1.0)
-    field: float = 0.46
+    field: PositiveFloat = 0.46
     unit: str = "activity"
     kind = "derenzo"
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_in_ball, random_rotation
+from mvrecon.quantities import PositiveFloat
 from mvrecon.scenes.analytic import AnalyticScene, uniform
 from mvrecon.scenes.solids import Phantom, Solids
 
@@ -25,7 +26,7 @@ class RandomEllipsoids(AnalyticScene):
     """
 
     count: tuple[int, int] = (3, 12)
-    sizes: tuple[float, float] = (0.1, 0.45)
+    sizes: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.45)
     kind = "ellipsoids"
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
+from mvrecon.quantities import PositiveFloat
 from mvrecon.scenes.attenuating import AttenuatingScene
 from mvrecon.scenes.solids import Phantom, Solids
 
@@ -89,11 +90,11 @@ class Nema(AttenuatingScene):
     """
 
     body_mm: tuple[float, float, float] = (100.0, 90.0, 60.0)
-    diameters: tuple[float, ...] = DIAMETERS
+    diameters: tuple[PositiveFloat, ...] = DIAMETERS
     circle_mm: float = CIRCLE
     contrast: float = 4.0
     mu: float = 0.01536
-    field: float = 0.5
+    field: PositiveFloat = 0.5
     unit: str = "activity"
     kind = "nema"
     length = 1

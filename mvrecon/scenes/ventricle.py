@@ -12,6 +12,7 @@ import torch
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation, random_in_ball, random_rotation
+from mvrecon.quantities import PositiveFloat
 from mvrecon.scenes.analytic import AnalyticScene
 from mvrecon.scenes.solids import Phantom, Solids
 
@@ -76,9 +77,9 @@ class RandomVentricle(AnalyticScene):
     """
 
     semi_axes_mm: tuple[float, float, float] = (32.0, 32.0, 45.0)
-    wall_mm: float = 10.0
+    wall_mm: PositiveFloat = 10.0
     blood: float = 0.0
-    field: float = 0.46
+    field: PositiveFloat = 0.46
     unit: str = "activity"
     kind = "ventricle"
 

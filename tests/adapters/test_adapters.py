@@ -16,6 +16,7 @@ from mvrecon.adapters.axes import (
     to_torchio,
 )
 from mvrecon.adapters.deepinv_physics import deepinv_physics
+from mvrecon.adapters.missing import needs
 from mvrecon.adapters.scipy_operator import scipy_operator
 from mvrecon.geometry.rigid import euler_rotation
 
@@ -104,7 +105,8 @@ def test_an_image_of_monai_and_torchio_is_as_nibabel_s_and_comes_back(library, t
 
 
 def test_a_library_that_is_missing_and_a_wrong_shape_are_named(monkeypatch: pytest.MonkeyPatch):
-    for name in ("scipy.sparse", "deepinv.physics", "monai.data", "torchio", "SimpleITK"):
+    names = ("scipy", "scipy.sparse", "deepinv", "deepinv.physics", "monai", "monai.data")
+    for name in (*names, "torchio", "SimpleITK"):
         monkeypatch.setitem(sys.modules, name, None)
     for act, package in [
         (lambda: scipy_operator(A), "scipy"),
@@ -116,6 +118,9 @@ def test_a_library_that_is_missing_and_a_wrong_shape_are_named(monkeypatch: pyte
         with pytest.raises(ImportError, match=f"needs {package}: pip install {package}"):
             act()
     monkeypatch.undo()
+    with pytest.raises(ImportError, match="os is installed but does not import: another build"):
+        with needs("os"):
+            raise RuntimeError("another build")
     pytest.importorskip("SimpleITK")
     with pytest.raises(ValueError, match=r"of the grid's \(3, 4, 5\) voxels"):
         to_simpleitk(VOLUME[0].mT, GRID)

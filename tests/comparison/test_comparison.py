@@ -73,6 +73,18 @@ def test_runs_are_named_by_what_differs(sweep):
     assert {row.run for row in read([sweep / "ours"])} == {"ours"}
 
 
+def test_the_runs_of_a_sweep_have_its_names_and_long_values_numbers(tmp_path):
+    for k, name in enumerate(("model=small", "model=unet", "model=small,views=4")):
+        model = {"name": "cross_view", "rounds": [{"widths": [8 << (k % 2)], "resolution": "half"}]}
+        run(tmp_path / name, {"model": model, "views": k // 2}, cross_view=(EASY, 1.0))
+    names = [row.run for row in read([tmp_path])]
+    assert names == ["model=small", "model=small,views=4", "model=unet"]
+    (tmp_path / "model=small").rename(tmp_path / "first")
+    names = {row.run for row in read([tmp_path])}
+    texts = ["model.rounds=#1, views=0", "model.rounds=#1, views=1", "model.rounds=#2, views=0"]
+    assert names == set(texts)
+
+
 def test_every_form_of_the_table_holds_every_method(sweep, tmp_path):
     out = tmp_path / "table"
     compare.compare([sweep], reference="unet", out=out)

@@ -8,6 +8,7 @@ import torch
 from mvrecon.config import compose
 from mvrecon.engine import checkpoints, fit
 from mvrecon.engine.module import ReconstructionModule
+from mvrecon.engine.progress import StepProgress
 from mvrecon.files.runs import folder_of_run
 
 PLAIN = (dict, list, tuple, str, int, float, bool, type(None), torch.Tensor)
@@ -166,3 +167,11 @@ def test_a_run_folder_is_found_from_anything_in_it(tmp_path):
         folder_of_run(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match="with config.yaml"):
         folder_of_run(tmp_path)
+
+
+def test_the_progress_line_has_the_label_of_the_table(settings, tmp_path):
+    compared = {**settings["compare"], "other": settings["model"]}
+    both = {**settings, "compare": compared, "callbacks": compose()["callbacks"]}
+    for label in (settings["model"]["name"], "other"):
+        line = fit.build_trainer(both, tmp_path, label).progress_bar_callback
+        assert isinstance(line, StepProgress) and line.label == label

@@ -84,6 +84,21 @@ def test_a_run_of_two_processes_one_of_which_is_killed_goes_on(pair, rank, tmp_p
     assert different(state(folder), state(pair[0])) == []
 
 
+@pytest.mark.door
+def test_the_error_of_a_lost_connection_names_the_process_that_ended():
+    """The first process of a training says which other one was killed, and keeps the words on how
+    to go on; an error of its own stays as it is.
+    """
+    error = RuntimeError("Read error: connection reset by peer")
+    error.add_note("resume=run goes on")
+    killed = "import os; os.kill(os.getpid(), 9)"
+    for code, expected in ((killed, "lost process 1 .exit status -9."), ("", "by peer")):
+        other = subprocess.Popen([sys.executable, "-c", code])
+        with pytest.raises(RuntimeError, match=expected) as told, processes.lost([other]):
+            raise error
+        assert told.value.__notes__ == ["resume=run goes on"]
+
+
 def test_processes_share_an_epoch_and_none_runs_out_of_cases_first():
     whole = list(EpochOrder(7, seed=3))
     shares = [EpochOrder(7, 3, rank, 3) for rank in range(3)]
