@@ -16,7 +16,14 @@ from mvrecon.reconstruct.cgls import check_not_negative
 from mvrecon.reconstruct.mlem import admitted, likelihood_of_residual, unexplained, uniform
 from mvrecon.reconstruct.pdhg_tv import RELAXATION
 from mvrecon.reconstruct.poisson import PoissonLikelihood
-from mvrecon.reconstruct.problem import Common, Watch, check_start, supported, without_gradient
+from mvrecon.reconstruct.problem import (
+    Common,
+    Watch,
+    check_iterations,
+    check_start,
+    supported,
+    without_gradient,
+)
 from mvrecon.reconstruct.total_variation import total_variation, voxel_steps
 
 
@@ -56,6 +63,7 @@ def tv_map(
     Raises:
         ValueError: as `mlem`; a weight that is negative, a balance that is not positive.
     """
+    check_iterations(iterations)
     check_not_negative(weight=weight)
     if not balance > 0:
         raise ValueError(f"Expected a positive balance, got {balance}")
