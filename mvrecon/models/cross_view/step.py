@@ -16,6 +16,7 @@ from mvrecon.models.cross_view.unet import PlainUNet, Precision
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import CAMERA_NETWORKS
 from mvrecon.projectors.operator import Projector
+from mvrecon.projectors.pixel_integral import sees_integrals
 
 
 class State(NamedTuple):
@@ -80,6 +81,7 @@ class Round(nn.Module):
         self.corrects = options.corrects
         self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
+        self.of_lines = sees_integrals(projector)
         self.opinions = self._opinions(projector, options, precision, self.cameras)
         cells, extra = self.edge**3, 0
         if options.opinions is not None:
@@ -120,7 +122,8 @@ class Round(nn.Module):
             if self.opinions is not None:
                 if state.correction is not None:
                     views = views + self._views(measured, state.correction)
-                fused = self.opinions(x, views, answer.placed, geometry.mask)
+                sums = None if self.of_lines else geometry.bounded_sums
+                fused = self.opinions(x, views, answer.placed, geometry.mask, sums)
                 state, extra = state._replace(fused=fused), [fused.evidence]
         learned, memory = self._world(measured, state, change, extra)
         x = x + geometry.within(learned + self.step * change)
