@@ -31,7 +31,7 @@ class PixelIntegral:
 
 
 def sees_integrals(A: "SaysPixelIntegral") -> bool:
-    """Whether an operator says that its pixels are line integrals themselves, without a weight."""
+    """Whether an operator says that its pixels are line integrals themselves, without weight."""
     pixel = A.pixel_integral()
     return pixel is not None and bool((pixel.weight == 1).all())
 
