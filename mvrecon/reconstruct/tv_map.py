@@ -51,8 +51,7 @@ def tv_map(
         counts: measured.
         iterations: all counts are used in each.
         weight: of the total variation, in mm; c is the mean sensitivity of the voxels that are
-            seen, so that f(a y) = a f(y), and that a longer measurement is not smoothed more.
-            1e-3 to 1 is usual.
+            seen: f(a y) = a f(y), a longer measurement is not smoothed more. 1e-3 to 1 is usual.
         balance: of the dual steps to the primal ones; it changes the speed alone.
         background: expected counts of other origin, one number or views that broadcast to the
             counts.
