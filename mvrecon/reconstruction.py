@@ -57,6 +57,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     out = Path(settings["out"] or folder / "volume.nii.gz").expanduser()
     check_ending(out)
     case = scan.open_scan(settings)
+    if settings["unit"] == "HU" and case.unit != scan.ATTENUATION:
+        raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
     if free := settings["calibrate"]:
         calibrate.check(free, case)
     solve.check(settings)  # what does not fit is told before the folder is anybody's
@@ -74,7 +76,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = solve.solve(case, settings, device)
         volume = outcome.volume
-        shown = review.Case(out.name, case.grid, 1.0, "1/mm")
+        shown = review.Case(out.name, case.grid, 1.0, case.unit)
         export.save_png(folder / "planes.png", review.scan(shown, volume))
         _save(out, outcome, settings["unit"], case.grid)
         table = {
@@ -112,7 +114,7 @@ def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
         "name": settings["name"],
         "method": settings["reconstructor"]["name"],
         "volume": str(out),
-        "unit": settings["unit"],
+        "unit": "HU" if settings["unit"] == "HU" else case.unit,
         "grid": {"shape": list(case.grid.shape), "spacing_mm": list(case.grid.spacing)},
         "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
     }

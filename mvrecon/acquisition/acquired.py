@@ -247,7 +247,8 @@ def projection_of(
             refusals.append(str(error))
     raise ValueError(
         f"The projector {projector['name']!r} cannot make views on a grid {fine} times finer "
-        f"(acquisition.fine): {refusals[0]}; nor with pixels {fine} times finer: {refusals[1]}"
+        f"(acquisition.fine): {refusals[0]}"
+        + (f"; nor with pixels {fine} times finer: {refusals[1]}" if len(set(refusals)) > 1 else "")
     )
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -26,6 +26,8 @@ VOLUMES = 3
 #: Of the grid's diagonal: as much a line integral of ones reaches in any view, and counts behind a
 #: pinhole, or a grey value, never.
 LINE = 0.02
+#: Unit of a volume whose views are line integrals, and of one that emits, where no file tells it.
+ATTENUATION, EMISSION = "1/mm", "activity"
 
 
 class Views(Protocol):
@@ -57,12 +59,14 @@ class Scan:
         cameras: one for each view.
         grid: voxels that are reconstructed.
         projector: name and options of the operator.
+        unit: of the volume.
     """
 
     measured: Views
     cameras: Cameras
     grid: Grid
     projector: Mapping[str, Any]
+    unit: str = ATTENUATION
 
     def operator(self, views: slice = slice(None)) -> Projector:
         """The operator of all views, or of some that follow one another."""
@@ -102,9 +106,13 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     bytes_needed = 4 * VOLUMES * math.prod(grid.shape)
     check_memory(bytes_needed, f"A reconstruction of {grid.shape} voxels")
     scan = Scan(measured, cameras, grid, settings["projector"])
-    if measured.stack.unit is not None:
-        check_unit(measured.stack.unit, scan, seeing)
-    return scan
+    unit = measured.stack.unit
+    if unit is not None:
+        check_unit(unit, scan, seeing)
+        return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
+    A, largest = _coarse(scan, seeing)
+    emits = A.pixel_integral() is None and 0 < largest < LINE
+    return replace(scan, unit=EMISSION) if emits else scan
 
 
 def check_unit(unit: str, scan: Scan, view: int) -> None:
@@ -119,24 +127,30 @@ def check_unit(unit: str, scan: Scan, view: int) -> None:
     Raises:
         Refused: line integrals for a projector of counts, or counts for one of line integrals.
     """
+    share, name = _coarse(scan, view)[1], scan.projector["name"]
+    if unit.endswith("* mm") and 0 < share < LINE:
+        raise Refused(
+            f"expected views in the unit of the projector {name!r}, got line integrals in {unit}; "
+            f"projector=drr is for those"
+        )
+    if " of " in unit and share >= LINE:
+        raise Refused(
+            f"expected line integrals for the projector {name!r}, got views in the unit {unit!r}; "
+            f"the projector that made them is {unit.partition(' of ')[0]!r}"
+        )
+
+
+def _coarse(scan: Scan, view: int) -> tuple[Projector, float]:
+    """The operator of a view of two voxels along each axis of the same box, and the greatest value
+    that ones have in that view, relative to the grid's diagonal.
+    """
     affine = scan.grid.affine.clone()
     affine[:3, :3] *= torch.tensor(scan.grid.shape[::-1], dtype=affine.dtype) / 2
     affine[:3, 3] = scan.grid.centre - affine[:3, :3].sum(dim=1) / 2
     blocks = Grid((2, 2, 2), affine)  # the same box
     A = PROJECTORS.from_config(scan.projector, grid=blocks, cameras=scan.cameras[view : view + 1])
     most = A(torch.ones(1, 1, *blocks.shape)).max().item()
-    diagonal = (affine[:3, :3].sum(dim=1) * 2).norm().item()
-    name = scan.projector["name"]
-    if unit.endswith("* mm") and 0 < most < LINE * diagonal:
-        raise Refused(
-            f"expected views in the unit of the projector {name!r}, got line integrals in {unit}; "
-            f"projector=drr is for those"
-        )
-    if " of " in unit and most >= LINE * diagonal:
-        raise Refused(
-            f"expected line integrals for the projector {name!r}, got views in the unit {unit!r}; "
-            f"the projector that made them is {unit.partition(' of ')[0]!r}"
-        )
+    return A, most / (affine[:3, :3].sum(dim=1) * 2).norm().item()
 
 
 def _with_pixels(camera: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Any]:

@@ -23,6 +23,9 @@ from mvrecon.reconstruct.iterative import (
     sirt_weights,
 )
 
+#: A chord counts as at least this part of the longest.
+SHORTEST = 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
@@ -83,6 +86,20 @@ class Geometry:
     def weights(self) -> SirtWeights:
         """R and C of SIRT."""
         return SirtWeights(self.row, self.column)
+
+    @property
+    def bounded_row(self) -> Float[Tensor, "#b 1 m v u"]:
+        """R with chords that count as at least `SHORTEST` of the longest: where views err, rays
+        that graze the region measure more than their chords explain.
+        """
+        of_longest = torch.where(self.row > 0, self.row, torch.inf).amin((1, 2, 3, 4), True)
+        return self.row.minimum(of_longest / SHORTEST)
+
+    @property
+    def bounded_sums(self) -> Float[Tensor, "#b 1 m v u"]:
+        """Views of ones, none of which is very small, and zero where no ray meets the region."""
+        row = self.bounded_row
+        return torch.where(row > 0, 1 / torch.where(row > 0, row, 1), 0)
 
     def back(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """Residual views as a correction of the volume, C A^T R r."""

@@ -17,6 +17,7 @@ from mvrecon.models.networks import upsampled
 from mvrecon.models.pooling import leave_one_out
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
+from mvrecon.projectors.pixel_integral import sees_integrals
 
 Prior = Literal["learned", "uniform"]
 
@@ -77,6 +78,7 @@ class Opinions(nn.Module):
         depth: DepthNetwork,
     ):
         super().__init__()
+        self.of_lines = sees_integrals(projector)
         self.binning, self.unit = depth.binning, typical_chord(projector.grid) / PARTS
         self.head = HEADS.from_config(head)
         self.learned = depth.prior == "learned"
@@ -105,21 +107,32 @@ class Opinions(nn.Module):
             start: a classical reconstruction.
             residual: measured less the re-projected start.
         """
-        fine, pixels = geometry.fine, geometry.fine.pixels(views)
+        fine = geometry.fine
+        pixels, residual = (self._integrals(geometry, values) for values in (views, residual))
         prior = fine.to_frusta(start[:, None])
         if not self.learned:
             density = self.head(torch.zeros_like(prior), torch.ones_like(prior), pixels, fine)
             opinions = geometry.within(fine.to_world(density))
             return opinions, opinions[:, :, :0]
-        answers = self._answers(
-            geometry, torch.stack([pixels, fine.pixels(residual)], dim=3), start
-        )
+        answers = self._answers(geometry, torch.stack([pixels, residual], dim=3), start)
         density = self.head(_at_fine_bins(answers[:, :, :1], geometry), prior, pixels, fine)
         # The change is carried to the world, not the density: what the start holds already is not
         # blurred by two warps.
         change = fine.to_world(density - prior * fine.occupied)
         features = geometry.coarse.to_world(answers[:, :, 1:])
         return start[:, None] + geometry.within(change), geometry.within(features)
+
+    def _integrals(
+        self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"]
+    ) -> Float[Tensor, "b 1 m r s"]:
+        """Views as line integrals in the frusta's pixels: of those in another unit, such as counts,
+        the mean density of each ray, R y, times its chord.
+        """
+        fine = geometry.fine
+        if self.of_lines:
+            return fine.pixels(views)
+        chord = fine.chord[..., 0, :, :].transpose(-4, -3)  # [*b 1 m v u]
+        return fine.pixels(views) * fine.pixels(geometry.bounded_row) * chord
 
     def _answers(
         self, geometry: Geometry, pixels: Tensor, start: Tensor

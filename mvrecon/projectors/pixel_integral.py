@@ -30,6 +30,12 @@ class PixelIntegral:
         return self if factors is None else replace(self, weight=self.weight * factors)
 
 
+def sees_integrals(A: "SaysPixelIntegral") -> bool:
+    """Whether an operator says that its pixels are line integrals themselves, without weight."""
+    pixel = A.pixel_integral()
+    return pixel is not None and bool((pixel.weight == 1).all())
+
+
 class SaysPixelIntegral:
     """An operator that may say how its pixels are made of line integrals.
 

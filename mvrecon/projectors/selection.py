@@ -4,6 +4,7 @@ them back among zeros.
 
 import math
 from collections.abc import Sequence
+from numbers import Integral
 
 import torch
 from jaxtyping import Bool, Float
@@ -84,12 +85,12 @@ def ordered_subsets(count: int, subsets: int) -> list[range]:
     from all around.
 
     Raises:
-        ValueError: fewer than one subset, or more than there are cameras.
+        ValueError: no whole number, fewer than one subset, or more than there are cameras.
     """
-    if not 1 <= subsets <= count:
+    if not isinstance(subsets, Integral) or not 1 <= subsets <= count:
         raise ValueError(
             f"Cameras are dealt out to 1 to {count} subsets, one camera each at least, got "
-            f"{subsets}"
+            f"{subsets!r}"
         )
     return [range(first, count, subsets) for first in range(subsets)]
 

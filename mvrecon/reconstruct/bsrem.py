@@ -21,7 +21,14 @@ from mvrecon.reconstruct.mlem import (
     uniform,
 )
 from mvrecon.reconstruct.poisson import PoissonLikelihood
-from mvrecon.reconstruct.problem import Common, Watch, check_start, supported, without_gradient
+from mvrecon.reconstruct.problem import (
+    Common,
+    Watch,
+    check_iterations,
+    check_start,
+    supported,
+    without_gradient,
+)
 from mvrecon.reconstruct.relative_difference import RelativeDifference
 from mvrecon.reconstruct.total_variation import voxel_steps
 
@@ -69,6 +76,7 @@ def bsrem(
         TypeError: an option that the prior does not have.
         ValueError: as `mlem` and `RelativeDifference`; a weight that is negative.
     """
+    check_iterations(iterations)
     check_not_negative(weight=weight)
     A, start = supported(bsrem, A, common), common.get("start")
     if start is not None:

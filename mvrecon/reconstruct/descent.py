@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.reconstruct.problem import Problem, Watch
+from mvrecon.reconstruct.problem import Problem, Watch, check_iterations
 
 #: From the residual views y - A x to a change of the volume, or from a volume to an allowed one.
 Map = Callable[[Tensor], Tensor]
@@ -35,6 +35,7 @@ def descend(
             the steps do not turn back, for each sample (O'Donoghue and Candes, Found. Comput. Math.
             15, 2015, 3.2): an inexact proximal map needs it.
     """
+    check_iterations(iterations)
     A, views, x, monitor = problem
     ahead, watch = x, Watch(monitor)
     t: float | Tensor = 1.0

@@ -14,7 +14,14 @@ from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.poisson import PoissonLikelihood, negative_log_likelihood
-from mvrecon.reconstruct.problem import Common, Watch, check_start, supported, without_gradient
+from mvrecon.reconstruct.problem import (
+    Common,
+    Watch,
+    check_iterations,
+    check_start,
+    supported,
+    without_gradient,
+)
 
 
 @without_gradient
@@ -56,8 +63,9 @@ def mlem(
     Raises:
         ValueError: as `PoissonLikelihood`; counts that the start does not allow, a start that is
             negative somewhere or not finite, a number of subsets that is below one or above that of
-            the cameras.
+            the cameras, iterations that are no whole number of at least 0.
     """
+    check_iterations(iterations)
     A, start = supported(mlem, A, common), common.get("start")
     if start is not None:
         check_start(A, start, counts)

@@ -196,6 +196,8 @@ def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
 
 
 def _spread(background: float | Tensor, counts: Tensor) -> Tensor:
+    if not isinstance(background, Tensor | int | float):
+        raise TypeError(f"Expected a background of one number or views, got {background!r}")
     added = torch.as_tensor(background, dtype=wide(counts[:0]).dtype, device=counts.device)
     try:
         return added.expand(counts.shape)

@@ -5,6 +5,7 @@ that looks at each iterate.
 import inspect
 from collections.abc import Callable
 from functools import wraps
+from numbers import Integral
 from typing import NamedTuple, ParamSpec, TypedDict
 
 import torch
@@ -144,6 +145,16 @@ def supported(method: Callable[..., Tensor], A: LinearOperator, options: Common)
         got = f"{support.dtype} {tuple(support.shape)}"
         raise ValueError(f"Expected a support, a mask of {tuple(A.domain_shape)}, got {got}")
     return A.with_support(support)
+
+
+def check_iterations(iterations: int) -> None:
+    """Refuse a number of iterations that is none.
+
+    Raises:
+        ValueError: no whole number, or a negative one.
+    """
+    if not isinstance(iterations, Integral) or iterations < 0:
+        raise ValueError(f"Expected iterations, a whole number of at least 0, got {iterations!r}")
 
 
 def check_start(A: LinearOperator, start: Tensor, views: Tensor) -> None:

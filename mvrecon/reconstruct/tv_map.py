@@ -17,7 +17,14 @@ from mvrecon.reconstruct.cgls import check_not_negative
 from mvrecon.reconstruct.mlem import admitted, likelihood_of_residual, unexplained, uniform
 from mvrecon.reconstruct.pdhg_tv import RELAXATION
 from mvrecon.reconstruct.poisson import PoissonLikelihood
-from mvrecon.reconstruct.problem import Common, Watch, check_start, supported, without_gradient
+from mvrecon.reconstruct.problem import (
+    Common,
+    Watch,
+    check_iterations,
+    check_start,
+    supported,
+    without_gradient,
+)
 from mvrecon.reconstruct.total_variation import total_variation, voxel_steps
 
 
@@ -45,8 +52,7 @@ def tv_map(
         counts: measured.
         iterations: all counts are used in each.
         weight: of the total variation, in mm; c is the mean sensitivity of the voxels that are
-            seen, so that f(a y) = a f(y), and that a longer measurement is not smoothed more.
-            1e-3 to 1 is usual.
+            seen: f(a y) = a f(y), a longer measurement is not smoothed more. 1e-3 to 1 is usual.
         balance: of the dual steps to the primal ones; it changes the speed alone.
         background: expected counts of other origin, one number or views that broadcast to the
             counts.
@@ -57,6 +63,7 @@ def tv_map(
     Raises:
         ValueError: as `mlem`; a weight that is negative, a balance that is not positive.
     """
+    check_iterations(iterations)
     check_not_negative(weight=weight)
     if not balance > 0:
         raise ValueError(f"Expected a positive balance, got {balance}")

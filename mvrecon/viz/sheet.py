@@ -202,5 +202,8 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int
     )
     size = 0.9 * TEXT * 72 / DPI
     bar.ax.tick_params(colors=WHITE, labelsize=size, length=3, pad=1)
+    least, _, most = bar.ax.get_xticklabels()  # long numbers stay between the bar's ends
+    least.set_horizontalalignment("left")
+    most.set_horizontalalignment("right")
     bar.set_label(scale.name, color=WHITE, fontsize=size, labelpad=0)
     bar.outline.set_edgecolor(WHITE)  # pyright: ignore[reportCallIssue]

@@ -4,6 +4,7 @@ import torch
 from mvrecon.cameras.camera import Cameras
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.parts import MODELS, PROJECTORS
+from mvrecon.projectors.operator import Scaled
 from tests.models.rig import small_projector, small_rig
 
 HEAD = {"name": "softmax_depth"}
@@ -47,6 +48,20 @@ def test_opinions_reproduce_their_own_views():
     fine = model.cropping.whole.fine
     sees = fine.chord.reshape(1, 1, 4, 12, 12) > 0
     assert _close(fine.integrate(seen[0]), views * sees, 1e-5)
+
+
+def test_counts_are_placed_along_rays_as_the_integrals_that_they_are_of():
+    """Pixels of any sensitivity: the opinions are those of the line integrals, but for R y times
+    the chord, where thin rays and the frusta's bins differ at the edge of the grid.
+    """
+    projector = small_projector()
+    _, views = _blob_views(projector)
+    weight = 1e-4 * torch.linspace(0.5, 1, views[0, 0].numel()).reshape(views.shape[2:])
+    volumes = []
+    for A, measured in ((projector, views), (Scaled(projector, pixels=weight), weight * views)):
+        model = _build("mean_fusion", A, opinion={"prior": "uniform"}, start=1, consistency=0)
+        volumes.append(model(measured).volume)
+    assert (volumes[1] - volumes[0]).norm() < 0.05 * volumes[0].norm()
 
 
 class _Unmoved(torch.nn.Module):

@@ -20,8 +20,6 @@ from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
 
-#: Of the longest chord of a support: as long counts each ray that meets it, at least.
-SHORTEST = 0.1
 #: Voxels around a support that networks see, and of whose multiples their boxes have bounds: cells
 #: and coarser voxels keep their places for networks of three scales.
 MARGIN, ALIGNED = 4, 8
@@ -125,17 +123,14 @@ class CrossView(nn.Module):
         )
 
     def _geometry(self, views: Float[Tensor, "b 1 m v u"]) -> Geometry:
-        """The whole grid's, within the support: R from the rays' chords of it, C zero outside.
-
-        Chords count as at least `SHORTEST` of the longest: where views err, rays that graze the
-        support measure more than their chords explain.
+        """The whole grid's, within the support: R from the rays' chords of it, none very short, C
+        zero outside.
         """
         whole = self.cropping.whole
         if self.cropping.options.support == "none":
             return whole
         within = whole.with_mask(self.cropping.mask(views), masked=False)
-        of_longest = torch.where(within.row > 0, within.row, torch.inf).amin((1, 2, 3, 4), True)
-        return replace(within, row=within.row.minimum(of_longest / SHORTEST))
+        return replace(within, row=within.bounded_row)
 
 
 def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Any]:

@@ -92,6 +92,7 @@ class Opinions(nn.Module):
         views: Float[Tensor, "b 1 m v u"],
         placed: Float[Tensor, "b m c D r s"] | None,
         mask: Bool[Tensor, "b 1 d h w"] | None,
+        sums: Float[Tensor, "#b 1 m v u"] | None = None,
     ) -> Fused:
         """The opinions about a volume.
 
@@ -101,9 +102,14 @@ class Opinions(nn.Module):
             placed: of the cameras' network: logits of depth and of confidence, and features; none
                 without a network.
             mask: voxels whose density may differ from zero; none for all.
+            sums: views of ones within the mask, for views that are no line integrals, such as
+                counts; none for those that are.
         """
         frusta, x = self.inside.frusta, self._cells(volume)
-        measured = means(views, self.binning)
+        measured, unit = means(views, self.binning), None
+        if sums is not None:
+            unit = self._unit(x, sums, mask)
+            measured = torch.where(unit > 0, measured / torch.where(unit > 0, unit, 1), 0)
         prior = frusta.to_frusta(x[:, None]).expand(-1, len(frusta.step), -1, -1, -1, -1)
         density, rest = self._density(prior, measured, placed)
         # The change is carried to the world, not the density: two warps would blur what x has.
@@ -129,6 +135,7 @@ class Opinions(nn.Module):
         rays = None
         if self.weigh_rays:
             rays = pixels(self._ray_weights(x, weights), self.binning, views)
+        expected = expected if unit is None else expected * unit
         return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)
 
     def _ray_weights(
@@ -144,6 +151,18 @@ class Opinions(nn.Module):
         own, equal = both.sum(dim=3).unbind(2)
         seen = equal > 0
         return torch.where(seen, own / torch.where(seen, equal, 1), 1)[:, None]
+
+    def _unit(
+        self,
+        x: Float[Tensor, "b 1 e i x"],
+        sums: Float[Tensor, "#b 1 m v u"],
+        mask: Bool[Tensor, "b 1 d h w"] | None,
+    ) -> Float[Tensor, "#b 1 m r s"]:
+        """Views per line integral, from views of ones and the rays' chords of the mask."""
+        frusta = self.inside.frusta
+        ones = torch.ones_like(x[:1]) if mask is None else self._cells(mask.to(x.dtype))
+        chords = frusta.integrate(frusta.to_frusta(ones[:, None]) * frusta.occupied)
+        return torch.where(chords > 0, means(sums, self.binning) / chords.clamp_min(1e-6), 0)
 
     def _cells(
         self, volume: Float[Tensor, "b 1 d h w"], largest: bool = False

@@ -16,6 +16,7 @@ from mvrecon.models.cross_view.unet import PlainUNet, Precision
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import CAMERA_NETWORKS
 from mvrecon.projectors.operator import Projector
+from mvrecon.projectors.pixel_integral import sees_integrals
 
 
 class State(NamedTuple):
@@ -94,6 +95,7 @@ class Round(nn.Module):
         self.trust = nn.Parameter(torch.ones(())) if corrected or self.corrects else None
         self.step = nn.Parameter(torch.ones(()))
         self.scale, self.entry = options.scale, None
+        self.of_lines = sees_integrals(projector)
         self.opinions = self._opinions(projector, options, precision, self.cameras)
         extra = 0 if options.judged is None else 2 + options.judged.handed
         cells, beside = self.edge**3, 0 if self.scale else extra
@@ -137,7 +139,8 @@ class Round(nn.Module):
             if self.opinions is not None:
                 if state.correction is not None:
                     views = views + self._views(measured, state.correction)
-                fused = self.opinions(x, views, answer.placed, geometry.mask)
+                sums = None if self.of_lines else geometry.bounded_sums
+                fused = self.opinions(x, views, answer.placed, geometry.mask, sums)
                 state, extra = state._replace(fused=fused), [fused.evidence]
             change = geometry.back(_weighed(state, residual))
         learned, memory = self._world(measured, state, change, extra)

@@ -22,6 +22,10 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 
+#: Linear attenuation in 1/mm that no collimator reaches from 70 keV up (tungsten above its K edge
+#: 22), and that lead and tungsten at 140.5 keV in 1/cm exceed.
+DENSEST_EDGE = 25.0
+
 
 @dataclass(frozen=True)
 class Hole:
@@ -47,15 +51,16 @@ class Hole:
     sensitivity: Literal["anger", "paix"] = "anger"
 
     def __post_init__(self) -> None:
-        sizes = self.sides
+        sizes = self.sides if _is_size(self.size_mm) else ()
         if len(sizes) != 2 or not all(0 < side < math.inf for side in sizes):
             raise ValueError(
                 f"A pinhole's diameter must be positive mm, got {self.size_mm}; a rectangular "
                 "one has two sides (u, v)"
             )
-        if self.collimator_mu is not None and not self.collimator_mu > 0:
+        if self.collimator_mu is not None and not 0 < self.collimator_mu <= DENSEST_EDGE:
             raise ValueError(
-                f"A collimator's attenuation must be positive 1/mm, got {self.collimator_mu}"
+                f"A collimator's attenuation must be positive 1/mm, at most {DENSEST_EDGE:g} "
+                f"(tungsten at 140.5 keV: 3.604), got {self.collimator_mu}; is it in 1/cm?"
             )
         if not 0 <= self.opening_degrees < 180:
             raise ValueError(
@@ -68,6 +73,19 @@ class Hole:
             )
         if self.sensitivity not in ("anger", "paix"):
             raise ValueError(f"Expected the law 'anger' or 'paix', got {self.sensitivity!r}")
+
+    def check_way(self, cameras: Cameras) -> None:
+        """Check that the hole is smaller than its way to every detector.
+
+        Raises:
+            ValueError: it is as wide: cm and mm are mixed up.
+        """
+        way = cameras.distance.detach().min().item()
+        if max(self.sides) >= way:
+            raise ValueError(
+                f"Expected a hole smaller than its way to the detector, {way:g} mm, got "
+                f"{max(self.sides):g} mm; look at mm and cm of hole and camera"
+            )
 
     @property
     def round(self) -> bool:
@@ -114,3 +132,9 @@ class Hole:
         if self.acceptance_degrees is None:
             return weight
         return weight * (cosine >= math.cos(math.radians(self.acceptance_degrees)))
+
+
+def _is_size(size: object) -> bool:
+    """Whether a value is a number, or a sequence of numbers."""
+    some = size if isinstance(size, Sequence) and not isinstance(size, str) else (size,)
+    return all(isinstance(n, int | float) and not isinstance(n, bool) for n in some)

@@ -28,7 +28,8 @@ def attenuation_on(
 
     Raises:
         TypeError: no tensor, number or path, such as the name of a map of each case.
-        ValueError: values that cannot be attenuation in 1/mm, or a tensor of another shape.
+        ValueError: values that cannot be attenuation in 1/mm, a tensor of another shape, or a map
+            whose matter all lies outside of the grid.
     """
     if isinstance(mu, str | Path) and str(mu) not in ("case", "measured"):
         from mvrecon.data.resample import resample
@@ -37,9 +38,21 @@ def attenuation_on(
 
         values, source = (read_mu if Path(mu).suffix.lower() == ".hv" else read_volume)(mu)
         check_mu(values, source)
-        return resample(values, source, grid).clamp_min(0)
+        on_grid = resample(values, source, grid).clamp_min(0)
+        if values.any() and not on_grid.any():
+            raise ValueError(
+                f"{mu}: expected attenuation in the grid about {_point(grid.centre)}, got all of "
+                f"it elsewhere, in a map about {_point(source.centre)}; look at mm, cm and the "
+                f"axes of the file"
+            )
+        return on_grid
     if not isinstance(mu, Tensor | float | int):
         raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}{OF_CASES}")
     values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))
     check_mu(values, grid)
     return values
+
+
+def _point(place: Float[Tensor, "3"]) -> str:
+    """A place as words, (x, y, z) in mm."""
+    return f"({', '.join(f'{x:g}' for x in place.tolist())}) mm"

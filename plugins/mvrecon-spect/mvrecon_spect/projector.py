@@ -52,8 +52,9 @@ class Spect(Scaled):
             sensitivity), and those of `drr`; with blur `method` and `backend` of them.
 
     Raises:
-        ValueError: cameras whose detectors are not behind a pinhole, a pinhole in the grid, a
-            diameter that is not positive, or an attenuation that cannot be one in 1/mm.
+        ValueError: cameras whose detectors are not behind a pinhole, a pinhole in the grid or with
+            all of the grid on its detector's side, a hole as wide as its way to the detector, an
+            `intrinsic_mm` without blur, or an attenuation that cannot be one in 1/mm.
     """
 
     def __init__(
@@ -69,8 +70,13 @@ class Spect(Scaled):
         check_pinholes(cameras, grid)
         if not 0 <= intrinsic_mm < float("inf"):
             raise ValueError(f"Expected an intrinsic FWHM of 0 mm or more, got {intrinsic_mm}")
+        if intrinsic_mm and not blur:
+            raise ValueError(
+                f"Expected blur=True with an intrinsic FWHM, got {intrinsic_mm} mm and blur={blur}"
+            )
         edge = {name: options.pop(name) for name in EDGE if name in options}
         hole = Hole(diameter_mm, **edge)
+        hole.check_way(cameras)
         matter = None if mu is None else attenuation_on(grid, mu)
         optics = Optics(hole, float(intrinsic_mm))
         if blur and blurs(grid, cameras, optics):
@@ -105,7 +111,8 @@ def check_pinholes(cameras: Cameras, grid: Grid) -> None:
     """Check that cameras are pinholes with the detector behind them, outside of the grid.
 
     Raises:
-        ValueError: parallel beams, another extent of the rays, or a pinhole in the grid's box.
+        ValueError: parallel beams, another extent of the rays, a pinhole in the grid's box, or one
+            with all of the grid on its detector's side, whose views are zero.
     """
     if cameras.extent != "behind" or cameras.parallel:
         kind = "parallel" if cameras.parallel else cameras.extent
@@ -117,6 +124,12 @@ def check_pinholes(cameras: Cameras, grid: Grid) -> None:
         raise ValueError(
             f"Expected pinholes outside of the grid, got pinhole {int(inside.nonzero()[0, 0])} in "
             "it, in the object; make the grid smaller, or look at mm and cm of camera and grid"
+        )
+    averted = cameras.depth_range(grid)[:, 0].detach() >= 0
+    if averted.any():
+        raise ValueError(
+            f"Expected the grid in front of every pinhole and its detector behind it, got all of "
+            f"the grid on the detector's side of pinhole {int(averted.nonzero()[0, 0])}"
         )
 
 

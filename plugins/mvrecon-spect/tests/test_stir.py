@@ -217,9 +217,11 @@ def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
     table = reconstruct(settings, tmp_path / "run")
     volume, placed = read_volume(tmp_path / "run" / "volume.nii.gz")
     torch.testing.assert_close(placed.affine, grid.affine)
-    assert table["view_nrmse"] < 0.05
+    assert table["view_nrmse"] < 0.05 and table["unit"] == "activity"
     assert (volume - truth[0, 0]).norm() < 0.3 * truth.norm()
     assert volume.sum().item() == pytest.approx(truth.sum().item(), rel=0.02)
+    with pytest.raises(ValueError, match="for the unit HU, got activity"):
+        reconstruct({**settings, "unit": "HU"}, tmp_path / "in_hu")
 
 
 def files(folder: Path) -> tuple[Path, Path, Path]:

@@ -125,8 +125,8 @@ def test_the_settings_are_the_options(root):
 
 def test_mirrored_images_are_read_as_if_they_were_not(scan):
     views = MeasuredViews.of(Measured(path=str(scan), columns=[1, 5])).whole().views
-    mirrored = MeasuredViews.of(Measured(path=str(scan), columns=[3, 7], flip_columns=True)).whole().views
-    assert torch.equal(mirrored, views.flip(-1))
+    mirrored = Measured(path=str(scan), columns=[3, 7], flip_columns=True)
+    assert torch.equal(MeasuredViews.of(mirrored).whole().views, views.flip(-1))
 
 
 def test_cameras_are_those_of_the_views_that_are_taken(scan):

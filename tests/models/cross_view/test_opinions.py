@@ -224,6 +224,22 @@ def test_in_its_frustum_every_camera_meets_its_own_view_whatever_the_network_say
     assert rays.any() and torch.allclose(met[rays], measured[:, 0][rays], rtol=1e-5, atol=1e-5)
 
 
+def test_counts_count_as_the_integrals_that_they_are_of():
+    """Pixels of any sensitivity, but for chords in cells and in thin rays at the grid's edge."""
+    projector = small_projector()
+    opinions = stirred(projector).rounds[0].opinions
+    volume = blob(projector)
+    views, sums = projector(volume), projector(torch.ones_like(volume))
+    placed = torch.randn(1, 4, 4, 4, 4, 4)
+    plain = opinions(volume, views, placed, None)
+    weight = 1e-4 * torch.linspace(0.9, 1.1, 4)[:, None, None]
+    counts = opinions(volume, weight * views, placed, None, weight * sums)
+    change = plain.opinions - opinions._cells(volume)[:, None]
+    assert (counts.opinions - plain.opinions).norm() < 0.1 * change.norm()
+    error = counts.expected / weight - plain.expected
+    assert error.norm() < 0.1 * plain.expected.norm()
+
+
 @pytest.mark.parametrize("choice", ["weighted", "coarse"])
 def test_what_the_others_predict_of_a_view_does_not_depend_on_it(choice):
     projector = small_projector()

@@ -47,7 +47,7 @@ def _attenuate(matter, rig, ray, part, ascending, steps, desk):
     visited = visit(rig, ray, part, desk.room)
     cells(rig, ray, visited[0], steps, desk.room)
     integrals(matter, rig, ray, steps, desk.room, visited[0], desk.path.depth)
-    transmit(desk.path, segments_of(rig, visited[0]), ascending)
+    transmit(desk.path, rig, visited[0], ascending)
     return visited
 
 
@@ -55,15 +55,15 @@ def _attenuate(matter, rig, ray, part, ascending, steps, desk):
 def _spread(volume, rig, ray, span, made, steps, desk):
     """Add to a volume, along a span of a ray, every segment's length times its number in `value`.
 
-    `made` are the slabs whose segments are known, and whose cells are in the room unless it ends
-    before it begins.
+    `made` is of the segments that are known: their first slab, how many slabs, and whether the
+    cells of these are in the room.
     """
     store, n, real = volume.store, volume.at, volume.store.values.dtype.type
     count = np.uint32(span[1] - span[0])
-    if made[0] != span[0] or made[1] != span[1]:
+    if not made[2] or made[1] != count:
         count = visit(rig, ray, span, desk.room)[0]
         cells(rig, ray, count, steps, desk.room)
-    weigh(rig, desk.room, desk.path.value, span[0] - made[0], count)
+    weigh(rig, desk.room, desk.path.value, made[1], span[0] - made[0], count)
     if rig.method == SIDDON:
         siddon.spread(store, n, count, desk.room, real(ray.length))
     else:
@@ -96,7 +96,7 @@ def project_rows(store, matter, rig, desk, reads, views, units):
                     )
                     deal(path, count, views[n, m, v, u])
                 continue
-            weigh(rig, desk.room, desk.path.share, 0, visited[0])
+            weigh(rig, desk.room, desk.path.share, visited[0], 0, visited[0])
             length = store.values.dtype.type(ray.length)
             for n in range(len(views)):
                 if rig.method == SIDDON:
@@ -132,7 +132,7 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
                     path.value[i] *= path.share[i]
-                made = part if n == 0 else (part[0], part[0] - 1)
+                made = (part[0], visited[0], n == 0)
                 _spread(Matter(store, n), rig, ray, span, made, steps, desk)
 
 
@@ -168,5 +168,6 @@ def bend_slabs(store, matter, rig, desk, reads, views, slabs):
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
                     path.source[i] += path.value[i] * path.emission[i]
-            bend(path, count, ascending)
-            _spread(Matter(store, 0), rig, ray, span, part, steps, desk)
+            bend(path, rig, visited[0], ascending)
+            made = (part[0], visited[0], True)
+            _spread(Matter(store, 0), rig, ray, span, made, steps, desk)

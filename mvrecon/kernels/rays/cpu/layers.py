@@ -25,7 +25,7 @@ def layer_of(rig, ray, line, pixel, layers, count, desk):
         along = (D / (np.float64(slab[i]) - start) - layers[0]) * scale
         between = real(min(max(along, 0.0), np.float64(last)))
         if rig.method == SIDDON:
-            layer[3 * i], layer[3 * i + 1], layer[3 * i + 2] = between, between, between
+            layer[i], layer[count + i], layer[2 * count + i] = between, between, between
         else:
             layer[i] = between
 

@@ -8,6 +8,10 @@ method, the part in one cell for Siddon's. Of what it emits the share
 
 comes out at the ray's end on the detector's side: m its optical depth mu D, A the sum of those on
 the way out (Gullberg et al., Phys. Med. Biol. 30 (1985) 799).
+
+Segments stand slab by slab for Joseph's method. For Siddon's the first cells of all slabs come
+first, then the second ones, then the third: so every loop but one runs along memory, and that one,
+over what is left of a ray behind each slab, takes a step for a slab and not for a cell.
 """
 
 from collections import namedtuple
@@ -36,16 +40,17 @@ def path_of(room) -> Path:
 
 @scalar
 def segments_of(rig, slabs):
-    """How many segments so many slabs are, or where those of the next slab begin."""
+    """How many segments so many slabs are."""
     return 3 * slabs if rig.method == SIDDON else slabs
 
 
 @scalar
 def mean_transmission(m):
     """(1 - exp(-m)) / m for 0 <= m <= SERIES: a segment's own, sum (-m)^k / (k + 1)!."""
-    sums = type(m)(1)
-    for k in range(14, 1, -1):
-        sums = type(m)(1) - m * sums * type(m)(1.0 / k)
+    real = type(m)
+    sums, single = real(1), real(1) + real(1e-10) == real(1)
+    for k in range(8 if single else 14, 1, -1):
+        sums = real(1) - m * sums * real(1.0 / k)
     return sums
 
 
@@ -77,9 +82,10 @@ def integrals(volume, rig, ray, steps, room, count, into):
         index0, index1, index2, part0, part1, part2 = siddon.crossed(room)
         flat, offset = store.values, np.uint64(n * store.size)
         for i in range(np.uint32(count)):
-            into[3 * i] = length * part0[i] * flat[np.uint64(index0[i]) + offset]
-            into[3 * i + 1] = length * part1[i] * flat[np.uint64(index1[i]) + offset]
-            into[3 * i + 2] = length * part2[i] * flat[np.uint64(index2[i]) + offset]
+            second, third = np.uint32(count) + i, np.uint32(2 * count) + i
+            into[i] = length * part0[i] * flat[np.uint64(index0[i]) + offset]
+            into[second] = length * part1[i] * flat[np.uint64(index1[i]) + offset]
+            into[third] = length * part2[i] * flat[np.uint64(index2[i]) + offset]
         return
     joseph.fetch(store.pairs, n * store.size, steps.far, count, room)
     y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
@@ -101,11 +107,9 @@ def deepest(depth, number):
 
 
 @scalar
-def transmit(path, number, ascending):
-    """From optical depths to shares: from the first segment on when `ascending`, else from the
-    last.
-    """
-    depth, share, passed = path.depth, path.share, path.passed
+def weaken(path, number):
+    """From optical depths to the mean transmission within each segment, and to what it takes."""
+    depth, share, gone = path.depth, path.share, path.value
     real = depth.dtype.type
     for i in range(np.uint32(number)):
         share[i] = mean_transmission(depth[i])
@@ -113,25 +117,63 @@ def transmit(path, number, ascending):
         for i in range(np.uint32(number)):
             if depth[i] > real(SERIES):
                 share[i] = real(-expm1(-depth[i]) / depth[i])
-    left = 1.0  # in double, since it is a product of as many factors as there are segments
-    for j in range(np.uint32(number)):
-        i = j if ascending else np.uint32(number) - np.uint32(1) - j
-        passed[i] = real(left)
-        mean = share[i]
-        share[i] = real(left * mean)
-        left -= left * (depth[i] * mean)
+    for i in range(np.uint32(number)):
+        gone[i] = depth[i] * share[i]
 
 
 @scalar
-def weigh(rig, room, share, first, count):
-    """The cells of a room with shares of their segments, those of the slabs from `first` on."""
+def transmit(path, rig, slabs, ascending):
+    """From optical depths to shares: from the first segment on when `ascending`, else from the
+    last. It overwrites `value`.
+    """
+    share, passed, gone, number = path.share, path.passed, path.value, segments_of(rig, slabs)
+    weaken(path, number)
+    if rig.method == SIDDON:
+        pass_slabs(path, slabs, ascending)
+    before = gone if rig.method == SIDDON else passed
+    left = 1.0  # in double, since it is a product of as many factors as there are slabs
+    for j in range(np.uint32(slabs)):
+        i = j if ascending else np.uint32(slabs) - np.uint32(1) - j
+        lost = gone[i]
+        before[i] = passed.dtype.type(left)
+        left -= left * lost
+    if rig.method == SIDDON:
+        n = np.uint32(slabs)
+        for i in range(n):
+            passed[i] *= gone[i]
+            passed[n + i] *= gone[i]
+            passed[n + n + i] *= gone[i]
+    for i in range(np.uint32(number)):
+        share[i] *= passed[i]
+
+
+@scalar
+def pass_slabs(path, slabs, ascending):
+    """Of Siddon's three cells in each slab: into `passed` what those of them that are nearer to the
+    detector leave of a ray; into the first third of `value`, from what each takes, what all do.
+    """
+    passed, gone = path.passed, path.value
+    one, n = gone.dtype.type(1), np.uint32(slabs)
+    for i in range(n):
+        first, second, third = gone[i], gone[n + i], gone[n + n + i]
+        near, far = (first, third) if ascending else (third, first)
+        both = near + second - near * second
+        passed[i] = one if ascending else one - both
+        passed[n + i] = one - near
+        passed[n + n + i] = one - both if ascending else one
+        gone[i] = both + far - both * far
+
+
+@scalar
+def weigh(rig, room, share, slabs, first, count):
+    """The cells of a room with shares of their segments: of so many slabs those from `first` on."""
     if rig.method == SIDDON:
         part0, part1, part2 = siddon.crossed(room)[3:]
         for i in range(np.uint32(count)):
-            k = 3 * (first + i)
+            k = np.uint32(first) + i
             part0[i] *= share[k]
-            part1[i] *= share[k + 1]
-            part2[i] *= share[k + 2]
+            part1[i] *= share[np.uint32(slabs) + k]
+            part2[i] *= share[np.uint32(2 * slabs) + k]
         return
     one = room.three
     for i in range(np.uint32(count)):
@@ -139,14 +181,14 @@ def weigh(rig, room, share, first, count):
 
 
 @scalar
-def bend(path, number, ascending):
+def bend(path, rig, slabs, ascending):
     """Into `value`: the derivative of the sum of what all segments send out by their optical
     depths.
 
     A segment weakens itself and all those beyond it.
     """
     depth, share, passed, source = path.depth, path.share, path.passed, path.source
-    value, real = path.value, depth.dtype.type
+    value, real, number = path.value, depth.dtype.type, segments_of(rig, slabs)
     for i in range(np.uint32(number)):
         value[i] = slope_of_mean(depth[i])
     if deepest(depth, number) > real(SERIES):
@@ -157,8 +199,10 @@ def bend(path, number, ascending):
     for i in range(np.uint32(number)):
         value[i] *= passed[i] * source[i]
         source[i] *= share[i]
-    beyond = 0.0
-    for j in range(np.uint32(number)):
-        i = np.uint32(number) - np.uint32(1) - j if ascending else j
-        value[i] = real(value[i] - beyond)
-        beyond += source[i]
+    beyond, pieces = 0.0, number // np.uint32(max(slabs, 1))
+    for j in range(np.uint32(slabs)):
+        for k in range(pieces):
+            i = np.uint32(j + k * slabs)
+            i = np.uint32(number) - np.uint32(1) - i if ascending else i
+            value[i] = real(value[i] - beyond)
+            beyond += source[i]

@@ -18,8 +18,8 @@ class InterfileViews(ProjectionStack):
 
     Raises:
         FileNotFoundError: the header or its data is not there.
-        Refused: missing keys, a size that does not fit the file; negative counts when they are
-            read.
+        Refused: missing keys, a size that does not fit the file; counts that are negative or not
+            finite, when they are read.
     """
 
     kind = "integrals"
@@ -33,9 +33,9 @@ class InterfileViews(ProjectionStack):
 
     def _block(self, first: int, last: int) -> np.ndarray:
         counts = self._numbers.read(first, last)
-        if (counts < 0).any():
+        if not (np.isfinite(counts) & (counts >= 0)).all():
             raise Refused(
-                f"{self.path}: expected counts, not negative, got {counts.min():g} in views "
-                f"{first} to {last - 1}"
+                f"{self.path}: expected counts, finite and not negative, got {counts.min():g} in "
+                f"views {first} to {last - 1}"
             )
         return counts
