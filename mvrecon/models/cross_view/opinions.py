@@ -106,10 +106,8 @@ class Opinions(nn.Module):
                 counts; none for those that are.
         """
         frusta, x = self.inside.frusta, self._cells(volume)
-        measured, unit = means(views, self.binning), None
-        if sums is not None:
-            unit = self._unit(x, sums, mask)
-            measured = torch.where(unit > 0, measured / torch.where(unit > 0, unit, 1), 0)
+        unit = None if sums is None else self._unit(x, sums, mask)
+        measured = _divided(means(views, self.binning), unit)
         prior = frusta.to_frusta(x[:, None]).expand(-1, len(frusta.step), -1, -1, -1, -1)
         density, rest = self._density(prior, measured, placed)
         # The change is carried to the world, not the density: two warps would blur what x has.
@@ -120,13 +118,8 @@ class Opinions(nn.Module):
         change, confidence, features = self._parts(carried)
         mean, variance, _ = leave_one_out(change, frusta.visible)
         expected = frusta.integrate(prior + frusta.to_frusta(mean) * frusta.occupied)
-        logits = torch.zeros_like(change)
-        if self.weighting is not None:
-            with torch.no_grad():  # a hint for the weights
-                unexplained = frusta.to_world(frusta.spread(measured - expected))
-            ours = x[:, None].expand(-1, change.shape[1], -1, -1, -1, -1)
-            small = MAGNIFIED * torch.cat([change, mean, deviation(variance), unexplained], dim=2)
-            logits = self._logits(torch.cat([small, ours, confidence], dim=2), confidence)
+        changes = torch.cat([change, mean, deviation(variance)], dim=2)
+        logits = self._logits(changes, measured - expected, x, confidence)
         fused, weights = fuse(torch.cat([change, features], dim=2), logits, frusta.visible)
         _, spread = pooled(change, frusta.visible)
         average, features = fused.split([1, fused.shape[1] - 1], dim=1)
@@ -148,9 +141,9 @@ class Opinions(nn.Module):
         density = (x.detach().clamp_min(0) + LEAST)[:, None] * frusta.visible
         relative = weights * frusta.visible.sum(dim=0)
         both = frusta.to_frusta(torch.cat([density * relative, density], dim=2))
-        own, equal = both.sum(dim=3).unbind(2)
+        weighted, equal = both.sum(dim=3).unbind(2)
         seen = equal > 0
-        return torch.where(seen, own / torch.where(seen, equal, 1), 1)[:, None]
+        return torch.where(seen, weighted / torch.where(seen, equal, 1), 1)[:, None]
 
     def _unit(
         self,
@@ -194,18 +187,33 @@ class Opinions(nn.Module):
 
     def _logits(
         self,
-        evidence: Float[Tensor, "b m c d h w"],
+        changes: Float[Tensor, "b m 3 d h w"],
+        unexplained: Float[Tensor, "b 1 m r s"],
+        x: Float[Tensor, "b 1 d h w"],
         confidence: Float[Tensor, "b m #k d h w"],
     ) -> Float[Tensor, "b m 1 d h w"]:
-        """One logit for each voxel and camera; of so many cameras at once that their features are
-        no more than one volume.
+        """One logit for each voxel and camera, zeros without a network; of so many cameras at once
+        that their features are no more than one volume.
         """
-        assert self.weighting is not None
-        logits = torch.cat(
-            [
-                self.weighting(some.flatten(0, 1)).unflatten(0, some.shape[:2])
-                for some in evidence.split(self.at_once, dim=1)
-            ],
-            dim=1,
-        )
-        return logits + confidence.sum(dim=2, keepdim=True)
+        if self.weighting is None:
+            return torch.zeros_like(changes[:, :, :1])
+        frusta = self.inside.frusta
+        with torch.no_grad():  # a hint for the weights
+            rest = frusta.to_world(frusta.spread(unexplained))
+        volumes = x[:, None].expand(-1, changes.shape[1], -1, -1, -1, -1)
+        small = MAGNIFIED * torch.cat([changes, rest], dim=2)
+        evidence = torch.cat([small, volumes, confidence], dim=2)
+        logits = [
+            self.weighting(part.flatten(0, 1)).unflatten(0, part.shape[:2])
+            for part in evidence.split(self.at_once, dim=1)
+        ]
+        return torch.cat(logits, dim=1) + confidence.sum(dim=2, keepdim=True)
+
+
+def _divided(
+    views: Float[Tensor, "b 1 m r s"], unit: Float[Tensor, "#b 1 m r s"] | None
+) -> Float[Tensor, "b 1 m r s"]:
+    """Line integrals of views in a unit, zero where that is zero."""
+    if unit is None:
+        return views
+    return torch.where(unit > 0, views / torch.where(unit > 0, unit, 1), 0)
