@@ -75,14 +75,13 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = solve.solve(case, settings, device)
-        volume = outcome.volume
         shown = review.Case(out.name, case.grid, 1.0, case.unit)
-        export.save_png(folder / "planes.png", review.scan(shown, volume))
+        export.save_png(folder / "planes.png", review.scan(shown, outcome.volume))
         _save(out, outcome, settings["unit"], case.grid)
         table = {
             **_row(settings, case, out),
             **outcome.row(),
-            **_values(volume, settings["unit"]),
+            **_values(outcome.volume, settings["unit"]),
             "doubts": doubts(case, settings["reconstructor"]["name"], outcome.view_nrmse, device),
             "left_out": solve.left_out(case, settings, device) if settings["left_out"] else None,
             **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
@@ -121,13 +120,13 @@ def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
 
 
 def _values(volume: "Tensor", unit: str) -> dict[str, list[float]]:
-    """The 1st and the 99th percentile of a volume in the unit; of a large one, of one voxel in
-    some.
+    """The 1st and the 99th percentile of a volume in the unit; of a large one, of every n-th
+    voxel.
     """
     from mvrecon.data.attenuation import hounsfield
 
-    some = volume.flatten()[:: 1 + volume.numel() // 2**20].double()
-    ends = some.quantile(some.new_tensor([0.01, 0.99]))
+    values = volume.flatten()[:: 1 + volume.numel() // 2**20].double()
+    ends = values.quantile(values.new_tensor([0.01, 0.99]))
     return {"percentiles_1_99": (hounsfield(ends) if unit == "HU" else ends).tolist()}
 
 
@@ -154,11 +153,11 @@ def task(config: DictConfig) -> None:
     if fit := table.get("calibration"):
         console.print(f"calibrate: {fit['words']}; {fit['cameras']}", soft_wrap=True)
     low, high = table["percentiles_1_99"]
-    water = 0 if table["unit"] == "HU" else WATER
+    water = {"HU": " (water: 0)", "1/mm": f" (water: {WATER})"}.get(table["unit"], "")
     console.print(
         f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
         f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
-        f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']} (water: {water})",
+        f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{water}",
         *sentences(table.get("cameras")),
         *(f"doubt: {words}" for words in table["doubts"]),
         sep="\n",

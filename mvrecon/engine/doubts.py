@@ -13,7 +13,7 @@ from mvrecon.data.projections.region import Region
 from mvrecon.engine.coarse import coarse
 from mvrecon.engine.scan import Scan
 from mvrecon.metrics import nrmse
-from mvrecon.projectors.drr import Drr
+from mvrecon.parts import PROJECTORS
 from mvrecon.reconstruct.iterative import sirt
 
 #: Voxels along the grid's longest side, views, and iterations of SIRT that tell mirrored views.
@@ -83,7 +83,8 @@ def reversed_nrmse(scan: Scan, device: str = "cpu") -> dict[str, float]:
     kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])
     region = Region.of((rows, columns), kept[0], kept[1], joined)
     numbers = range(0, len(scan.cameras), math.ceil(len(scan.cameras) / VIEWS))
-    A = Drr(grid, region.seen_by(scan.cameras[torch.tensor(numbers)])).to(device)
+    rig = region.seen_by(scan.cameras[torch.tensor(numbers)])
+    A = PROJECTORS.build(scan.projector["name"], grid=grid, cameras=rig).to(device)
     parts = [_as_all(scan.measured.read(n, n + 1).views, region) for n in numbers]
     views = torch.stack(parts, dim=1)[:, None].to(device)
     with torch.no_grad():

@@ -5,12 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular
+from mvrecon.cameras.rigs import circular, parallel
 from mvrecon.data.projections.views import Corrected
 from mvrecon.engine.doubts import doubts, reversed_nrmse
 from mvrecon.engine.scan import Scan
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.drr import Drr
+from mvrecon.projectors.radon import Radon
 
 GRID = Grid.centred(16, spacing=6.0)
 RIG = circular(24, 300.0, 450.0, {"pixels": [24, 26], "pixel_mm": 6.0})
@@ -64,3 +65,15 @@ def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
     assert "osem" not in "".join(doubts(counts, "osem", 0.1))
     (words,) = doubts(scan_of(views, "of_a_plugin"), "fdk", 0.5)
     assert "does not explain" in words
+
+
+@pytest.mark.parametrize("slices", [1, 12])
+def test_parallel_beams_raise_no_doubt_of_their_own(slices):
+    """Reversed columns of a parallel scan are those of the object turned by half a circle."""
+    rig = parallel(24, {"pixels": [slices, 26], "pixel_mm": [6.0, 6.0]})
+    grid = Grid.centred(size=(16, 16, slices), spacing=6.0)
+    mu = torch.zeros(1, 1, *grid.shape)
+    mu[..., 3:7, 4:11] = 0.02
+    mu[..., 9:12, 10:13] = 0.04
+    scan = Scan(InMemory(Radon(grid, rig)(mu)[0, 0]), rig, grid, {"name": "radon"})
+    assert doubts(scan, "fbp", 0.05) == []
