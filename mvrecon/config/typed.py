@@ -19,6 +19,7 @@ WRITTEN = {
         "pixel_mm": "PositiveFloat | Pair[PositiveFloat]",
         "offset_mm": "float | Pair[float]",
     },
+    "grid": {"like": "str"},
     "data": {"overlap": "bool", "sizes": ""},
     "data.sizes": dict.fromkeys(("train", "val", "test"), "NonNegativeInt"),
     "optimizer": {

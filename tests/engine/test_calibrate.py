@@ -8,6 +8,7 @@ from mvrecon.cameras.misalignment import Misalignment, misaligned
 from mvrecon.cameras.rigs import circular
 from mvrecon.data.projections.views import Corrected
 from mvrecon.engine import calibrate
+from mvrecon.engine.coarse import coarse
 from mvrecon.engine.scan import Scan
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.projectors.drr import Drr
@@ -55,6 +56,6 @@ def test_the_coarse_grid_fills_the_same_box():
     turned = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     fine = Grid.centred(size=(100, 80, 10), spacing=(1.0, 1.0, 2.0), centre=(5.0, 0.0, -3.0))
     fine = fine.moved(turned.double(), torch.tensor([1.0, 2.0, 3.0]).double())
-    coarse = calibrate._coarse(fine)
-    assert coarse.size == (64, 52, 10)
-    assert torch.allclose(coarse.corners(), fine.corners())
+    fewer = coarse(fine, 64)
+    assert fewer.size == (64, 52, 10)
+    assert torch.allclose(fewer.corners(), fine.corners())

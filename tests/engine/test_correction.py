@@ -40,7 +40,7 @@ def case():
 def reconstructed(case, folder, *options: str, method=SIRT) -> tuple[float, dict]:
     """Relative error of the volume of the app, and its results."""
     A, truth, views = case
-    stored = save_views(folder, "scan", views[0, 0], "1")
+    stored = save_views(folder, "scan", views[0, 0], "1/mm")
     files.save(A.cameras, folder / "rig.json")
     fixed = (
         f"views.path={stored}/views.h5",
