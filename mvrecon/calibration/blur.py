@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
+from mvrecon.reconstruct.division import divided
 
 
 class Blur(LinearOperator):
@@ -63,7 +64,7 @@ def blurred(
     counts = views.new_ones(1, 1, *shape) if mask is None else mask[None, None].to(views)
     weight = blur(counts)
     total = blur(torch.where(counts > 0, views, 0.0))
-    return torch.where(weight > 0, total / torch.where(weight > 0, weight, 1.0), 0.0)
+    return divided(total, weight)
 
 
 def _band(size: int, sigma: float) -> Float[Tensor, "n n"]:

@@ -19,10 +19,10 @@ def _with_path_quoted(argument: str) -> str:
     if not sign or key.startswith("-") or not SIGNS & set(value):
         return argument
     try:
-        there = Path(value).expanduser().exists()
+        is_path = Path(value).expanduser().exists()
     except (OSError, ValueError):  # too long for a path
         return argument
-    return f"{key}={quoted(value)}" if there else argument
+    return f"{key}={quoted(value)}" if is_path else argument
 
 
 def with_options_added(arguments: Sequence[str], sections: Collection[str]) -> list[str]:

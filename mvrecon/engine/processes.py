@@ -92,10 +92,10 @@ def lost(others: Sequence[subprocess.Popen[bytes]]) -> Iterator[None]:
         ]
         if not ends:
             raise
-        told = RuntimeError(f"Before its end the training lost {', '.join(ends)}")
+        failure = RuntimeError(f"Before its end the training lost {', '.join(ends)}")
         for note in getattr(error, "__notes__", ()):
-            told.add_note(note)
-        raise told from error
+            failure.add_note(note)
+        raise failure from error
 
 
 class Environment(LightningEnvironment):

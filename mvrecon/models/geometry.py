@@ -16,6 +16,7 @@ from torch.nn.functional import adaptive_max_pool3d
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.networks import MULTIPLE
 from mvrecon.projectors.operator import Projector
+from mvrecon.reconstruct.division import divided
 from mvrecon.reconstruct.iterative import (
     SirtWeights,
     correction,
@@ -99,7 +100,7 @@ class Geometry:
     def bounded_sums(self) -> Float[Tensor, "#b 1 m v u"]:
         """Views of ones, none of which is very small, and zero where no ray meets the region."""
         row = self.bounded_row
-        return torch.where(row > 0, 1 / torch.where(row > 0, row, 1), 0)
+        return divided(1.0, row)
 
     def back(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """Residual views as a correction of the volume, C A^T R r."""

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.reconstruct.division import divided
 from mvrecon.reconstruct.problem import Iterate, Monitor
 from mvrecon.reconstruct.total_variation import gradient, gradient_adjoint
 from mvrecon.reconstruct.weighted_fit import WeightedFit
@@ -79,7 +80,7 @@ class PenalisedFit(NamedTuple):
         lowest = torch.zeros_like(reach) if self.nonnegative else -reach
         terms.append(_sum(slope * (volume - torch.where(slope > 0, lowest, reach))))
         total = torch.stack(terms).sum(dim=0)
-        return torch.where(value > 0, total / torch.where(value > 0, value, 1), 0)
+        return divided(total, value)
 
 
 def closed(gap: float) -> Monitor:

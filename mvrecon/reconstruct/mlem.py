@@ -13,6 +13,7 @@ from torch import Tensor
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
 from mvrecon.quantities import NonNegativeInt
+from mvrecon.reconstruct.division import divided
 from mvrecon.reconstruct.poisson import PoissonLikelihood, negative_log_likelihood
 from mvrecon.reconstruct.problem import (
     Common,
@@ -103,7 +104,7 @@ def _step(
     """
     most = torch.maximum(s, share)
     rest = (most - s) + part.explained(x)
-    return x * torch.where(most > 0, rest / torch.where(most > 0, most, 1), 1)
+    return x * divided(rest, most, 1.0)
 
 
 @without_gradient

@@ -14,6 +14,7 @@ from mvrecon.kernels.differences.shrinkage import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.cgls import check_not_negative
+from mvrecon.reconstruct.division import divided
 from mvrecon.reconstruct.mlem import admitted, likelihood_of_residual, unexplained, uniform
 from mvrecon.reconstruct.pdhg_tv import RELAXATION
 from mvrecon.reconstruct.poisson import PoissonLikelihood
@@ -115,7 +116,7 @@ def _iterates(
     s = fit.sensitivity(x.dtype)
     rows, columns = fit.bins(torch.ones_like(x[:1, :1])), fit.bins.T(torch.ones_like(fit.counts))
     primal = (s > 0) / (balance * (columns[:1, :1] + level))
-    dual = torch.where(rows > 0, balance / torch.where(rows > 0, rows, 1), 0)
+    dual = divided(balance, rows)
     shrinkage, kernels = Shrinkage(weight * level * primal, steps, True), differences_for(x)
     rate = balance * min(steps) / (4 * weight * sum(1 / step for step in steps)) if weight else 0.0
     field = kernels.dual_step(x, x.new_zeros(3, *x.shape), rate, steps)

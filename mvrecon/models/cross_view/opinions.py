@@ -19,6 +19,7 @@ from mvrecon.models.pooling import deviation, leave_one_out, pooled
 from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
+from mvrecon.reconstruct.division import divided
 
 #: Density by which an empty voxel counts along a ray, relative to the content's scale.
 LEAST = 0.01
@@ -107,7 +108,8 @@ class Opinions(nn.Module):
         """
         frusta, x = self.inside.frusta, self._cells(volume)
         unit = None if sums is None else self._unit(x, sums, mask)
-        measured = _divided(means(views, self.binning), unit)
+        measured = means(views, self.binning)
+        measured = measured if unit is None else divided(measured, unit)
         prior = frusta.to_frusta(x[:, None]).expand(-1, len(frusta.step), -1, -1, -1, -1)
         density, rest = self._density(prior, measured, placed)
         # The change is carried to the world, not the density: two warps would blur what x has.
@@ -142,8 +144,7 @@ class Opinions(nn.Module):
         relative = weights * frusta.visible.sum(dim=0)
         both = frusta.to_frusta(torch.cat([density * relative, density], dim=2))
         weighted, equal = both.sum(dim=3).unbind(2)
-        seen = equal > 0
-        return torch.where(seen, weighted / torch.where(seen, equal, 1), 1)[:, None]
+        return divided(weighted, equal, 1.0)[:, None]
 
     def _unit(
         self,
@@ -208,12 +209,3 @@ class Opinions(nn.Module):
             for part in evidence.split(self.at_once, dim=1)
         ]
         return torch.cat(logits, dim=1) + confidence.sum(dim=2, keepdim=True)
-
-
-def _divided(
-    views: Float[Tensor, "b 1 m r s"], unit: Float[Tensor, "#b 1 m r s"] | None
-) -> Float[Tensor, "b 1 m r s"]:
-    """Line integrals of views in a unit, zero where that is zero."""
-    if unit is None:
-        return views
-    return torch.where(unit > 0, views / torch.where(unit > 0, unit, 1), 0)

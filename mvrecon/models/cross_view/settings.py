@@ -153,8 +153,8 @@ class RoundOptions(Checked):
         """Scale of the network in the world whose voxels opinions have: 0, the finest, where they
         have the round's resolution.
         """
-        own = self.judged.resolution if self.judged else None
-        return EDGES[own or self.resolution].bit_length() - self.edge.bit_length()
+        chosen = self.judged.resolution if self.judged else None
+        return EDGES[chosen or self.resolution].bit_length() - self.edge.bit_length()
 
     @property
     def corrects(self) -> bool:

@@ -136,5 +136,5 @@ class Hole:
 
 def _is_size(size: object) -> bool:
     """Whether a value is a number, or a sequence of numbers."""
-    some = size if isinstance(size, Sequence) and not isinstance(size, str) else (size,)
-    return all(isinstance(n, int | float) and not isinstance(n, bool) for n in some)
+    numbers = size if isinstance(size, Sequence) and not isinstance(size, str) else (size,)
+    return all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers)

@@ -9,6 +9,9 @@ from PIL import Image as Pillow
 from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian
 
+from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.views import MeasuredViews
+
 VIEWS, ROWS, COLUMNS = 12, 6, 8
 
 
@@ -99,3 +102,8 @@ def scan(tmp_path):
         field = np.full((ROWS, COLUMNS), value, "u2")
         Pillow.fromarray(field).save(folder / f"{name}.tif")
     return folder
+
+
+def opened(path, **options) -> MeasuredViews:
+    """Measured views by their path and options."""
+    return MeasuredViews.of(Measured(path=str(path), **options))

@@ -14,12 +14,11 @@ from mvrecon.data.projections.corrections import Fields, filled, transmission
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.region import Region
-from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, PROJECTORS
 from tests.data.conftest import RIG
-from tests.data.projections.conftest import VIEWS, grey
+from tests.data.projections.conftest import VIEWS, grey, opened
 
 
 def views(count=3, rows=20, columns=30):
@@ -31,7 +30,7 @@ def views(count=3, rows=20, columns=30):
 def test_what_is_written_without_noise_comes_back_to_a_grey_value(tmp_path):
     integrals = views()
     write_projections(tmp_path / "scan", integrals, Exposure(photons=None))
-    measured = MeasuredViews.of(Measured(path=str(tmp_path / "scan")))
+    measured = opened(tmp_path / "scan")
     assert measured.kind == "intensities" and measured.names[1] == "view_00001"
     step = 0.5 / (50_000 - 100) * integrals.exp()  # half a grey value
     back = measured.whole()
@@ -42,7 +41,7 @@ def test_what_is_written_without_noise_comes_back_to_a_grey_value(tmp_path):
 def test_noise_has_the_variance_of_the_photons(tmp_path):
     photons, integral = 1000.0, 1.0
     write_projections(tmp_path / "scan", torch.full((4, 100, 100), integral), Exposure(photons))
-    got = MeasuredViews.of(Measured(path=str(tmp_path / "scan"))).whole().views.neg().exp().double()
+    got = opened(tmp_path / "scan").whole().views.neg().exp().double()
     expected = math.exp(-integral)
     deviation = (expected / photons) ** 0.5
     assert got.mean().item() == pytest.approx(expected, abs=5 * deviation / 200)
@@ -62,24 +61,24 @@ def test_simple_itk_reads_the_images_that_are_written(tmp_path):
 
 
 def test_fields_are_numbers_files_or_the_folders_own(scan, tmp_path):
-    own = MeasuredViews.of(Measured(path=str(scan))).whole().views
+    own = opened(scan).whole().views
     expected = -torch.log((torch.from_numpy(grey().astype("f4")) - 100) / 60_000)
     assert torch.allclose(own, expected, atol=1e-5)
     dark, flat = str(scan / "dark.tif"), str(scan / "flat.tif")
     for options in ({"dark": 100, "flat": 60_100.0}, {"dark": dark, "flat": flat}, {"flat": flat}):
-        assert torch.equal(MeasuredViews.of(Measured(path=str(scan), **options)).whole().views, own)
+        assert torch.equal(opened(scan, **options).whole().views, own)
     flats = tmp_path / "flats"
     flats.mkdir()
     for k, value in enumerate((60_000, 60_200)):  # their mean is the flat field
         Pillow.fromarray(np.full((6, 8), value, "u2")).save(flats / f"flat_{k}.tif")
-    averaged = MeasuredViews.of(Measured(path=str(scan), flat=str(flats))).whole().views
+    averaged = opened(scan, flat=str(flats)).whole().views
     assert torch.allclose(averaged, own, atol=1e-6)
 
 
 def test_every_second_view_a_part_of_the_rows_and_joined_pixels(scan):
     options = {"every": 2, "rows": [2, 6], "columns": [1, 7], "binning": [2, 3]}
-    part = MeasuredViews.of(Measured(path=str(scan), **options))
-    light = MeasuredViews.of(Measured(path=str(scan))).whole().views[::2, 2:6, 1:7].neg().exp()
+    part = opened(scan, **options)
+    light = opened(scan).whole().views[::2, 2:6, 1:7].neg().exp()
     expected = -light.reshape(6, 2, 2, 2, 3).mean(dim=(2, 4)).log()  # as larger pixels measure
     assert (part.n_views, part.shape) == (6, (2, 2))
     assert torch.allclose(part.whole().views, expected, atol=1e-5)
@@ -88,7 +87,7 @@ def test_every_second_view_a_part_of_the_rows_and_joined_pixels(scan):
 
 def test_integrals_are_joined_by_their_mean(tmp_path):
     np.save(tmp_path / "p.npy", views().numpy())
-    part = MeasuredViews.of(Measured(path=str(tmp_path / "p.npy"), kind="integrals", binning=2))
+    part = opened(tmp_path / "p.npy", kind="integrals", binning=2)
     expected = views().reshape(3, 10, 2, 15, 2).mean(dim=(2, 4))
     assert torch.allclose(part.whole().views, expected, atol=1e-6) and part.whole().mask.all()
 
@@ -124,16 +123,16 @@ def test_the_settings_are_the_options(root):
 
 
 def test_mirrored_images_are_read_as_if_they_were_not(scan):
-    views = MeasuredViews.of(Measured(path=str(scan), columns=[1, 5])).whole().views
-    mirrored = Measured(path=str(scan), columns=[3, 7], flip_columns=True)
-    assert torch.equal(MeasuredViews.of(mirrored).whole().views, views.flip(-1))
+    views = opened(scan, columns=[1, 5]).whole().views
+    mirrored = opened(scan, columns=[3, 7], flip_columns=True).whole().views
+    assert torch.equal(mirrored, views.flip(-1))
 
 
 def test_cameras_are_those_of_the_views_that_are_taken(scan):
     cameras = CAMERAS.from_config(
         {**RIG, "n_views": VIEWS, "detector": {**RIG["detector"], "pixels": [6, 8]}}
     )
-    part = MeasuredViews.of(Measured(path=str(scan), every=3, columns=[0, 4]))
+    part = opened(scan, every=3, columns=[0, 4])
     got = part.cameras(cameras)
     assert len(got) == part.n_views == 4 and got.shape == part.shape
     assert torch.equal(got.source, cameras.source[::3])

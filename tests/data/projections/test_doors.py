@@ -11,10 +11,16 @@ from PIL import Image as Pillow
 from mvrecon.data.projections import images as image_module
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.opening import open_projections
-from mvrecon.data.projections.views import MeasuredViews
-from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.files.checks import Refused
-from tests.data.projections.conftest import VIEWS, array, dicom_image, grey, images, many_pages
+from tests.data.projections.conftest import (
+    VIEWS,
+    array,
+    dicom_image,
+    grey,
+    images,
+    many_pages,
+    opened,
+)
 
 
 def field(folder, name, values):
@@ -33,7 +39,7 @@ def test_a_flat_field_of_nothing_is_refused(dark, scan):
     field(scan, "flat", np.full((6, 8), dark))
     field(scan, "dark", np.full((6, 8), dark))
     with pytest.raises(Refused, match=rf"flat field above the dark one, got .*{dark} and {dark}"):
-        MeasuredViews.of(Measured(path=str(scan)))
+        opened(scan)
 
 
 @pytest.mark.door
@@ -41,10 +47,10 @@ def test_intensities_need_a_flat_field(tmp_path):
     """Grey values without a flat field are refused, with the option that gives one."""
     folder = images(tmp_path / "scan", grey())
     with pytest.raises(Refused, match="expected a flat field for intensities; give flat="):
-        MeasuredViews.of(Measured(path=str(folder)))
+        opened(folder)
     with pytest.raises(Refused, match=r"flat field of the views' \(6, 8\) pixels, got \(3, 8\)"):
         np.save(tmp_path / "flat.npy", np.ones((3, 8)))
-        MeasuredViews.of(Measured(path=str(folder), flat=str(tmp_path / "flat.npy")))
+        opened(folder, flat=str(tmp_path / "flat.npy"))
 
 
 @pytest.mark.door
@@ -55,9 +61,9 @@ def test_the_kind_of_floats_is_not_guessed(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((2, 4, 4), "f4"))
     np.save(tmp_path / "b.npy", np.ones((2, 4, 4), "u2"))
     with pytest.raises(Refused, match="expected kind=integrals or kind=intensities for .*float32"):
-        MeasuredViews.of(Measured(path=str(tmp_path / "a.npy")))
+        opened(tmp_path / "a.npy")
     with pytest.raises(Refused, match="expected floats for line integrals, got pixels of uint16"):
-        MeasuredViews.of(Measured(path=str(tmp_path / "b.npy"), kind="integrals"))
+        opened(tmp_path / "b.npy", kind="integrals")
     with pytest.raises(ValueError, match="integrals or intensities, got 'counts'"):
         Measured(path="a.npy", kind="counts")  # type: ignore[arg-type]
 
@@ -69,7 +75,7 @@ def test_dark_pixels_count_as_the_floor_and_are_counted(scan):
     values[2, 1:4] = (100, 90, 103)  # at, below and just above the dark field
     Pillow.fromarray(values).save(scan / "view_3.tif")
     with pytest.warns(UserWarning, match="3 pixels of 12 views have a transmission of at most"):
-        back = MeasuredViews.of(Measured(path=str(scan))).whole()
+        back = opened(scan).whole()
     assert back.floored == 3 and back.views.isfinite().all()
     assert torch.allclose(back.views[3, 2, 1:4], torch.tensor(1e4).log())
 
@@ -79,7 +85,7 @@ def test_a_view_without_light_is_refused(scan):
     """A view that is dark everywhere is refused with its name."""
     field(scan, "view_7", np.full((6, 8), 90))
     with pytest.raises(Refused, match=r"expected light in every view, got none .* in view_7"):
-        MeasuredViews.of(Measured(path=str(scan))).read(6, 9)
+        opened(scan).read(6, 9)
 
 
 @pytest.mark.door
@@ -92,20 +98,20 @@ def test_saturated_and_dead_pixels_are_told_and_masked(scan):
     values[0, 0:3] = 65_535
     Pillow.fromarray(values).save(scan / "view_5.tif")
     with pytest.warns(UserWarning, match="2 of 48 pixels are dead"):
-        measured = MeasuredViews.of(Measured(path=str(scan)))
+        measured = opened(scan)
     with pytest.warns(UserWarning, match="3 pixels of 12 views are saturated .*65535 or more"):
         back = measured.whole()
     expected = torch.ones(VIEWS, 6, 8, dtype=torch.bool)
     expected[:, 1, 1] = expected[:, 4, 6] = expected[5, 0, 0:3] = False
     assert torch.equal(back.mask, expected) and back.views.isfinite().all()
     with pytest.warns(UserWarning):
-        joined = MeasuredViews.of(Measured(path=str(scan), binning=2)).whole()
+        joined = opened(scan, binning=2).whole()
     assert torch.equal(joined.mask, expected.reshape(VIEWS, 3, 2, 4, 2).all(dim=4).all(dim=2))
     field(scan, "flat", np.full((6, 8), 65_535))
     with pytest.raises(
         Refused, match="expected at least half of the pixels between dark and satur"
     ):
-        MeasuredViews.of(Measured(path=str(scan)))
+        opened(scan)
 
 
 @pytest.mark.door
@@ -162,9 +168,7 @@ def test_images_of_several_sizes_are_refused(scan, tmp_path):
     with pytest.raises(Refused, match="those of PNG and TIFF; choose by pattern="):
         open_projections(scan)
     Pillow.fromarray(values).save(scan / "view_4.tif")
-    chosen = MeasuredViews.of(
-        Measured(path=str(scan), pattern="*.tif")
-    )  # dark and flat are no views
+    chosen = opened(scan, pattern="*.tif")  # dark and flat are no views
     assert chosen.n_views == VIEWS and chosen.whole().views.isfinite().all()
     pages = [Pillow.fromarray(values), Pillow.fromarray(values[:3])]
     pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:])
@@ -272,32 +276,10 @@ def test_a_headers_values_lie_beside_it(name, tmp_path):
 def test_options_of_views_are_within_range(options, message, scan):
     """Rows, columns, binning and thresholds of views out of range are refused with their range."""
     with pytest.raises(ValueError, match=message):
-        MeasuredViews.of(Measured(path=str(scan), **options))
-
-
-@pytest.mark.door
-def test_a_scan_is_written_whole_or_not_at_all(tmp_path):
-    """A scan that breaks off while it is written leaves nothing, and none is written over."""
-
-    def breaking():
-        yield torch.ones(4, 5)
-        yield torch.full((4, 5), torch.nan)
-
-    with pytest.raises(Refused, match="expected finite line integrals, got 20 .* in view 1"):
-        write_projections(tmp_path / "scan", breaking())
-    for wrong in ([], [torch.ones(4, 5), torch.ones(5, 4)], [torch.ones(2, 4, 5)]):
-        with pytest.raises(Refused):
-            write_projections(tmp_path / "scan", wrong)
-    assert not list(tmp_path.iterdir())
-    write_projections(tmp_path / "scan", torch.ones(2, 4, 5))
-    with pytest.raises(FileExistsError, match="expected a new or an empty folder"):
-        write_projections(tmp_path / "scan", torch.ones(2, 4, 5))
-    for wrong in ({"dark": 9, "flat": 9}, {"flat": 2**16}, {"photons": 0}):
-        with pytest.raises(ValueError, match="Expected"):
-            Exposure(**wrong)
+        opened(scan, **options)
 
 
 def test_a_sound_scan_warns_of_nothing(scan):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        MeasuredViews.of(Measured(path=str(scan))).whole()
+        opened(scan).whole()
