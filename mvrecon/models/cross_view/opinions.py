@@ -1,5 +1,5 @@
-"""The cameras' opinions within a round: each places its corrected view along its rays, all are
-compared, and a network weighs them.
+"""The cameras' opinions within a round: each places what its corrected view misses along its rays,
+all are compared, and a network weighs them.
 """
 
 from typing import NamedTuple
@@ -32,8 +32,8 @@ class Fused(NamedTuple):
         opinions: of each camera, relative to the content's scale.
         visible: which voxels each camera's frustum holds.
         weights: of each camera; they sum to one over those that see a voxel.
-        expected: what the others' opinions together predict of each camera's view, in cells of
-            pixels.
+        expected: what the others' opinions together expect of each camera's view, in cells of
+            pixels; of `Opinions` itself what they add to the view of x.
         evidence: for the network in the world: the fused change, the deviation over the cameras,
             and the fused features.
         ray_weights: how much the residual of each ray counts; none where all count as one.
@@ -50,11 +50,12 @@ class Fused(NamedTuple):
 class Opinions(nn.Module):
     """M camera volumes as changes of the volume x, compared and fused, in the unit of x.
 
-    In its frustum each camera's density meets its own corrected view (in cells of pixels, to
-    rounding; heads whose `keeps_views` is true). The change goes to the world by inverse
+    In its frustum each camera's change of the density meets its own residual view (in cells of
+    pixels, to rounding; heads whose `keeps_views` is true): the error of coarse cells along a ray
+    is in x and in the opinion alike, and drops out. The change goes to the world by inverse
     projection, the mean of all others' changes comes back along the rays (leave-one-out), and what
-    of the camera's view they do not explain is evidence for the weights. Of each camera all this
-    is in cells: with cells of 8 voxels an eighth of a volume.
+    of the camera's residual they do not explain is evidence for the weights. Of each camera all
+    this is in cells: with cells of 8 voxels an eighth of a volume.
 
     Args:
         projector: its grid and its rig.
@@ -76,7 +77,8 @@ class Opinions(nn.Module):
     ):
         super().__init__()
         self.edge, self.binning, self.learned = edge, binning, options.learned
-        self.weigh_rays = options.weigh_rays
+        # before training all rays count as one: noise of the weights is an error where none errs
+        self.strength = nn.Parameter(torch.zeros(())) if options.weigh_rays else None
         cameras = Binned.of(projector, binning).cameras
         self.inside = FixedFrusta(projector.grid.coarsened(edge), cameras, depths)
         self.head = HEADS.from_config(options.head)
@@ -90,7 +92,7 @@ class Opinions(nn.Module):
     def forward(
         self,
         volume: Float[Tensor, "b 1 d h w"],
-        views: Float[Tensor, "b 1 m v u"],
+        residual: Float[Tensor, "b 1 m v u"],
         placed: Float[Tensor, "b m c D r s"] | None,
         mask: Bool[Tensor, "b 1 d h w"] | None,
         sums: Float[Tensor, "#b 1 m v u"] | None = None,
@@ -99,7 +101,7 @@ class Opinions(nn.Module):
 
         Args:
             volume: x, relative to the content's scale.
-            views: corrected, relative to the content's scale.
+            residual: corrected views less those of x, relative to the content's scale.
             placed: of the cameras' network: logits of depth and of confidence, and features; none
                 without a network.
             mask: voxels whose density may differ from zero; none for all.
@@ -108,28 +110,29 @@ class Opinions(nn.Module):
         """
         frusta, x = self.inside.frusta, self._cells(volume)
         unit = None if sums is None else self._unit(x, sums, mask)
-        measured = means(views, self.binning)
-        measured = measured if unit is None else divided(measured, unit)
+        missed = means(residual, self.binning)
+        missed = missed if unit is None else divided(missed, unit)
         prior = frusta.to_frusta(x[:, None]).expand(-1, len(frusta.step), -1, -1, -1, -1)
-        density, rest = self._density(prior, measured, placed)
-        # The change is carried to the world, not the density: two warps would blur what x has.
         prior = prior * frusta.occupied
+        density, rest = self._density(prior, frusta.integrate(prior) + missed, placed)
+        # The change is carried to the world, not the density: two warps would blur what x has.
         carried = frusta.to_world(torch.cat([density - prior, *rest], dim=2))
         if mask is not None:
             carried = carried * self._cells(mask.to(x.dtype), largest=True)[:, None]
         change, confidence, features = self._parts(carried)
         mean, variance, _ = leave_one_out(change, frusta.visible)
-        expected = frusta.integrate(prior + frusta.to_frusta(mean) * frusta.occupied)
+        expected = frusta.integrate(frusta.to_frusta(mean) * frusta.occupied)
         changes = torch.cat([change, mean, deviation(variance)], dim=2)
-        logits = self._logits(changes, measured - expected, x, confidence)
+        logits = self._logits(changes, missed - expected, x, confidence)
         fused, weights = fuse(torch.cat([change, features], dim=2), logits, frusta.visible)
         _, spread = pooled(change, frusta.visible)
         average, features = fused.split([1, fused.shape[1] - 1], dim=1)
         small = MAGNIFIED * torch.cat([average, deviation(spread)[:, 0]], dim=1)
         evidence = torch.cat([small, features], dim=1)
         rays = None
-        if self.weigh_rays:
-            rays = pixels(self._ray_weights(x, weights), self.binning, views)
+        if self.strength is not None:
+            relative = pixels(self._ray_weights(x, weights), self.binning, residual)
+            rays = 1 + self.strength * (relative - 1)
         expected = expected if unit is None else expected * unit
         return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)
 

@@ -13,6 +13,7 @@ from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence
 from mvrecon.models.cross_view.opinions import Fused, Opinions
 from mvrecon.models.cross_view.settings import RoundOptions
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
+from mvrecon.models.cross_view.views import means
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import CAMERA_NETWORKS
 from mvrecon.projectors.operator import Projector
@@ -126,8 +127,9 @@ class Round(nn.Module):
 
     def forward(self, measured: Measured, state: State) -> State:
         """The state after the round."""
-        geometry, x, views = measured.geometry, state.volume, measured.views
-        residual = views - geometry.A(x)
+        geometry, x = measured.geometry, state.volume
+        projected = geometry.A(x)
+        residual = measured.views - projected
         if state.correction is not None:
             residual = residual + self._views(measured, state.correction)
         change = geometry.back(_weighed(state, residual))
@@ -137,11 +139,13 @@ class Round(nn.Module):
             if answer.correction is not None:
                 residual = residual + self._views(measured, answer.correction)
             if self.opinions is not None:
-                if state.correction is not None:
-                    views = views + self._views(measured, state.correction)
                 sums = None if self.of_lines else geometry.bounded_sums
-                fused = self.opinions(x, views, answer.placed, geometry.mask, sums)
-                state, extra = state._replace(fused=fused), [fused.evidence]
+                # detached: a correction's task is the operator's view, not that an opinion be good
+                own = residual.detach()
+                fused = self.opinions(x, own, answer.placed, geometry.mask, sums)
+                seen = fused.expected + means(projected, self.opinions.binning)
+                state = state._replace(fused=fused._replace(expected=seen))
+                extra = [fused.evidence]
             change = geometry.back(_weighed(state, residual))
         learned, memory = self._world(measured, state, change, extra)
         x = x + geometry.within(learned + self.step * change)

@@ -77,8 +77,9 @@ class PlainUNet(nn.Module):
             level: padded(part, self.multiple >> level) for level, part in (coarse or {}).items()
         }
         whole = padded(x, self.multiple)
-        if x.ndim == 5:  # three quarters of the time of the default order, on a CPU
-            whole = whole.contiguous(memory_format=torch.channels_last_3d)
+        # three quarters of the time of the default order, on a CPU
+        order = torch.channels_last_3d if x.ndim == 5 else torch.channels_last
+        whole = whole.contiguous(memory_format=order)
         with arithmetic(self.precision, x):
             answer = self._answer(whole, coarse)
         return trimmed(answer, x.shape[2:]).to(x.dtype)
@@ -96,7 +97,7 @@ class PlainUNet(nn.Module):
             x = self.up[level](self.finer[level](x) + skips[level])
         # sums of few products: not half precision, whose rounding would stay in what it predicts
         with torch.autocast(x.device.type, enabled=False):
-            return self.last(x.to(self.last.weight.dtype))
+            return pointwise(self.last, x.to(self.last.weight.dtype))
 
 
 class Block(nn.Module):
@@ -117,6 +118,13 @@ class Block(nn.Module):
 def spread(conv: nn.Module, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
     """A convolution of 3 pixels; of volumes, by the quicker way of `convolution`."""
     return convolution(x, conv.weight, conv.bias) if isinstance(conv, nn.Conv3d) else conv(x)
+
+
+def pointwise(conv: nn.Conv2d | nn.Conv3d, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
+    """A convolution of one pixel as a product of matrices: less than half the time on a CPU where
+    channels are few.
+    """
+    return F.linear(x.movedim(1, -1), conv.weight.flatten(1), conv.bias).movedim(-1, 1)
 
 
 #: Of a processor that multiplies bfloat16 by itself, as torch calls them.

@@ -168,13 +168,27 @@ def test_counts_count_as_the_integrals_that_they_are_of():
     volume = blob(projector)
     views, sums = projector(volume), projector(torch.ones_like(volume))
     placed = torch.randn(1, 4, 4, 4, 4, 4)
-    plain = opinions(volume, views, placed, None)
+    residual = views - projector(0.9 * volume)
+    plain = opinions(0.9 * volume, residual, placed, None)
     weight = 1e-4 * torch.linspace(0.9, 1.1, 4)[:, None, None]
-    counts = opinions(volume, weight * views, placed, None, weight * sums)
-    change = plain.opinions - opinions._cells(volume)[:, None]
+    counts = opinions(0.9 * volume, weight * residual, placed, None, weight * sums)
+    change = plain.opinions - 0.9 * opinions._cells(volume)[:, None]
     assert (counts.opinions - plain.opinions).norm() < 0.1 * change.norm()
     error = counts.expected / weight - plain.expected
     assert error.norm() < 0.1 * plain.expected.norm()
+
+
+@torch.no_grad()
+def test_before_training_cameras_that_miss_nothing_keep_the_volume_however_coarse_cells_are():
+    """But for the floor of the head, of a hundredth of the density along a ray."""
+    projector = small_projector()
+    torch.manual_seed(2)
+    opinions = CrossView(projector, CHOICES["coarse"]).rounds[0].opinions
+    volume, placed = blob(projector) + 0.5, torch.zeros(1, 4, 2, 4, 4, 4)
+    nothing = torch.zeros(1, 1, 4, 12, 12)
+    fused = opinions(volume, nothing, torch.cat([placed, placed], dim=2), None)
+    x = opinions._cells(volume)[:, None].expand_as(fused.opinions)
+    assert (fused.opinions - x).norm() < 0.01 * x.norm()
 
 
 @pytest.mark.parametrize("choice", ["weighted", "coarse"])
@@ -274,8 +288,8 @@ def test_a_loss_relative_to_the_start_is_two_for_the_start_and_knows_no_unit():
 
 
 def test_with_a_loss_of_their_own_opinions_leave_the_start_and_differ():
-    """Views of one camera are 20 % too bright: opinions come nearer to the truth than the start is,
-    and they are no longer one picture."""
+    """Views of one camera are 20 % too bright, and nobody corrects them: opinions come nearer to
+    the truth than the start, whose loss is 2, and they are no longer one picture."""
     projector = small_projector()
     truth = blob(projector)
     views = projector(truth)
@@ -292,7 +306,7 @@ def test_with_a_loss_of_their_own_opinions_leave_the_start_and_differ():
         optimizer.zero_grad()
         terms["total"].backward()
         optimizer.step()
-    assert errors[-1] < 0.7 * errors[0]
+    assert errors[-1] < 0.8 * errors[0] and errors[-1] < 1.5
     opinions = out.opinions.detach()
     spread = (opinions - opinions.mean(dim=1, keepdim=True)).square().mean()
     start = torch.nn.functional.avg_pool3d(out.start, 2)[:, None]
