@@ -32,8 +32,8 @@ class Fused(NamedTuple):
         opinions: of each camera, relative to the content's scale.
         visible: which voxels each camera's frustum holds.
         weights: of each camera; they sum to one over those that see a voxel.
-        expected: what the others' opinions together expect of each camera's view, in cells of
-            pixels; of `Opinions` itself what they add to the view of x.
+        expected: what the others' opinions together predict of each camera's view, in cells of
+            pixels.
         evidence: for the network in the world: the fused change, the deviation over the cameras,
             and the fused features.
         ray_weights: how much the residual of each ray counts; none where all count as one.
@@ -77,6 +77,7 @@ class Opinions(nn.Module):
     ):
         super().__init__()
         self.edge, self.binning, self.learned = edge, binning, options.learned
+        self.of_residual = options.places == "residual"
         # before training all rays count as one: noise of the weights is an error where none errs
         self.strength = nn.Parameter(torch.zeros(())) if options.weigh_rays else None
         cameras = Binned.of(projector, binning).cameras
@@ -93,6 +94,7 @@ class Opinions(nn.Module):
         self,
         volume: Float[Tensor, "b 1 d h w"],
         residual: Float[Tensor, "b 1 m v u"],
+        projected: Float[Tensor, "b 1 m v u"],
         placed: Float[Tensor, "b m c D r s"] | None,
         mask: Bool[Tensor, "b 1 d h w"] | None,
         sums: Float[Tensor, "#b 1 m v u"] | None = None,
@@ -102,6 +104,7 @@ class Opinions(nn.Module):
         Args:
             volume: x, relative to the content's scale.
             residual: corrected views less those of x, relative to the content's scale.
+            projected: the views of x, likewise.
             placed: of the cameras' network: logits of depth and of confidence, and features; none
                 without a network.
             mask: voxels whose density may differ from zero; none for all.
@@ -110,11 +113,13 @@ class Opinions(nn.Module):
         """
         frusta, x = self.inside.frusta, self._cells(volume)
         unit = None if sums is None else self._unit(x, sums, mask)
-        missed = means(residual, self.binning)
-        missed = missed if unit is None else divided(missed, unit)
         prior = frusta.to_frusta(x[:, None]).expand(-1, len(frusta.step), -1, -1, -1, -1)
         prior = prior * frusta.occupied
-        density, rest = self._density(prior, frusta.integrate(prior) + missed, placed)
+        integral = frusta.integrate(prior)
+        missed = means(residual if self.of_residual else residual + projected, self.binning)
+        missed = missed if unit is None else divided(missed, unit)
+        missed = missed if self.of_residual else missed - integral
+        density, rest = self._density(prior, integral + missed, placed)
         # The change is carried to the world, not the density: two warps would blur what x has.
         carried = frusta.to_world(torch.cat([density - prior, *rest], dim=2))
         if mask is not None:
@@ -134,6 +139,7 @@ class Opinions(nn.Module):
             relative = pixels(self._ray_weights(x, weights), self.binning, residual)
             rays = 1 + self.strength * (relative - 1)
         expected = expected if unit is None else expected * unit
+        expected = expected + means(projected, self.binning)
         return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)
 
     def _ray_weights(

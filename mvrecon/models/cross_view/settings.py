@@ -52,12 +52,14 @@ class OpinionOptions(Checked):
         fusion: "weighted" by a network over the cameras, or the plain "mean".
         widths: channels of each scale of that network, the finest first.
         weigh_rays: whether the residual of each ray counts by the weight of its camera along it.
+        places: along the rays: "residual": what the corrected view has more than that of x; "view":
+            the whole view, with the errors of coarse cells and bins along a ray in it.
         prior: "learned": the cameras' network moves the density of x along the rays; "uniform": no
             network, all depths equally likely.
 
     Raises:
-        ValueError: an unknown resolution, fusion or prior, no scale, a width below 1, or less than
-            no feature.
+        ValueError: an unknown resolution, fusion, places or prior, no scale, a width below 1, or
+            less than no feature.
     """
 
     what: ClassVar[str] = "The opinion of a round"
@@ -68,6 +70,7 @@ class OpinionOptions(Checked):
     fusion: Literal["weighted", "mean"] = "weighted"
     widths: Sequence[int] = (8, 16)
     weigh_rays: bool = False
+    places: Literal["residual", "view"] = "residual"
     prior: Literal["learned", "uniform"] = "learned"
 
     def __post_init__(self) -> None:
@@ -75,6 +78,8 @@ class OpinionOptions(Checked):
             _check_resolution("opinions", self.resolution)
         if self.fusion not in ("weighted", "mean"):
             raise ValueError(f"Expected the fusion weighted or mean, got {self.fusion!r}")
+        if self.places not in ("residual", "view"):
+            raise ValueError(f"Expected places as residual or view, got {self.places!r}")
         if self.prior not in ("learned", "uniform"):
             raise ValueError(f"Expected the prior learned or uniform, got {self.prior!r}")
         _check_widths("the network that weighs opinions", self.widths)

@@ -13,7 +13,6 @@ from mvrecon.models.cross_view.evidence import MAGNIFIED, Answer, Evidence
 from mvrecon.models.cross_view.opinions import Fused, Opinions
 from mvrecon.models.cross_view.settings import RoundOptions
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
-from mvrecon.models.cross_view.views import means
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import CAMERA_NETWORKS
 from mvrecon.projectors.operator import Projector
@@ -142,10 +141,8 @@ class Round(nn.Module):
                 sums = None if self.of_lines else geometry.bounded_sums
                 # detached: a correction's task is the operator's view, not that an opinion be good
                 own = residual.detach()
-                fused = self.opinions(x, own, answer.placed, geometry.mask, sums)
-                seen = fused.expected + means(projected, self.opinions.binning)
-                state = state._replace(fused=fused._replace(expected=seen))
-                extra = [fused.evidence]
+                fused = self.opinions(x, own, projected, answer.placed, geometry.mask, sums)
+                state, extra = state._replace(fused=fused), [fused.evidence]
             change = geometry.back(_weighed(state, residual))
         learned, memory = self._world(measured, state, change, extra)
         x = x + geometry.within(learned + self.step * change)

@@ -42,6 +42,7 @@ CHOICES = {
     "mean": rounds(opinions={"fusion": "mean"}),
     "uniform": rounds(opinions={"prior": "uniform"}),
     "density": rounds(opinions={"head": {"name": "density"}}),
+    "view": rounds(opinions={"places": "view"}),
     "full": rounds(opinions={}, resolution="full"),
     "quarter": rounds(opinions={}, resolution="quarter"),
     "placed alone": rounds({**RAYS, "correct": False}, opinions={}),
@@ -168,10 +169,12 @@ def test_counts_count_as_the_integrals_that_they_are_of():
     volume = blob(projector)
     views, sums = projector(volume), projector(torch.ones_like(volume))
     placed = torch.randn(1, 4, 4, 4, 4, 4)
-    residual = views - projector(0.9 * volume)
-    plain = opinions(0.9 * volume, residual, placed, None)
+    projected = projector(0.9 * volume)
+    residual = views - projected
+    plain = opinions(0.9 * volume, residual, projected, placed, None)
     weight = 1e-4 * torch.linspace(0.9, 1.1, 4)[:, None, None]
-    counts = opinions(0.9 * volume, weight * residual, placed, None, weight * sums)
+    seen = weight * residual, weight * projected
+    counts = opinions(0.9 * volume, *seen, placed, None, weight * sums)
     change = plain.opinions - 0.9 * opinions._cells(volume)[:, None]
     assert (counts.opinions - plain.opinions).norm() < 0.1 * change.norm()
     error = counts.expected / weight - plain.expected
@@ -186,7 +189,8 @@ def test_before_training_cameras_that_miss_nothing_keep_the_volume_however_coars
     opinions = CrossView(projector, CHOICES["coarse"]).rounds[0].opinions
     volume, placed = blob(projector) + 0.5, torch.zeros(1, 4, 2, 4, 4, 4)
     nothing = torch.zeros(1, 1, 4, 12, 12)
-    fused = opinions(volume, nothing, torch.cat([placed, placed], dim=2), None)
+    seen = nothing, projector(volume)
+    fused = opinions(volume, *seen, torch.cat([placed, placed], dim=2), None)
     x = opinions._cells(volume)[:, None].expand_as(fused.opinions)
     assert (fused.opinions - x).norm() < 0.01 * x.norm()
 
@@ -196,9 +200,10 @@ def test_what_the_others_predict_of_a_view_does_not_depend_on_it(choice):
     projector = small_projector()
     opinions = stirred(projector, choice).rounds[0].opinions
     volume = blob(projector)
-    views = projector(volume).requires_grad_()
+    projected = projector(volume)
+    views = (1.1 * projected).requires_grad_()
     placed = torch.randn(1, 4, 4, 4, 4, 4)
-    expected = opinions(volume, views, placed, None).expected
+    expected = opinions(volume, views - projected, projected, placed, None).expected
     for m in range(4):
         (gradient,) = torch.autograd.grad(expected[:, :, m].sum(), views, retain_graph=True)
         own, others = gradient[:, :, m].abs().max(), gradient.abs().max()
