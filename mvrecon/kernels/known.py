@@ -12,8 +12,8 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.lines import tensors_of, writes
 
-#: Results kept for a rig, the latest ones.
-KEPT = 16
+#: Results kept for a rig, the latest ones: more than a CUDA graph of it reads, which must stay.
+KEPT = 256
 _results: WeakKeyDictionary[Cameras, OrderedDict[Hashable, Any]] = WeakKeyDictionary()
 
 

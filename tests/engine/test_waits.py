@@ -60,7 +60,7 @@ def stepped(module: ReconstructionModule, batch: dict, moved: bool = False) -> A
         optimizer = torch.optim.AdamW(weights) if weights else None
         if moved:
             with torch.no_grad():
-                module.model(batch["views"])
+                module.training_step(batch, 0)
             gpu.waits.clear()
         if optimizer is None:
             module.model(batch["views"])
