@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.models import sparse
-from mvrecon.models.normalisation import normalised_silu
+from mvrecon.models.normalisation import keeps_channels_last, normalised_silu
 from mvrecon.models.sparse import Voxels, pyramid
 
 #: Levels of a U-Net, and how many voxels along each axis its coarsest level joins into one: crops
@@ -141,7 +141,7 @@ def convolution(
     """A 3x3x3 convolution, zero beyond the volume; a small volume that is alone goes as two
     halves.
     """
-    if x.is_cuda:  # steps between scales give channels first
+    if keeps_channels_last(x):  # steps between scales give channels first
         x = x.contiguous(memory_format=torch.channels_last_3d)
     n, channels, d, h = x.shape[:4]
     quick = x.is_cuda or torch.is_autocast_enabled(x.device.type)  # bfloat16 is left to oneDNN

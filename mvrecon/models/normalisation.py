@@ -5,15 +5,25 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+#: Values from which on a GPU normalises with channels last, 16 channels of 102^3 voxels: by counts,
+#: not by a clock. It saves five transpositions, of 0.03 ms for each 2^23 values at 4 TB/s, and
+#: starts some 35 small kernels more, of 0.005 ms.
+LARGE = 2**24
+
+
+def keeps_channels_last(x: Tensor) -> bool:
+    """Whether steps on a tensor leave channels last in memory, at the cost of more kernels."""
+    return x.is_cuda and x.numel() >= LARGE
+
 
 def normalised_silu(norm: nn.GroupNorm, x: Float[Tensor, "n c *d"]) -> Float[Tensor, "n c *d"]:
     """SiLU of group normalisation (Wu & He, ECCV 2018) by a layer's groups, scale and shift.
 
     Not the layer's own call, which refuses a group of one value, of which the shift is left.
-    torch's kernel for a GPU takes channels first alone: it would transpose what a convolution gives
-    with channels last, twice more on the way back, and leave the next convolution channels first.
+    torch's kernel for a GPU takes channels first alone: it transposes what a convolution gives with
+    channels last, twice more on the way back, and leaves the next convolution channels first.
     """
-    if x.is_cuda:
+    if keeps_channels_last(x):
         return F.silu(in_any_order(norm, x))
     return F.silu(torch.group_norm(x, norm.num_groups, norm.weight, norm.bias, norm.eps))
 
