@@ -17,6 +17,7 @@ degrees with no code of its own.
 """
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -126,7 +127,16 @@ class Cameras:
         return (self[m] for m in range(len(self)))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> "Cameras":
-        return replace(self, **{name: change(getattr(self, name)) for name in VECTORS})
+        """The same cameras, some of them or elsewhere; they are not judged again, for which a GPU
+        would be waited for.
+        """
+        vectors = {name: change(getattr(self, name)) for name in VECTORS}
+        if not len(vectors["source"]):
+            return replace(self, **vectors)  # which is refused
+        other = copy(self)
+        for name, vector in vectors.items():
+            object.__setattr__(other, name, vector)
+        return other
 
     def to(self, device: torch.device | str) -> "Cameras":
         """The same rig on a device; geometry stays in float64."""

@@ -47,7 +47,9 @@ def check_graph(
         ValueError: no GPU, several of them, scaled losses, several rigs, cases with
             operators of their own, or a model whose sizes depend on its views.
     """
-    support, precision = model.get("support") or "none", str(trainer.get("precision", "32-true"))
+    precision = str(trainer.get("precision", "32-true"))
+    # cross_view keeps to a support on the whole grid; other models crop to it
+    support = "none" if model["name"] == "cross_view" else model.get("support") or "none"
     gpu = trainer.get("accelerator", "auto") != "cpu" and torch.cuda.is_available()
     reasons = {
         "a GPU, got a training on a CPU": not gpu,

@@ -115,6 +115,17 @@ def bounds(masks: Bool[Tensor, "b d h w"]) -> Int[Tensor, "b 6"]:
     return torch.stack(low + high, dim=1) * lines[0].any(dim=1, keepdim=True)
 
 
+def filled(bounds: Int[Tensor, "b 6"], shape: Sequence[int]) -> Bool[Tensor, "b d h w"]:
+    """Masks of the voxels in boxes, from their rows of `bounds`, on the bounds' device."""
+    inside = bounds.new_ones((len(bounds), 1, 1, 1), dtype=torch.bool)
+    for axis, size in enumerate(shape):
+        place = torch.arange(size, device=bounds.device)
+        low, high = bounds[:, axis, None], bounds[:, axis + 3, None]
+        sizes = [-1, *(size if other == axis else 1 for other in range(3))]
+        inside = inside & ((place >= low) & (place < high)).view(sizes)
+    return inside
+
+
 def placed(
     part: Shaped[Tensor, "*b a e i"], box: Box, shape: Sequence[int]
 ) -> Shaped[Tensor, "*b d h w"]:

@@ -11,14 +11,14 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.geometry.box import Box, placed
+from mvrecon.geometry.box import Box, bounds, filled, placed
 from mvrecon.models.crops import cropped_geometry, occupied_bricks
-from mvrecon.models.geometry import Geometry, whole_geometry
+from mvrecon.models.geometry import Geometry, changes_nothing, whole_geometry
 from mvrecon.models.networks import MULTIPLE
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
-from mvrecon.visual_hull.support import WORTH, Support, support_from_views
+from mvrecon.visual_hull.support import WORTH, hull_mask, middle
 
 #: Crops whose geometry is kept; a fixed rig's scenes share few.
 KEPT = 8
@@ -69,27 +69,20 @@ class Cropping(nn.Module):
     def region(self, views: Float[Tensor, "b 1 m v u"]) -> tuple[Geometry, Box]:
         """The crop around the support of views, with the support as its mask, and where it lies."""
         options, shape = self.options, self.projector.grid.shape
-        support = self._hull(views)
-        mask = self._mask(support)
-        box = Box.around(mask)
-        box = box if box.size else support.box
+        mask = self.mask(views)
+        on_host = mask.cpu()  # once for all sizes: for each number the host would wait for a GPU
+        box = Box.around(on_host)
+        box = box if box.size else middle(self.projector.grid)
         box = box.grown(options.margin, shape).aligned(MULTIPLE, shape)
-        mask = mask[..., *box.slices]
-        crop = self.crop(box, occupied_bricks(mask) if options.masked else None)
-        return crop.with_mask(mask, options.masked), box
+        mask, on_host = mask[..., *box.slices], on_host[..., *box.slices]
+        masked = options.masked and not changes_nothing(on_host)
+        crop = self.crop(box, occupied_bricks(on_host) if options.masked else None)
+        return crop.with_mask(mask, masked), box
 
     def mask(self, views: Float[Tensor, "b 1 m v u"]) -> Bool[Tensor, "b 1 d h w"]:
-        """The support of views on the whole grid."""
-        return self._mask(self._hull(views))
-
-    def _hull(self, views: Float[Tensor, "b 1 m v u"]) -> Support:
+        """The support of views on the whole grid, for which a GPU is not waited for."""
         grid, noise = self.projector.grid, self.options.noise
-        return support_from_views(views, self.cameras, grid, "hull", noise)
-
-    def _mask(self, support: Support) -> Bool[Tensor, "b 1 d h w"]:
-        assert support.mask is not None  # a hull has a mask
-        kind = self.options.support
-        return torch.cat([support_of(one, kind) for one in support.mask.split(1)])
+        return support_of(hull_mask(views, self.cameras, grid, noise), self.options.support)
 
     def crop(self, box: Box, bricks: Bool[Tensor, "z y x"] | None = None) -> Geometry:
         """The geometry of a crop, or of some bricks of it, made at most once while it is kept."""
@@ -147,16 +140,14 @@ def among(
     return whole.index_copy(1, index, values)
 
 
-def support_of(hull: Bool[Tensor, "1 1 d h w"], kind: str) -> Bool[Tensor, "1 1 d h w"]:
-    """A sample's mask: its visual "hull", that hull's "box", or by "auto" the hull if its box is
+def support_of(hull: Bool[Tensor, "b 1 d h w"], kind: str) -> Bool[Tensor, "b 1 d h w"]:
+    """Each sample's mask: its visual "hull", that hull's "box", or by "auto" the hull if its box is
     small, else the whole grid.
-
-    Samples are looked at one by one, so that it does not matter with which others one is in a
-    batch.
     """
-    box = Box.around(hull)
-    if kind == "hull" or (kind == "auto" and box.size < WORTH * hull.numel()):
+    if kind == "hull":
         return hull
-    mask = torch.full_like(hull, kind == "auto")
-    mask[..., *box.slices] = True
-    return mask
+    box = filled(bounds(hull[:, 0]), hull.shape[2:])[:, None]
+    if kind == "box":
+        return box
+    small = box.flatten(1).sum(dim=1) < WORTH * hull[0].numel()
+    return hull | ~small.view(-1, 1, 1, 1, 1)

@@ -149,7 +149,9 @@ class Frusta:
         if self.first is None:
             ramp = torch.linspace(-1, 1, self.n_depths, device=like.device, dtype=like.dtype)
             return ramp[:, None, None]
-        index = (self.first[:, :1] + torch.arange(self.shape[0])).to(like)
+        count, own = self.shape[0], {"device": like.device, "dtype": like.dtype}
+        # each made on the device, for nothing is copied there
+        index = torch.stack([torch.arange(z, z + count, **own) for z, *_ in self.first.tolist()])
         return (2 * index / max(1, self.n_depths - 1) - 1)[:, None, :, None, None]
 
     def to_world(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:

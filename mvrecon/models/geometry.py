@@ -5,7 +5,6 @@ Convention: inside a network every volume has the geometry's shape, be it the wh
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -67,15 +66,10 @@ class Geometry:
             raise ValueError("This geometry was made without frusta")
         return self.frusta
 
-    @cached_property
+    @property
     def network_mask(self) -> Bool[Tensor, "b 1 d h w"] | None:
-        """The mask for the networks in the world; none where one of ones would change nothing, and
-        take longer.
-        """
-        if not self.masked or self.mask is None:
-            return None
-        plain = self.mask.all() and not any(size % MULTIPLE for size in self.mask.shape[2:])
-        return None if plain else self.mask
+        """The mask for the networks in the world, if they know it."""
+        return self.mask if self.masked else None
 
     @property
     def visible(self) -> Bool[Tensor, "*b m 1 d h w"]:
@@ -138,6 +132,13 @@ class Geometry:
         column, cameras = self.column.to(row), self.cameras.to(row.device)
         frusta = None if self.frusta is None else (self.fine.to(row), self.coarse.to(row))
         return replace(self, row=row, column=column, cameras=cameras, frusta=frusta)
+
+
+def changes_nothing(mask: Bool[Tensor, "b 1 d h w"]) -> bool:
+    """Whether networks do the same without a mask, and take less time: one of ones, of sizes that
+    all of their scales halve.
+    """
+    return bool(mask.all()) and not any(size % MULTIPLE for size in mask.shape[2:])
 
 
 def whole_geometry(A: Projector, binning: int | None = None) -> Geometry:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.models import sparse
+from mvrecon.models.normalisation import keeps_channels_last, normalised_silu
 from mvrecon.models.sparse import Voxels, pyramid
 
 #: Levels of a U-Net, and how many voxels along each axis its coarsest level joins into one: crops
@@ -127,9 +128,7 @@ class ConvBlock(nn.Module):
 def _step(steps: nn.Sequential, x: Tensor, on: Voxels | None) -> Tensor:
     conv, norm = cast(nn.Conv3d, steps[0]), cast(nn.GroupNorm, steps[1])
     if on is None:
-        values = convolution(x, conv.weight)
-        # not the module's own call: it refuses a group of one value, of which the shift is left
-        return F.silu(torch.group_norm(values, norm.num_groups, norm.weight, norm.bias, norm.eps))
+        return normalised_silu(norm, convolution(x, conv.weight))
     x = sparse.convolved(x, conv.weight, on)
     return F.silu(
         sparse.group_norm(x, on.counts, norm.num_groups, (norm.weight, norm.bias), norm.eps)
@@ -142,6 +141,8 @@ def convolution(
     """A 3x3x3 convolution, zero beyond the volume; a small volume that is alone goes as two
     halves.
     """
+    if keeps_channels_last(x):  # steps between scales give channels first
+        x = x.contiguous(memory_format=torch.channels_last_3d)
     n, channels, d, h = x.shape[:4]
     quick = x.is_cuda or torch.is_autocast_enabled(x.device.type)  # bfloat16 is left to oneDNN
     if n > 1 or d < 2 or quick or channels * d * h > ALONE:

@@ -13,44 +13,18 @@ from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays.lines import tensors_of
 from mvrecon.models.consistency import anything, content_scale, typical_chord
 from mvrecon.models.cross_view.cells import from_cells, trimmed
 from mvrecon.models.cross_view.unet import PlainUNet
 from mvrecon.models.door import admitted
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
-from mvrecon.projectors.voxel_driven import Images, image_maps, looked
+from mvrecon.projectors.voxel_driven import Images, images_of, looked
 
 #: Voxels of the grid, along each axis, in one of the coarse grid of `Svct`.
 COARSE = 2
 #: The logit of a camera that does not see a voxel.
 UNSEEN = -1e4
-
-
-class KnownImages:
-    """Where the cameras of a rig see the voxels of grids, computed once on a device unless the
-    cameras may move.
-
-    Args:
-        cameras: the rig.
-    """
-
-    def __init__(self, cameras: Cameras):
-        self.cameras = cameras
-        self._known: dict[tuple[Sequence[int], torch.device], Images] = {}
-
-    def of(self, grid: Grid, device: torch.device) -> Images:
-        """Where the voxels of a grid are seen."""
-        key = grid.shape, device
-        if key in self._known:
-            return self._known[key]
-        with torch.inference_mode(False):  # training may use what evaluation has computed
-            maps = image_maps(self.cameras, grid).to(device)
-        images = Images(maps, self.cameras.ray_extent, grid.shape)
-        if not any(tensor.requires_grad for tensor in tensors_of(self.cameras)):
-            self._known[key] = images
-        return images
 
 
 def at_voxels(features: Float[Tensor, "b m c v u"], images: Images) -> Float[Tensor, "b m c d h w"]:
@@ -86,7 +60,6 @@ class PixelAligned(nn.Module):
         self.projector = projector
         self.chord = typical_chord(projector.grid)
         self.encoder = PlainUNet(2, 1, features, widths)
-        self._images = KnownImages(projector.cameras)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         views = admitted(views, self.projector.cameras, self.encoder.first.weight).contiguous()
@@ -105,8 +78,7 @@ class PixelAligned(nn.Module):
         self, features: Float[Tensor, "b m c v u"], grid: Grid
     ) -> Float[Tensor, "b m c d h w"]:
         """Each view's features at the projections of voxels' centres; zero where it sees none."""
-        images = self._images.of(grid, features.device)
-        return at_voxels(features, images)
+        return at_voxels(features, images_of(self.projector.cameras, grid, features))
 
 
 class DifNet(PixelAligned):

@@ -19,11 +19,12 @@ from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
-from mvrecon.models.pixel_aligned import KnownImages, at_voxels
+from mvrecon.models.pixel_aligned import at_voxels
 from mvrecon.models.sparse_view.filtered import Geometry as Slices
 from mvrecon.models.sparse_view.filtered import filtered, in_full_precision
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.radon import Radon
+from mvrecon.projectors.voxel_driven import images_of
 from mvrecon.reconstruct.filtered.filters import Filter
 
 #: Projections of the full circle for each voxel along the longer side of a slice: 256 for 64.
@@ -93,7 +94,6 @@ class RadonUNet(nn.Module):
         self.corrected_cameras = rig[list(range(angles // 2))]
         self.radon = Radon(grid, self.corrected_cameras)
         self.cropping = Cropping(projector, Options())
-        self._images = KnownImages(cameras)
         self.start = checked_start(start)
         self.filter: Filter = filter
         self.chord = typical_chord(grid)
@@ -123,7 +123,7 @@ class RadonUNet(nn.Module):
     ) -> Float[Tensor, "b 1 a z s"]:
         """Ideal projections over half a circle, in the unit of the volume times mm."""
         means = (geometry.row * views).transpose(1, 2)
-        images = self._images.of(geometry.A.grid, means.device)
+        images = images_of(geometry.A.cameras, geometry.A.grid, means)
         lifted = at_voxels(means, images).squeeze(2)
         residual = MAGNIFIED * geometry.residual(start, views)
         features = self.net(torch.cat([start, residual, lifted], dim=1))

@@ -65,21 +65,25 @@ class Voxels:
 
 def voxels_of(mask: Bool[Tensor, "n 1 d h w"]) -> Voxels:
     """The voxels in which masks are true."""
+    return pyramid(mask, 1)[0]
+
+
+def _voxels(mask: Bool[Tensor, "n 1 d h w"], n_bricks: int, counts: list[int]) -> Voxels:
+    """The voxels in which masks are true, whose numbers and that of their bricks are known."""
     n, _, d, h, w = mask.shape
-    behind = [-size % edge for size, edge in zip((d, h, w), BRICK, strict=True)]
-    padded = F.pad(mask[:, 0], (0, behind[2], 0, behind[1], 0, behind[0]))
-    bricks = _bricks(padded, 0)
-    active = bricks.any(dim=-1).any(dim=-1).any(dim=-1).nonzero()  # [q 4]
+    bricks = _bricks(_padded(mask), 0)
+    active = _places_in(bricks.flatten(4).any(dim=-1), n_bricks)  # [q 4]
     voxels = bricks[tuple(active.unbind(dim=1))].flatten(1)  # [q 128]
-    brick, inner = voxels.nonzero().unbind(dim=1)
+    brick, inner = _places_in(voxels, sum(counts)).unbind(dim=1)
     sample, *corner = active[brick].unbind(dim=1)
     steps = zip(corner, BRICK, places_of(inner, BRICK), strict=True)
     z, y, x = (first * edge + step for first, edge, step in steps)
-    row = torch.full((n, *[size + 2 for size in padded.shape[1:]]), len(z), device=mask.device)
+    outer = [count * edge + 2 for count, edge in zip(bricks.shape[1:4], BRICK, strict=True)]
+    row = torch.full((n, *outer), len(z), device=mask.device)
     row[sample, z + 1, y + 1, x + 1] = torch.arange(len(z), device=mask.device)
     return Voxels(
         shape=(n, d, h, w),
-        counts=mask.flatten(1).sum(dim=1).tolist(),
+        counts=counts,
         place=((sample * d + z) * h + y) * w + x,
         row=row,
         around=_bricks(row, 2)[tuple(active.unbind(dim=1))],
@@ -105,12 +109,30 @@ def _bricks(volumes: Shaped[Tensor, "n d h w"], more: int) -> Shaped[Tensor, "n 
     return volumes
 
 
+def _padded(mask: Bool[Tensor, "n 1 d h w"]) -> Bool[Tensor, "n e i x"]:
+    """Masks of whole bricks."""
+    d, h, w = (-size % edge for size, edge in zip(mask.shape[2:], BRICK, strict=True))
+    return F.pad(mask[:, 0], (0, w, 0, h, 0, d))
+
+
+def _places_in(mask: Bool[Tensor, "*n"], count: int) -> Int[Tensor, "k axes"]:
+    """Where a mask is true, in so many places; where that is known, a GPU is not waited for."""
+    return torch.nonzero_static(mask, size=count) if mask.is_cuda else mask.nonzero()
+
+
 def pyramid(mask: Bool[Tensor, "n 1 d h w"], levels: int) -> list[Voxels]:
-    """The voxels of a mask, and of it max-pooled by 2, 4, ..."""
-    scales = [voxels_of(mask)]
+    """The voxels of a mask, and of it max-pooled by 2, 4, ...; their numbers are read at once, for
+    each of which the host would wait for a GPU.
+    """
+    masks = [mask]
     for _ in range(1, levels):
-        scales.append(voxels_of(F.max_pool3d(scales[-1].mask.float(), 2, ceil_mode=True) > 0))
-    return scales
+        masks.append(F.max_pool3d(masks[-1].float(), 2, ceil_mode=True) > 0)
+    bricks = (_bricks(_padded(one), 0).flatten(4).any(dim=-1).sum().view(1) for one in masks)
+    sizes = [
+        torch.cat([q, one.flatten(1).sum(dim=1)]) for q, one in zip(bricks, masks, strict=True)
+    ]
+    numbers = torch.stack(sizes).tolist()
+    return [_voxels(one, q, counts) for one, (q, *counts) in zip(masks, numbers, strict=True)]
 
 
 def convolved(

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.models.networks import GROUPS
+from mvrecon.models.normalisation import normalised_silu
 
 
 class UNet2d(nn.Module):
@@ -80,13 +81,8 @@ class ConvBlock2d(nn.Module):
         self.second_norm = nn.GroupNorm(groups, outputs)
 
     def forward(self, x: Float[Tensor, "n i h w"]) -> Float[Tensor, "n o h w"]:
-        x = _normalised(self.first_norm, self.first(x))
-        return x + _normalised(self.second_norm, self.second(x))
-
-
-def _normalised(norm: nn.GroupNorm, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    # not the module's own call: it refuses a group of one value, of which the shift is left
-    return F.silu(torch.group_norm(x, norm.num_groups, norm.weight, norm.bias, norm.eps))
+        x = normalised_silu(self.first_norm, self.first(x))
+        return x + normalised_silu(self.second_norm, self.second(x))
 
 
 def by_slices(

@@ -14,6 +14,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
 from mvrecon.kernels.backends import kernels_for
+from mvrecon.kernels.known import key_of, known
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.kernels.voxels import reference as voxel_reference
@@ -58,8 +59,7 @@ def backproject(
     if weight not in ("none", "distance"):
         raise ValueError(f"Unknown weight {weight!r}. Known: none, distance")
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
-    images = Images(image_maps(cameras, grid).to(views.device), cameras.ray_extent, grid.shape)
-    return looked(views, images, weight == "distance", backend)
+    return looked(views, images_of(cameras, grid, views), weight == "distance", backend)
 
 
 class Images(NamedTuple):
@@ -74,6 +74,18 @@ class Images(NamedTuple):
     maps: Float[Tensor, "m 4 2 3"]
     ray_extent: Sequence[float]
     shape: Sequence[int]
+
+
+def images_of(cameras: Cameras, grid: Grid, like: Tensor) -> Images:
+    """Where the voxels of a grid are seen, on the device of a tensor; computed there once, unless
+    the cameras may move.
+    """
+
+    def maps() -> Tensor:
+        return image_maps(cameras, grid).to(like.device)
+
+    key = "image maps", key_of(grid)
+    return Images(known(cameras, key, like, maps), cameras.ray_extent, grid.shape)
 
 
 def looked(

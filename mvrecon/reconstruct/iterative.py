@@ -33,7 +33,8 @@ def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> SirtW
     """
     ones = torch.ones(1, 1, *A.domain_shape, dtype=dtype, device=A.device)
     with torch.no_grad():
-        mirror = A.mirror()
+        # a GPU does the whole in less time than its host waits for lists of views
+        mirror = None if A.device.type == "cuda" else A.mirror()
         if mirror is None:
             rows = A(ones)
             return SirtWeights(inverse_sums(rows), inverse_sums(A.T(torch.ones_like(rows))))

@@ -26,6 +26,8 @@ from mvrecon.kernels.rays.cuda import selfcheck
 GPU = torch.device("cuda", 0)
 #: Operators that take tensors of both memories.
 MIXED = {"copy_", "_to_copy", "index", "index_put", "index_put_", "_index_put_impl_"}
+#: Operators of mvrecon that read whole numbers (where a support lies) from main memory.
+ALONG_RAYS = {"project", "backproject", "lines_vjp"}
 #: Operators whose result, or its size, the host waits for.
 WAITING = {
     *("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "bincount"),
@@ -135,7 +137,9 @@ class _Operators(TorchDispatchMode):
         kwargs, name = kwargs or {}, str(func.overloadpacket).partition(".")[2]
         tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
         device = any(isinstance(x, OnGpu) for x in tensors)
-        host = [tuple(x.shape) for x in tensors if not isinstance(x, OnGpu) and x.ndim]
+        read = name in ALONG_RAYS
+        away = [x for x in tensors if not isinstance(x, OnGpu) and x.ndim]
+        host = [tuple(x.shape) for x in away if not (read and x.dtype == torch.int32)]
         if device and host and name not in MIXED:
             raise RuntimeError(f"{func}: tensors on cuda:0 and in main memory, {host}")
         if device and name in PRODUCTS and not tensors[0].is_floating_point():

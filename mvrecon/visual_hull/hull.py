@@ -2,7 +2,6 @@
 of the views (Laurentini, IEEE PAMI 16, 1994).
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 
 import torch
@@ -15,7 +14,8 @@ from mvrecon.cameras.views import check_finite
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.cuda import bricks
-from mvrecon.kernels.footprints import Rule
+from mvrecon.kernels.footprints import Prints, Rule
+from mvrecon.kernels.known import key_of, known
 from mvrecon.kernels.rays.cuda import selfcheck
 from mvrecon.visual_hull.footprints import Bricks, footprints, prints_of, summed_area_tables
 from mvrecon.visual_hull.judging import AT_ONCE, judged, proofs
@@ -55,7 +55,8 @@ def visual_hull(
     than `ray_gap`; else see `thin_witnesses`.
 
     Args:
-        views: line integrals, one a ray, finite.
+        views: line integrals, one a ray, finite; what is not finite on a GPU, which is not asked,
+            is no background: it makes no brick empty.
         cameras: the rig.
         grid, brick: where the voxels lie, and how many make a brick's edge; the last bricks may be
             cut.
@@ -69,7 +70,7 @@ def visual_hull(
         ValueError: views of another size than the rig's or not finite, a NaN threshold, an edge or
             witnesses below one.
     """
-    check_measured(views, cameras)
+    check_measured(views, cameras, on_gpu=False)
     if brick < 1 or witnesses < 1:
         raise ValueError(
             f"Need a brick's edge and witnesses of at least 1, got {brick} and {witnesses}"
@@ -89,10 +90,13 @@ def at_once(
     judge: Callable[..., Tensor] = judged,
 ) -> Bool[Tensor, "b z y x"]:
     """The bricks that stay, all of them and all views at once."""
-    prints = prints_of(cameras, grid, GAPS)
-    numbers = prints.numbers.to(foreground.device, non_blocking=foreground.is_cuda)
-    tables = summed_area_tables(foreground)
-    return judge(tables, prints._replace(numbers=numbers), rule, grid.shape)
+
+    def moved() -> Prints:
+        prints = prints_of(cameras, grid, GAPS)
+        return prints._replace(numbers=prints.numbers.to(foreground.device))
+
+    prints = known(cameras, ("footprints", key_of(grid)), foreground, moved)
+    return judge(summed_area_tables(foreground), prints, rule, grid.shape)
 
 
 def refined(
@@ -129,8 +133,10 @@ def expand(
     return _repeated(bricks, brick, shape)[:, None]
 
 
-def check_measured(views: Float[Tensor, "b 1 m v u"], cameras: Cameras) -> None:
-    """Refuse views from which no hull can be computed.
+def check_measured(
+    views: Float[Tensor, "b 1 m v u"], cameras: Cameras, on_gpu: bool = True
+) -> None:
+    """Refuse views from which no hull can be computed; `on_gpu` as of `check_finite`.
 
     Raises:
         ValueError: a wrong rank or size, or values that are not finite.
@@ -140,7 +146,7 @@ def check_measured(views: Float[Tensor, "b 1 m v u"], cameras: Cameras) -> None:
         raise ValueError(
             f"Expected views [b 1 m v u] with last sizes {expected}, got {tuple(views.shape)}"
         )
-    check_finite(views)
+    check_finite(views, on_gpu)
 
 
 def _foreground(
@@ -149,10 +155,12 @@ def _foreground(
     # a number is checked on the host, since a tensor of one would have to be copied to a GPU
     several = isinstance(threshold, Tensor)
     limits = threshold.to(views).expand_as(views) if several else float(threshold)
-    bad = int(limits.isnan().sum()) if isinstance(limits, Tensor) else int(math.isnan(limits))
+    asked = not isinstance(limits, Tensor) or limits.is_cpu
+    bad = int(torch.as_tensor(limits).isnan().sum()) if asked else 0
     if bad:
         raise ValueError(f"Expected a threshold, got {bad} values that are NaN")
-    return (views > limits)[:, 0]
+    # what is not finite, which nobody waits for on a GPU, proves nothing empty
+    return (~(views <= limits) | views.isinf())[:, 0]
 
 
 def _tried(device: str, dtype: torch.dtype) -> selfcheck.Tried:

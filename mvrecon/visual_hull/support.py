@@ -87,14 +87,38 @@ def support_from_views(
         raise ValueError(f"Unknown support {kind!r}. Known: {', '.join(KINDS)}")
     if kind == "none":
         return Support(Box.whole(grid.shape), None, "none", 1.0)
+    rig = _with_frusta(cameras)
+    brick = brick_edge(grid) if brick is None else brick
+    bricks, evidence = _bricks(views, rig, grid, brick, dict(noise or {}), keep_unseen)
+    return _chosen(kind, expand(bricks, brick, grid.shape), middle(grid, brick), evidence)
+
+
+def hull_mask(
+    views: Float[Tensor, "b 1 m v u"],
+    cameras: Cameras | ExplicitRays,
+    grid: Grid,
+    noise: Mapping[str, Any] | None = None,
+) -> Bool[Tensor, "b 1 d h w"]:
+    """The voxels of the views' visual hull, on the views' device; a GPU is waited for with counts
+    alone.
+
+    Args:
+        views, cameras, grid, noise: as of `support_from_views`, which also tells the box.
+
+    Raises:
+        ValueError: as `support_from_views`.
+    """
+    brick = brick_edge(grid)
+    bricks, _ = _bricks(views, _with_frusta(cameras), grid, brick, dict(noise or {}), True)
+    return expand(bricks, brick, grid.shape)
+
+
+def _with_frusta(cameras: Cameras | ExplicitRays) -> Cameras:
     if isinstance(cameras, ExplicitRays):
         raise ValueError(
-            f"A support is computed from cameras with frusta, got explicit rays and kind {kind!r}; "
-            f"use 'none'"
+            "A support is computed from cameras with frusta, got explicit rays; use kind 'none'"
         )
-    brick = brick_edge(grid) if brick is None else brick
-    bricks, evidence = _bricks(views, cameras, grid, brick, dict(noise or {}), keep_unseen)
-    return _chosen(kind, expand(bricks, brick, grid.shape), _middle(grid, brick), evidence)
+    return cameras
 
 
 def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stacklevel: int = 3) -> None:
@@ -139,9 +163,11 @@ def brick_edge(grid: Grid) -> int:
     return min(8, max(1, max(grid.shape) // 32))
 
 
-def _middle(grid: Grid, brick: int) -> Box:
+def middle(grid: Grid, brick: int | None = None) -> Box:
+    """The brick at a grid's centre, by default of `brick_edge`."""
     d, h, w = (n // 2 for n in grid.shape)
-    return Box((d, h, w), (d + 1, h + 1, w + 1)).aligned(brick, grid.shape)
+    edge = brick_edge(grid) if brick is None else brick
+    return Box((d, h, w), (d + 1, h + 1, w + 1)).aligned(edge, grid.shape)
 
 
 def _bricks(

@@ -76,7 +76,7 @@ REFUSED = {
     "no GPU": ({"accelerator": "cpu"}, {}, {}, "a GPU, got a training on a CPU"),
     "several devices": ({"devices": 2}, {}, {}, "one device, got trainer.devices=2"),
     "scaled losses": ({"precision": "16-mixed"}, {}, {}, "got trainer.precision=16-mixed"),
-    "a hull": ({}, {"support": "hull"}, {}, "got model.support=hull"),
+    "a hull": ({}, {"name": "single_pass", "support": "hull"}, {}, "got model.support=hull"),
     "a crop": ({}, {"support": "hull", "crop": True}, {}, "got model.crop=true"),
     "many rigs": ({}, {}, {"rigs": 4}, "one rig, got data.rigs=4"),
     "alignment": ({}, {"name": "corrected"}, {}, "got corrected"),
@@ -91,6 +91,7 @@ def test_what_no_graph_can_hold_is_refused(what, monkeypatch):
     """
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     check_graph(TRAINER, MODEL, DATA)
+    check_graph(TRAINER, {"name": "cross_view", "support": "hull"}, DATA)  # on the whole grid
     trainer, model, data, words = REFUSED[what]
     with pytest.raises(ValueError, match=f"trainer.graph=true needs .*{words}; trainer.graph=f"):
         check_graph({**TRAINER, **trainer}, {**MODEL, **model}, {**DATA, **data})

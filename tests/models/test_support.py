@@ -9,7 +9,6 @@ from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import cropping
 from mvrecon.models.pooling import disagreement
 from mvrecon.parts import MODELS
-from mvrecon.visual_hull.support import Support
 
 HEAD = {"name": "softmax_depth"}
 MODEL_OPTIONS = {
@@ -50,8 +49,7 @@ def _build(
 
 def _with_mask(monkeypatch, mask: torch.Tensor) -> None:
     """As if the views told this mask."""
-    found = Support(Box.around(mask), mask, "hull", float(mask.float().mean()))
-    monkeypatch.setattr(cropping, "support_from_views", lambda *_args, **_options: found)
+    monkeypatch.setattr(cropping, "hull_mask", lambda *_args, **_options: mask)
 
 
 def _close(a: torch.Tensor, b: torch.Tensor, relative: float) -> bool:
@@ -166,6 +164,14 @@ def test_auto_takes_everything_where_the_hull_holds_most_of_it():
     assert cropping.support_of(hull, "auto").all() and torch.equal(
         cropping.support_of(hull, "hull"), hull
     )
+    small = torch.zeros_like(hull)
+    small[..., 2, 3:5, 7] = True
+    both = torch.cat([hull, small])  # each by itself
+    assert cropping.support_of(both, "auto")[0].all()
+    assert torch.equal(cropping.support_of(both, "auto")[1:], small)
+    assert torch.equal(cropping.support_of(both, "box")[1:], small)
+    assert cropping.support_of(both, "box")[0].sum() == 8 * 10 * 10
+    assert not cropping.support_of(torch.zeros_like(hull), "box").any()
 
 
 def test_every_parameter_learns_on_a_support_met_first_in_evaluation(

@@ -9,6 +9,7 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
+from mvrecon.kernels.known import known
 from mvrecon.reconstruct.filtered.orbit import Orbit, orbit_of
 
 #: A scan is a whole turn if its largest gap is at most so many median steps.
@@ -57,7 +58,8 @@ class AngularUpsampling:
         """Views of all angles, linear between measured neighbours; measured ones stay as they
         are.
         """
-        views = views[:, :, self.order.to(views.device)]
+        order = known(self.cameras, "order", views, lambda: self.order.to(views.device))
+        views = views.index_select(2, order)
         if self.factor == 1:
             return views
         after = views.roll(-1, dims=2)

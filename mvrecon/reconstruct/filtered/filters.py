@@ -79,5 +79,6 @@ def filter_rows(
     Divide by the pixel pitch in mm for (unit of the views) / mm. Rows are continued by zeros.
     """
     length = 2 * (len(response) - 1)
-    spectrum = torch.fft.rfft(views, n=length) * response.to(views)
+    spectrum = torch.fft.rfft(views, n=length)
+    spectrum *= response.to(views)  # in place: a spectrum is twice as large as the views
     return torch.fft.irfft(spectrum, n=length)[..., : views.shape[-1]]

@@ -19,8 +19,6 @@ factor (R / D) belongs to its virtual detector at the axis. Rows of a cone beam 
 in their tilted planes, as theirs are. For parallel rays W = 1 / T.U.
 """
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -36,24 +34,22 @@ from mvrecon.reconstruct.filtered.scan_weights import (
 
 
 def pixel_weights(
-    cameras: Cameras, scan: Scan, views: slice, dtype: torch.dtype = torch.float32
+    rig: Cameras, scan: Scan, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "m v u"]:
-    """The weights of some views' pixels, without unit: radian per pixel times mm per mm.
+    """The weights of views' pixels, without unit: radian per pixel times mm per mm.
 
     Args:
-        cameras: the whole rig.
-        scan: its scan.
-        views: which views.
+        rig: the views' cameras.
+        scan: of these views, on the cameras' device.
         dtype: of the arithmetic over pixels; geometry is float64.
     """
-    rig, orbit = cameras[views], scan.orbit
-    device = rig.source.device
+    orbit, device = scan.orbit, rig.source.device
     v, u = (torch.arange(n, dtype=dtype, device=device) for n in rig.shape)
-    tangents, rows, pitch = orbit.tangents[views], unit(rig.u), rig.u.norm(dim=-1)
+    tangents, rows, pitch = orbit.tangents, unit(rig.u), rig.u.norm(dim=-1)
     slant = (tangents * rows).sum(dim=-1)
-    angle = (scan.steps[views] / pitch).to(dtype)[:, None, None]
-    fan = _fan(rig, scan, views, u, v)
-    share = redundancy(scan, views, fan) * angle
+    angle = (scan.steps / pitch).to(dtype)[:, None, None]
+    fan = _fan(rig, scan, u, v)
+    share = redundancy(scan, fan) * angle
     if rig.parallel:
         return share / slant.abs().to(dtype)[:, None, None]
     start = rig.origin - rig.source
@@ -64,13 +60,12 @@ def pixel_weights(
 
 
 def _fan(
-    rig: Cameras, scan: Scan, views: slice, u: Float[Tensor, " u"], v: Float[Tensor, " v"]
+    rig: Cameras, scan: Scan, u: Float[Tensor, " u"], v: Float[Tensor, " v"]
 ) -> Float[Tensor, "m v u"]:
     """Fan coordinates; of one pixel a view where the shares do not depend on them."""
     if scan.kind == "full":
         return u.new_zeros(len(rig), 1, 1)
-    part = replace(scan.orbit, outwards=scan.orbit.outwards[views])
-    return fan_coordinate(rig, part, u, v)
+    return fan_coordinate(rig, scan.orbit, u, v)
 
 
 def _squares(

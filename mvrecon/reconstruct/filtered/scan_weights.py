@@ -9,7 +9,7 @@ theta + pi.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -57,6 +57,19 @@ class Scan:
     overlap: float = 0.0
     side: int = 1
     columns: tuple[int, int] = (0, 0)
+
+    def of(self, views: slice) -> "Scan":
+        """The part of some views; what the whole scan is made for stays."""
+        orbit = replace(self.orbit, outwards=self.orbit.outwards[views])
+        return replace(self, orbit=orbit, angles=self.angles[views], steps=self.steps[views])
+
+    def to(self, device: torch.device) -> "Scan":
+        """The same on a device."""
+        orbit = self.orbit
+        axis, centre, outwards = (x.to(device) for x in (orbit.axis, orbit.centre, orbit.outwards))
+        moved = replace(orbit, axis=axis, centre=centre, outwards=outwards)
+        angles, steps = self.angles.to(device), self.steps.to(device)
+        return replace(self, orbit=moved, angles=angles, steps=steps)
 
 
 def scan_of(cameras: Cameras, grid: Grid, kind: ScanKind = "auto") -> Scan:
@@ -187,8 +200,8 @@ def along(
     return first + by_v * v[:, None] + by_u * u
 
 
-def redundancy(scan: Scan, views: slice, fan: Float[Tensor, "m v u"]) -> Float[Tensor, "m v u"]:
-    """The share of each ray, so that the shares of a line's measurements add up to one.
+def redundancy(scan: Scan, fan: Float[Tensor, "m v u"]) -> Float[Tensor, "m v u"]:
+    """The share of each ray of a scan's views; the shares of a line's measurements add up to one.
 
     Short scans: Parker, Optimal short scan convolution reconstruction for fanbeam CT, Med. Phys. 9,
     1982, eq. 12; with a longer arc than needed the fan angle is the one that it would suffice for
@@ -196,7 +209,7 @@ def redundancy(scan: Scan, views: slice, fan: Float[Tensor, "m v u"]) -> Float[T
     array, Med. Phys. 29, 2002.
     """
     if scan.kind == "short":
-        beta, delta = scan.angles[views, None, None].to(fan), scan.overlap
+        beta, delta = scan.angles[:, None, None].to(fan), scan.overlap
         gamma = fan.clamp(-delta * 0.9999, delta * 0.9999)
         begin = (beta / (delta + gamma)).clamp(0, 2)
         end = ((math.pi + 2 * delta - beta) / (delta - gamma)).clamp(0, 2)

@@ -1,7 +1,7 @@
 """Filtered back-projection block by block, so that views may be larger than memory."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,15 +12,18 @@ from torch.nn.functional import pad
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.known import key_of, known
 from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check_floating, check_views
-from mvrecon.projectors.voxel_driven import backproject
+from mvrecon.projectors.voxel_driven import Images, image_maps, looked
 from mvrecon.reconstruct.filtered.filters import Filter, filter_rows, ramp_response
 from mvrecon.reconstruct.filtered.pixel_weights import pixel_weights
-from mvrecon.reconstruct.filtered.scan_weights import ScanKind, scan_of
+from mvrecon.reconstruct.filtered.scan_weights import Scan, ScanKind, scan_of
 
-#: Pixels in memory at a time; filtering takes about 24 bytes for each of them.
+#: Pixels in memory at a time, weighted and filtered: 8 bytes for each of them.
 BLOCK_PIXELS = 2**24
+#: Pixels filtered at a time, which takes about 24 bytes for each of them.
+FILTERED_PIXELS = 2**21
 
 #: read(first, last): the views [b c first..last v u].
 Read = Callable[[int, int], Tensor]
@@ -34,6 +37,70 @@ class Filtering:
     cutoff: float = 1.0
     scan: ScanKind = "auto"
     weights_from: Cameras | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is computed of a rig before any view is filtered.
+
+    Args:
+        rig: that weights and filter belong to.
+        scan: of this rig.
+        response: of the filter.
+        images: where every voxel is seen in the filtered views.
+        pixels: of a filtered view.
+    """
+
+    rig: Cameras
+    scan: Scan
+    response: Float[Tensor, " frequency"]
+    images: Images
+    pixels: int
+
+    def to(self, device: torch.device) -> "Plan":
+        """The same on a device."""
+        rig, scan, response = (x.to(device) for x in (self.rig, self.scan, self.response))
+        images = self.images._replace(maps=self.images.maps.to(device))
+        return replace(self, rig=rig, scan=scan, response=response, images=images)
+
+    def filtered(self, views: Float[Tensor, "b c k v u"], part: slice) -> Tensor:
+        """Some of the views, weighted and filtered, a few at a time."""
+        volumes, rows = views.shape[0] * views.shape[1], []
+        size = max(1, FILTERED_PIXELS // (volumes * self.pixels))
+        for some in _slices(part.start, part.stop, size):
+            weights = pixel_weights(self.rig[some], self.scan.of(some), views.dtype)
+            block = views[:, :, some.start - part.start : some.stop - part.start]
+            block = pad(block * weights, self.scan.columns)
+            rows.append(filter_rows(block, self.response).contiguous())
+        return rows[0] if len(rows) == 1 else torch.cat(rows, dim=2)
+
+
+def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
+    rig = cameras if filtering.weights_from is None else filtering.weights_from
+    scan = scan_of(rig, grid, filtering.scan)
+    target = _widened(cameras, *scan.columns)
+    response = ramp_response(target.shape[1], filtering.filter, filtering.cutoff)
+    maps = image_maps(target, grid)
+    images = Images(maps, target.ray_extent, grid.shape)
+    return Plan(rig, scan, response, images, math.prod(target.shape))
+
+
+def _known(
+    cameras: Cameras, grid: Grid, filtering: Filtering, like: Tensor, make: Callable[[], Plan]
+) -> Plan:
+    """A plan that is made once on each device, but with weights from another rig, which may be
+    written to.
+    """
+    if filtering.weights_from is not None:
+        return make()
+    options = filtering.filter, filtering.cutoff, filtering.scan
+    return known(cameras, ("filtering", key_of(grid), *options), like, make)
+
+
+def _slices(first: int, last: int, size: int) -> Iterator[slice]:
+    """Consecutive parts of a range, each of so many at most."""
+    for start in range(first, last, size):
+        yield slice(start, min(start + size, last))
 
 
 def filtered_backprojection(
@@ -57,19 +124,16 @@ def filtered_backprojection(
             f"Expected weights_from as a rig of {len(cameras)} views of {cameras.shape}, got "
             f"{len(ideal)} of {ideal.shape}"
         )
-    plan = scan_of(ideal, grid, filtering.scan)
-    target = _widened(cameras, *plan.columns)
-    response = ramp_response(target.shape[1], filtering.filter, filtering.cutoff)
-    size = max(1, BLOCK_PIXELS // (volumes * math.prod(target.shape)))
+    plan = _known(cameras, grid, filtering, cameras.source, lambda: _plan(cameras, grid, filtering))
+    size = max(1, BLOCK_PIXELS // (volumes * plan.pixels))
     total = None
-    for first in range(0, len(cameras), size):
-        part = slice(first, min(first + size, len(cameras)))
+    for part in _slices(0, len(cameras), size):
         views = read(part.start, part.stop)
         check_views(views, cameras[part])
         check_floating(views, "views")
-        weights = pixel_weights(ideal, plan, part, wide(views).dtype).to(views.device)
-        rows = filter_rows(pad(wide(views) * weights, plan.columns), response)
-        volume = backproject(rows, target[part], grid, "distance")
+        near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
+        images = near.images._replace(maps=near.images.maps[part])
+        volume = looked(near.filtered(wide(views), part), images, weighted=True)
         total = volume if total is None else total.add_(volume)
     assert total is not None  # a rig has at least one camera
     return total

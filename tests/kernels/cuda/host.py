@@ -103,6 +103,10 @@ class Driver:
         run(function, c_void_p(arguments[0]), c_int(across), c_int(down))
         return 0
 
+    def cuDriverGetVersion(self, number) -> int:
+        number._obj.value = 12020
+        return 0
+
     def cuGetErrorString(self, code, text) -> int:
         text._obj.value = b"a reason"
         return 0

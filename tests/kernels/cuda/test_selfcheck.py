@@ -29,6 +29,7 @@ def test_a_wrong_back_end_is_found_and_said_once(host, monkeypatch, caplog):
     for _ in range(2):
         assert "project differs" in str(selfcheck.reason("cpu", "siddon"))
     assert len(caplog.records) == 1
+    assert refused("project differs from the reference by 1.0e-03, expected at most 1e-04")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
@@ -100,8 +101,27 @@ REASONS = {
 }
 
 
+def refused(words):
+    """Whether "auto" takes the reference and "cuda" raises with the words, in one line; the tensor
+    says that it is on a GPU, which the stand-in has in main memory.
+    """
+    x = SimpleNamespace(device=torch.device("cuda:0"), shape=(1, 1, 4, 4, 4), dtype=torch.float32)
+    right = selfcheck.reason
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(RuntimeError) as error:
+        patch.setattr(selfcheck, "reason", lambda device, *rest: right("cpu", *rest))
+        assert kernels_for(x, "auto", "siddon") == ("reference", reference)
+        kernels_for(x, "cuda", "siddon")
+    line = str(error.value)
+    assert line.startswith("backend 'cuda' cannot be used on cuda:0: ") and "\n" not in line
+    return words in line
+
+
+@pytest.mark.door
 @pytest.mark.parametrize("what", REASONS)
 def test_what_is_missing_is_the_reason(what, host, monkeypatch):
+    """Without a driver or a compiler, or with an old one, `auto` takes the reference and `cuda`
+    raises with the reason.
+    """
     module, name, result, words = REASONS[what]
 
     def fail(*_):
@@ -110,31 +130,36 @@ def test_what_is_missing_is_the_reason(what, host, monkeypatch):
         return result
 
     monkeypatch.setattr(module, name, fail)
-    assert words in str(selfcheck.reason("cpu"))
+    assert words in str(selfcheck.reason("cpu")) and refused(words)
     monkeypatch.undo()
     assert words in str(selfcheck.reason("cpu"))  # it is remembered
 
 
-@pytest.mark.parametrize("call", ["cuModuleLoadData", "cuLaunchKernel"])
+REFUSALS = {
+    "cuModuleLoadData": "CUDA's driver, of CUDA 12.2, does not take kernels by NVRTC 0.0: a reason "
+    "(error 222)",
+    "cuLaunchKernel": "CUDA's driver: a reason (error 222)",
+}
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("call", REFUSALS)
 def test_what_the_driver_refuses_is_the_reason(call, host):
+    """Kernels that an old driver does not take, or a device does not start, are not used, and the
+    reason names both versions.
+    """
     host.failure[call] = 222
-    assert "CUDA's driver: a reason (error 222)" in str(selfcheck.reason("cpu"))
+    assert REFUSALS[call] in str(selfcheck.reason("cpu")) and refused(REFUSALS[call])
 
 
-def test_a_full_memory_is_not_remembered(host):
-    host.failure["cuLaunchKernel"] = driver.OUT_OF_MEMORY
-    assert "out of memory" in str(selfcheck.reason("cpu"))
+@pytest.mark.door
+@pytest.mark.parametrize("call", REFUSALS)
+def test_a_full_memory_is_not_remembered(call, host):
+    """A full memory of a device is told, and forgotten, since another time there may be room."""
+    host.failure[call] = driver.OUT_OF_MEMORY
+    assert "out of memory" in str(selfcheck.reason("cpu")) and refused("out of memory")
     host.failure.clear()
     assert selfcheck.reason("cpu") is None
-
-
-def test_auto_falls_back_where_cuda_raises(host):
-    """The tensor says that it is on a GPU, of which there is none."""
-    x = SimpleNamespace(device=torch.device("cuda:0"), shape=(1, 1, 4, 4, 4), dtype=torch.float32)
-    host.failure["cuLaunchKernel"] = 222
-    assert kernels_for(x, "auto", "joseph") == ("reference", reference)
-    with pytest.raises(RuntimeError, match="backend 'cuda' cannot be used on cuda:0: "):
-        kernels_for(x, "cuda", "joseph")
 
 
 @pytest.mark.parametrize(("trial", "name"), [(warp_trial, "warp_back"), (voxel_trial, "show")])

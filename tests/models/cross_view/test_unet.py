@@ -1,5 +1,7 @@
 """The U-Net without normalisation: sizes, its start, and the numbers that it convolves in."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -71,6 +73,23 @@ def test_bfloat16_is_taken_only_where_the_processor_has_it_and_it_is_asked_for(m
         assert torch.equal(network(x), exact)
     with arithmetic("auto", x.double()):
         assert not torch.is_autocast_enabled("cpu")
+
+
+@pytest.mark.parametrize(("capability", "narrow"), [((7, 5), False), ((8, 0), True)])
+def test_a_gpu_convolves_in_bfloat16_from_ampere_on(capability, narrow, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda *_, **__: narrow)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: capability)
+    x = SimpleNamespace(
+        is_cpu=False, is_cuda=True, dtype=torch.float32, device=torch.device("cuda", 7)
+    )
+    unet.gpu_has_bfloat16.cache_clear()
+    context = arithmetic("auto", x)
+    unet.gpu_has_bfloat16.cache_clear()
+    if narrow:
+        assert (context.device, context.fast_dtype) == ("cuda", torch.bfloat16)
+    else:
+        assert not isinstance(context, torch.autocast)
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,8 @@ def test_views_come_once_in_blocks_of_the_stated_size(monkeypatch):
     assert calls == [(k, k + 5) for k in range(0, 120, 5)]
     assert torch.allclose(streamed, whole, atol=1e-6 * whole.abs().max().item())
     assert torch.allclose(fdk(Drr(VOLUME, rig), views), streamed, atol=1e-6)
+    monkeypatch.setattr(streaming, "FILTERED_PIXELS", 2 * rows * columns + 1)
+    assert torch.equal(fdk_streamed(read, rig, VOLUME), streamed)  # two views filtered at a time
 
 
 @pytest.mark.door

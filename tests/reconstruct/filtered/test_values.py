@@ -132,8 +132,8 @@ def test_shares_of_a_line_add_up_to_one(kind: str, beta: float):
     from_there = beta + torch.pi - 2 * fan
     one = replace(scan, angles=torch.full((41,), beta, dtype=torch.float64))
     other = replace(scan, angles=from_there)
-    first = redundancy(one, slice(None), fan.reshape(-1, 1, 1)).flatten()
-    second = redundancy(other, slice(None), -fan.reshape(-1, 1, 1)).flatten()
+    first = redundancy(one, fan.reshape(-1, 1, 1)).flatten()
+    second = redundancy(other, -fan.reshape(-1, 1, 1)).flatten()
     measured = (from_there <= scan.angles.max()) | (kind == "offset")
     assert kind == "short" or measured.all()
     total = first + torch.where(measured, second, 0.0)

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from mvrecon.kernels.rays.cuda import nvrtc
 from mvrecon.kernels.rays.cuda.scene import Packed
 from mvrecon.kernels.rays.cuda.sources import BLOCK
 
@@ -67,7 +68,14 @@ def load(machine_code: bytes, names: Sequence[str], device: torch.device) -> dic
     """
     driver, module = library(), c_void_p()
     before = _enter(device)
-    _check(driver.cuModuleLoadData(byref(module), c_char_p(machine_code)))
+    code = driver.cuModuleLoadData(byref(module), c_char_p(machine_code))
+    if code and code != OUT_OF_MEMORY:
+        number = version()
+        raise RuntimeError(
+            f"CUDA's driver, of CUDA {number // 1000}.{number % 1000 // 10}, does not take kernels "
+            f"by NVRTC {nvrtc.version()}: {_name(driver, code)}"
+        )
+    _check(code)
     functions = {name: c_void_p() for name in names}
     for name, function in functions.items():
         _check(driver.cuModuleGetFunction(byref(function), module, name.encode()))
