@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from mvrecon.config import launch, to_plain
+from mvrecon.config import labelled, launch, to_plain
 from mvrecon.config.plugins import import_plugins
 from mvrecon.config.quiet import silence_libraries
 from mvrecon.files.rank import rank
@@ -99,8 +99,9 @@ def task(config: DictConfig) -> float:
     from mvrecon.engine.progress import tell
     from mvrecon.engine.report import show
 
-    settings = run_folder.anchored(to_plain(config))
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    runtime = HydraConfig.get().runtime
+    settings = run_folder.anchored(labelled(to_plain(config), runtime.choices))
+    folder = Path(runtime.output_dir)
     if settings["resume"]:
         import_plugins(settings["plugins"])
         lines = HydraConfig.get().overrides.task

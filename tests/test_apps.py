@@ -54,7 +54,7 @@ def test_a_run_folder_holds_what_it_should(run):
         "review",
     } <= names
     boards = {path.parent.relative_to(folder).as_posix() for path in folder.rglob("events.*")}
-    assert boards == {"cross_view", "cross_view/test", "sirt/test"} and not list(
+    assert boards == {"cross_view_small", "cross_view_small/test", "sirt/test"} and not list(
         folder.rglob("hparams.yaml")
     )
     settings = yaml.safe_load((folder / "config.yaml").read_text())
@@ -76,8 +76,10 @@ def test_the_log_tells_losses_figures_and_times(run):
 def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    board = EventAccumulator(str(run[0] / "cross_view")).Reload()
-    test = EventAccumulator(str(run[0] / "cross_view/test"), {"images": 0, "tensors": 0}).Reload()
+    board = EventAccumulator(str(run[0] / "cross_view_small")).Reload()
+    test = EventAccumulator(
+        str(run[0] / "cross_view_small/test"), {"images": 0, "tensors": 0}
+    ).Reload()
     tags, results = board.Tags(), test.Tags()
     kinds = [tag.split("/")[0] for tag in tags["images"]]
     assert sorted(kinds) == ["mip", "opinions", "planes", "views", "weights"]
@@ -92,7 +94,7 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     text = test.Tensors("text/overrides/text_summary")[0].tensor_proto.string_val[0].decode()
     assert "seed=3" in text and "experiment=smoke" in text
     table = test.Tensors("text/results/text_summary")[0].tensor_proto.string_val[0].decode()
-    assert "| cross_view |" in table and "| sirt |" in table
+    assert "| cross_view_small |" in table and "| sirt |" in table
     assert "hp_metric" not in tags["scalars"]
 
 
@@ -104,22 +106,22 @@ def test_results_hold_every_figure_with_units_seed_and_versions(run):
         and found["units"]["psnr"] == "dB"
         and found["units"]["ms_per_volume"] == "ms"
     )
-    assert list(found["methods"]) == ["cross_view", "sirt"]
+    assert list(found["methods"]) == ["cross_view_small", "sirt"]
     for row in found["methods"].values():
         for figure in FIGURES:
             assert len(row[figure]["values"]) == 3
             assert row[figure]["mean"] == pytest.approx(sum(row[figure]["values"]) / 3)
         assert row["ms_per_volume"] > 0
     assert (
-        found["methods"]["cross_view"]["train_steps"] == 3
-        and found["methods"]["cross_view"]["parameters"] > 0
+        found["methods"]["cross_view_small"]["train_steps"] == 3
+        and found["methods"]["cross_view_small"]["parameters"] > 0
     )
     assert (
         found["methods"]["sirt"]["train_steps"] == 0 and found["methods"]["sirt"]["parameters"] == 0
     )
 
 
-@pytest.mark.parametrize("part", ["", "checkpoints", "checkpoints/cross_view.ckpt"])
+@pytest.mark.parametrize("part", ["", "checkpoints", "checkpoints/cross_view_small.ckpt"])
 def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
     folder, first = run
     again = call(mvrecon.eval, tmp_path / "eval", f"checkpoint={folder / part}")
@@ -131,7 +133,10 @@ def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
             )
         assert again["methods"][method]["train_seconds"] == row["train_seconds"]
     printed = capsys.readouterr().out
-    assert "cross_view" in printed and f"{first['methods']['sirt']['psnr']['mean']:.2f}" in printed
+    assert (
+        "cross_view_small" in printed
+        and f"{first['methods']['sirt']['psnr']['mean']:.2f}" in printed
+    )
 
 
 def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
@@ -139,7 +144,7 @@ def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
     found = call(mvrecon.eval, tmp_path / "eval", f"checkpoint={run[0]}", *options)
     assert len(found["scenes"]) == 1 and found["scenes"] != run[1]["scenes"][:1]
     case = next((tmp_path / "eval" / "cases").iterdir())
-    assert {"views.png", "planes.png", "truth.nii.gz", "cross_view.nii.gz"} <= {
+    assert {"views.png", "planes.png", "truth.nii.gz", "cross_view_small.nii.gz"} <= {
         p.name for p in case.iterdir()
     }
 
@@ -149,8 +154,8 @@ def test_resume_goes_on_in_the_same_folder(run, tmp_path):
     found, where = mvrecon.train.resumed(str(folder), []), folder
     assert found == (run_folder.read_settings(folder), where)
     again = mvrecon.train.train(*found)
-    assert again["methods"]["cross_view"]["psnr"]["values"] == pytest.approx(
-        first["methods"]["cross_view"]["psnr"]["values"], abs=1e-6
+    assert again["methods"]["cross_view_small"]["psnr"]["values"] == pytest.approx(
+        first["methods"]["cross_view_small"]["psnr"]["values"], abs=1e-6
     )
     with pytest.raises(ValueError, match="but got also trainer.max_steps=9"):
         mvrecon.train.resumed(str(folder), ["trainer.max_steps=9"])

@@ -251,6 +251,14 @@ class Cameras:
         shape = (rows[1] - rows[0], columns[1] - columns[0])
         return replace(self.shifted(first), shape=shape)
 
+    def transposed(self) -> "Cameras":
+        """The same detectors about their centres with as many rows as they had columns, and as many
+        columns as rows: of views whose axes were exchanged.
+        """
+        rows, columns = self.shape
+        half = (columns - rows) / 2
+        return replace(self.shifted(self.source.new_tensor([[half, -half]])), shape=(columns, rows))
+
     def shifted(self, pixels: Float[Tensor, "#m 2"]) -> "Cameras":
         """The same detectors moved in their planes by so many columns and rows, (u, v)."""
         column, row = pixels.split(1, dim=1)

@@ -12,7 +12,7 @@ from mvrecon.files.runs import EVALUATION, RESULTS, SETTINGS, leaves, read_resul
 #: Figures of merit that are compared; larger is better for those of `RISING`.
 FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
 #: Settings that say nothing of what is compared, and the most that make up a run's name.
-SILENT, NAMED = ("name", "resume", "plugins", "checkpoint", "save"), 4
+SILENT, NAMED = ("name", "label", "resume", "plugins", "checkpoint", "save"), 4
 #: Characters of a value in a run's name, at most; values that are longer are numbered.
 LONG = 32
 

@@ -7,9 +7,9 @@ Lightning.
 
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from io import TextIOWrapper
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import hydra
@@ -18,7 +18,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mvrecon.config.arguments import with_options_added, with_paths_quoted
 from mvrecon.config.errors import OF_MODELS, one_line
@@ -182,7 +182,26 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
     guard = guarded(conf_dir(), plugin_conf_dirs())
     with guard, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
         added = with_options_added(overrides, OF_RUN.get(config_name, ()))
-        return to_plain(hydra.compose(config_name, added))
+        config = hydra.compose(config_name, added, return_hydra_config=True)
+    choices = dict(config.hydra.runtime.choices)
+    with open_dict(config):
+        del config["hydra"]
+    return labelled(to_plain(config), choices)
+
+
+def labelled(settings: dict[str, Any], choices: Mapping[str, str | None]) -> dict[str, Any]:
+    """Settings of which a null `label` is the name of the main method's file of settings.
+
+    A class serves several such files: `world_unet` is `cross_view` without cameras' networks.
+
+    Args:
+        settings: plain.
+        choices: file by config group, as Hydra has them in `hydra.runtime.choices`.
+    """
+    choice = choices.get("model")
+    if not choice or settings.get("label", "") is not None:
+        return settings
+    return {**settings, "label": PurePosixPath(choice).name}
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:

@@ -39,6 +39,7 @@ class Settings(Measurement):
 
     test_scene: Any = None
     model: Any = None
+    label: str | None = None
     compare: Any = field(default_factory=dict)
     loss: Any = field(default_factory=dict)
     optimizer: Any = None

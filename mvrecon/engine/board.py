@@ -19,7 +19,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.viz import review
 
 #: Settings of a run that make no difference to what comes out, or whose place is taken by `model`.
-SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "model")
+SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "model", "label")
 #: Figures of the table by their names in the results; costs, and theirs.
 FIGURES = ("psnr", "ssim", "view_nrmse")
 COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}

@@ -128,11 +128,17 @@ class BoardReview(L.Callback):
         every: of how many validations one is pictured.
         cases: how many of the first batch's scenes are shown.
         baselines: training-free models shown beside ours.
+        label: of the method in the run's table; "": its class's name.
     """
 
     def __init__(
-        self, every: int = 1, cases: int = 2, baselines: Sequence[str] = ("backprojection", "sirt")
+        self,
+        every: int = 1,
+        cases: int = 2,
+        baselines: Sequence[str] = ("backprojection", "sirt"),
+        label: str = "",
     ):
+        self.label = label
         self.every, self.cases, self.baselines = every, cases, tuple(baselines)
         self.n_validations = 0
         self._fixed: list[dict[str, Tensor]] = []
@@ -192,7 +198,8 @@ class BoardReview(L.Callback):
         truth, top, rig = batch["volume"][number, 0], module.hparams["data_range"], module.on(batch)
         case = review.Case(batch["name"][number], module.projector.grid, top, *units)
         scored = case._replace(name=f"{case.name}: PSNR in dB, SSIM")
-        label = named(module.hparams["model"]["name"], out.volume[number], batch, number, top)
+        name = self.label or module.hparams["model"]["name"]
+        label = named(name, out.volume[number], batch, number, top)
         volumes = {label: out.volume[number, 0], **self._baselines(rig, batch, top)[number]}
         rim = None if out.support is None else outlined(truth, out.support[number, 0], top)
         predicted = rig.A(out.volume)[number, 0]

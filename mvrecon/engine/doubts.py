@@ -1,42 +1,54 @@
-"""What speaks against a reconstruction although nothing failed: mirrored views, counts taken for
-line integrals, a volume that does not explain its views.
+"""What speaks against a reconstruction although nothing failed: views that are mirrored or have
+their axes exchanged, counts taken for line integrals, a volume that does not explain its views.
 """
 
 import math
+from contextlib import suppress
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.field import resolution
 from mvrecon.data.projections.region import Region
 from mvrecon.engine.coarse import coarse
 from mvrecon.engine.scan import Scan
 from mvrecon.metrics import nrmse
-from mvrecon.parts import PROJECTORS
+from mvrecon.parts import PROJECTORS, RECONSTRUCTORS
+from mvrecon.projectors.operator import Projector
+from mvrecon.projectors.pixel_integral import sees_integrals
 from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstruct.problem import kind_of_views
 
 #: Voxels along the grid's longest side, views, and iterations of SIRT that tell mirrored views.
 VOXELS, VIEWS, ITERATIONS = 32, 40, 8
-#: Reversed views are told where they leave less than this part of the residual.
+#: Views in another orientation are told where they leave less than this part of the residual.
 BETTER = 0.75
 #: View NRMSE above which a volume does not explain its views.
 POOR = 0.25
 #: Line integral that no X-ray comes through: 2e-9 of it does.
 OPAQUE = 20.0
-#: Projectors of line integrals.
-LINES = ("drr", "radon")
-#: Reconstructors of counts, and of whatever a network was trained on.
-OF_COUNTS = ("bsrem", "mlem", "osem", "trained", "tv_map")
+#: What is asked of views that fit better in another orientation than in the stored one.
 CURES = {
-    "columns": "does the rig turn the other way (camera.clockwise, the sign of the angles), or are "
-    "the images mirrored (views.flip_columns=true)? The two volumes are mirror images",
-    "rows": "do the rows of the views run upwards (views.flip_rows=true)?",
+    "columns reversed": "does the rig turn the other way (camera.clockwise, the sign of the "
+    "angles), or are the images mirrored (views.flip_columns=true)? The two volumes are mirror "
+    "images",
+    "rows reversed": "do the rows of the views run upwards (views.flip_rows=true)?",
+    "axes exchanged": "are the images stored as [u, v]? Expected [v, u], a row of the detector "
+    "after the other; exchange the axes of the file (numpy: swapaxes(1, 2))",
+    "axes exchanged and columns reversed": "are the images turned by a quarter? Turn them back, or "
+    "exchange the axes of the file (numpy: swapaxes(1, 2)) and give views.flip_columns=true",
 }
+STORED, COLUMNS, ROWS, EXCHANGED, TURNED = "stored", *CURES
 
 
 def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> list[str]:
     """What speaks against a scan's reconstruction, in words, without a unit; empty for most.
+
+    A projector whose `pixel_integral` says nothing, and one of weighted integrals, have doubts of
+    their volume's residual alone; a reconstructor says by `takes` what its views are.
 
     Args:
         scan: that was reconstructed.
@@ -45,20 +57,17 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
         device: for the comparison.
     """
     words = []
-    if scan.projector["name"] in LINES:
-        first = scan.measured.read(0, 1).views
-        if method not in OF_COUNTS and first.max() > OPAQUE and first.equal(first.round()):
+    orders = _orders(scan)
+    if sees_integrals(orders[0].A):
+        first, views = _read(scan, orders)
+        if kind_of_views(RECONSTRUCTORS.get(method)) == "integrals":
+            words += _of_counts(first)
+        figures = _nrmse(orders, views, device)
+        best = min(figures, key=lambda name: figures[name])
+        if figures[best] < BETTER * figures[STORED]:
             words.append(
-                f"expected line integrals, got whole numbers up to {first.max().item():g}; grey "
-                f"values want views.kind=intensities and views.flat, counts of emission osem"
-            )
-        figures = reversed_nrmse(scan, device)
-        stored, best = figures["stored"], min(figures, key=lambda name: figures[name])
-        if figures[best] < BETTER * stored:
-            words.append(
-                f"views with their {best} reversed fit the rig better, view NRMSE "
-                f"{figures[best]:.2g} in place of {stored:.2g} (SIRT on a coarse grid); "
-                f"{CURES[best]}"
+                f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
+                f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
             )
     if view_nrmse > POOR and not words:
         words.append(
@@ -69,30 +78,93 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
     return words
 
 
-def reversed_nrmse(scan: Scan, device: str = "cpu") -> dict[str, float]:
-    """The view NRMSE of a coarse volume by SIRT, of the views as they are stored, and with their
-    columns or rows reversed: a rig whose sense of rotation is wrong has the views of a mirrored
-    object.
+def oriented_nrmse(scan: Scan, device: str = "cpu") -> dict[str, float]:
+    """The view NRMSE of a coarse volume by SIRT, of the views as they are stored and in the
+    orientations of `CURES`.
 
-    Reversed rows of a circular scan are those of a mirrored object, and fit as well.
+    A rig whose sense of rotation is wrong has the views of a mirrored object. Reversed rows of a
+    circular scan are those of a mirrored object, and fit as well. Exchanged axes of a body of
+    revolution, such as a ball at the centre, fit as well.
     """
-    grid = coarse(scan.grid, VOXELS)
-    size = max(1, int(max(grid.spacing) / resolution(scan.cameras, grid.centre)))
-    rows, columns = scan.cameras.shape
-    joined = (min(size, rows), min(size, columns))
-    kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])
-    region = Region.of((rows, columns), kept[0], kept[1], joined)
-    numbers = range(0, len(scan.cameras), math.ceil(len(scan.cameras) / VIEWS))
-    rig = region.seen_by(scan.cameras[torch.tensor(numbers)])
-    A = PROJECTORS.build(scan.projector["name"], grid=grid, cameras=rig).to(device)
-    parts = [_as_all(scan.measured.read(n, n + 1).views, region) for n in numbers]
-    views = torch.stack(parts, dim=1)[:, None].to(device)
-    with torch.no_grad():
-        again = A(sirt(A, views, ITERATIONS, momentum=True))
-    names = ("stored", "columns", "rows")
-    return {name: nrmse(a, y) for name, a, y in zip(names, again, views, strict=True)}
+    orders = _orders(scan)
+    return _nrmse(orders, _read(scan, orders)[1], device)
 
 
-def _as_all(view: Float[Tensor, "1 v u"], region: Region) -> Float[Tensor, "3 i j"]:
-    """A view as it is stored, with reversed columns, and with reversed rows, binned."""
-    return region.binned(region.cropped(torch.cat([view, view.flip(-1), view.flip(-2)])))
+def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
+    """The doubt of a view whose values are whole numbers that no line integral reaches."""
+    if view.max() <= OPAQUE or not view.equal(view.round()):
+        return []
+    return [
+        f"expected line integrals, got whole numbers up to {view.max().item():g}; grey values want "
+        f"views.kind=intensities and views.flat, counts of emission osem"
+    ]
+
+
+class _Order(NamedTuple):
+    """Some views with their axes in one order.
+
+    Args:
+        names: of the orientations: as they are, with reversed columns, with reversed rows.
+        A: their operator on a coarse grid.
+        region: the pixels that are joined to one of the operator's.
+    """
+
+    names: tuple[str, ...]
+    A: Projector
+    region: Region
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], scan: Scan, cameras: Cameras) -> Self:
+        """Of a scan's projector; raises what that does."""
+        grid = coarse(scan.grid, VOXELS)
+        size = max(1, int(max(grid.spacing) / resolution(cameras, grid.centre)))
+        rows, columns = cameras.shape
+        joined = (min(size, rows), min(size, columns))
+        kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])
+        region = Region.of((rows, columns), kept[0], kept[1], joined)
+        rig = region.seen_by(cameras[torch.tensor(_numbers(scan))])
+        return cls(names, PROJECTORS.from_config(scan.projector, grid=grid, cameras=rig), region)
+
+    def oriented(self, view: Float[Tensor, "1 v u"]) -> Float[Tensor, "n i j"]:
+        """A view in the orientations, binned."""
+        views = [view, view.flip(-1), view.flip(-2)][: len(self.names)]
+        return self.region.binned(self.region.cropped(torch.cat(views)))
+
+
+def _orders(scan: Scan) -> list[_Order]:
+    """The axes as they are stored, and exchanged unless the projector refuses such cameras.
+
+    Of exchanged axes those with reversed rows are left out: of a circular scan they fit as well.
+    """
+    orders = [_Order.of((STORED, COLUMNS, ROWS), scan, scan.cameras)]
+    with suppress(ValueError):
+        orders.append(_Order.of((EXCHANGED, TURNED), scan, scan.cameras.transposed()))
+    return orders
+
+
+def _read(scan: Scan, orders: list[_Order]) -> tuple[Float[Tensor, "1 v u"], list[Tensor]]:
+    """The first view as it is stored, and some views in every orientation [n 1 m i j], each read
+    once.
+    """
+    first, seen = torch.empty(0), [[] for _ in orders]
+    for number in _numbers(scan):
+        view = scan.measured.read(number, number + 1).views
+        first = first if number else view
+        for order, views, kept in zip(orders, (view, view.mT), seen, strict=False):
+            kept.append(order.oriented(views))
+    return first, [torch.stack(views, dim=1)[:, None] for views in seen]
+
+
+def _nrmse(orders: list[_Order], views: list[Tensor], device: str) -> dict[str, float]:
+    """The view NRMSE of a volume by SIRT in every orientation, by its name."""
+    figures = {}
+    for order, y in zip(orders, (y.to(device) for y in views), strict=True):
+        A = order.A.to(device)
+        with torch.no_grad():
+            again = A(sirt(A, y, ITERATIONS, momentum=True))
+        figures |= {name: nrmse(a, b) for name, a, b in zip(order.names, again, y, strict=True)}
+    return figures
+
+
+def _numbers(scan: Scan) -> range:
+    return range(0, len(scan.cameras), math.ceil(len(scan.cameras) / VIEWS))

@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 
 from mvrecon.config.targets import instantiate
 from mvrecon.data.module import SceneData
-from mvrecon.engine.callbacks import Clock, Confined
+from mvrecon.engine.callbacks import BoardReview, Clock, Confined
 from mvrecon.engine.checkpoints import finished, unfinished
 from mvrecon.engine.graph import check_graph
 from mvrecon.engine.labels import methods
@@ -150,7 +150,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
     ]
     for callback in callbacks:
-        if isinstance(callback, StepProgress):
+        if isinstance(callback, StepProgress | BoardReview):
             callback.label = method
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
     events = folder / method  # TensorBoard calls a run by its folder

@@ -5,20 +5,22 @@ from mvrecon.files.checks import plain_name
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
-    """The models of a run's result table by label: the main one first, then those of `compare` that
-    are not null.
+    """The models of a run's result table by label: the main one first, under `label` or, where the
+    settings have none, its class's name; then those of `compare` that are not null.
 
     Raises:
         ValueError: the main model's label is taken twice, or a label is no plain name: files are
             called by it. "truth" is refused: its file is the truth's own.
     """
     main = settings["model"]
+    label = settings.get("label") or main["name"]
     others = {label: model for label, model in settings["compare"].items() if model}
-    if main["name"] in others:
+    if label in others:
         raise ValueError(
-            f"compare holds {main['name']!r}, which is the main model's own label; give it another"
+            f"compare holds {label!r}, which is the main model's own label; give this one another "
+            f"by label=..., or leave the other out by compare.{label}=null"
         )
-    labelled = {main["name"]: main, **others}
+    labelled = {label: main, **others}
     # whatever the case: some file systems do not tell it
     if taken := [label for label in labelled if str(label).casefold() == "truth"]:
         raise ValueError(

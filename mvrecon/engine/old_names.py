@@ -25,7 +25,8 @@ def current(settings: Any) -> Any:
     """The settings of a run, or the geometry of a checkpoint, with the option names of this
     version; other values are returned unchanged.
 
-    Runs up to version 0.1.0 had a perfect detector, and no case in two sets.
+    Runs up to version 0.1.0 had a perfect detector, no case in two sets, and their main method went
+    by its class's name.
     """
     if not isinstance(settings, dict):
         return settings
@@ -38,6 +39,8 @@ def current(settings: Any) -> Any:
         settings = {**settings, "acquisition": acquisition}
     if "scene" in settings and isinstance(settings.get("loss"), dict):
         settings = {**settings, "loss": {**NEW_TERMS, **settings["loss"]}}
+    if "scene" in settings and isinstance(model := settings.get("model"), dict):
+        settings = {**settings, "label": settings.get("label") or model.get("name")}
     if "model" in settings:
         settings = {**settings, "model": current_model(settings["model"])}
     if isinstance(settings.get("compare"), dict):

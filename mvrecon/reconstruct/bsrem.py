@@ -27,6 +27,7 @@ from mvrecon.reconstruct.problem import (
     check_iterations,
     check_start,
     supported,
+    takes,
     without_gradient,
 )
 from mvrecon.reconstruct.relative_difference import RelativeDifference
@@ -39,6 +40,7 @@ RELAXATION = 1 / 15
 FLOOR = 1e-6
 
 
+@takes("counts")
 @without_gradient
 def bsrem(
     A: LinearOperator,

@@ -21,10 +21,12 @@ from mvrecon.reconstruct.problem import (
     check_iterations,
     check_start,
     supported,
+    takes,
     without_gradient,
 )
 
 
+@takes("counts")
 @without_gradient
 def mlem(
     A: LinearOperator,
@@ -107,6 +109,7 @@ def _step(
     return x * divided(rest, most, 1.0)
 
 
+@takes("counts")
 @without_gradient
 def osem(
     A: LinearOperator,

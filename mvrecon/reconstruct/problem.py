@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable
 from functools import wraps
 from numbers import Integral
-from typing import NamedTuple, ParamSpec, TypedDict
+from typing import Any, Literal, NamedTuple, ParamSpec, TypedDict, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,6 +19,9 @@ from mvrecon.projectors.operator import LinearOperator
 from mvrecon.registry import hint
 
 P = ParamSpec("P")
+Method = TypeVar("Method", bound=Callable[..., Any])
+#: What a method's views are: line integrals, counts, or what a network was trained on.
+Kind = Literal["integrals", "counts", "trained"]
 
 
 class Iterate(NamedTuple):
@@ -59,6 +62,23 @@ class Common(TypedDict, total=False):
     start: Float[Tensor, "b c d h w"] | None
     support: Bool[Tensor, "d h w"] | None
     monitor: Monitor | None
+
+
+def takes(kind: Kind) -> Callable[[Method], Method]:
+    """Decorator that says what a reconstructor's views are, in its attribute `views`; without it
+    they are line integrals.
+    """
+
+    def said(method: Method) -> Method:
+        setattr(method, "views", kind)  # noqa: B010 - functions have no such attribute by type
+        return method
+
+    return said
+
+
+def kind_of_views(method: Callable[..., Any]) -> Kind:
+    """What a reconstructor's views are, by its attribute `views`."""
+    return getattr(method, "views", "integrals")
 
 
 def without_gradient(method: Callable[P, Tensor]) -> Callable[P, Tensor]:

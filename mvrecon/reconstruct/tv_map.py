@@ -24,11 +24,13 @@ from mvrecon.reconstruct.problem import (
     check_iterations,
     check_start,
     supported,
+    takes,
     without_gradient,
 )
 from mvrecon.reconstruct.total_variation import total_variation, voxel_steps
 
 
+@takes("counts")
 @without_gradient
 def tv_map(
     A: LinearOperator,

@@ -169,6 +169,19 @@ def test_binned_pixels_are_centred_on_the_pixels_that_they_join(parallel):
             cameras.binned(factor)
 
 
+@pytest.mark.parametrize("parallel", [False, True])
+def test_transposed_detectors_stay_where_they_are(parallel):
+    """The middle of the detector stays, and twice transposed is as before."""
+    cameras = record(shape=(5, 8), parallel=parallel)
+    other = cameras.transposed()
+    assert other.shape == (8, 5)
+    middle = cameras.origin + 3.5 * cameras.u + 2 * cameras.v
+    torch.testing.assert_close(other.origin + 2 * other.u + 3.5 * other.v, middle)
+    again = other.transposed()
+    torch.testing.assert_close(again.origin, cameras.origin)
+    torch.testing.assert_close(again.source, cameras.source)
+
+
 def test_moving_the_rig_moves_what_it_sees():
     cameras, rng = random_cameras(), torch.Generator().manual_seed(4)
     R, t = random_rotation(rng), torch.randn(3, generator=rng, dtype=torch.float64)

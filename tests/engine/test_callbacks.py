@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mvrecon.config import compose
-from mvrecon.engine import fit
+from mvrecon.engine import callbacks, fit
 from mvrecon.engine.callbacks import Clock, outlined
 
 
@@ -21,16 +21,23 @@ def test_an_outline_is_the_masks_outermost_voxels():
 
 
 @pytest.mark.parametrize("support", ["none", "hull"])
-def test_the_board_tells_the_support_at_validation(support, tmp_path):
+def test_the_board_tells_the_support_at_validation_and_names_the_method(
+    support, tmp_path, monkeypatch
+):
+    shown, named = [], callbacks.named
+    monkeypatch.setattr(
+        callbacks, "named", lambda name, *rest: shown.append(name) or named(name, *rest)
+    )
     settings = copy.deepcopy(compose("experiment=smoke"))
     settings["model"] |= {"support": support}
     settings["trainer"] |= {"max_steps": 2}
     board = {"_target_": "mvrecon.engine.callbacks.BoardReview", "baselines": [], "cases": 1}
     settings["callbacks"] = {"board": board}
-    fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
+    fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     header = next(tmp_path.rglob("metrics.csv")).read_text().splitlines()[0]
     assert ("val/support_fraction" in header) == (support == "hull")
     assert len(list((tmp_path / "review").glob("*/planes.png"))) == 1
+    assert set(shown) == {"cross_view_small"}, "its label in the table, not its class"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the GPU's memory is told everywhere")

@@ -127,29 +127,29 @@ def runs(tmp_path_factory):
     that does neither.
     """
     folder, tells = tmp_path_factory.mktemp("run"), "model.uncertainty=true"
-    return trained_for_a_step(folder, "cross_view", "geometry_free", options=(tells,))
+    return trained_for_a_step(folder, "cross_view_small", "geometry_free", options=(tells,))
 
 
 def test_views_are_corrected_by_the_cameras_of_a_trained_model(runs):
-    module = mv.load(runs, "cross_view").module.eval()
+    module = mv.load(runs, "cross_view_small").module.eval()
     views = module.projector(torch.rand(1, 1, *module.projector.grid.shape))
     with torch.inference_mode():
         expected = module(views).corrected_views[-1]
     assert torch.equal(
-        corrected_by(module.projector, views, str(runs), "cross_view").views, expected
+        corrected_by(module.projector, views, str(runs), "cross_view_small").views, expected
     )
 
 
 def test_the_app_writes_the_standard_deviation_beside_the_volume(runs, tmp_path):
     """In the volume's unit: 1000 HU are 0.0192/mm where all that may be is less than water."""
-    A = mv.load(runs, "cross_view").module.projector
+    A = mv.load(runs, "cross_view_small").module.projector
     truth = torch.full((1, 1, *A.grid.shape), 0.01)
-    of_run = f"reconstructor.checkpoint={runs}", "reconstructor.method=cross_view"
+    of_run = f"reconstructor.checkpoint={runs}", "reconstructor.method=cross_view_small"
     method = "reconstructor=trained", *of_run
     reconstructed((A, truth, A(truth)), tmp_path, "unit=HU", method=method)
     saved, grid = read_volume(tmp_path / "run" / "volume.sigma.nii.gz")
     with torch.inference_mode():
-        out = mv.load(runs, "cross_view").module.eval()(A(truth))
+        out = mv.load(runs, "cross_view_small").module.eval()(A(truth))
     light = (out.volume + out.sigma < WATER)[0, 0]
     assert light.any() and torch.allclose(grid.affine, A.grid.affine)
     expected = out.sigma[0, 0][light] * 1000 / WATER
@@ -161,7 +161,7 @@ def test_a_correction_that_does_not_fit_is_refused(case, runs, tmp_path, capsys)
     """A model that corrects no view, a calibration without an alignment and an unknown option are
     refused.
     """
-    A = mv.load(runs, "cross_view").module.projector
+    A = mv.load(runs, "cross_view_small").module.projector
     with pytest.raises(ValueError, match="whose cameras correct"):
         corrected_by(A, torch.ones(1, 1, *A.range_shape), str(runs), "geometry_free")
     with pytest.raises(TypeError, match="alternations"):

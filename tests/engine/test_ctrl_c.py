@@ -12,7 +12,7 @@ from mvrecon.engine.survival import remembered
 def test_ctrl_c_says_how_to_resume(kept: bool, tmp_path: Path):
     """Lightning turns it into an exit without a word."""
     run = tmp_path / "run"
-    last = run / "checkpoints" / "cross_view" / "last.ckpt"
+    last = run / "checkpoints" / "cross_view_small" / "last.ckpt"
     last.parent.mkdir(parents=True)
     if kept:
         last.touch()

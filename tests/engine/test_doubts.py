@@ -5,13 +5,16 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mvrecon.cameras.field import auto_grid
 from mvrecon.cameras.rigs import circular, parallel
 from mvrecon.data.projections.views import Corrected
-from mvrecon.engine.doubts import doubts, reversed_nrmse
+from mvrecon.engine.doubts import doubts, oriented_nrmse
 from mvrecon.engine.scan import Scan
 from mvrecon.geometry.grid import Grid
+from mvrecon.parts import PROJECTORS, RECONSTRUCTORS
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.radon import Radon
+from mvrecon.reconstruct.problem import takes
 
 GRID = Grid.centred(16, spacing=6.0)
 RIG = circular(24, 300.0, 450.0, {"pixels": [24, 26], "pixel_mm": 6.0})
@@ -21,20 +24,26 @@ class InMemory:
     """Views of a scan that are no files."""
 
     def __init__(self, views):
-        self.views = views
+        self.views, self.ranges = views, []
 
     def read(self, first, last):
+        self.ranges.append((first, last))
         part = self.views[first:last]
         return Corrected(part, torch.ones_like(part, dtype=torch.bool))
 
 
-@pytest.fixture(scope="module")
-def views():
-    """Line integrals of two cubes beside each other: no mirror image is the object itself."""
+def two_cubes():
+    """No mirror image of two cubes beside each other is the object itself."""
     mu = torch.zeros(1, 1, *GRID.shape)
     mu[..., 6:11, 3:7, 4:11] = 0.02
     mu[..., 4:8, 9:12, 10:13] = 0.04
-    return Drr(GRID, RIG)(mu)[0, 0]
+    return mu
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Line integrals of the two cubes."""
+    return Drr(GRID, RIG)(two_cubes())[0, 0]
 
 
 def scan_of(views, projector="drr"):
@@ -48,8 +57,8 @@ def test_a_right_scan_raises_no_doubt(views):
 @pytest.mark.door
 def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):
     """A mirrored detector, or a rig that turns the other way, is told with what mends it."""
-    figures = reversed_nrmse(scan_of(views.flip(-1)))
-    assert figures["columns"] == pytest.approx(reversed_nrmse(scan_of(views))["stored"])
+    figures = oriented_nrmse(scan_of(views.flip(-1)))
+    assert figures["columns reversed"] == pytest.approx(oriented_nrmse(scan_of(views))["stored"])
     backwards = replace(scan_of(views), cameras=RIG[[0, *range(23, 0, -1)]])
     for wrong in (scan_of(views.flip(-1)), backwards):
         (words,) = doubts(wrong, "fdk", 0.1)
@@ -63,8 +72,44 @@ def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
     (words,) = doubts(counts, "fdk", 0.5)
     assert "expected line integrals, got whole numbers up to" in words
     assert "osem" not in "".join(doubts(counts, "osem", 0.1))
-    (words,) = doubts(scan_of(views, "of_a_plugin"), "fdk", 0.5)
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("shape", [(24, 26), (12, 30)])
+def test_views_whose_axes_were_exchanged_are_told(shape):
+    """Views stored as [u, v], whose detector has the file's number of pixels, are told."""
+    rig = circular(12, 300.0, 450.0, {"pixels": list(shape), "pixel_mm": 6.0})
+    right = Drr(GRID, rig)(two_cubes())[0, 0]
+    assert doubts(Scan(InMemory(right), rig, GRID, {"name": "drr"}), "fdk", 0.05) == []
+    taken = rig.transposed()  # of the file's rows and columns
+    for stored, what in (
+        (right.mT, "exchanged fit"),
+        (right.flip(-1).mT, "exchanged and columns reversed fit"),
+    ):
+        wrong = Scan(InMemory(stored), taken, auto_grid(taken), {"name": "drr"})
+        (words,) = doubts(wrong, "fdk", 0.4)
+        assert what in words and "swapaxes(1, 2)" in words
+
+
+def test_a_plugins_own_words_decide_what_is_doubted(views, monkeypatch):
+    """A projector says what its pixels are, a reconstructor what its views are, whatever its name;
+    every view is read once.
+    """
+    monkeypatch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts})
+    monkeypatch.setattr(RECONSTRUCTORS, "_parts", {**RECONSTRUCTORS._parts})
+    PROJECTORS.register("as_lines")(lambda grid, cameras: Drr(grid, cameras))
+    PROJECTORS.register("doubled")(lambda grid, cameras: 2 * Drr(grid, cameras))
+    RECONSTRUCTORS.register("of_lines")(lambda A, views: views)
+    RECONSTRUCTORS.register("of_counts")(takes("counts")(lambda A, counts: counts))
+    counts = (4e4 * torch.exp(-views)).round()
+    assert "whole numbers" in "".join(doubts(scan_of(counts, "as_lines"), "of_lines", 0.1))
+    assert "whole numbers" not in "".join(doubts(scan_of(counts, "as_lines"), "of_counts", 0.1))
+    assert doubts(scan_of(counts, "doubled"), "of_lines", 0.1) == []
+    (words,) = doubts(scan_of(views, "doubled"), "of_lines", 0.5)
     assert "does not explain" in words
+    scan = scan_of(views.flip(-1), "as_lines")
+    assert "columns reversed" in "".join(doubts(scan, "of_lines", 0.1))
+    assert scan.measured.ranges == [(n, n + 1) for n in range(24)], "every view once"
 
 
 @pytest.mark.parametrize("slices", [1, 12])

@@ -27,7 +27,7 @@ def data(settings):
 @pytest.fixture(scope="module")
 def run(settings, data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    fit.fit("cross_view", settings, data, folder)
+    fit.fit("cross_view_small", settings, data, folder)
     return folder
 
 
@@ -40,14 +40,14 @@ def all_plain(value):
 
 
 def test_a_checkpoint_loads_with_torch_defaults_and_is_plain(run, settings):
-    state = torch.load(checkpoints.finished(run, "cross_view"))
+    state = torch.load(checkpoints.finished(run, "cross_view_small"))
     assert state["global_step"] == settings["trainer"]["max_steps"]
     assert state["hyper_parameters"]["model"] == settings["model"]
     assert all_plain(state["hyper_parameters"]) and all_plain(state["callbacks"])
 
 
 def test_a_module_comes_back_from_its_checkpoint_alone(run, data):
-    path = checkpoints.finished(run, "cross_view")
+    path = checkpoints.finished(run, "cross_view_small")
     module = ReconstructionModule.load_from_checkpoint(path)
     again = checkpoints.load(path)
     data.setup("test")
@@ -58,21 +58,22 @@ def test_a_module_comes_back_from_its_checkpoint_alone(run, data):
 
 
 def test_only_the_finished_checkpoint_stays(run):
-    assert [path.name for path in (run / "checkpoints").iterdir()] == ["cross_view.ckpt"]
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["cross_view_small.ckpt"]
 
 
 def test_training_changes_the_weights_and_equal_seeds_give_equal_weights(
     run, settings, data, tmp_path
 ):
-    fit.fit("cross_view", settings, data, tmp_path)
+    fit.fit("cross_view_small", settings, data, tmp_path)
     first, second = (
-        checkpoints.load(checkpoints.finished(f, "cross_view")).module for f in (run, tmp_path)
+        checkpoints.load(checkpoints.finished(f, "cross_view_small")).module
+        for f in (run, tmp_path)
     )
     torch.manual_seed(settings["seed"])
     other = copy.deepcopy(settings)
     other["seed"] = 1
-    fit.fit("cross_view", other, data, tmp_path / "other")
-    third = checkpoints.load(checkpoints.finished(tmp_path / "other", "cross_view")).module
+    fit.fit("cross_view_small", other, data, tmp_path / "other")
+    third = checkpoints.load(checkpoints.finished(tmp_path / "other", "cross_view_small")).module
     weights = [torch.cat([p.flatten() for p in m.parameters()]) for m in (first, second, third)]
     assert torch.equal(weights[0], weights[1])
     assert not torch.allclose(weights[0], weights[2])
@@ -90,19 +91,19 @@ def test_a_broken_run_goes_on_as_if_it_had_not_broken(run, settings, data, tmp_p
 
     monkeypatch.setattr(ReconstructionModule, "training_step", breaking)
     with pytest.raises(RuntimeError, match="power cut"):
-        fit.fit("cross_view", settings, data, tmp_path)
-    assert checkpoints.unfinished(tmp_path, "cross_view").exists()
-    before = torch.load(checkpoints.unfinished(tmp_path, "cross_view"))
-    fit.fit("cross_view", settings, data, tmp_path)
-    after = checkpoints.load(checkpoints.finished(tmp_path, "cross_view"))
+        fit.fit("cross_view_small", settings, data, tmp_path)
+    assert checkpoints.unfinished(tmp_path, "cross_view_small").exists()
+    before = torch.load(checkpoints.unfinished(tmp_path, "cross_view_small"))
+    fit.fit("cross_view_small", settings, data, tmp_path)
+    after = checkpoints.load(checkpoints.finished(tmp_path, "cross_view_small"))
     assert seen == [0, 1, "broken", 2]
     assert before["global_step"] == 2 and after.steps == 3
     assert after.seconds > before["callbacks"]["Clock"]["seconds"] > 0
-    unbroken = checkpoints.load(checkpoints.finished(run, "cross_view")).module.state_dict()
+    unbroken = checkpoints.load(checkpoints.finished(run, "cross_view_small")).module.state_dict()
     assert all(
         torch.equal(value, unbroken[name]) for name, value in after.module.state_dict().items()
     )
-    fit.fit("cross_view", settings, data, tmp_path)
+    fit.fit("cross_view_small", settings, data, tmp_path)
     assert seen[-1] == 2, "a finished method is not trained again"
 
 
@@ -112,8 +113,8 @@ def test_a_loss_that_is_not_finite_stops_with_a_remedy(settings, data, tmp_path)
     with pytest.raises(
         FloatingPointError, match=r"cross_view is not finite at step [12]: .*optimizer.lr"
     ):
-        fit.fit("cross_view", wild, data, tmp_path)
-    assert not checkpoints.finished(tmp_path, "cross_view").exists()
+        fit.fit("cross_view_small", wild, data, tmp_path)
+    assert not checkpoints.finished(tmp_path, "cross_view_small").exists()
 
 
 def test_averaged_weights_are_what_a_checkpoint_holds(run, settings, data, tmp_path):
@@ -122,10 +123,10 @@ def test_averaged_weights_are_what_a_checkpoint_holds(run, settings, data, tmp_p
         "decay": 0.5,
         "use_buffers": False,
     }
-    fit.fit("cross_view", {**settings, "callbacks": {"ema": averaging}}, data, tmp_path)
-    path = checkpoints.finished(tmp_path, "cross_view")
+    fit.fit("cross_view_small", {**settings, "callbacks": {"ema": averaging}}, data, tmp_path)
+    path = checkpoints.finished(tmp_path, "cross_view_small")
     state, loaded = torch.load(path), checkpoints.load(path).module.state_dict()
-    plain = checkpoints.load(checkpoints.finished(run, "cross_view")).module.state_dict()
+    plain = checkpoints.load(checkpoints.finished(run, "cross_view_small")).module.state_dict()
     assert all_plain(state["averaging_state"])
     assert all(torch.equal(loaded[name], state["state_dict"][name]) for name in loaded)
     assert any(not torch.equal(loaded[name], plain[name]) for name in loaded)
@@ -138,10 +139,20 @@ def test_methods_without_weights_are_not_trained(settings, data, tmp_path):
 
 
 def test_a_label_is_used_once(settings):
-    twice = {**settings, "compare": {"cross_view": {"name": "sirt"}}}
-    with pytest.raises(ValueError, match="'cross_view'.*own label"):
+    twice = {**settings, "compare": {"cross_view_small": {"name": "sirt"}}}
+    with pytest.raises(ValueError, match="'cross_view_small'.*own label"):
         fit.methods(twice)
-    assert list(fit.methods({**settings, "compare": {"sirt": None}})) == ["cross_view"]
+    assert list(fit.methods({**settings, "compare": {"sirt": None}})) == ["cross_view_small"]
+
+
+def test_the_main_method_goes_by_its_file_of_settings_whatever_its_class(settings):
+    """A class has many files: the U-Net in the world is cross_view without cameras' networks."""
+    unet = compose("experiment=smoke", "model=world_unet")
+    assert unet["model"]["name"] == settings["model"]["name"] == "cross_view"
+    assert list(fit.methods(unet)) == ["world_unet", "sirt"]
+    mine = compose("experiment=smoke", "model=world_unet", "label=mine")
+    assert list(fit.methods(mine)) == ["mine", "sirt"]
+    assert list(fit.methods({**unet, "label": None})) == ["cross_view", "sirt"], "of a run of then"
 
 
 @pytest.mark.door

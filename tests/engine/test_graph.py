@@ -102,7 +102,7 @@ def test_what_no_graph_can_hold_is_refused(what, monkeypatch):
 def test_a_run_on_a_cpu_says_that_it_has_no_graph(tmp_path):
     settings = compose("experiment=smoke", "trainer.graph=true", "trainer.accelerator=cpu")
     with pytest.raises(ValueError, match="trainer.graph=true needs a GPU"):
-        fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
+        fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
 
 
 def test_a_step_that_cannot_be_captured_says_why(monkeypatch):

@@ -56,7 +56,7 @@ def test_a_training_step_projects_as_often_as_the_model_says_and_never_asks_for_
         monkeypatch.setattr(
             ReconstructionModule, "on_train_batch_end", lambda *_: steps.append(dict(kernels.calls))
         )
-        fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
+        fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     start, consistency = settings["model"]["start"], settings["model"]["consistency"]
     rounds = len(settings["model"]["rounds"])  # cameras correct in each
     # A x of: each SIRT iteration of the start; each round's residual; each consistency step; the
@@ -119,7 +119,7 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
     }
     trainer = {**settings["trainer"], "val_check_interval": 1, "num_sanity_val_steps": 0}
     settings = {**settings, "callbacks": {"board": board}, "trainer": trainer}
-    fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
+    fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     assert [kind for kind, _ in groupby(happened)] == [
         "training_step",
         "validation_step",

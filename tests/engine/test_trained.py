@@ -16,12 +16,14 @@ from tests.engine.runs import trained_for_a_step
 def run(tmp_path_factory) -> Path:
     """A run of one step; its other method, SIRT, learns nothing and has no checkpoint."""
     place = tmp_path_factory.mktemp("run")
-    return trained_for_a_step(place, "cross_view", options=["callbacks=best", "~callbacks.board"])
+    return trained_for_a_step(
+        place, "cross_view_small", options=["callbacks=best", "~callbacks.board"]
+    )
 
 
 def test_a_run_folder_and_its_checkpoint_are_one_method(run: Path):
-    first, second = mv.load(run), mv.load(checkpoints.finished(run, "cross_view"))
-    third = mv.load(str(run), "cross_view")
+    first, second = mv.load(run), mv.load(checkpoints.finished(run, "cross_view_small"))
+    third = mv.load(str(run), "cross_view_small")
     weights = first.module.state_dict()
     for other in (second, third):
         assert all(torch.equal(weights[k], v) for k, v in other.module.state_dict().items())
@@ -46,7 +48,7 @@ def test_a_trained_method_is_called_with_views_and_with_another_rig_and_grid(run
 
 
 def test_a_method_that_a_run_does_not_have_is_named(run: Path):
-    with pytest.raises(LookupError, match="no method 'unet'. It has cross_view"):
+    with pytest.raises(LookupError, match="no method 'unet'. It has cross_view_small"):
         mv.load(run, "unet")
     with pytest.raises(FileNotFoundError, match="sirt.*did the training of"):
         mv.load(run, "sirt")
@@ -81,7 +83,7 @@ def test_a_method_begins_with_the_weights_of_another_on_any_rig(run: Path, tmp_p
             begun.append(module.model.state_dict())
 
     monkeypatch.setattr(fit, "build_trainer", lambda *_: Trainer())
-    fit.fit("cross_view", settings, fit.build_data(settings), tmp_path)
+    fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     assert all(torch.equal(begun[0][name], value) for name, value in weights.items())
     other = compose(*options, "model=backprojection_unet")
     with pytest.raises(ValueError, match="weights of the same model.*'backprojection_unet'"):

@@ -24,7 +24,7 @@ from tests.engine.runs import call, trained_for_a_step
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """One step of two methods: one that takes any rig, and one that is made for its own."""
-    return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view", "geometry_free")
+    return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view_small", "geometry_free")
 
 
 @pytest.fixture(scope="module")
