@@ -44,10 +44,10 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
         view_nrmse: |y - A x| / |y| of its volume.
         device: for the comparison.
     """
-    words = []
+    words, first = [], scan.measured.read(0, 1).views
+    whole = first.equal(first.round())
     if scan.projector["name"] in LINES:
-        first = scan.measured.read(0, 1).views
-        if method not in OF_COUNTS and first.max() > OPAQUE and first.equal(first.round()):
+        if method not in OF_COUNTS and first.max() > OPAQUE and whole:
             words.append(
                 f"expected line integrals, got whole numbers up to {first.max().item():g}; grey "
                 f"values want views.kind=intensities and views.flat, counts of emission osem"
@@ -60,6 +60,11 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
                 f"{figures[best]:.2g} in place of {stored:.2g} (SIRT on a coarse grid); "
                 f"{CURES[best]}"
             )
+    elif method in OF_COUNTS and view_nrmse > POOR and not whole:
+        words.append(
+            f"expected counts, got numbers that are not whole, which the volume does not explain "
+            f"(view NRMSE {view_nrmse:.2g}); projector=drr is for line integrals"
+        )
     if view_nrmse > POOR and not words:
         words.append(
             f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); look at "

@@ -65,6 +65,9 @@ def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
     assert "osem" not in "".join(doubts(counts, "osem", 0.1))
     (words,) = doubts(scan_of(views, "of_a_plugin"), "fdk", 0.5)
     assert "does not explain" in words
+    (words,) = doubts(scan_of(views, "of_a_plugin"), "osem", 0.5)
+    assert "expected counts, got numbers that are not whole" in words
+    assert doubts(scan_of(views, "of_a_plugin"), "osem", 0.1) == []
 
 
 @pytest.mark.parametrize("slices", [1, 12])

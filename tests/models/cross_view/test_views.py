@@ -29,7 +29,7 @@ def test_a_cell_beyond_the_detector_is_where_its_pixels_would_be():
 
 
 def test_most_pixels_beside_the_object_are_empty_and_few_in_it():
-    """A stray count counts itself alone; an empty pixel among counts counts; one by the edge not."""
+    """A stray count is for itself; an empty pixel among counts is one of them, by the edge not."""
     counts = torch.zeros(1, 1, 1, 8, 8)
     counts[..., 1, 6] = 1
     counts[..., 3:, :4] = 5
