@@ -16,9 +16,10 @@ import torch
 
 from mvrecon.config import compose
 from mvrecon.engine.evaluation import load_methods
-from mvrecon.engine.fit import build_data
+from mvrecon.engine.fit import build_data, methods
 from mvrecon.engine.module import build_projector
 from mvrecon.engine.on_case import OwnAttenuation, reconstructed
+from mvrecon.engine.run_folder import read_settings
 from mvrecon.files.tables import write_rows
 from mvrecon.metrics import nrmse
 from mvrecon.parts import RECONSTRUCTORS
@@ -93,20 +94,24 @@ def table(options: argparse.Namespace) -> None:
             print(f"{folder} has no results.json: not trained yet", file=sys.stderr)
             continue
         results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+        models = methods(read_settings(folder))
         for label, own in results["methods"].items():
+            known = models[label].get("reconstructor", {})
             row = {"experiment": name, "method": label, "steps": own["train_steps"]}
+            row |= {"iterations": known.get("iterations", "")}
             row |= {key: f"{own[key]['mean']:.{n}f}" for key, n in FIGURES.items()}
             row |= {"train_seconds": round(own["train_seconds"])}
             rows.append(row | {"ms_per_volume": round(own["ms_per_volume"])})
-        pictures[name] = case_of(name, folder, options)
+        pictures[name] = case_of(folder)
     write_rows(HERE / "results.csv", rows)
     draw(pictures, HERE / "volumes.png")
 
 
 @torch.no_grad()
-def case_of(name: str, folder: Path, options: argparse.Namespace) -> dict[str, torch.Tensor]:
-    """The first test case and what every method makes of it."""
-    run = settings_of(name, options)
+def case_of(folder: Path) -> dict[str, torch.Tensor]:
+    """The first test case of a run and what every method makes of it."""
+    run = read_settings(folder)
+    run["data"]["sizes"]["test"] = 1
     data = build_data(run)
     data.setup("test")
     case = next(iter(data.test_dataloader()))
