@@ -56,11 +56,11 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
         view_nrmse: |y - A x| / |y| of its volume.
         device: for the comparison.
     """
-    words = []
-    orders = _orders(scan)
+    words: list[str] = []
+    orders, kind = _orders(scan), kind_of_views(RECONSTRUCTORS.get(method))
     if sees_integrals(orders[0].A):
         first, views = _read(scan, orders)
-        if kind_of_views(RECONSTRUCTORS.get(method)) == "integrals":
+        if kind == "integrals":
             words += _of_counts(first)
         figures = _nrmse(orders, views, device)
         best = min(figures, key=lambda name: figures[name])
@@ -69,6 +69,11 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
                 f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
                 f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
             )
+    elif kind == "counts" and view_nrmse > POOR and not _whole(scan.measured.read(0, 1).views):
+        words.append(
+            f"expected counts, got numbers that are not whole, which the volume does not explain "
+            f"(view NRMSE {view_nrmse:.2g}); projector=drr is for line integrals"
+        )
     if view_nrmse > POOR and not words:
         words.append(
             f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); look at "
@@ -92,12 +97,17 @@ def oriented_nrmse(scan: Scan, device: str = "cpu") -> dict[str, float]:
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
     """The doubt of a view whose values are whole numbers that no line integral reaches."""
-    if view.max() <= OPAQUE or not view.equal(view.round()):
+    if view.max() <= OPAQUE or not _whole(view):
         return []
     return [
         f"expected line integrals, got whole numbers up to {view.max().item():g}; grey values want "
         f"views.kind=intensities and views.flat, counts of emission osem"
     ]
+
+
+def _whole(view: Float[Tensor, "1 v u"]) -> bool:
+    """Whether all values are whole numbers."""
+    return view.equal(view.round())
 
 
 class _Order(NamedTuple):

@@ -110,6 +110,9 @@ def test_a_plugins_own_words_decide_what_is_doubted(views, monkeypatch):
     scan = scan_of(views.flip(-1), "as_lines")
     assert "columns reversed" in "".join(doubts(scan, "of_lines", 0.1))
     assert scan.measured.ranges == [(n, n + 1) for n in range(24)], "every view once"
+    (words,) = doubts(scan_of(views, "doubled"), "of_counts", 0.5)
+    assert "expected counts, got numbers that are not whole" in words
+    assert doubts(scan_of(views, "doubled"), "of_counts", 0.1) == []
 
 
 @pytest.mark.parametrize("slices", [1, 12])

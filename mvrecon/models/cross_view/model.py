@@ -14,6 +14,7 @@ from mvrecon.models.cropping import Cropping
 from mvrecon.models.cross_view.settings import ROUNDS, Computing, RoundOptions
 from mvrecon.models.cross_view.step import Measured, Round, State
 from mvrecon.models.cross_view.uncertainty import Uncertainty
+from mvrecon.models.cross_view.views import among_counts
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
@@ -32,7 +33,8 @@ class CrossView(nn.Module):
     From SIRT with momentum in the support each round adds to x what its networks make of the
     residual views y + e - A x, where e is what the cameras have corrected; then come data
     consistency with the corrected views, and non-negativity. Everything is divided by the
-    content's scale, f(a y) = a f(y).
+    content's scale, f(a y) = a f(y). With Poisson noise pixels that are empty as most about them
+    are not corrected: what a network adds there comes back as activity beside the object.
 
     Args:
         projector: its grid and its rig.
@@ -93,7 +95,10 @@ class CrossView(nn.Module):
         views = admitted(views, self.cropping.cameras, self.consistency.lengths)
         geometry = self._geometry(views)
         y, x0, scale = normalised(geometry, views, self.start)
-        chord = torch.where(geometry.row > 0, 1 / geometry.row, 0)
+        correctable = geometry.row > 0
+        if self.consistency.poisson:
+            correctable = correctable & among_counts(views)
+        chord = torch.where(correctable, 1 / geometry.row, 0)
         boxes = boxes_of(geometry.mask) if self.crop and geometry.mask is not None else None
         measured, state = Measured(geometry, y, chord, boxes), State(x0, torch.zeros_like(x0))
         volumes, corrected, before = [], [], x0

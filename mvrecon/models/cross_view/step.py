@@ -54,7 +54,7 @@ class Measured(NamedTuple):
     Args:
         geometry: the operator and SIRT's weights; C is zero outside the support.
         views: y, relative to the content's scale.
-        chord: 1 / R in mm, zero where R is.
+        chord: 1 / R in mm, zero where R is, and where views are not corrected.
         boxes: of each sample, what the networks in the world see; none for the whole grid.
     """
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
@@ -54,6 +54,17 @@ def image_cells(evidence: Evidence, edge: int) -> Float[Tensor, "b m k r s"]:
     residual = MAGNIFIED * evidence.residual.squeeze(1)
     views = torch.stack([residual, measured, MAGNIFIED * (measured - mean)], dim=2)
     return to_cells(padded(views.flatten(0, 1), edge), edge).unflatten(0, measured.shape[:2])
+
+
+def among_counts(counts: Float[Tensor, "b 1 m v u"]) -> Bool[Tensor, "b 1 m v u"]:
+    """Whether a pixel counted anything, or most of the 3 x 3 about it did.
+
+    Beside the object most pixels are empty; in its image, where one count a pixel is expected,
+    less than half by Poisson's law.
+    """
+    some = (counts > 0).to(counts.dtype)
+    share = F.avg_pool2d(some.flatten(0, 2), 3, stride=1, padding=1, count_include_pad=False)
+    return (some > 0) | (share.reshape(counts.shape) > 0.5)
 
 
 def correction_of(

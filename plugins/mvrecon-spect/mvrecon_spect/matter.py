@@ -1,5 +1,6 @@
 """Linear attenuation on a grid, in 1/mm, from a tensor, a number or a file."""
 
+import warnings
 from pathlib import Path
 
 import torch
@@ -15,6 +16,10 @@ OF_CASES = (
     "attenuates (cardiac, nema, spect_ct)"
 )
 
+#: 1/mm: a body's tissue is at most that of half its voxels (water at 140.5 keV 0.01536, at 70 keV
+#: 0.0192; lung in 1/cm, 0.04, is more), and at least that where it is densest.
+TISSUE, WATERY = 0.025, 0.006
+
 
 def attenuation_on(
     grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path
@@ -26,6 +31,9 @@ def attenuation_on(
         mu: a tensor on the grid, a number for all of it, or the path of a volume in 1/mm (of
             Interfile, .hv, in 1/cm), which is resampled to the grid, and zero outside of its own.
 
+    Warns:
+        UserWarning: values that a patient has not, as of another unit.
+
     Raises:
         TypeError: no tensor, number or path, such as the name of a map of each case.
         ValueError: values that cannot be attenuation in 1/mm, a tensor of another shape, or a map
@@ -36,8 +44,11 @@ def attenuation_on(
         from mvrecon.data.volume_files import read_volume
         from mvrecon_spect.files.interfile_volume import read_mu
 
-        values, source = (read_mu if Path(mu).suffix.lower() == ".hv" else read_volume)(mu)
+        interfile = Path(mu).suffix.lower() == ".hv"
+        values, source = (read_mu if interfile else read_volume)(mu)
         check_mu(values, source)
+        if not interfile:  # read_mu has doubts of its own
+            _doubt(values, str(mu))
         on_grid = resample(values, source, grid).clamp_min(0)
         if values.any() and not on_grid.any():
             raise ValueError(
@@ -50,7 +61,26 @@ def attenuation_on(
         raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}{OF_CASES}")
     values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))
     check_mu(values, grid)
+    _doubt(values, "mu")
     return values
+
+
+def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:
+    """Warn of attenuation that is too much or too little for most of a patient."""
+    most = values.detach().max()
+    if not most:
+        return
+    typical = values.detach()[values > 0.1 * most].median().item()
+    if typical > TISSUE:
+        got, cause = f"{typical:.3g} in half of what attenuates", "is it in 1/cm"
+    elif most < WATERY:
+        got, cause = f"at most {most.item():.3g}", "was it divided by 10 twice"
+    else:
+        return
+    warnings.warn(
+        f"{name}: expected attenuation in 1/mm (water at 140.5 keV: 0.01536), got {got}; {cause}?",
+        stacklevel=4,
+    )
 
 
 def _point(place: Float[Tensor, "3"]) -> str:

@@ -106,6 +106,26 @@ def test_a_map_of_another_place_is_refused(tmp_path: Path):
 
 @pytest.mark.door
 @pytest.mark.parametrize(
+    ("value", "message"),
+    [(0.04, "0.04 in half of what attenuates; is it in 1/cm"), (0.0015, "at most 0.0015")],
+)
+def test_attenuation_of_lung_in_1_per_cm_is_doubted(value: float, message: str):
+    """Attenuation that could be in 1/mm, but is too much or too little for a body, is doubted."""
+    mu = torch.zeros(GRID.shape)
+    mu[2:6, 2:6, 2:6] = value
+    with pytest.warns(UserWarning, match=message):
+        Spect(GRID, RIG, mu=mu)
+
+
+def test_water_bone_and_air_raise_no_doubt(recwarn: pytest.WarningsRecorder):
+    mu = torch.full(GRID.shape, 1e-5)
+    mu[1:7, 1:7, 1:7], mu[3, 3] = 0.01536, 0.0295
+    Spect(GRID, RIG, mu=mu)
+    assert not recwarn.list
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         (["camera=circular", "projector=spect"], "extent 'behind', got 'segment'"),

@@ -289,3 +289,14 @@ def test_a_crop_is_each_sample_s_own_and_of_the_whole_grid_it_changes_nothing():
 def test_a_crop_needs_a_support():
     with pytest.raises(ValueError, match="got crop=True and support='none'"):
         CrossView(small_projector(), SMALL["M3"], crop=True)
+
+
+def test_views_of_counts_are_not_corrected_where_all_is_empty():
+    """What a network adds beside the object would come back as activity there."""
+    projector = small_projector()
+    views = projector(blob(projector))
+    empty, exact = views == 0, stirred(projector)(views).corrected_views[-1]
+    counted = stirred(projector, consistency={"steps": 2, "noise": "poisson"})(views)
+    assert exact[empty].abs().max() > 0 and not counted.corrected_views[-1][empty].any()
+    within = views > 0.2 * views.max()
+    assert torch.equal(counted.corrected_views[-1][within], exact[within])

@@ -3,7 +3,7 @@
 import torch
 
 from mvrecon.models.cross_view.sampling import RaySamples
-from mvrecon.models.cross_view.views import Binned, means
+from mvrecon.models.cross_view.views import Binned, among_counts, means
 from mvrecon.models.frusta import Frusta
 from mvrecon.parts import PROJECTORS
 from tests.models.rig import small_projector, small_rig
@@ -26,3 +26,13 @@ def test_a_cell_beyond_the_detector_is_where_its_pixels_would_be():
     views = torch.rand(1, 1, 4, 11, 10)
     expected = views[..., 9:11, 9:].mean(dim=(-2, -1))
     assert torch.allclose(means(views, 3)[..., -1, -1], expected)
+
+
+def test_most_pixels_beside_the_object_are_empty_and_few_in_it():
+    """A stray count is for itself; an empty pixel among counts is one of them, by the edge not."""
+    counts = torch.zeros(1, 1, 1, 8, 8)
+    counts[..., 1, 6] = 1
+    counts[..., 3:, :4] = 5
+    counts[..., 5, 2] = 0
+    seen = among_counts(counts)[0, 0, 0]
+    assert seen[1, 6] and seen[3:, :4].all() and seen.sum() == 1 + 5 * 4
