@@ -23,6 +23,9 @@ from mvrecon.reconstruct.division import divided
 
 #: Density by which an empty voxel counts along a ray, relative to the content's scale.
 LEAST = 0.01
+#: By which the strength of the rays' weights is learned faster than other weights: one number that
+#: should be where it belongs, between 0 and about 1, within the first tenth of a training.
+FASTER = 10.0
 
 
 class Fused(NamedTuple):
@@ -137,7 +140,7 @@ class Opinions(nn.Module):
         rays = None
         if self.strength is not None:
             relative = pixels(self._ray_weights(x, weights), self.binning, residual)
-            rays = 1 + self.strength * (relative - 1)
+            rays = 1 + FASTER * self.strength * (relative - 1)
         expected = expected if unit is None else expected * unit
         expected = expected + means(projected, self.binning)
         return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from mvrecon.models.cross_view.model import CrossView
+from mvrecon.models.cross_view.opinions import FASTER
 from mvrecon.models.cross_view.step import Measured, State
 from mvrecon.models.geometry import whole_geometry
 from tests.models.cross_view.test_model import blob
@@ -33,7 +34,7 @@ def test_a_view_whose_rays_count_nothing_changes_no_volume(monkeypatch):
     """In a round before training, where networks change nothing."""
     projector = small_projector()
     (one,) = CrossView(projector, CHOICES["rays"]).rounds
-    one.opinions.strength.fill_(1.0)
+    one.opinions.strength.fill_(1 / FASTER)
     weights = torch.ones(1, 1, 4, 4, 4)
     weights[:, :, 1] = 0
     monkeypatch.setattr(one.opinions, "_ray_weights", lambda *_: weights)
