@@ -40,7 +40,6 @@ EXTENTS: dict[str, tuple[float, float]] = {
     "line": (-torch.inf, torch.inf),
 }
 
-
 VECTORS = ("source", "origin", "u", "v")
 
 
@@ -127,15 +126,12 @@ class Cameras:
         return (self[m] for m in range(len(self)))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> "Cameras":
-        """The same cameras, some of them or elsewhere; they are not judged again, for which a GPU
-        would be waited for.
-        """
+        """Some of the cameras, or all elsewhere; not judged again, as a GPU would be waited for."""
         vectors = {name: change(getattr(self, name)) for name in VECTORS}
         if not len(vectors["source"]):
             return replace(self, **vectors)  # which is refused
         other = copy(self)
-        for name, vector in vectors.items():
-            object.__setattr__(other, name, vector)
+        vars(other).update(vectors)
         return other
 
     def to(self, device: torch.device | str) -> "Cameras":
@@ -252,12 +248,10 @@ class Cameras:
         return replace(self.shifted(first), shape=shape)
 
     def transposed(self) -> "Cameras":
-        """The same detectors about their centres with as many rows as they had columns, and as many
-        columns as rows: of views whose axes were exchanged.
-        """
+        """Detectors about the same centres, of as many rows as they had columns and vice versa."""
         rows, columns = self.shape
-        half = (columns - rows) / 2
-        return replace(self.shifted(self.source.new_tensor([[half, -half]])), shape=(columns, rows))
+        half = self.source.new_tensor([[columns - rows, rows - columns]]) / 2
+        return replace(self.shifted(half), shape=(columns, rows))
 
     def shifted(self, pixels: Float[Tensor, "#m 2"]) -> "Cameras":
         """The same detectors moved in their planes by so many columns and rows, (u, v)."""
