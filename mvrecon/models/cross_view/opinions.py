@@ -23,8 +23,8 @@ from mvrecon.reconstruct.division import divided
 
 #: Density by which an empty voxel counts along a ray, relative to the content's scale.
 LEAST = 0.01
-#: By which the strength of the rays' weights is learned faster than other weights: one number that
-#: should be where it belongs, between 0 and about 1, within the first tenth of a training.
+#: By which the logarithm of the strength of the rays' weights is learned faster than other weights:
+#: one number that should be where it belongs within the first tenth of a training.
 FASTER = 10.0
 
 
@@ -81,8 +81,9 @@ class Opinions(nn.Module):
         super().__init__()
         self.edge, self.binning, self.learned = edge, binning, options.learned
         self.of_residual = options.places == "residual"
-        # before training all rays count as one: noise of the weights is an error where none errs
-        self.strength = nn.Parameter(torch.zeros(())) if options.weigh_rays else None
+        # towards 0 where no camera errs, since noise of the weights is an error there; never below,
+        # where cameras would be believed the more the less weight they have
+        self.log_strength = nn.Parameter(torch.zeros(())) if options.weigh_rays else None
         cameras = Binned.of(projector, binning).cameras
         self.inside = FixedFrusta(projector.grid.coarsened(edge), cameras, depths)
         self.head = HEADS.from_config(options.head)
@@ -138,9 +139,9 @@ class Opinions(nn.Module):
         small = MAGNIFIED * torch.cat([average, deviation(spread)[:, 0]], dim=1)
         evidence = torch.cat([small, features], dim=1)
         rays = None
-        if self.strength is not None:
+        if self.log_strength is not None:
             relative = pixels(self._ray_weights(x, weights), self.binning, residual)
-            rays = 1 + FASTER * self.strength * (relative - 1)
+            rays = 1 + (FASTER * self.log_strength).exp() * (relative - 1)
         expected = expected if unit is None else expected * unit
         expected = expected + means(projected, self.binning)
         return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from mvrecon.models.cross_view.model import CrossView
-from mvrecon.models.cross_view.opinions import FASTER
 from mvrecon.models.cross_view.step import Measured, State
 from mvrecon.models.geometry import whole_geometry
 from tests.models.cross_view.test_model import blob
@@ -19,7 +18,7 @@ def test_rays_count_as_their_camera_and_equally_before_training():
     torch.manual_seed(0)
     model = CrossView(projector, CHOICES["rays"])
     opinions, out = model.rounds[0].opinions, model(views)
-    opinions.strength = None
+    opinions.log_strength = None
     assert torch.allclose(model(views).volume, out.volume, rtol=1e-5, atol=1e-7)
     x, visible = opinions._cells(volume), opinions.inside.frusta.visible.float()
     visible[0] = 0
@@ -34,7 +33,6 @@ def test_a_view_whose_rays_count_nothing_changes_no_volume(monkeypatch):
     """In a round before training, where networks change nothing."""
     projector = small_projector()
     (one,) = CrossView(projector, CHOICES["rays"]).rounds
-    one.opinions.strength.fill_(1 / FASTER)
     weights = torch.ones(1, 1, 4, 4, 4)
     weights[:, :, 1] = 0
     monkeypatch.setattr(one.opinions, "_ray_weights", lambda *_: weights)
