@@ -15,6 +15,7 @@ import figure
 import learned
 
 from mvrecon.files.atomic import written_whole
+from mvrecon.files.tables import read_rows
 
 HERE = Path(__file__).parent
 COLUMNS = (
@@ -50,9 +51,7 @@ def main() -> None:
     parser.add_argument("--large", action="store_true", help="512^2 pixels from 128 views, too")
     options = parser.parse_args()
     out: Path = options.out
-    table: list[dict[str, Any]] = []
-    if out.exists():
-        table = list(csv.DictReader(out.open(encoding="utf-8")))
+    table = read_rows(out)
     known = {(row["method"], row["size"], row["seed"]) for row in table}
     for run in classical.RUNS + (classical.LARGE_RUNS if options.large else ()):
         if (run.label, str(run.scan.size), "") not in known:
@@ -63,7 +62,7 @@ def main() -> None:
         if (training.label, size, str(training.seed)) not in known:
             table += learned.rows(training, options.outputs)
             write(table, out)
-    figure.draw(list(csv.DictReader(out.open(encoding="utf-8"))), out.with_name("convergence.png"))
+    figure.draw(read_rows(out), out.with_name("convergence.png"))
 
 
 if __name__ == "__main__":

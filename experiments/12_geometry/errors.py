@@ -34,15 +34,15 @@ def cases_at(shift: float, data: Path) -> Iterable[dict[str, Any]]:
 
 
 def sirt(A: mv.LinearOperator) -> Callable[[torch.Tensor], torch.Tensor]:
-    """SIRT as the study's other rows have it."""
+    """25 iterations of SIRT with momentum."""
     return lambda views: mv.sirt(A, views, 25, momentum=True)
 
 
 def longest(runs: Path) -> dict[str, Path]:
     """Of each arm the run of the longest training."""
-    folders = {arm: (runs / "rig" / arm).glob("*s_0/results.json") for arm in ARMS}
-    ended = {arm: [path.parent for path in paths] for arm, paths in folders.items()}
-    return {arm: max(runs, key=seconds) for arm, runs in ended.items() if runs}
+    results = {arm: list((runs / "rig" / arm).glob("*s_0/results.json")) for arm in ARMS}
+    folders = {arm: [file.parent for file in files] for arm, files in results.items() if files}
+    return {arm: max(choice, key=seconds) for arm, choice in folders.items()}
 
 
 def seconds(folder: Path) -> int:

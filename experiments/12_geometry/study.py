@@ -9,7 +9,6 @@ arm trains for the same processor time of one thread: steps = seconds / pace.
 """
 
 import argparse
-import csv
 import json
 import os
 import subprocess
@@ -26,7 +25,7 @@ from arms import ALIGNED, ARMS, CLASSICAL, REGIMES, paths, settings
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_data, build_module
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.files.tables import write_rows
+from mvrecon.files.tables import read_rows, write_rows
 
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
@@ -74,10 +73,7 @@ def _seconds(module: ReconstructionModule, batches: Iterable[dict]) -> dict[str,
 
 def _paces() -> dict[tuple[str, str], dict[str, str]]:
     """Of each regime and arm, the measured seconds by their names."""
-    if not PACE.exists():
-        return {}
-    with open(PACE, newline="") as file:
-        return {(row.pop("regime"), row.pop("arm")): row for row in csv.DictReader(file)}
+    return {(row.pop("regime"), row.pop("arm")): row for row in read_rows(PACE)}
 
 
 def steps(regime: str, arm: str, seconds: int) -> int:

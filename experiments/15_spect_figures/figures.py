@@ -4,7 +4,6 @@ attenuation, MTF, wells, bias of counts; its rig and its 80 views.
 python experiments/15_spect_figures/figures.py OUT_FOLDER [geometry] [bias] [edges] [wells]
 """
 
-import csv
 import sys
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from geometry import HOLE, ball, counts_of, geometry
 
 import mvrecon as mv
 from mvrecon.engine.export import save_png
-from mvrecon.files.tables import write_rows
+from mvrecon.files.tables import read_rows, write_rows
 from mvrecon.scenes.derenzo import derenzo
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon.viz.montage import enlarged, radiographs, tiled
@@ -144,8 +143,7 @@ def draw(out: Path) -> None:
         (axes[2], "bias", "counts", "iteration", "inner_half"),
     )
     for axis, table, key, x, y in panels:
-        with (out / f"{table}.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = read_rows(out / f"{table}.csv")
         for name in dict.fromkeys(r[key] for r in rows):
             points = [(float(r[x]), float(r[y])) for r in rows if r[key] == name]
             axis.plot(*zip(*points, strict=True), ".-", label=name)

@@ -11,7 +11,6 @@ arm trains for the same processor time of one thread: steps = seconds / pace.
 """
 
 import argparse
-import csv
 import os
 import subprocess
 import sys
@@ -28,7 +27,7 @@ import mvrecon as mv
 from mvrecon.config import compose
 from mvrecon.data.module import TEST, SceneData
 from mvrecon.engine.fit import build_data, build_module
-from mvrecon.files.tables import write_rows
+from mvrecon.files.tables import read_rows, write_rows
 from mvrecon.metrics import nrmse, volume_metrics
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 
@@ -81,7 +80,7 @@ def operator(options: argparse.Namespace) -> Any:
 
 def tune(options: argparse.Namespace) -> None:
     """Write the error of OSEM and BSREM on validation cases after each iteration."""
-    A, rows = operator(options), _rows(HERE / "tuned.csv")
+    A, rows = operator(options), read_rows(HERE / "tuned.csv")
     trials = [Classical("osem", ITERATIONS, {"subsets": n}) for n in (1, SUBSETS)]
     for weight in WEIGHTS:
         trials.append(Classical("bsrem", ITERATIONS, {"subsets": SUBSETS, "weight": weight}))
@@ -109,7 +108,7 @@ def errors(A: Any, method: Classical, known: dict[str, Any]) -> list[float]:
 
 def tuned(total: str) -> dict[str, Classical]:
     """The best of each method on validation cases, and OSEM as networks start from it."""
-    rows = [row for row in _rows(HERE / "tuned.csv") if row["total"] == total]
+    rows = [row for row in read_rows(HERE / "tuned.csv") if row["total"] == total]
     chosen = {"osem, 5 iterations": Classical("osem", 5, {"subsets": SUBSETS})}
     for name in ("osem", "bsrem"):
         best = min((r for r in rows if r["method"] == name), key=lambda r: float(r["nrmse"]))
@@ -124,7 +123,7 @@ def pace(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     _, known = cases("val", "5e5", options)
     batch = {key: known[key][:2] for key in ("views", "volume", "inside")}
-    rows = {row["arm"]: row["seconds_per_step"] for row in _rows(HERE / "pace.csv")}
+    rows = {row["arm"]: row["seconds_per_step"] for row in read_rows(HERE / "pace.csv")}
     for arm in options.arms:
         run = compose(*settings("5e5", arm, options))
         module, times = build_module(run, run["model"], 1.0), []
@@ -141,7 +140,7 @@ def pace(options: argparse.Namespace) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Train every arm that was asked for and is not trained yet, one after the other."""
-    paces = {row["arm"]: float(row["seconds_per_step"]) for row in _rows(HERE / "pace.csv")}
+    paces = {row["arm"]: float(row["seconds_per_step"]) for row in read_rows(HERE / "pace.csv")}
     for seed, total, arm in product(options.seeds, options.totals, options.arms):
         folder = options.runs / total / arm / f"{options.seconds}s_{seed}"
         if (folder / "results.json").exists():
@@ -228,13 +227,6 @@ def draw(pictures: dict[str, dict[str, torch.Tensor]], file: Path) -> None:
                 error = (volumes[name] - truth)[k]
                 difference.imshow(error, cmap="RdBu_r", vmin=-0.7, vmax=0.7, origin="lower")
     figure.savefig(file, dpi=110)
-
-
-def _rows(path: Path) -> list[dict[str, Any]]:
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def main() -> None:

@@ -5,7 +5,6 @@ python experiments/20_dcspect/study.py table  # results.csv, volumes.png, of run
 """
 
 import argparse
-import csv
 import json
 import sys
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from mvrecon.engine.fit import build_data, methods
 from mvrecon.engine.module import build_projector
 from mvrecon.engine.on_case import OwnAttenuation, reconstructed
 from mvrecon.engine.run_folder import read_settings
-from mvrecon.files.tables import write_rows
+from mvrecon.files.tables import read_rows, write_rows
 from mvrecon.metrics import nrmse
 from mvrecon.parts import RECONSTRUCTORS
 
@@ -61,7 +60,7 @@ def tune(options: argparse.Namespace) -> None:
         batch = data.sets["val"].prepare()
         pairs = zip(operators(run, batch), batch["views"], batch["volume"], strict=True)
         cases = [(A, views[None], truth) for A, views, truth in pairs]
-        rows = [row for row in _rows(HERE / "tuned.csv") if row["experiment"] != name]
+        rows = [row for row in read_rows(HERE / "tuned.csv") if row["experiment"] != name]
         for trial in TRIALS:
             how = {"experiment": name, "method": trial["name"], "subsets": trial["subsets"]}
             how["weight"] = trial.get("weight", "")
@@ -143,13 +142,6 @@ def draw(pictures: dict[str, dict[str, torch.Tensor]], file: Path) -> None:
             one.imshow(volume[k], cmap="gray_r", vmin=0, vmax=truth.max(), origin="lower")
             one.set_title(f"{name}: {label}", fontsize=7)
     figure.savefig(file, dpi=110)
-
-
-def _rows(path: Path) -> list[dict[str, Any]]:
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def main() -> None:

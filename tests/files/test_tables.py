@@ -4,7 +4,7 @@ import csv
 
 import pytest
 
-from mvrecon.files.tables import write_rows
+from mvrecon.files.tables import read_rows, write_rows
 
 
 def test_rows_come_back_and_a_failed_write_leaves_the_earlier_file(tmp_path):
@@ -13,6 +13,7 @@ def test_rows_come_back_and_a_failed_write_leaves_the_earlier_file(tmp_path):
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert rows == [{"method": "sirt", "psnr": "31.5"}, {"method": "a, b", "psnr": ""}]
+    assert read_rows(path) == rows and read_rows(tmp_path / "none.csv") == []
     before = path.read_bytes()
     with pytest.raises(ValueError, match="other"):
         write_rows(path, [{"method": "sirt"}, {"other": 1}])

@@ -140,8 +140,8 @@ class Round(nn.Module):
             if self.opinions is not None:
                 sums = None if self.of_lines else geometry.bounded_sums
                 # detached: a correction's task is the operator's view, not that an opinion be good
-                own = residual.detach()
-                fused = self.opinions(x, own, projected, answer.placed, geometry.mask, sums)
+                missed = residual.detach()
+                fused = self.opinions(x, missed, projected, answer.placed, geometry.mask, sums)
                 state, extra = state._replace(fused=fused), [fused.evidence]
             change = geometry.back(_weighed(state, residual))
         learned, memory = self._world(measured, state, change, extra)

@@ -62,9 +62,9 @@ def among_counts(counts: Float[Tensor, "b 1 m v u"]) -> Bool[Tensor, "b 1 m v u"
     Beside the object most pixels are empty; in its image, where one count a pixel is expected,
     less than half by Poisson's law.
     """
-    some = (counts > 0).to(counts.dtype)
-    share = F.avg_pool2d(some.flatten(0, 2), 3, stride=1, padding=1, count_include_pad=False)
-    return (some > 0) | (share.reshape(counts.shape) > 0.5)
+    filled = (counts > 0).to(counts.dtype)
+    share = F.avg_pool2d(filled.flatten(0, 2), 3, stride=1, padding=1, count_include_pad=False)
+    return (filled > 0) | (share.reshape(counts.shape) > 0.5)
 
 
 def correction_of(

@@ -171,8 +171,8 @@ def test_counts_count_as_the_integrals_that_they_are_of():
     residual = views - projected
     plain = opinions(0.9 * volume, residual, projected, placed, None)
     weight = 1e-4 * torch.linspace(0.9, 1.1, 4)[:, None, None]
-    seen = weight * residual, weight * projected
-    counts = opinions(0.9 * volume, *seen, placed, None, weight * sums)
+    parts = weight * residual, weight * projected
+    counts = opinions(0.9 * volume, *parts, placed, None, weight * sums)
     change = plain.opinions - 0.9 * opinions._cells(volume)[:, None]
     assert (counts.opinions - plain.opinions).norm() < 0.1 * change.norm()
     error = counts.expected / weight - plain.expected
@@ -187,8 +187,8 @@ def test_before_training_cameras_that_miss_nothing_keep_the_volume_however_coars
     opinions = CrossView(projector, CHOICES["coarse"]).rounds[0].opinions
     volume, placed = blob(projector) + 0.5, torch.zeros(1, 4, 2, 4, 4, 4)
     nothing = torch.zeros(1, 1, 4, 12, 12)
-    seen = nothing, projector(volume)
-    fused = opinions(volume, *seen, torch.cat([placed, placed], dim=2), None)
+    parts = nothing, projector(volume)
+    fused = opinions(volume, *parts, torch.cat([placed, placed], dim=2), None)
     x = opinions._cells(volume)[:, None].expand_as(fused.opinions)
     assert (fused.opinions - x).norm() < 0.01 * x.norm()
 

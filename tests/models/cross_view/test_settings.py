@@ -23,6 +23,11 @@ from tests.models.rig import small_projector
             "learned or uniform, got 'flat'",
         ),
         (
+            {"cameras": {"name": "rays2d"}, "opinions": {"places": "all"}},
+            ValueError,
+            "places as residual or view, got 'all'",
+        ),
+        (
             {"cameras": {"name": "rays2d"}, "opinions": {"resolution": "double"}},
             ValueError,
             "resolution of opinions as quarter, half, full, got 'double'",
