@@ -108,6 +108,7 @@ REGIMES = {
     "photons_1e4": Regime(("acquisition=photons", "acquisition.photons=1e4")),
     "photons_1e3": Regime(("acquisition=photons", "acquisition.photons=1e3"), "none", "rig"),
     "rig": RIG,
+    "rig_cases": RIG._replace(views=(*RIG.views, "data.sizes.train=2592")),
     "rig_one": _disturbed("views: 1, shift_px: 1.0, gain: 0.05"),
     "rig_all": _disturbed("views: 8, shift_px: 1.0, gain: 0.05"),
     "tilt": _disturbed("views: 3, tilt_deg: 5.0"),

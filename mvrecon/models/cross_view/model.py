@@ -131,11 +131,10 @@ class CrossView(nn.Module):
         """The whole grid's, within the support: R from the rays' chords of it, none very short, C
         zero outside.
         """
-        whole = self.cropping.whole
-        if self.cropping.options.support == "none":
-            return whole
-        within = whole.with_mask(self.cropping.mask(views), masked=False)
-        return replace(within, row=within.bounded_row)
+        geometry = self.cropping.whole
+        if self.cropping.options.support != "none":
+            geometry = geometry.with_mask(self.cropping.mask(views), masked=False)
+        return replace(geometry, row=geometry.bounded_row)
 
 
 def _opinions(state: State, scale: Float[Tensor, "b 1 1 1 1"]) -> dict[str, Any]:

@@ -141,7 +141,8 @@ class Opinions(nn.Module):
         rays = None
         if self.log_strength is not None:
             relative = pixels(self._ray_weights(x, weights), self.binning, residual)
-            rays = 1 + (FASTER * self.log_strength).exp() * (relative - 1)
+            # a ray below 0 would take x away from the view of a camera that is not believed
+            rays = (1 + (FASTER * self.log_strength).exp() * (relative - 1)).clamp_min(0)
         expected = expected if unit is None else expected * unit
         expected = expected + means(projected, self.binning)
         return Fused(x[:, None] + change, frusta.visible, weights, expected, evidence, rays)

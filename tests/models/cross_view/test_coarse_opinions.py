@@ -1,9 +1,12 @@
 """Opinions at a resolution of their own, and rays that count by the weight of their camera."""
 
+import math
+
 import pytest
 import torch
 
 from mvrecon.models.cross_view.model import CrossView
+from mvrecon.models.cross_view.opinions import FASTER
 from mvrecon.models.cross_view.step import Measured, State
 from mvrecon.models.geometry import whole_geometry
 from tests.models.cross_view.test_model import blob
@@ -28,11 +31,14 @@ def test_rays_count_as_their_camera_and_equally_before_training():
     assert rays[:, :, 1:].min() >= 1 - 1e-5 and rays.max() == pytest.approx(4 / 3)
 
 
+@pytest.mark.parametrize("strength", [1.0, 3.0])
 @torch.no_grad()
-def test_a_view_whose_rays_count_nothing_changes_no_volume(monkeypatch):
-    """In a round before training, where networks change nothing."""
+def test_a_view_whose_rays_count_nothing_changes_no_volume(monkeypatch, strength):
+    """In a round before training, where networks change nothing; with a strength above one, too:
+    no ray counts less than nothing."""
     projector = small_projector()
     (one,) = CrossView(projector, CHOICES["rays"]).rounds
+    one.opinions.log_strength.fill_(math.log(strength) / FASTER)
     weights = torch.ones(1, 1, 4, 4, 4)
     weights[:, :, 1] = 0
     monkeypatch.setattr(one.opinions, "_ray_weights", lambda *_: weights)

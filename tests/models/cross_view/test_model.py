@@ -13,7 +13,7 @@ from mvrecon.losses import EARLIER, ReconstructionLoss
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstruct.iterative import SirtWeights, sirt, sirt_weights
 from mvrecon.testing import check_model
 from tests.models.rig import small_projector, small_rig
 
@@ -64,12 +64,17 @@ def test_the_presets_have_as_many_weights_as_in_the_docs():
 
 
 def test_before_training_a_round_is_a_step_of_sirt():
-    """What networks change or correct starts at zero, and every step has length one."""
+    """What networks change or correct starts at zero, and every step has length one; short chords
+    count as a tenth of the longest.
+    """
     projector = small_projector()
     views = projector(blob(projector))
     model = CrossView(projector, SMALL["CM3"], start=3, consistency=2)
-    expected = sirt(projector, views, 3, momentum=True)
-    expected = sirt(projector, views, 4, nonnegative=False, start=expected).clamp_min(0)
+    row, column = sirt_weights(projector)
+    weights = SirtWeights(row.clamp_max(10 * row[row > 0].min()), column)
+    expected = sirt(projector, views, 3, momentum=True, weights=weights)
+    expected = sirt(projector, views, 4, nonnegative=False, start=expected, weights=weights)
+    expected = expected.clamp_min(0)
     volume = model(views).volume
     assert (volume - expected).abs().max() < 1e-5 * expected.abs().max()
 
@@ -108,12 +113,15 @@ def test_outside_the_hull_all_rounds_are_zero_and_inside_not():
 
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
+@pytest.mark.parametrize("support", ["none", "hull"])
 @torch.no_grad()
-def test_no_ray_is_weighted_by_less_than_a_tenth_of_the_longest_chord_of_the_hull():
+def test_no_ray_is_weighted_by_less_than_a_tenth_of_the_longest_chord(support):
+    """What an overexposed view reads where rays graze the region would be all of the loss."""
     projector = small_projector()
-    model = CrossView(projector, SMALL["M3"], support="hull")
+    model = CrossView(projector, SMALL["M3"], support=support)
     geometry = model._geometry(projector(blob(projector, 2)))
-    chords = projector(geometry.mask.float())
+    region = torch.ones(1, 1, 12, 12, 12) if geometry.mask is None else geometry.mask.float()
+    chords = projector(region)
     longest = chords.amax(dim=(1, 2, 3, 4), keepdim=True)
     expected = torch.where(chords > 0, 1 / chords.maximum(0.1 * longest), 0.0)
     assert ((chords > 0) & (chords < 0.1 * longest)).any()
