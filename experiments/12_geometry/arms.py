@@ -71,12 +71,21 @@ class Regime(NamedTuple):
         support: that the networks work in; a hull of views that err can cut into the object.
         pace: the regime whose training steps take as long.
         options: of every network.
+        begins: the run of the same arm whose weights training begins with, at half its greatest
+            learning rate; none for random weights.
     """
 
     views: tuple[str, ...] = ()
     support: str = "hull"
     pace: str = "clean"
     options: tuple[str, ...] = ()
+    begins: str = ""
+
+    def start(self, runs: Path, arm: str, seed: int) -> list[str]:
+        """The overrides that say where training begins."""
+        if not self.begins:
+            return []
+        return [f"init_from={runs / self.begins.format(arm=arm, seed=seed)}", "optimizer.lr=1e-3"]
 
 
 def _disturbed(options: str) -> Regime:
@@ -130,6 +139,7 @@ REGIMES = {
     ),
     "clean_64": _fine(Regime(), 64, "clean_64"),
     "rig_64": _fine(RIG, 64, "rig_64"),
+    "rig_64_tuned": _fine(RIG, 64, "rig_64")._replace(begins="rig_cases/{arm}/1600s_{seed}"),
     "clean_128": _fine(Regime(), 128, "clean_128"),
     "rig_128": _fine(RIG, 128, "rig_128"),
 }

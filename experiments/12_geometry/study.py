@@ -95,7 +95,7 @@ def train(options: argparse.Namespace) -> None:
         command = [sys.executable, "-m", "mvrecon.train", *settings(REGIMES[regime], arm)]
         command += [*paths(options.data), f"data.cache={options.runs / 'cases'}", f"seed={seed}"]
         command += [f"trainer.max_steps={count}", f"trainer.val_check_interval={min(count, 400)}"]
-        command += [f"hydra.run.dir={folder}"]
+        command += [f"hydra.run.dir={folder}", *REGIMES[regime].start(options.runs, arm, seed)]
         subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 
