@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from mvrecon.reconstruct.filtered.fdk import fbp as fbp
     from mvrecon.reconstruct.filtered.fdk import fdk as fdk
     from mvrecon.reconstruct.filtered.streaming import fdk_streamed as fdk_streamed
+    from mvrecon.reconstruct.finer import finer as finer
     from mvrecon.reconstruct.fista_tv import fista_tv as fista_tv
     from mvrecon.reconstruct.held_out import held_out as held_out
     from mvrecon.reconstruct.iterative import sirt as sirt
@@ -67,6 +68,7 @@ _DOOR = {
     "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.cameras.rigs:dome",
     "epipolar_line": "mvrecon.cameras.epipolar:epipolar_line",
+    "finer": "mvrecon.reconstruct.finer:finer",
     "fista_tv": "mvrecon.reconstruct.fista_tv:fista_tv",
     "fbp": "mvrecon.reconstruct.filtered.fdk:fbp",
     "fdk": "mvrecon.reconstruct.filtered.fdk:fdk",

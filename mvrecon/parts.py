@@ -69,6 +69,7 @@ RECONSTRUCTORS = Registry(
     osem="mvrecon.reconstruct.mlem:osem",
     bsrem="mvrecon.reconstruct.bsrem:bsrem",
     tv_map="mvrecon.reconstruct.tv_map:tv_map",
+    finer="mvrecon.reconstruct.finer:finer",
 )
 #: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
 STREAMED = Registry(

@@ -33,6 +33,11 @@ ARMS = {
     "world_rounds": ("model=world_rounds",),
     "world_unet": ("model=world_unet", f"model.{NARROW}"),
 }
+#: These begin with SIRT on a grid twice as fine, which is made once a case and not in the pace.
+FINER = {
+    f"{arm}_finer": (*ARMS[arm], "model.start={name: finer}")
+    for arm in ("cross_view", "one_round", "world_unet")
+}
 ALIGNED = {
     "cross_view_aligned": ("model=corrected", "model@model.model=cross_view"),
     "one_round_aligned": (
@@ -147,8 +152,10 @@ REGIMES = {
 
 def settings(regime: Regime, arm: str) -> list[str]:
     """The overrides of an arm in a regime."""
-    options = [*BASE, *(ARMS | ALIGNED | CLASSICAL)[arm], *regime.views]
-    if arm not in ARMS:  # options of the experiment's own model, which these have not
+    options = [*BASE, *(ARMS | FINER | ALIGNED | CLASSICAL)[arm], *regime.views]
+    if (
+        arm in ALIGNED or arm in CLASSICAL
+    ):  # options of the experiment's own model, which these have not
         options += ["~model.support", "~model.precision"]
     if arm in CLASSICAL:
         return options

@@ -9,7 +9,7 @@ the mirrored object as the other does.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
@@ -112,3 +112,10 @@ def _partners(
             partner[m], partner[free] = free, m
     partners = torch.tensor(partner)
     return partners, by_rows.cpu()[torch.arange(len(partners)), partners]
+
+
+def same_weights(one: Shaped[Tensor, "*n"], other: Shaped[Tensor, "*#n"]) -> bool:
+    """Whether weights are the same, to rounding; masks to the last bit."""
+    if one.dtype == torch.bool:
+        return torch.equal(one, other)
+    return torch.allclose(one, other.expand_as(one), rtol=1e-9, atol=0)

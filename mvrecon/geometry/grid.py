@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from mvrecon.files.memory import check_memory
@@ -232,6 +232,15 @@ def voxel_centres(grid: Grid, dtype: torch.dtype = torch.float64) -> Float[Tenso
     axes = [torch.arange(n, dtype=torch.float64) for n in grid.shape]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
     return grid.to_world(torch.stack([x, y, z], dim=-1)).to(dtype)
+
+
+def subdivided(volume: Shaped[Tensor, "*b d h w"], factor: int) -> Shaped[Tensor, "*b e i x"]:
+    """Voxels cut into `factor` along each axis, all of their voxel's value, as `Grid.refined` cuts
+    them; undone by the mean.
+    """
+    for axis in (-3, -2, -1):
+        volume = volume.repeat_interleave(factor, dim=axis)
+    return volume
 
 
 def pixel_centres(

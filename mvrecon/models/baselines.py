@@ -9,16 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import (
-    Consistency,
-    Start,
-    Steps,
-    anything,
-    checked_start,
-    content_scale,
-    normalised,
-    typical_chord,
-)
+from mvrecon.models.consistency import Consistency, Steps
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
@@ -26,6 +17,14 @@ from mvrecon.models.network import network_by_name
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.single_pass import SinglePass
+from mvrecon.models.start import (
+    ClassicalStart,
+    Start,
+    anything,
+    content_scale,
+    normalised,
+    typical_chord,
+)
 from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import SirtWeights, correction, sirt, sirt_weights
@@ -93,7 +92,7 @@ class BackprojectionUNet(nn.Module):
         self.options = Options.of(type(self), options)
         _refuse_where(self.options)
         self.cropping = Cropping(projector, self.options)
-        self.start = checked_start(start)
+        self.start = ClassicalStart(start)
         self.net = network_by_name(self.options.network, 3, 1, width, zero=1)
         self.consistency = Consistency(consistency)
 
@@ -103,7 +102,7 @@ class BackprojectionUNet(nn.Module):
 
     def reconstruct(self, views: Float[Tensor, "b 1 m v u"], geometry: Geometry) -> Reconstruction:
         """The volume on a geometry: the whole grid's, or a crop's."""
-        y, x0, scale = normalised(geometry, views, self.start)
+        y, x0, scale = normalised(geometry, views, self.start, self.training)
         evidence = torch.cat([x0, geometry.back(y), geometry.residual(x0, y)], dim=1)
         volume = x0 + geometry.within(self.net(evidence, geometry.network_mask))
         sigma = None if self.options.sigma is None else self.options.sigma / scale

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import typical_chord
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.network import network_by_name
 from mvrecon.models.networks import upsampled
 from mvrecon.models.pooling import leave_one_out
+from mvrecon.models.start import typical_chord
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.pixel_integral import sees_integrals

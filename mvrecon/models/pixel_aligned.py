@@ -13,11 +13,11 @@ from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.consistency import anything, content_scale, typical_chord
 from mvrecon.models.cross_view.cells import from_cells, trimmed
 from mvrecon.models.cross_view.unet import PlainUNet
 from mvrecon.models.door import admitted
 from mvrecon.models.output import Reconstruction
+from mvrecon.models.start import anything, content_scale, typical_chord
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.voxel_driven import Images, images_of, looked
 

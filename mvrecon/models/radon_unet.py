@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.sinogram import sinogram_rig
-from mvrecon.models.consistency import Start, checked_start, normalised, typical_chord
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.cross_view.evidence import MAGNIFIED
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
@@ -22,6 +21,7 @@ from mvrecon.models.output import Reconstruction
 from mvrecon.models.pixel_aligned import at_voxels
 from mvrecon.models.sparse_view.filtered import Geometry as Slices
 from mvrecon.models.sparse_view.filtered import filtered, in_full_precision
+from mvrecon.models.start import ClassicalStart, Start, normalised, typical_chord
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.radon import Radon
 from mvrecon.projectors.voxel_driven import images_of
@@ -94,7 +94,7 @@ class RadonUNet(nn.Module):
         self.corrected_cameras = rig[list(range(angles // 2))]
         self.radon = Radon(grid, self.corrected_cameras)
         self.cropping = Cropping(projector, Options())
-        self.start = checked_start(start)
+        self.start = ClassicalStart(start)
         self.filter: Filter = filter
         self.chord = typical_chord(grid)
         inputs = 2 + len(cameras)
@@ -105,7 +105,7 @@ class RadonUNet(nn.Module):
         views = admitted(views, self.cropping.cameras, self.net.first.weight)
         geometry = self.cropping.whole
         with in_full_precision(views):
-            y, start, scale = normalised(geometry, views, self.start)
+            y, start, scale = normalised(geometry, views, self.start, self.training)
             projections = self.projections(geometry, y, start)
             volume = self.backprojected(projections).clamp_min(0)
         return Reconstruction(

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import Consistency, Start, Steps, checked_start, normalised
+from mvrecon.models.consistency import Consistency, Steps
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
@@ -22,6 +22,7 @@ from mvrecon.models.opinion import DepthNetwork, Opinions
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.pooling import deviation, disagreement, pooled
+from mvrecon.models.start import ClassicalStart, Start, normalised
 from mvrecon.models.weighting import Weighting, comparison, fuse
 from mvrecon.projectors.operator import Projector
 
@@ -64,7 +65,7 @@ class SinglePass(nn.Module):
         if fusion not in ("weighted", "mean"):
             raise ValueError(f"fusion must be 'weighted' or 'mean', got {fusion!r}")
         self.options = Options.of(type(self), options)
-        self.start = checked_start(start)
+        self.start = ClassicalStart(start)
         self.opinions = Opinions(projector, head, DepthNetwork(**(opinion or {})))
         self.cropping = Cropping(projector, self.options, self.opinions.binning)
         self.weighting = Weighting(5) if fusion == "weighted" else None
@@ -87,7 +88,7 @@ class SinglePass(nn.Module):
 
     def reconstruct(self, views: Float[Tensor, "b 1 m v u"], geometry: Geometry) -> Reconstruction:
         """The volume and the opinions on a geometry: the whole grid's, or a crop's."""
-        y, x0, scale = normalised(geometry, views, self.start)
+        y, x0, scale = normalised(geometry, views, self.start, self.training)
         expected = geometry.A(x0)
         opinions, features = self.opinions(geometry, y, x0, y - expected)
         cross_views = geometry.A(opinions[:, :, 0])  # each opinion as every camera would see it

@@ -12,15 +12,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.symmetry import Mirror
+from mvrecon.cameras.symmetry import Mirror, same_weights
 from mvrecon.geometry.box import Box, placed
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, subdivided
 from mvrecon.projectors.pixel_integral import PixelIntegral, SaysPixelIntegral
+from mvrecon.projectors.refining import Refinable
 
 Weight = Tensor | Callable[[], Tensor] | None
 
 
-class LinearOperator(SaysPixelIntegral):
+class LinearOperator(SaysPixelIntegral, Refinable):
     """A linear map y = A x from tensors [b c *domain_shape] to [b c *range_shape], and its adjoint.
 
     SIRT, MLEM, likelihoods and models need no more. What an operator can do at less than the cost
@@ -240,6 +241,10 @@ class Scaled(Wrapped):
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
         return Scaled(self.A.with_support(support), self.factors or self.fixed_factors, self.voxels)
 
+    def refined(self, factor: int) -> Projector:
+        voxels = None if self.voxels is None else subdivided(self.voxels, factor)
+        return Scaled(self.A.refined(factor), self.factors or self.fixed_factors, voxels)
+
     def pixel_integral(self) -> PixelIntegral | None:
         """A's own, times the pixels' factors."""
         own = self.A.pixel_integral()
@@ -248,9 +253,10 @@ class Scaled(Wrapped):
     def mirror(self) -> Mirror | None:
         """A's own, where it mirrors the weights into themselves, too."""
         mirror, p, v = self.A.mirror(), self.pixels, self.voxels
-        if mirror is None or not (p is None or _same(mirror.views(p.expand(self.range_shape)), p)):
+        if mirror is None:
             return None
-        return mirror if v is None or _same(mirror.volume(v), v) else None
+        kept = p is None or same_weights(mirror.views(p.expand(self.range_shape)), p)
+        return mirror if kept and (v is None or same_weights(mirror.volume(v), v)) else None
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> Weight:
         """The pixels' factors after a change, as a function where they were one."""
@@ -289,9 +295,3 @@ class Cropped(Wrapped):
         index = torch.tensor(self.views, device=y.device)
         whole = y.new_zeros(*y.shape[:2], *self.A.range_shape).index_copy(2, index, y)
         return self.A.adjoint(whole)[..., *self.box.slices]
-
-
-def _same(one: Tensor, other: Tensor) -> bool:
-    if one.dtype == torch.bool:
-        return torch.equal(one, other)
-    return torch.allclose(one, other.expand_as(one), rtol=1e-9, atol=0)

@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.cameras.symmetry import Mirror, mirror_pairs
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import subdivided
 from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.integrals import LineIntegrals
@@ -61,7 +62,7 @@ class RayTransform(LineIntegrals):
             does not fit.
     """
 
-    capabilities = frozenset({"subset", "crop", "support"})
+    capabilities = frozenset({"subset", "crop", "support", "refine"})
 
     def __init_subclass__(cls, **options: object) -> None:
         """A subclass that computes something else has the whole operator's parts alone: right, but
@@ -92,6 +93,19 @@ class RayTransform(LineIntegrals):
         cameras = rig if views is None else rig[torch.tensor(views, device=rig.source.device)]
         options = (self.method, self.backend, self.rays_per_pixel, self.skip, support)
         return RayTransform(self.grid.cropped(box), cameras, *options).to(self.device)
+
+    def refined(self, factor: int) -> Projector:
+        """The same on a finer grid, with the same options, and rays as much closer.
+
+        Raises:
+            ValueError: explicit rays, which stand for no pixels, or a subclass that computes
+                something else.
+        """
+        if "refine" not in self.capabilities:
+            return super().refined(factor)
+        support = None if self.support is None else subdivided(self.support.cpu(), factor)
+        options = (self.method, self.backend, factor * self.rays_per_pixel, self.skip, support)
+        return RayTransform(self.grid.refined(factor), self.cameras, *options).to(self.device)
 
     def pixel_integral(self) -> PixelIntegral | None:
         """The line integral, or its mean over a pixel's rays; None with a support, which the object

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.geometry.box import Box, bounds
-from mvrecon.models.consistency import Consistency, Start, Steps, checked_start, normalised
+from mvrecon.models.consistency import Consistency, Steps
 from mvrecon.models.cropping import Cropping
 from mvrecon.models.cross_view.settings import ROUNDS, Computing, RoundOptions
 from mvrecon.models.cross_view.step import Measured, Round, State
@@ -19,6 +19,7 @@ from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
+from mvrecon.models.start import ClassicalStart, Start, normalised
 from mvrecon.projectors.operator import Projector
 
 #: Voxels around a support that networks see, and of whose multiples their boxes have bounds: cells
@@ -40,7 +41,7 @@ class CrossView(nn.Module):
         projector: its grid and its rig.
         rounds: options of each round: `{resolution, widths, cameras, opinions}`.
         start: iterations of SIRT with momentum, the classical start, or a reconstructor as `{name:
-            ..., **options}`.
+            ..., **options}`, whose volumes are kept in training.
         consistency: learned gradient steps towards the corrected views at the end, or `{steps: ...,
             noise: poisson}` for counts.
         support: where the density may differ from zero, from the views: the visual "hull", its
@@ -73,7 +74,7 @@ class CrossView(nn.Module):
         self.cropping = Cropping(projector, Options(support=support, noise=noise))
         if how.crop and support == "none":
             raise ValueError("Expected a support to crop to, got crop=True and support='none'")
-        self.crop, self.start = how.crop, checked_start(start)
+        self.crop, self.start = how.crop, ClassicalStart(start)
         self.rounds = nn.ModuleList(
             Round(projector, one, first < i, how.precision) for i, one in enumerate(options)
         )
@@ -94,7 +95,7 @@ class CrossView(nn.Module):
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         views = admitted(views, self.cropping.cameras, self.consistency.lengths)
         geometry = self._geometry(views)
-        y, x0, scale = normalised(geometry, views, self.start)
+        y, x0, scale = normalised(geometry, views, self.start, self.training)
         correctable = geometry.row > 0
         if self.consistency.poisson:
             correctable = correctable & among_counts(views)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.consistency import anything, content_scale
 from mvrecon.models.network import network_by_name
+from mvrecon.models.start import anything, content_scale
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.filtered.fdk import fbp, fdk
 from mvrecon.reconstruct.filtered.filters import Filter

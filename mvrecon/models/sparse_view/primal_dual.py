@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.consistency import anything, content_scale
 from mvrecon.models.door import admitted
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.sparse_view.filtered import sinograms
+from mvrecon.models.start import anything, content_scale
 from mvrecon.models.unet2d import by_slices
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import SirtWeights, correction, sirt_weights

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.models.consistency import typical_chord
 from mvrecon.models.door import admitted
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.sparse_view.angles import AngularUpsampling
@@ -25,6 +24,7 @@ from mvrecon.models.sparse_view.filtered import (
     scaled,
     sinograms,
 )
+from mvrecon.models.start import typical_chord
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.filtered.filters import Filter
 from mvrecon.reconstruct.filtered.scan_weights import scan_of

@@ -1,0 +1,128 @@
+"""What networks begin with: a classical volume, and the scale by which they divide everything."""
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.models.geometry import Geometry
+from mvrecon.parts import RECONSTRUCTORS
+from mvrecon.reconstruct.iterative import sirt
+
+#: Iterations of SIRT with momentum, or a reconstructor as a mapping: its name and options.
+Start = int | Mapping[str, Any]
+#: Bytes of volumes that a training keeps at most.
+ROOM = 2 << 30
+
+
+class ClassicalStart:
+    """The volume that a network begins with, by SIRT with momentum or another reconstructor, in the
+    unit of (views / mm).
+
+    It is not differentiated. In training another reconstructor's volume of a case is computed once
+    and kept, as long as there is room: views of a training case are the same in every epoch.
+
+    Args:
+        start: iterations of SIRT with momentum, or a reconstructor: `{name: ..., **options}`.
+
+    Raises:
+        LookupError: an unknown name.
+        TypeError: an option that the reconstructor does not have, or a mapping without a name.
+    """
+
+    def __init__(self, start: Start):
+        if isinstance(start, Mapping):
+            RECONSTRUCTORS.check(start)
+        self.start = start
+        self._known: dict[bytes, Float[Tensor, "1 1 d h w"]] = {}
+        self._room = ROOM
+
+    @torch.no_grad()
+    def __call__(
+        self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
+    ) -> Float[Tensor, "b 1 d h w"]:
+        """The volumes of views within each sample's mask."""
+        if not isinstance(self.start, Mapping):
+            A, weights = geometry.A, geometry.weights
+            return sirt(A, views, self.start, weights=weights, momentum=True)
+        samples = views.split(1)
+        masks = [None] * len(samples) if geometry.mask is None else geometry.mask[:, 0]
+        volumes = []
+        for own, mask in zip(samples, masks, strict=True):
+            known = self._recalled if training else self._made
+            volumes.append(known(geometry, own, mask))
+        return torch.cat(volumes)
+
+    def _recalled(self, geometry: Geometry, views: Tensor, mask: Tensor | None) -> Tensor:
+        name = hashlib.sha256(views.detach().cpu().numpy().tobytes()).digest()
+        if name in self._known:
+            return self._known[name].to(views)
+        volume = self._made(geometry, views, mask)
+        size = volume.numel() * volume.element_size()
+        if size <= self._room:
+            self._room -= size
+            self._known[name] = volume.cpu()
+        return volume
+
+    def _made(self, geometry: Geometry, views: Tensor, mask: Tensor | None) -> Tensor:
+        """The reconstructor's volume of views that were scaled to a mean density of the rays of
+        about one before, so that a weight of its options is relative to the content.
+        """
+        level = content_scale(views) / typical_chord(geometry.A.grid)
+        within = {} if mask is None else {"support": mask}
+        assert isinstance(self.start, Mapping)
+        return RECONSTRUCTORS.from_config(self.start, geometry.A, views / level, **within) * level
+
+
+def normalised(
+    geometry: Geometry,
+    views: Float[Tensor, "b 1 m v u"],
+    start: ClassicalStart,
+    training: bool = False,
+) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
+    """Views and their classical start, both divided by the content's scale, and that scale.
+
+    The scale of views of nothing is zero.
+    """
+    x = start(geometry, views, training)
+    scale = content_scale(x)
+    return views / scale, x / scale, scale * anything(views)
+
+
+def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:
+    """The value of what is there, sum x^2 / sum |x|: v for any object of one value v, however
+    small.
+
+    Dividing by it makes a network's answer scale with its input: f(a y) = a f(y). One for an empty
+    volume. Relative to the largest value, whose square may be no number of the dtype.
+    """
+    peak = volume.abs().amax(dim=(1, 2, 3, 4), keepdim=True)
+    peak = torch.where(peak > 0, peak, 1.0)
+    part = (volume / peak).abs()
+    scale = part.square().sum(dim=(1, 2, 3, 4), keepdim=True) / part.sum(
+        dim=(1, 2, 3, 4), keepdim=True
+    ).clamp_min(1)
+    return torch.where(scale > 0, scale * peak, 1.0)
+
+
+def typical_chord(grid: Grid) -> float:
+    """The length in mm by which a network's views are divided, so that it sees densities and no
+    unit of length.
+
+    Of the whole grid, since a crop's would change with the crop.
+    """
+    return max(grid.shape) * min(grid.spacing)
+
+
+def anything(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:
+    """One where views show anything, zero where they show nothing: f(0) = 0. NaN where a value is
+    not finite, which `check_finite` does not tell of a GPU's views.
+    """
+    values = views.flatten(1)
+    shown = values.any(dim=1).to(views.dtype)
+    finite = values.isfinite().all(dim=1)
+    return torch.where(finite, shown, torch.nan).reshape(-1, 1, 1, 1, 1)
