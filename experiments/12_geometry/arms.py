@@ -153,9 +153,7 @@ REGIMES = {
 def settings(regime: Regime, arm: str) -> list[str]:
     """The overrides of an arm in a regime."""
     options = [*BASE, *(ARMS | FINER | ALIGNED | CLASSICAL)[arm], *regime.views]
-    if (
-        arm in ALIGNED or arm in CLASSICAL
-    ):  # options of the experiment's own model, which these have not
+    if arm in ALIGNED | CLASSICAL:  # options of the experiment's own model, which these have not
         options += ["~model.support", "~model.precision"]
     if arm in CLASSICAL:
         return options
