@@ -143,7 +143,7 @@ def task(config: DictConfig) -> None:
 
     from mvrecon.data.attenuation import WATER
     from mvrecon.engine.run_folder import anchored
-    from mvrecon.engine.wrong_cameras import sentences
+    from mvrecon.engine.wrong_cameras import little_weight, sentences
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     table = reconstruct(anchored(to_plain(config)), folder)
@@ -159,6 +159,7 @@ def task(config: DictConfig) -> None:
         f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
         f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{water}",
         *sentences(table.get("cameras")),
+        *little_weight(table["camera_weights"]),
         *(f"doubt: {words}" for words in table["doubts"]),
         sep="\n",
         soft_wrap=True,

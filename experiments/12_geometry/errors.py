@@ -1,4 +1,5 @@
-"""Networks of the regime `rig` where cameras err by less or more than in their training.
+"""Networks of the regimes `rig` and `rig_cases` where cameras err by less or more than in their
+training.
 
 python experiments/12_geometry/errors.py  # errors.csv, errors.png
 """
@@ -39,10 +40,11 @@ def sirt(A: mv.LinearOperator) -> Callable[[torch.Tensor], torch.Tensor]:
 
 
 def longest(runs: Path) -> dict[str, Path]:
-    """Of each arm the run of the longest training."""
-    results = {arm: list((runs / "rig" / arm).glob("*s_0/results.json")) for arm in ARMS}
-    folders = {arm: [file.parent for file in files] for arm, files in results.items() if files}
-    return {arm: max(choice, key=seconds) for arm, choice in folders.items()}
+    """Of each arm the run of the longest training, of `rig_cases` where two are equal."""
+    regimes = ("rig_cases", "rig")
+    results = [file for name in regimes for file in runs.glob(f"{name}/*/*s_0/results.json")]
+    folders = {arm: [file.parent for file in results if file.parts[-3] == arm] for arm in ARMS}
+    return {arm: max(choice, key=seconds) for arm, choice in folders.items() if choice}
 
 
 def seconds(folder: Path) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from mvrecon.losses import binned_like
-from mvrecon.metrics import coverage, mean_and_spread, nrmse, opinion_spread
+from mvrecon.metrics import auc, coverage, mean_and_spread, nrmse, opinion_spread
 from mvrecon.models.output import Reconstruction
 
 #: Percent of the voxels that intervals should cover.
@@ -24,7 +24,8 @@ WITHOUT_TRUTH = {
 def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float]:
     """What a reconstruction tells of its own error, without a unit: the NRMSE that its standard
     deviation predicts, the spread of its opinions, and how well these predict the other cameras'
-    views; and how many of the voxels inside the object its intervals cover.
+    views; how many of the voxels inside the object its intervals cover; and the AUC by which the
+    weights of its cameras tell those whose views are wrong.
     """
     figures = {}
     if out.sigma is not None:
@@ -34,6 +35,8 @@ def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float
         figures |= {f"coverage_{share}": coverage(*off, share / 100) for share in SHARES}
     if out.opinions is not None and out.weights is not None:
         figures["opinion_spread"] = opinion_spread(out.opinions, out.weights)
+    if out.camera_weights is not None and "wrong" in scene:
+        figures["wrong_cameras_auc"] = auc(-out.camera_weights, scene["wrong"])
     if out.cross_views is not None:
         views = binned_like(scene["views"], out.cross_views).expand_as(out.cross_views)
         figures["cross_view_nrmse"] = nrmse(out.cross_views, views)
@@ -76,6 +79,9 @@ def sentence(quality: Mapping[str, Any]) -> str:
     if "coverage_68" in quality:
         covered = " and ".join(f"{quality[f'coverage_{share}']['mean']:.1%}" for share in SHARES)
         parts.append(f"intervals of 68 % and 95 % cover {covered} of the voxels inside")
+    if "wrong_cameras_auc" in quality:
+        area = quality["wrong_cameras_auc"]["mean"]
+        parts.append(f"weights of cameras tell which views are wrong, AUC {area:.3f}")
     ranks = {WITHOUT_TRUTH[k]: q["rank"] for k, q in quality.items() if "rank" in q}
     known = [f"{name} {rank:.2f}" for name, rank in ranks.items() if not math.isnan(rank)]
     if known:

@@ -39,6 +39,7 @@ class Outcome:
         chosen: iterations and weight that views which were left out have chosen.
         view_nrmse: |y - A x| / |y| over the measured pixels; NaN for views of zero.
         sigma: standard deviation of each voxel's error, where the method expects one.
+        camera_weights: how much each camera counts, sum one; empty where they are not weighed.
     """
 
     volume: Float[Tensor, "d h w"]
@@ -48,6 +49,7 @@ class Outcome:
     residuals: list[float] = field(default_factory=list)
     chosen: dict[str, Any] = field(default_factory=dict)
     sigma: Float[Tensor, "d h w"] | None = None
+    camera_weights: list[float] = field(default_factory=list)
 
     def row(self) -> dict[str, Any]:
         """All but volumes, for `results.json`."""
@@ -88,7 +90,8 @@ def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outco
     seconds = time.perf_counter() - start
     volume = run.volume[0, 0].cpu()
     sigma = None if run.sigma is None else run.sigma[0, 0].cpu()
-    return Outcome(volume, seconds, peak(), run.misfit(), run.residuals, run.chosen, sigma)
+    told = (run.misfit(), run.residuals, run.chosen, sigma, run.camera_weights)
+    return Outcome(volume, seconds, peak(), *told)
 
 
 class _Run(NamedTuple):
@@ -97,7 +100,7 @@ class _Run(NamedTuple):
     Args:
         volume: in the unit of the views per mm.
         misfit: |y - A x| / |y|, computed without the method's time.
-        residuals, chosen, sigma: as of `Outcome`.
+        residuals, chosen, sigma, camera_weights: as of `Outcome`.
     """
 
     volume: Float[Tensor, "1 1 d h w"]
@@ -105,6 +108,7 @@ class _Run(NamedTuple):
     residuals: list[float] = []
     chosen: dict[str, Any] = {}
     sigma: Float[Tensor, "1 1 d h w"] | None = None
+    camera_weights: list[float] = []
 
 
 class _Runs:
@@ -172,7 +176,11 @@ def _direct(scan: Scan, name: str, options: dict[str, Any], device: str) -> _Run
         rest = (views - A(volume))[0, 0]
         return _share(rest[mask].norm().item(), views[0, 0][mask].norm().item())
 
-    return _Run(volume, misfit, sigma=outputs[0].sigma if outputs else None)
+    if not outputs:
+        return _Run(volume, misfit)
+    (out,) = outputs
+    weights = [] if out.camera_weights is None else out.camera_weights[0].tolist()
+    return _Run(volume, misfit, sigma=out.sigma, camera_weights=weights)
 
 
 def _share(rest: float, whole: float) -> float:

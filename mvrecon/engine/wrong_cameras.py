@@ -11,6 +11,8 @@ from mvrecon.metrics import camera_metrics
 
 #: Standard errors from which a camera counts as wrong.
 CLEAR = 3.0
+#: Of the weight that each camera would have if all had the same: below, its view may be wrong.
+LITTLE = 0.4
 #: The true shifts and gains of a batch, and which cameras are wrong, by their names in it.
 TRUTH = ("shift_px", "gain", "wrong")
 
@@ -59,3 +61,15 @@ def _sentence(by: Alignment, m: int) -> str:
         f"camera {m}: shifted by {u:+.2f} +- {u_error:.2f} columns and {v:+.2f} +- {v_error:.2f} "
         f"rows, gain {by.gain[0, m]:.3f} +- {by.gain_error[0, m]:.3f}"
     )
+
+
+def little_weight(weights: Sequence[float]) -> list[str]:
+    """One line for each camera to which a network gives little weight, the least first."""
+    equal = 1 / max(1, len(weights))
+    order = sorted(range(len(weights)), key=lambda m: weights[m])
+    return [
+        f"camera {m}: the network gives it a weight of {weights[m]:.3f} (equal: {equal:.3f}); its "
+        f"view may be wrong"
+        for m in order
+        if weights[m] < LITTLE * equal
+    ]

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d
 
 from mvrecon.calibration.alignment import Alignment
+from mvrecon.reconstruct.division import divided
 
 
 @dataclass
@@ -48,3 +50,15 @@ class Reconstruction:
     corrected_views: tuple[Float[Tensor, "b 1 n v u"], ...] = ()
     row: Float[Tensor, "#b 1 #n #v #u"] | None = None
     alignment: Alignment | None = None
+
+    @property
+    def camera_weights(self) -> Float[Tensor, "b m"] | None:
+        """How much each camera counts over the object, without a unit: the mean of its weights, in
+        which a voxel counts by its density; they sum to one. None where cameras are not weighed.
+        """
+        if self.weights is None:
+            return None
+        d, h, w = self.weights.shape[-3:]
+        density = adaptive_avg_pool3d(self.volume.clamp_min(0), (d, h, w))
+        sums = (self.weights * density[:, None]).flatten(2).sum(dim=2)
+        return divided(sums, sums.sum(dim=1, keepdim=True))

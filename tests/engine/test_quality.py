@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from mvrecon.engine.quality import quality_of, quality_row, rank_correlation, sentence
+from mvrecon.engine.wrong_cameras import little_weight
 from mvrecon.models.output import Reconstruction
 
 
@@ -34,6 +35,21 @@ def test_figures_of_a_scene():
     assert figures["opinion_spread"] == pytest.approx(0.1, rel=1e-4)
     assert figures["cross_view_nrmse"] == pytest.approx(0.1, rel=1e-4)
     assert quality_of(Reconstruction(out.volume), case) == {}
+
+
+def test_weights_tell_of_wrong_cameras_where_the_object_is():
+    """Camera 2 counts nothing at the object's only voxel, and most beside it."""
+    volume, weights = torch.zeros(1, 1, 2, 2, 2), torch.ones(1, 3, 1, 2, 2, 2)
+    volume[..., 1] = 2.0
+    weights[:, 2, ..., 0], weights[:, 2, ..., 1], weights[:, 1, ..., 1] = 8.0, 0.0, 3.0
+    out = Reconstruction(volume, weights=weights / weights.sum(dim=1, keepdim=True))
+    assert out.camera_weights.tolist() == [[0.25, 0.75, 0.0]]
+    case = {"wrong": torch.tensor([[False, False, True]])}
+    assert quality_of(out, case) == {"wrong_cameras_auc": 1.0}
+    assert quality_of(out, {"wrong": ~case["wrong"]}) == {"wrong_cameras_auc": 0.0}
+    (line,) = little_weight(out.camera_weights[0].tolist())
+    assert line.startswith("camera 2: the network gives it a weight of 0.000 (equal: 0.333)")
+    assert little_weight([]) == []
 
 
 def test_ranks_over_the_scenes_and_words():

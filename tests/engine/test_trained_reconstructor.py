@@ -66,7 +66,10 @@ def test_a_checkpoint_reconstructs_a_scan_of_its_own_rig_as_its_module_does(
         expected = mv.load(run).module.eval()(views).volume[0, 0]
     assert torch.allclose(volume, expected, rtol=1e-4, atol=1e-5) and expected.max() > 0.1
     assert torch.allclose(grid.affine, A.grid.affine)
-    assert json.loads((tmp_path / "run" / "results.json").read_text())["method"] == "trained"
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert results["method"] == "trained" and results["camera_weights"] == pytest.approx(
+        mv.load(run).module.eval()(views).camera_weights[0].tolist(), abs=1e-4
+    )
 
 
 def test_another_rig_or_grid_is_reconstructed_and_told_in_words(run, A, views):
