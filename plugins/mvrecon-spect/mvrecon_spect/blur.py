@@ -50,8 +50,8 @@ class BlurredPinholes(Projector):
     attenuated integral), and the matched adjoint.
 
     What lies beside the detector's field blurs into it. Layers and pixels that nothing is seen in
-    are not blurred, which changes no more than a convolution's rounding. Differentiable in the volume and mu; in the
-    cameras by the reference.
+    are not blurred, which changes no more than a convolution's rounding. Differentiable in the
+    volume and mu; in the cameras by the reference.
 
     Args:
         grid: where the activity lies; no pinhole may stand in its box.

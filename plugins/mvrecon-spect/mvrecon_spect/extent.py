@@ -22,10 +22,10 @@ class Extent(NamedTuple):
 @torch.library.custom_op("mvrecon_spect::extents", mutates_args=())
 def extents_of(layers: Tensor) -> Tensor:
     """`Extent` of each view [m 6] of what is not zero in the layers of views [n m v u k]."""
-    there = (layers != 0).any(dim=0)
-    ends = [torch.stack(_ends(there.flatten(2).any(dim=2)), dim=1)]
-    ends += [torch.stack(_ends(there.any(dim=axes)), dim=1) for axes in ((1, 3), (1, 2))]
-    return torch.cat(ends, dim=1)
+    size = layers.abs()  # not `!= 0` and `any`: torch takes nine times as long
+    below = size.amax(dim=(0, 2)) != 0
+    places = size.amax(dim=(0, 3, 4)) != 0, below.any(dim=2), below.any(dim=1)
+    return torch.cat([torch.stack(_ends(there), dim=1) for there in places], dim=1)
 
 
 @extents_of.register_fake
