@@ -25,7 +25,7 @@ def extents_of(layers: Tensor) -> Tensor:
     size = layers.abs()  # not `!= 0` and `any`: torch takes nine times as long
     below = size.amax(dim=(0, 2)) != 0
     places = size.amax(dim=(0, 3, 4)) != 0, below.any(dim=2), below.any(dim=1)
-    return torch.cat([torch.stack(_ends(there), dim=1) for there in places], dim=1)
+    return torch.cat([torch.stack(_ends(occupied), dim=1) for occupied in places], dim=1)
 
 
 @extents_of.register_fake
@@ -38,10 +38,10 @@ def _(info, in_dims, layers):
     return extents_of(layers.movedim(in_dims[0], 0).flatten(0, 1)), None
 
 
-def _ends(there: Bool[Tensor, "m s"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+def _ends(occupied: Bool[Tensor, "m s"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
     """The first place of each row that is true, and one behind the last; 0, 0: none is."""
-    low, behind = there.int().argmax(dim=1), there.flip(1).int().argmax(dim=1)
-    return low, (there.shape[1] - behind) * there.any(dim=1)
+    low, behind = occupied.int().argmax(dim=1), occupied.flip(1).int().argmax(dim=1)
+    return low, (occupied.shape[1] - behind) * occupied.any(dim=1)
 
 
 def blurred(
