@@ -36,7 +36,8 @@ class AttenuatedTransform(RayTransform):
     of those between it and the detector (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). A
     segment is a slab's for "joseph", a cell's for "siddon". Differentiable in lambda, mu and, by
     the reference, the cameras. Where mu is zero it is `RayTransform` to the last bit, and costs the
-    same.
+    same. The CPU leaves out rays beside the box of what emits, and what lies behind it on others;
+    that changes no bit.
 
     Convention: counts run along a ray towards growing w, see `Cameras`: to the pinhole and the
     detector behind it, or to a collimator's end plane w = 1.

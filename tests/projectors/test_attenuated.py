@@ -176,6 +176,28 @@ def test_every_bit_is_the_same_for_any_number_of_threads():
     assert all(torch.equal(one, other) for one, other in zip(*results, strict=True))
 
 
+@pytest.mark.parametrize("method", ["joseph", "siddon"])
+def test_rays_beside_the_emission_and_what_lies_behind_it_change_no_bit(method):
+    grid, mu, x = scene(torch.float32)
+    x[:, 0] = 0
+    x[0, 0, :2, 1:4, 7:] = 1  # in a corner; the other channel is full, and both are computed whole
+    A = AttenuatedTransform(grid, rig(), mu, method=method)
+    alone = A(x[:, :1])
+    assert torch.equal(alone, A(x)[:, :1])
+    assert 0 < (alone != 0).float().mean() < 0.9
+
+
+def test_no_emission_is_no_counts_and_nan_is_never_skipped():
+    grid, mu, x = scene(torch.float32)
+    A = AttenuatedTransform(grid, rig(), mu)
+    assert not A(0 * x).any()
+    one = torch.zeros_like(x[:, :1])
+    one[0, 0, 0, 1, 11] = 1
+    seen = A(one) != 0
+    assert seen.any()
+    assert A(one * torch.nan)[seen].isnan().all()
+
+
 @pytest.mark.door
 @pytest.mark.parametrize(
     ("value", "told"),

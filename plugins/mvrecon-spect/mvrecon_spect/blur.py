@@ -29,6 +29,7 @@ from mvrecon.projectors.attenuated import check_mu
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.selection import ViewSelection
+from mvrecon_spect.extent import Extent, blurred, extents_of
 from mvrecon_spect.hole import Hole
 
 #: Layers of magnification of a view; cameras whose layers are in memory at a time.
@@ -48,8 +49,9 @@ class BlurredPinholes(Projector):
     """Counts [b c m v u] behind blurring pinholes of volumes [b c d h w] in counts / mm^3, Blur(w *
     attenuated integral), and the matched adjoint.
 
-    What lies beside the detector's field blurs into it. Differentiable in the volume and mu; in the
-    cameras by the reference.
+    What lies beside the detector's field blurs into it. Layers and pixels that nothing is seen in
+    are not blurred, which changes no more than a convolution's rounding. Differentiable in the
+    volume and mu; in the cameras by the reference.
 
     Args:
         grid: where the activity lies; no pinhole may stand in its box.
@@ -86,6 +88,7 @@ class BlurredPinholes(Projector):
         self.kernels = kernels_of(cameras, self.magnification(), optics)
         margin = [(n - 1) // 2 for n in self.kernels.shape[-2:]]
         self.wider = grown(cameras, margin)
+        self.weight = None if self.pose_gradient else optics.hole.weight(self.wider)
 
     @property
     def device(self) -> torch.device:
@@ -127,12 +130,11 @@ class BlurredPinholes(Projector):
         for part in self._parts(volume):
             rays = part.lines, part.layers, window, detector, self.method
             layers = ops.project(volume, self.mu, *rays) * part.weight[..., None]
-            planes = layers.movedim(-1, 2).flatten(1, 2)
-            single = part.kernels.flatten(0, 1)[:, None]
-            # layer by layer and then summed: torch is 25 times slower to sum itself
-            blurred = F.conv2d(planes, single, groups=planes.shape[1])
-            views.append(blurred.unflatten(1, (len(part.lines), -1)).sum(dim=2))
-        return torch.cat(views, dim=1).unflatten(0, x.shape[:2])
+            extents = extents_of(layers.detach()).tolist()
+            shape = self.cameras.shape
+            for m, extent in enumerate(extents):
+                views.append(blurred(layers[:, m], part.kernels[m], Extent(*extent), shape))
+        return torch.stack(views, dim=1).unflatten(0, x.shape[:2])
 
     def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """The matched adjoint: volumes of views.
@@ -186,7 +188,8 @@ class BlurredPinholes(Projector):
     def _parts(self, like: Tensor) -> Iterator["Part"]:
         """A few cameras at a time."""
         lines = lines_of(self.wider, self.grid).to(like.device)
-        weight = self.optics.hole.weight(self.wider).to(like)
+        weight = self.optics.hole.weight(self.wider) if self.weight is None else self.weight
+        weight = weight.to(like)
         layers = -self.magnification().to(like.device)
         kernels = self.kernels.to(like)
         for first in range(0, len(lines), TOGETHER):
@@ -221,19 +224,8 @@ def kernels_of(
     widths = magnification.new_tensor(optics.hole.blurring_mm) * (1 + magnification)[..., None]
     sides = widths / pitch[:, None]  # in pixels (u, v)
     reach = [int(math.ceil(sides[..., axis].max().item() / 2 - 0.5)) for axis in range(2)]
-    places = [_places(max(r, 0)).to(sides) for r in reach]
-    u, v = places[0][None, :], places[1][:, None]
-    half = sides[..., None, None, :] / 2
-    if optics.hole.round:
-        distance = ((u / half[..., 0]) ** 2 + (v / half[..., 1]) ** 2).sqrt()
-    else:
-        distance = torch.maximum(
-            *torch.broadcast_tensors((u / half[..., 0]).abs(), (v / half[..., 1]).abs())
-        )
-    edge = PARTS * half.amin(dim=-1)  # an edge a part of a pixel wide, so that widths count in full
-    inside = ((1 - distance) * edge + 0.5).clamp(0, 1)
-    image = F.avg_pool2d(inside, PARTS)
-    image = image / image.sum(dim=(-2, -1), keepdim=True)
+    # a view at a time: near a pinhole images are large, and they are drawn in many parts
+    image = torch.stack([_hole_images(one, reach, optics.hole.round) for one in sides])
     if not optics.intrinsic_mm:
         return image
     sigma = optics.intrinsic_mm / FWHM / pitch
@@ -242,6 +234,24 @@ def kernels_of(
     rows, columns = kernels.shape[-2:]
     padded = F.pad(image, (columns - 1, columns - 1, rows - 1, rows - 1))
     return F.conv2d(padded.transpose(0, 1), kernels, groups=len(kernels)).transpose(0, 1)
+
+
+def _hole_images(
+    sides: Float[Tensor, "k 2"], reach: Sequence[int], circular: bool
+) -> Float[Tensor, "k i j"]:
+    """Images of a hole, of the sum 1, that are so many pixels (u, v) wide."""
+    places = [_places(max(r, 0)).to(sides) for r in reach]
+    u, v = places[0][None, :], places[1][:, None]
+    half = sides[:, None, None] / 2
+    across, down = u / half[..., 0], v / half[..., 1]
+    if circular:
+        distance = (across**2 + down**2).sqrt()
+    else:
+        distance = torch.maximum(*torch.broadcast_tensors(across.abs(), down.abs()))
+    edge = PARTS * half.amin(dim=-1)  # an edge a part of a pixel wide, so that widths count in full
+    inside = ((1 - distance) * edge + 0.5).clamp(0, 1)
+    image = F.avg_pool2d(inside, PARTS)
+    return image / image.sum(dim=(-2, -1), keepdim=True)
 
 
 def _places(reach: int) -> Float[Tensor, " n"]:

@@ -78,3 +78,18 @@ def test_a_support_is_the_projectors(A):
     x = torch.rand(1, 1, *GRID.shape)
     assert {"subset", "crop", "support"} <= A.capabilities
     torch.testing.assert_close(A.with_support(support)(x), A(x * support))
+
+
+def test_blur_is_computed_where_the_emission_is_seen_and_is_the_same():
+    """But for the rounding of a convolution of another size."""
+    mu = torch.full(GRID.shape, 0.01, dtype=torch.float64)
+    B = Spect(GRID, dcspect80(pixels=[40, 36], rows=[0], columns=[0, 7]), mu=mu, blur=True)
+    x = torch.rand(1, 2, *GRID.shape, dtype=torch.float64)
+    x[:, 0] = 0
+    assert not B(x[:, :1]).any()
+    x[0, 0, 3:6, 5:7, 5:7] = 1
+    alone = B(x[:, :1])
+    assert 0 < (alone != 0).double().mean() < 0.9
+    torch.testing.assert_close(alone, B(x)[:, :1], rtol=1e-12, atol=1e-15)
+    each = torch.func.vmap(B)(x[None])[0]
+    torch.testing.assert_close(each, B(x), rtol=1e-12, atol=1e-15)

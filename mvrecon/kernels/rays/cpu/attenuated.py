@@ -3,9 +3,12 @@ for any number of threads, as those of `operators.py`.
 
 A ray is read as a whole, since what lies near the detector weakens what lies behind it: volumes are
 one piece, and a thread that owns some slabs of the adjoint walks all of the rays that meet them.
+Rays beside the box of the emission, and what lies behind it on the others, change no bit and are
+left out.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,18 +19,21 @@ from torch import Tensor
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays.cpu.attenuated_loops import (
     Desk,
+    Emission,
     Matter,
     backproject_slabs,
     bend_slabs,
     project_rows,
 )
 from mvrecon.kernels.rays.cpu.loops import room_of
+from mvrecon.kernels.rays.cpu.nonzero import box_of, readable
 from mvrecon.kernels.rays.cpu.operators import Copy, copies, piece_sizes
 from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, part_of, store
 from mvrecon.kernels.rays.cpu.plan import Plan, Scene, whole_plan_of
-from mvrecon.kernels.rays.cpu.rig import Rig, Slabs, Units
+from mvrecon.kernels.rays.cpu.rig import Rig, Slabs, Units, bounds_of
 from mvrecon.kernels.rays.cpu.transmission import path_of
-from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.kernels.rays.occupancy import Occupancy, boxes_of
+from mvrecon.kernels.rays.trace import Space
 from mvrecon.kernels.threads import share
 
 Spread = Callable[[Store, Copy, Desk, Slabs], None]
@@ -58,15 +64,23 @@ def project(
     """Attenuated line integrals; see `attenuated_reference.project`."""
     both = torch.cat([wide(volume), mu.to(wide(volume[:0]).dtype)[None]])
     plan, occupancy = _plan(lines, window, detector, method, mu)
+    emitting = Occupancy(occupancy.shape, box_of(readable(wide(volume))))
+    plan = replace(plan, boxes=boxes_of(emitting))
+    space = Space(plan.rig.window, plan.rig.sizes, bounds_of(emitting))
     views = np.zeros(
         (len(volume), len(lines), *plan.rig.detector, layers.shape[1]), both.numpy().dtype
     )
+    if not emitting.box.size:
+        return torch.from_numpy(views)
     for copy in copies(both, occupancy, plan):
         matter, reads = Matter(copy.store, len(volume)), plan.reads[copy.store.near]
+        emission = Emission(copy.store, space)
 
-        def add_rows(first: int, last: int, copy=copy, matter=matter, reads=reads) -> None:
+        def add_rows(
+            first: int, last: int, copy=copy, emission=emission, matter=matter, reads=reads
+        ) -> None:
             units, desk = Units(copy.axes, first, last), _desk(copy.rig, copy.store, layers)
-            project_rows(copy.store, matter, copy.rig, desk, reads, views, units)
+            project_rows(emission, matter, copy.rig, desk, reads, views, units)
 
         share(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
     return torch.from_numpy(views)

@@ -20,6 +20,7 @@ from mvrecon.kernels.rays.cpu.transmission import (
     bend,
     cells,
     integrals,
+    retain,
     segments_of,
     transmit,
     weigh,
@@ -27,8 +28,10 @@ from mvrecon.kernels.rays.cpu.transmission import (
 from mvrecon.kernels.rays.trace import SIDDON, from_centre, main_axis, trace, within
 from mvrecon.kernels.rays.trace import at as component
 
-#: A store and one of its volumes, as of attenuation; what one thread works in: see `loops.Room`
+#: A store of emission, and what its rays are traced through to where it may be anything but zero;
+#: a store and one of its volumes, as of attenuation; what one thread works in: see `loops.Room`
 #: and `transmission.Path`; and the layers [m k] of every view, see `layers.py`.
+Emission = namedtuple("Emission", ["store", "space"])
 Matter = namedtuple("Matter", ["store", "at"])
 Desk = namedtuple("Desk", ["room", "path", "layers"])
 
@@ -52,6 +55,18 @@ def _attenuate(matter, rig, ray, part, ascending, steps, desk):
 
 
 @scalar
+def _cut(rig, ray, span, known, steps, desk):
+    """Of the segments that are known, from a first slab on so many slabs, leave those of a span
+    with their cells and shares; returns what `visit` does.
+    """
+    visited = visit(rig, ray, span, desk.room)
+    if visited[0] != known[1]:
+        cells(rig, ray, visited[0], steps, desk.room)
+        retain(rig, desk.path.share, known[1], span[0] - known[0], visited[0])
+    return visited
+
+
+@scalar
 def _spread(volume, rig, ray, span, made, steps, desk):
     """Add to a volume, along a span of a ray, every segment's length times its number in `value`.
 
@@ -70,9 +85,19 @@ def _spread(volume, rig, ray, span, made, steps, desk):
         joseph.spread(store, n, steps, count, desk.room, real(ray.length))
 
 
+@scalar
+def _towards(ray, span, ascending):
+    """The part of a ray from the detector's end to the far end of a span."""
+    return (ray.first, span[1]) if ascending else (span[0], ray.last)
+
+
 @compiled
-def project_rows(store, matter, rig, desk, reads, views, units):
-    """Add to views [n m v u] the attenuated sums of volumes along the rays of some units."""
+def project_rows(emission, matter, rig, desk, reads, views, units):
+    """Add to views [n m v u] the attenuated sums of volumes along the rays of some units.
+
+    What lies behind the emission is not met, and what lies before it weakens alone.
+    """
+    store, space = emission
     for unit in range(units.first, units.last):
         view, place, start, stop = walk(rig, reads.spans, unit)
         m, tall = reads.views[view], reads.tall[view]
@@ -83,10 +108,17 @@ def project_rows(store, matter, rig, desk, reads, views, units):
             axis = main_axis(line, pixel[0], pixel[1])
             if not units.axes[axis]:
                 continue
-            ray = trace(line, axis, store.near, pixel, rig, rig.method)
-            steps = steps_of(rig, store, axis)
-            part, ascending = (ray.first, ray.last), ascends(line, ray, pixel)
+            emits = trace(line, axis, store.near, pixel, space, rig.method)
+            if emits.first >= emits.last:
+                continue
+            ray = emits
+            if space.box != rig.box:
+                ray = trace(line, axis, store.near, pixel, rig, rig.method)
+            steps, span = steps_of(rig, store, axis), (emits.first, emits.last)
+            ascending = ascends(line, ray, pixel)
+            part = _towards(ray, span, ascending)
             visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
+            visited = _cut(rig, ray, span, (part[0], visited[0]), steps, desk)
             if len(desk.layers[m]) > 1:
                 layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
                 count, path = segments_of(rig, visited[0]), desk.path
@@ -124,7 +156,7 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
             if span[0] >= span[1]:
                 continue
             ascending = ascends(line, ray, pixel)
-            part = (ray.first, span[1]) if ascending else (span[0], ray.last)
+            part = _towards(ray, span, ascending)
             visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
             layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
             count, path = segments_of(rig, visited[0]), desk.path

@@ -165,6 +165,14 @@ def pass_slabs(path, slabs, ascending):
 
 
 @scalar
+def retain(rig, share, slabs, first, count):
+    """Of the segments' shares of so many slabs keep those from `first` on, in front."""
+    for third in range(3 if rig.method == SIDDON else 1):
+        for i in range(np.uint32(count)):
+            share[third * count + i] = share[third * slabs + first + i]
+
+
+@scalar
 def weigh(rig, room, share, slabs, first, count):
     """The cells of a room with shares of their segments: of so many slabs those from `first` on."""
     if rig.method == SIDDON:

@@ -1,0 +1,74 @@
+"""Which part of a pinhole's layers of magnification holds anything, and the blur of that part."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+class Extent(NamedTuple):
+    """Rows, columns and layers from the first that hold something to one behind the last."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+    near: int
+    far: int
+
+
+@torch.library.custom_op("mvrecon_spect::extents", mutates_args=())
+def extents_of(layers: Tensor) -> Tensor:
+    """`Extent` of each view [m 6] of what is not zero in the layers of views [n m v u k]."""
+    size = layers.abs()  # not `!= 0` and `any`: torch takes nine times as long
+    below = size.amax(dim=(0, 2)) != 0
+    places = size.amax(dim=(0, 3, 4)) != 0, below.any(dim=2), below.any(dim=1)
+    return torch.cat([torch.stack(_ends(occupied), dim=1) for occupied in places], dim=1)
+
+
+@extents_of.register_fake
+def _(layers):
+    return layers.new_empty(layers.shape[1], 6, dtype=torch.int64)
+
+
+@extents_of.register_vmap
+def _(info, in_dims, layers):
+    return extents_of(layers.movedim(in_dims[0], 0).flatten(0, 1)), None
+
+
+def _ends(occupied: Bool[Tensor, "m s"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+    """The first place of each row that is true, and one behind the last; 0, 0: none is."""
+    low, behind = occupied.int().argmax(dim=1), occupied.flip(1).int().argmax(dim=1)
+    return low, (occupied.shape[1] - behind) * occupied.any(dim=1)
+
+
+def blurred(
+    layers: Float[Tensor, "n v u k"],
+    kernels: Float[Tensor, "k i j"],
+    extent: Extent,
+    shape: tuple[int, int],
+) -> Float[Tensor, "n rows columns"]:
+    """A view of a shape from its layers, of which those pixels are blurred that the extent reaches;
+    the others are zero.
+    """
+    kernels = kernels[extent.near : extent.far]
+    rows, columns = (n - 1 for n in kernels.shape[-2:])
+    wide = (kernels.detach() != 0).any(dim=0)
+    y, x = _rim(wide.any(dim=1)), _rim(wide.any(dim=0))
+    top, bottom = max(extent.top - rows + y, 0), min(extent.bottom - y, shape[0])
+    left, right = max(extent.left - columns + x, 0), min(extent.right - x, shape[1])
+    if extent.near == extent.far or top >= bottom or left >= right:
+        return layers.new_zeros(len(layers), *shape)
+    down, across = slice(top + y, bottom + rows - y), slice(left + x, right + columns - x)
+    planes = layers[:, down, across, extent.near : extent.far].movedim(-1, 1)
+    inner = kernels[:, None, y : rows + 1 - y, x : columns + 1 - x]
+    # layer by layer and then summed: torch is 25 times slower to sum itself
+    view = F.conv2d(planes, inner, groups=planes.shape[1]).sum(dim=1)
+    return F.pad(view, (left, shape[1] - right, top, shape[0] - bottom))
+
+
+def _rim(wide: Bool[Tensor, " n"]) -> int:
+    """How many places at each end of a symmetrical row are not true."""
+    return int(wide.int().argmax())
