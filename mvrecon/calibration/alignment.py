@@ -145,7 +145,7 @@ def alignment(
     fit = _Fit(
         _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
-        views.new_tensor([prior.shift_px, prior.shift_px, prior.gain]).pow(-2),
+        torch.cat([views.new_full((n,), spread**-2) for n, spread in zip((2, 1), prior)]),
     )
     for _ in range(steps):
         rest = (blurred(aligned(views, one), BLUR) - smooth) / unit
@@ -176,7 +176,8 @@ class _Fit(NamedTuple):
             scale = self._scale(left)
             weight = self.weight * (HUBER * scale / left.abs().clamp_min(ROUNDING)).clamp_max(1)
             weighted = self.columns * (weight / (ALIKE * scale**2))[..., None]
-            inverse = torch.linalg.inv(weighted.mT @ self.columns + self.precision.diag())
+            # the prior keeps it from being singular, so that nobody has to wait for a check
+            inverse = torch.linalg.inv_ex(weighted.mT @ self.columns + self.precision.diag())[0]
             slope = (weighted.mT @ rest[..., None])[..., 0] - self.precision * present
             change = (inverse @ slope[..., None])[..., 0]
         error = inverse.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -201,7 +202,7 @@ def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
     """Derivatives by the two shifts (difference quotients of half a pixel to each side) and by the
     gain.
     """
-    halves = 0.5 * torch.eye(2).to(smooth)[:, None, None]
+    halves = 0.5 * torch.eye(2, dtype=smooth.dtype, device=smooth.device)[:, None, None]
     ahead, behind = ([translated(smooth, side * half) for half in halves] for side in (1, -1))
     moved = [one - other for one, other in zip(ahead, behind, strict=True)]
     return torch.stack([*moved, smooth], dim=-1)[:, 0].flatten(2, 3)
