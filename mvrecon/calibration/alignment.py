@@ -40,6 +40,13 @@ class Prior(NamedTuple):
     shift_px: float = 1.0
     gain: float = 0.05
 
+    def precision(self, like: Tensor) -> Float[Tensor, " 3"]:
+        """Inverse variances of both shifts and of the gain, as a tensor on the device of another,
+        which is not waited for.
+        """
+        shifts, gain = like.new_full((2,), self.shift_px), like.new_full((1,), self.gain)
+        return torch.cat([shifts, gain]).pow(-2)
+
 
 #: A pixel and 5 %.
 USUAL = Prior()
@@ -145,7 +152,7 @@ def alignment(
     fit = _Fit(
         _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
-        torch.cat([views.new_full((n,), spread**-2) for n, spread in zip((2, 1), prior)]),
+        prior.precision(views),
     )
     for _ in range(steps):
         rest = (blurred(aligned(views, one), BLUR) - smooth) / unit

@@ -14,8 +14,8 @@ from mvrecon.reconstruct.power import power_norm
 from mvrecon.reconstruct.problem import Common, posed, without_gradient
 from mvrecon.reconstruct.total_variation import (
     Shrinkage,
-    total_variation,
     dual_rate,
+    total_variation,
     tv_proximal,
     voxel_steps,
 )

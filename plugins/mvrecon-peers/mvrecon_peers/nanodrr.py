@@ -47,8 +47,8 @@ class Nanodrr(Traced):
         first: Float[Tensor, "k r 3"],
         last: Float[Tensor, "k r 3"],
     ) -> Float[Tensor, "k r"]:
-        """nanodrr's views, on the whole detector, whose neighbouring pixels its kernel takes together;
-        the ends of the rays tell where its pixels lie.
+        """nanodrr's views, on the whole detector, since its kernel takes neighbouring pixels
+        together; the ends of the rays tell where they lie.
         """
         x = volume[None, None]
         affine, counts = self.box.affine.to(volume), volume.new_tensor(volume.shape[::-1])
