@@ -128,6 +128,9 @@ def test_conjugate_gradients_that_nobody_stops_stay_where_they_are_done(scanned)
 @pytest.mark.door
 @pytest.mark.parametrize("name", [name for name, waits in BEFORE.items() if waits < 4])
 def test_a_view_that_is_not_finite_shows_in_the_volume_of_a_gpu(name, scanned):
+    """Iterative methods of a GPU, which do not wait to look at their views, give NaN where a view
+    is not finite, never a volume of numbers alone.
+    """
     volume, _ = reconstructed(scanned, name, 2, break_off=True)
     assert not volume.isfinite().all()
 
