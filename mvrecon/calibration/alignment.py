@@ -40,6 +40,13 @@ class Prior(NamedTuple):
     shift_px: float = 1.0
     gain: float = 0.05
 
+    def precision(self, like: Tensor) -> Float[Tensor, " 3"]:
+        """Inverse variances of both shifts and of the gain, as a tensor on the device of another,
+        which is not waited for.
+        """
+        shifts, gain = like.new_full((2,), self.shift_px), like.new_full((1,), self.gain)
+        return torch.cat([shifts, gain]).pow(-2)
+
 
 #: A pixel and 5 %.
 USUAL = Prior()
@@ -145,7 +152,7 @@ def alignment(
     fit = _Fit(
         _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
-        views.new_tensor([prior.shift_px, prior.shift_px, prior.gain]).pow(-2),
+        prior.precision(views),
     )
     for _ in range(steps):
         rest = (blurred(aligned(views, one), BLUR) - smooth) / unit
@@ -176,7 +183,8 @@ class _Fit(NamedTuple):
             scale = self._scale(left)
             weight = self.weight * (HUBER * scale / left.abs().clamp_min(ROUNDING)).clamp_max(1)
             weighted = self.columns * (weight / (ALIKE * scale**2))[..., None]
-            inverse = torch.linalg.inv(weighted.mT @ self.columns + self.precision.diag())
+            # the prior keeps it from being singular, so that nobody has to wait for a check
+            inverse = torch.linalg.inv_ex(weighted.mT @ self.columns + self.precision.diag())[0]
             slope = (weighted.mT @ rest[..., None])[..., 0] - self.precision * present
             change = (inverse @ slope[..., None])[..., 0]
         error = inverse.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -201,7 +209,7 @@ def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
     """Derivatives by the two shifts (difference quotients of half a pixel to each side) and by the
     gain.
     """
-    halves = 0.5 * torch.eye(2).to(smooth)[:, None, None]
+    halves = 0.5 * torch.eye(2, dtype=smooth.dtype, device=smooth.device)[:, None, None]
     ahead, behind = ([translated(smooth, side * half) for half in halves] for side in (1, -1))
     moved = [one - other for one, other in zip(ahead, behind, strict=True)]
     return torch.stack([*moved, smooth], dim=-1)[:, 0].flatten(2, 3)

@@ -27,7 +27,7 @@ class Blur(LinearOperator):
     ):
         self.domain_shape = self.range_shape = tuple(shape)
         self._bands = [
-            _band(size, sigma).to(device) if sigma else None
+            _band(size, sigma, torch.device(device)) if sigma else None
             for size, sigma in zip(shape, sigmas, strict=True)
         ]
         self._device = torch.device(device)
@@ -67,11 +67,12 @@ def blurred(
     return divided(total, weight)
 
 
-def _band(size: int, sigma: float) -> Float[Tensor, "n n"]:
+def _band(size: int, sigma: float, device: torch.device) -> Float[Tensor, "n n"]:
     """The weights of a Gaussian between the places of a row; the same whichever way they are read,
     which needs the sum of the unbounded row for all of them.
     """
-    place = torch.arange(size, dtype=torch.float64)
+    place = torch.arange(size, dtype=torch.float64, device=device)
     apart = (place[:, None] - place).abs()
-    reach = torch.arange(-int(8 * sigma + 1), int(8 * sigma + 1) + 1, dtype=torch.float64)
+    most = int(8 * sigma + 1)
+    reach = torch.arange(-most, most + 1, dtype=torch.float64, device=device)
     return torch.exp(-((apart / sigma) ** 2) / 2) / torch.exp(-((reach / sigma) ** 2) / 2).sum()

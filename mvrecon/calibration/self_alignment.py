@@ -15,11 +15,14 @@ from torch import Tensor
 from mvrecon.calibration.alignment import Alignment, CorrectedViews, aligned, alignment
 from mvrecon.calibration.unknowns import motions
 from mvrecon.cameras.views import check_finite
+from mvrecon.kernels.known import key_of, known
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstruct.iterative import sirt, sirt_weights
 
 #: Shifts in pixels, and gains, below which a camera counts as standing still.
 STILL_PX, STILL_GAIN = 0.03, 0.003
+#: Of the sum of what modes move: modes that move less are shared by no cameras.
+NOT_SHARED = 1e-10
 #: Least squares, reweighted, for the least absolute deviations.
 REWEIGHTED = 10
 
@@ -63,13 +66,20 @@ def self_alignment(
         iterations: of SIRT with momentum in each, from the volume of the one before.
 
     Raises:
-        ValueError: views that are not finite, or no alternation.
+        ValueError: views that are not finite (on a GPU, where nobody waits for them, the volume of
+            such views is not finite either), or no alternation.
     """
     if alternations < 1:
         raise ValueError(f"expected at least one alternation, got {alternations}")
-    check_finite(views)
+    check_finite(views, on_gpu=False)
     by, volume, weights = Alignment.none(views), None, sirt_weights(A, views.dtype)
-    moves = motions(A.cameras, A.grid.centre)
+    cameras, centre = A.cameras, A.grid.centre
+    moves = known(
+        cameras,
+        ("motions", key_of(A.grid)),
+        views,
+        lambda: motions(cameras, centre).detach().to(views.device),
+    )
     for _ in range(alternations):
         volume = sirt(
             A, aligned(views, by), iterations, weights=weights, momentum=True, start=volume
@@ -89,9 +99,8 @@ def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
         by: the alignment.
         moves: what a motion of the object is in the views, by `motions`.
     """
-    moves = moves.to(by.shift_px)
-    shift = least_deviations(by.shift_px, moves, STILL_PX)
-    common = torch.ones_like(moves[:, :1, :1])
+    shift = least_deviations(by.shift_px, moves.to(by.shift_px.device), STILL_PX)
+    common = by.gain.new_ones(by.gain.shape[1], 1, 1)
     gain = least_deviations(by.gain.log()[..., None], common, STILL_GAIN)
     return replace(by, shift_px=shift, gain=gain[..., 0].exp())
 
@@ -107,11 +116,17 @@ def least_deviations(
         modes: what all cameras may share.
         floor: lengths below count as zero.
     """
+    dtype, values, modes = values.dtype, values.double(), modes.double()
     rest, flat = values, modes.flatten(0, 1)
+    unit = torch.eye(modes.shape[2], dtype=values.dtype, device=values.device)
     for _ in range(REWEIGHTED):
         weight = (rest.square().sum(dim=-1, keepdim=True) + floor**2).rsqrt()
         weighted = (modes * weight[..., None]).flatten(1, 2).mT
         slope = weighted @ values.flatten(1)[..., None]
-        shared = flat @ torch.linalg.pinv(weighted @ flat, hermitian=True) @ slope
+        normal = weighted @ flat
+        total = normal.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+        # so little that only modes that move nothing feel it; a pseudo-inverse would be waited for
+        damping = (NOT_SHARED * total + torch.finfo(values.dtype).eps) * unit
+        shared = flat @ torch.linalg.inv_ex(normal + damping)[0] @ slope
         rest = values - shared.view_as(values)
-    return rest
+    return rest.to(dtype)

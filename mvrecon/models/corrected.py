@@ -20,7 +20,8 @@ class Corrected(nn.Module):
     """Reconstruction by another model from corrected views, in the unit of (views / mm).
 
     The correction is not differentiated. In training the alignment of each view is computed once,
-    at the first time that it comes.
+    at the first time that it comes; for this the host reads the views of every step, the one wait
+    for a GPU. In evaluation there is none.
 
     Args:
         projector: its grid and its rig.
@@ -60,10 +61,10 @@ class Corrected(nn.Module):
         names = [hashlib.sha256(case.cpu().numpy().tobytes()).digest() for case in views.detach()]
         new = [i for i, name in enumerate(names) if name not in self._known]
         if new:
-            corrected = self._corrected(views[new])
+            corrected = self._corrected(torch.stack([views[i] for i in new]))
             if corrected.alignment is None:
                 return self._corrected(views)
-            for i, one in zip(new, corrected.alignment.to("cpu").split(), strict=True):
+            for i, one in zip(new, corrected.alignment.split(), strict=True):
                 self._known[names[i]] = one
         by = Alignment.joined([self._known[name] for name in names]).to(views)
         return CorrectedViews(aligned(views, by), by)

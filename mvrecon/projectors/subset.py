@@ -99,12 +99,14 @@ class SomePixels(SomeRays):
 
     def _prepare(self) -> None:
         _, rows, columns = self.selection.domain_shape
-        chosen = self.selection.chosen.to(self.device)
+        index = self.selection.index.to(self.device)
+        u, row = index % columns, index // columns
+        view, v = row // rows, row % rows
         # column by column: rays in turn mostly differ in z, and meet again the voxels that the
         # cache holds
-        view, u, v = chosen.mT.nonzero().unbind(dim=1)
-        self.pixels, self.detector = torch.stack([view, v, u]), (1, 1)
-        self.order = ((view * rows + v) * columns + u).argsort()
+        walk = ((view * columns + u) * rows + v).argsort()
+        self.pixels, self.detector = torch.stack([view, v, u]).index_select(1, walk), (1, 1)
+        self.order = walk.argsort()
 
     def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "r 4 3 k"]:
         """Each chosen pixel as a view of its own, of one ray or of as many as a pixel has."""
@@ -141,4 +143,4 @@ class SomeViews(SomeRays):
 
     def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]:
         count = self.selection.domain_shape[0]
-        return lines.unflatten(0, (count, -1))[self.selection.views].flatten(0, 1)
+        return lines.unflatten(0, (count, -1))[self.selection.places].flatten(0, 1)

@@ -13,6 +13,7 @@ from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import usual_subsets
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.cgls import check_not_negative
+from mvrecon.reconstruct.division import positive_mean
 from mvrecon.reconstruct.mlem import (
     admitted,
     likelihood_of_residual,
@@ -89,7 +90,7 @@ def bsrem(
     whole = torch.stack(sums).sum(dim=0)
     visible = whole > 0
     penalty = RelativeDifference(voxel_steps(A), visible[0, 0], **(prior or {}))
-    strength = weight * whole[visible].mean().item() if visible.any() else 0.0
+    strength = weight * positive_mean(whole, 0.0)
 
     def objective(volume: Tensor, residual: Tensor) -> Tensor:
         return likelihood_of_residual(counts, volume, residual) + strength * penalty(volume)

@@ -63,6 +63,9 @@ def conjugate_gradients(
     """The volume that minimises |y - A x|^2_W + <x, N x> - 2 <g, x>, by conjugate gradients, for
     each sample.
 
+    On a GPU the host asks only with a tolerance or a monitor, once an iteration, whether samples
+    are left to go on with; else all iterations run, and what is done stays as it is.
+
     Args:
         problem: operator, views, start.
         iterations: at most.
@@ -71,7 +74,8 @@ def conjugate_gradients(
         weights: W of the views; None: one.
         pull: g; None: zero.
     """
-    A, views, x, monitor = problem
+    A, views, x, monitor, started = problem
+    asked = views.is_cpu or tolerance > 0 or monitor is not None
     root = None if weights is None else weights.sqrt()
 
     def gradient(residual: Tensor, volume: Tensor | None) -> Tensor:
@@ -79,23 +83,24 @@ def conjugate_gradients(
         back = back if pull is None else back + pull
         return back if penalty is None or volume is None else back - penalty(volume)
 
-    r = views - A(x) if x.any() else views
+    r = problem.unexplained()
     s = gradient(r, x)
     floor = max(tolerance, torch.finfo(views.dtype).eps)
-    goal = floor * (norms(gradient(views, None)) if x.any() else norms(s))
+    goal = floor * (norms(gradient(views, None)) if started else norms(s))
     # with a penalty a residual of zero is no sign of the minimum
     enough = floor * norms(views) if penalty is None else torch.full_like(goal, -1)
     p, size, watch = s, norms(s), Watch(monitor)
     for number in range(1, iterations + 1):
-        active = (size > goal) & (norms(r) > enough)
-        if not active.any():
+        # what is not finite is never done, so that it shows in the volume
+        active = ~((size <= goal) | (norms(r) <= enough))
+        if asked and not active.any():
             break
         q = A(p)
         curvature = norms(q if root is None else root * q).square()
         if penalty is not None:
             curvature = curvature + _products(p, penalty(p))
         # <s, p> is |s|^2 up to rounding, and with it no step goes up, however many are taken
-        moves = active & (curvature > 0)
+        moves = active & ~(curvature <= 0)
         step = torch.where(moves, _products(s, p) / torch.where(moves, curvature, 1), 0)
         x, r = torch.addcmul(x, step, p), torch.addcmul(r, step, q, value=-1)
         if watch.ends(number, x, lambda: r):  # noqa: B023

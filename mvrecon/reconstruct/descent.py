@@ -36,7 +36,7 @@ def descend(
             15, 2015, 3.2): an inexact proximal map needs it.
     """
     check_iterations(iterations)
-    A, views, x, monitor = problem
+    A, views, x, monitor, _ = problem
     ahead, watch = x, Watch(monitor)
     t: float | Tensor = 1.0
     beta: float | Tensor = 0.0

@@ -1,4 +1,6 @@
-"""Division where the divisor may be zero."""
+"""Division where the divisor may be zero, and means of what is positive."""
+
+import math
 
 import torch
 from jaxtyping import Float
@@ -13,3 +15,12 @@ def divided(
     """
     positive = divisor > 0
     return torch.where(positive, dividend / torch.where(positive, divisor, 1), otherwise)
+
+
+def positive_mean(values: Float[Tensor, "*n"], otherwise: float) -> float:
+    """Mean of the positive values of a tensor, in their unit, or a number where there are none; a
+    GPU is waited for once.
+    """
+    positive = values > 0
+    mean = (torch.where(positive, values, 0).sum() / positive.sum()).item()
+    return otherwise if math.isnan(mean) else mean

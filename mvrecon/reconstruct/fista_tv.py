@@ -14,6 +14,7 @@ from mvrecon.reconstruct.power import power_norm
 from mvrecon.reconstruct.problem import Common, posed, without_gradient
 from mvrecon.reconstruct.total_variation import (
     Shrinkage,
+    dual_rate,
     total_variation,
     tv_proximal,
     voxel_steps,
@@ -74,14 +75,14 @@ def fista_tv(
         metric = metric * support.to(metric.device)
     shrinkage = Shrinkage(weight * metric, steps, nonnegative)
     dual = problem.start.new_zeros(3, *problem.start.shape)
-    lengths = metric / fit.level
+    lengths, rate = metric / fit.level, dual_rate(shrinkage)
 
     def step(residual: Tensor) -> Tensor:
         return problem.A.T(fit.weights.row * residual).mul(lengths)
 
     def proximal(volume: Tensor) -> Tensor:
         nonlocal dual
-        volume, dual = tv_proximal(volume, shrinkage, dual, inner)
+        volume, dual = tv_proximal(volume, shrinkage, dual, inner, rate)
         return volume
 
     return descend(problem, step, proximal, iterations, "restarted")

@@ -14,7 +14,11 @@ from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstruct.division import divided
-from mvrecon.reconstruct.poisson import PoissonLikelihood, negative_log_likelihood
+from mvrecon.reconstruct.poisson import (
+    PoissonLikelihood,
+    negative_log_likelihood,
+    refuse_impossible,
+)
 from mvrecon.reconstruct.problem import (
     Common,
     Watch,
@@ -168,12 +172,11 @@ def admitted(
     """
     every = torch.stack(sums).sum(dim=0)
     x = uniform(parts, every) if start is None else start
-    if (x < 0).any():
+    if start is not None and (x < 0).any():
         raise ValueError("Expected a start that is nowhere negative, got another")
     # 0 / 0 is 0: no counts can come from a voxel that no ray passes
     x = x * (every > 0)
-    for part in parts:
-        part.expected(x)
+    refuse_impossible(int(torch.stack([part.impossible(part.mean(x)) for part in parts]).sum()))
     return x
 
 

@@ -77,7 +77,7 @@ def pdhg_tv(
 def _descend(
     problem: Problem, objective: PenalisedFit, balance: float, iterations: int
 ) -> Float[Tensor, "b c d h w"]:
-    A, views, x, monitor = problem
+    A, views, x, monitor, _ = problem
     fit, weight, steps, nonnegative, support = objective
     # D is scaled so that its column sums are c, as those of A are in the mean
     primal = 1 / (balance * (fit.columns + fit.level))
@@ -87,7 +87,7 @@ def _descend(
     shrinkage = Shrinkage(weight * fit.level * primal, steps, nonnegative)
     kernels, watch, volume = differences_for(x), Watch(monitor), x
     field = kernels.dual_step(x, x.new_zeros(3, *x.shape), rate, steps) if weight else None
-    fresh, residual = field, views - A(x) if x.any() else views
+    fresh, residual = field, problem.unexplained()
     multiplier = fit.weights.row * residual * (balance / (1 + balance))
     for number in range(1, iterations + 1):
         back = A.T(multiplier)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from mvrecon.kernels.precision import wide
@@ -58,8 +58,9 @@ class PoissonLikelihood:
             ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views),
         )
         measured, added = wide(self.views(counts)), self.views(_spread(background, counts))
-        for what, values in (("counts", measured), ("background", added)):
-            bad = int((~(values >= 0) | ~values.isfinite()).sum())
+        bins = {"counts": measured, "background": added}
+        wrong = torch.stack([(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]).tolist()
+        for what, bad in zip(bins, wrong, strict=True):
             if bad:
                 raise ValueError(
                     f"Expected {what} that are finite and not negative, got {bad} bins that are not"
@@ -115,17 +116,22 @@ class PoissonLikelihood:
             ValueError: a volume of another batch than the counts, or one that allows no counts
                 where there are some.
         """
-        self._check(volume)
-        expected = self.bins(volume) + self.background
-        impossible = int(((self.counts > 0) & ~(expected > 0)).sum())
-        if impossible:
-            raise ValueError(
-                f"{impossible} bins hold counts where the volume and the background allow none: "
-                f"their likelihood is "
-                "zero. Give a background > 0, a grid or support that reaches these rays, or a "
-                "volume with values there"
-            )
+        expected = self.mean(volume)
+        refuse_impossible(int(self.impossible(expected)))
         return expected
+
+    def mean(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
+        """ybar, in counts, without the check that it allows the counts.
+
+        Raises:
+            ValueError: a volume of another batch than the counts.
+        """
+        self._check(volume)
+        return self.bins(volume) + self.background
+
+    def impossible(self, expected: Float[Tensor, "b c *n"]) -> Int64[Tensor, ""]:
+        """The number of bins with counts where none are expected, a tensor on the device."""
+        return ((self.counts > 0) & ~(expected > 0)).sum()
 
     def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, " b"]:
         """The negative log-likelihood of each case, in float64; differentiable in the volume and in
@@ -158,8 +164,7 @@ class PoissonLikelihood:
         That changes no multiplicative step: all voxels on the ray of such a bin are zero, and stay
         so.
         """
-        self._check(volume)
-        return self.bins.T(_ratio(self.counts, self.bins(volume) + self.background))
+        return self.bins.T(_ratio(self.counts, self.mean(volume)))
 
     def _check(self, volume: Tensor) -> None:
         if volume.shape[:2] != self.counts.shape[:2]:
@@ -168,6 +173,23 @@ class PoissonLikelihood:
                 f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got "
                 f"{tuple(volume.shape)}"
             )
+
+
+def refuse_impossible(bins: int) -> None:
+    """Refuse bins with counts where no counts are expected.
+
+    Args:
+        bins: how many there are.
+
+    Raises:
+        ValueError: one at least.
+    """
+    if bins:
+        raise ValueError(
+            f"{bins} bins hold counts where the volume and the background allow none: their "
+            f"likelihood is zero. Give a background > 0, a grid or support that reaches these "
+            f"rays, or a volume with values there"
+        )
 
 
 def negative_log_likelihood(
@@ -198,7 +220,10 @@ def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
 def _spread(background: float | Tensor, counts: Tensor) -> Tensor:
     if not isinstance(background, Tensor | int | float):
         raise TypeError(f"Expected a background of one number or views, got {background!r}")
-    added = torch.as_tensor(background, dtype=wide(counts[:0]).dtype, device=counts.device)
+    like = wide(counts[:0])
+    if not isinstance(background, Tensor):
+        return like.new_full((), background).expand(counts.shape)
+    added = background.to(like)
     try:
         return added.expand(counts.shape)
     except RuntimeError as error:

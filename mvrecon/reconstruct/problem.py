@@ -114,12 +114,18 @@ class Problem(NamedTuple):
         views: y, float32 or float64.
         start: the first volume, zero outside the support; same dtype.
         monitor: looks at every iterate.
+        started: whether the start is the user's; else it is zero.
     """
 
     A: LinearOperator
     views: Float[Tensor, "b c m v u"]
     start: Float[Tensor, "b c d h w"]
     monitor: Monitor | None = None
+    started: bool = False
+
+    def unexplained(self) -> Float[Tensor, "b c m v u"]:
+        """The residual views y - A x of the start; of none, the views, without a projection."""
+        return self.views - self.A(self.start) if self.started else self.views
 
 
 def posed(
@@ -136,6 +142,7 @@ def posed(
     check(views, "views", A.range_shape, A.device)
     check_finite(views, on_gpu=False)
     views, support, start = wide(views), options.get("support"), options.get("start")
+    started = start is not None
     if start is None:
         start = views.new_zeros(*views.shape[:2], *A.domain_shape)
     else:
@@ -143,7 +150,7 @@ def posed(
         start = start.to(views.dtype)
     if support is not None:
         start = start * support.to(start.device)
-    return Problem(within, views, start, options.get("monitor"))
+    return Problem(within, views, start, options.get("monitor"), started)
 
 
 def supported(method: Callable[..., Tensor], A: LinearOperator, options: Common) -> LinearOperator:
@@ -181,10 +188,11 @@ def check_start(A: LinearOperator, start: Tensor, views: Tensor) -> None:
     """Refuse a first volume that does not belong to the operator and the views.
 
     Raises:
-        ValueError: another shape, batch or device, or values that are not finite.
+        ValueError: another shape, batch or device, or values that are not finite; on a GPU, where
+            nobody waits for them, results from such values are not finite either.
     """
     check(start, "start", A.domain_shape, A.device)
-    if start.shape[:2] != views.shape[:2] or not start.isfinite().all():
+    if start.shape[:2] != views.shape[:2] or (start.is_cpu and not start.isfinite().all()):
         raise ValueError(
             f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
             f"{tuple(start.shape)} with {int((~start.isfinite()).sum())} values that are not finite"

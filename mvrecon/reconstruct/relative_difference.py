@@ -64,7 +64,7 @@ class RelativeDifference:
                 f"Expected a finite gamma of at least 0 and 1 to 26 similar neighbours, got "
                 f"{gamma} and {similar}"
             )
-        self.gamma, self.pairs = gamma, []
+        self.gamma, pairs = gamma, []
         reach = None if anatomy is None else _reach(_checked(anatomy, mask), similar)
         for offset in HALF:
             if any(abs(o) >= n for o, n in zip(offset, mask.shape, strict=True)):
@@ -74,8 +74,10 @@ class RelativeDifference:
             weight = (one & other).to(torch.float32) / distance**0.5
             if reach is not None and anatomy is not None:
                 weight = weight * _chosen(anatomy, reach, offset)
-            if weight.any():
-                self.pairs.append(Pairs(offset, weight))
+            pairs.append(Pairs(offset, weight))
+        # a GPU is waited for once
+        some = torch.stack([mask.any(), *(pair.weight.any() for pair in pairs)]).tolist()[1:]
+        self.pairs = [pair for pair, any_of_it in zip(pairs, some, strict=True) if any_of_it]
 
     def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, " b"]:
         """R of each case in float64, in the unit of the volume; differentiable."""

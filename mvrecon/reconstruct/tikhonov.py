@@ -98,6 +98,6 @@ class _Minimum(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, pull: Tensor) -> tuple[Tensor | None, ...]:
-        (A, views, start, _), weights, solve = ctx.settings
+        (A, views, start, *_), weights, solve = ctx.settings
         zero = Problem(A, torch.zeros_like(views), torch.zeros_like(start))
         return weights * A(solve(zero, pull)), None, None, None

@@ -18,6 +18,7 @@ from mvrecon.projectors.operator import LinearOperator
 
 __all__ = [
     "Shrinkage",
+    "dual_rate",
     "gradient",
     "gradient_adjoint",
     "total_variation",
@@ -56,6 +57,7 @@ def tv_proximal(
     shrinkage: Shrinkage,
     dual: Float[Tensor, "3 b c d h w"],
     iterations: int,
+    rate: float | None = None,
 ) -> tuple[Float[Tensor, "b c d h w"], Float[Tensor, "3 b c d h w"]]:
     """The proximal map of the total variation, argmin |x - z|^2 / (2 strength) + |D x|, in the unit
     of the volume, and the dual field that it ends with.
@@ -68,11 +70,11 @@ def tv_proximal(
         shrinkage: strength, voxel size and sign.
         dual: the field to begin with, vectors of length 1 at most; it is written over.
         iterations: gradient steps on the dual.
+        rate: of `dual_rate`, where it is known already.
     """
-    strongest = shrinkage.strength.max().item()
-    if strongest == 0:
+    rate = dual_rate(shrinkage) if rate is None else rate
+    if rate == 0:
         return (volume.clamp_min(0) if shrinkage.nonnegative else volume), dual
-    rate = 1 / (strongest * sum(4 / step**2 for step in shrinkage.steps))
     kernels, last, t, momentum = differences_for(volume), torch.zeros_like(dual), 1.0, 0.0
     for _ in range(iterations):
         stride = Stride(rate, momentum)
@@ -80,3 +82,12 @@ def tv_proximal(
         t, before = (1 + math.sqrt(1 + 4 * t * t)) / 2, t
         momentum = (before - 1) / t
     return kernels.primal(volume, dual, shrinkage), dual
+
+
+def dual_rate(shrinkage: Shrinkage) -> float:
+    """The longest stable step on the dual field, in mm by the unit of the volume; 0 where nothing
+    is shrunk. A GPU is waited for once.
+    """
+    strongest = shrinkage.strength.max().item()
+    steepest = strongest * sum(4 / step**2 for step in shrinkage.steps)
+    return 1 / steepest if steepest else 0.0

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
+from mvrecon.reconstruct.division import divided, positive_mean
 from mvrecon.reconstruct.iterative import SirtWeights, sirt_weights
 
 
@@ -31,14 +32,12 @@ class WeightedFit(NamedTuple):
     def of(cls, A: LinearOperator, dtype: torch.dtype) -> "WeightedFit":
         """The data term of an operator."""
         weights = sirt_weights(A, dtype)
-        met = weights.column > 0
-        return cls(weights, (1 / weights.column[met]).mean().item() if met.any() else 1.0)
+        return cls(weights, positive_mean(divided(1.0, weights.column), 1.0))
 
     @property
     def columns(self) -> Float[Tensor, "1 1 d h w"]:
         """The column sums of A, in mm."""
-        column = self.weights.column
-        return torch.where(column > 0, 1 / column, 0)
+        return divided(1.0, self.weights.column)
 
     def __call__(self, residual: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c"]:
         """The data term of residual views."""

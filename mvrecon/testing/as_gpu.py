@@ -31,8 +31,11 @@ ALONG_RAYS = {"project", "backproject", "lines_vjp"}
 #: Operators whose result, or its size, the host waits for.
 WAITING = {
     *("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "bincount"),
-    *("_unique", "_unique2", "unique_dim", "unique_consecutive", "linalg_inv_ex", "histc"),
+    *("_unique", "_unique2", "unique_dim", "unique_consecutive", "histc"),
 }
+#: Functions of torch that ask the device whether a matrix was regular, or an iteration converged.
+CHECKED = {f"linalg_{name}" for name in ("inv", "solve", "cholesky", "eigh", "eigvalsh", "svd")}
+CHECKED |= {"inverse", "linalg_pinv", "linalg_svdvals"}
 #: Products, which a GPU has of floating numbers alone.
 PRODUCTS = {"mm", "mv", "bmm", "dot", "addmm", "addmv", "baddbmm"}
 #: Operators that launch nothing.
@@ -189,6 +192,8 @@ class _Calls(TorchFunctionMode):
         kwargs, name = kwargs or {}, getattr(func, "__name__", "").strip("_")
         if args and isinstance(args[0], OnGpu) and name in self.ANSWERS:
             return self.ANSWERS[name](self, func, *args, **kwargs)
+        if name in CHECKED and any(isinstance(x, OnGpu) for x in tree_leaves((args, kwargs))):
+            self.gpu.wait(name)
         if name == "to":
             args, kwargs = tree_map(_numbered, (args, kwargs))
         if name in ("tensor", "as_tensor") and _is_gpu(kwargs.get("device")):

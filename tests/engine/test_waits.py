@@ -10,7 +10,7 @@ from mvrecon.engine.callbacks import Clock
 from mvrecon.engine.finite import FiniteLoss
 from mvrecon.engine.fit import build_data
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.parts import MODELS
+from mvrecon.parts import MODELS, RECONSTRUCTORS
 from mvrecon.testing.as_gpu import GPU, AsGpu, OnGpu, on_gpu
 from mvrecon.visual_hull.support import hull_mask
 
@@ -21,9 +21,15 @@ PARALLEL = {"name": "parallel", "n_views": 4, "detector": {"pixels": [12, 20], "
 FILTERING = ("fbp_unet", "sinogram_unet", "dual_domain", "itnet")
 #: Their first pass moves to the device what is kept there: an operator, a filter, weights of
 #: pixels, the images of voxels.
-MOVING = (*FILTERING, "dif_net", "svct", "radon_unet")
-#: Models of which no step can go without waits: views are aligned on the host.
-WAITING_MODELS = ("corrected",)
+MOVING = (*FILTERING, "dif_net", "svct", "radon_unet", "corrected")
+#: What a step of training waits for: the host tells views that are known from an earlier step.
+TOLD_BY_THE_HOST = {"corrected": 1}
+#: What reconstructors wait for before their first iteration: numbers that all iterations use; of
+#: counts the checks, and the lists of rays that have some, one of each for each of two subsets.
+BEFORE = {
+    **{"sirt": 0, "os_sart": 0, "cgls": 0, "tikhonov": 1, "pdhg_tv": 1, "fista_tv": 2},
+    **{"mlem": 4, "osem": 7, "bsrem": 9},
+}
 LOSS = {"edges": 0.1, "opinions_gain": 1e-3, "cross_view": 0.1, "corrected_views": 1.0}
 #: Kept as long as the tests: modules refer to it weakly.
 TRAINER = SimpleNamespace(log_every_n_steps=10, global_step=1, current_epoch=0)
@@ -72,11 +78,61 @@ def stepped(module: ReconstructionModule, batch: dict, moved: bool = False) -> A
     return gpu
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS.names() if name not in WAITING_MODELS])
+@pytest.mark.parametrize("name", MODELS.names())
 def test_a_training_step_waits_for_nothing(name):
     module, batch = module_of(name)
     gpu = stepped(module, batch, moved=name in MOVING)
-    assert not gpu.waits, dict(gpu.waits)
+    assert gpu.waits.total() == TOLD_BY_THE_HOST.get(name, 0), dict(gpu.waits)
+
+
+def test_new_views_are_aligned_to_the_same_volume_with_a_wait_for_the_rig_alone():
+    module, batch = module_of("corrected")
+    module.eval()
+    with torch.no_grad(), AsGpu() as gpu:
+        gpu.put(module)
+        result = module.model(on_gpu(batch["views"]))
+        assert gpu.waits.total() == 1, dict(gpu.waits)
+    expected = module_of("corrected")[0].eval().model(batch["views"])
+    torch.testing.assert_close(result.volume.values, expected.volume, rtol=1e-4, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def scanned():
+    module, batch = module_of("sirt")
+    return module, batch["views"]
+
+
+def reconstructed(scanned, name: str, iterations: int, break_off: bool = False):
+    """A method's volume on the stand-in, and what it waited for."""
+    (module, views), method = scanned, RECONSTRUCTORS.get(name)
+    views = views.masked_fill(views == views.max(), torch.nan) if break_off else views
+    with AsGpu() as gpu:
+        gpu.put(module)
+        return method(module.projector, on_gpu(views), iterations=iterations).values, gpu.waits
+
+
+@pytest.mark.parametrize("name", BEFORE)
+def test_no_iteration_waits(name, scanned):
+    for iterations in (1, 3):
+        _, waits = reconstructed(scanned, name, iterations)
+        assert waits.total() == BEFORE[name], dict(waits)
+
+
+def test_conjugate_gradients_that_nobody_stops_stay_where_they_are_done(scanned):
+    volume, waits = reconstructed(scanned, "cgls", 60)
+    expected = RECONSTRUCTORS.get("cgls")(module_of("sirt")[0].projector, scanned[1], iterations=60)
+    torch.testing.assert_close(volume, expected, rtol=1e-4, atol=1e-5)
+    assert not waits
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", [name for name, waits in BEFORE.items() if waits < 4])
+def test_a_view_that_is_not_finite_shows_in_the_volume_of_a_gpu(name, scanned):
+    """Iterative methods of a GPU, which do not wait to look at their views, give NaN where a view
+    is not finite, never a volume of numbers alone.
+    """
+    volume, _ = reconstructed(scanned, name, 2, break_off=True)
+    assert not volume.isfinite().all()
 
 
 def test_a_step_with_uncertainty_waits_for_nothing_and_learns():
@@ -144,6 +200,8 @@ WAITING = {
     "bool": lambda x: bool((x > 0).any()),
     "tolist": lambda x: x.tolist(),
     "cpu": lambda x: x.cpu(),
+    "an inverse": lambda x: torch.linalg.inv(x.diag()),
+    "a pseudo-inverse": lambda x: torch.linalg.pinv(x.diag(), hermitian=True),
     "nonzero": lambda x: x.nonzero(),
     "a mask": lambda x: x[x > 0],
     "a list of indices": lambda x: x[[0, 1]],

@@ -47,8 +47,10 @@ class Nanodrr(Traced):
         first: Float[Tensor, "k r 3"],
         last: Float[Tensor, "k r 3"],
     ) -> Float[Tensor, "k r"]:
-        """nanodrr's views; its detector is one row of all rays, since only their ends matter."""
-        x, size = volume[None, None], first.shape[1]
+        """nanodrr's views, on the whole detector, since its kernel takes neighbouring pixels
+        together; the ends of the rays tell where they lie.
+        """
+        x = volume[None, None]
         affine, counts = self.box.affine.to(volume), volume.new_tensor(volume.shape[::-1])
         scale = torch.diag(
             torch.cat([2 / counts, counts.new_ones(1)])
@@ -61,6 +63,5 @@ class Nanodrr(Traced):
         still = torch.eye(4).to(volume).expand(len(first), 4, 4)
         frame = still[:, :3, :3], still, volume.new_ones(len(first))
         ends = {"src": first, "tgt": last}
-        return self.march(subject, *frame, 1, size, self.samples, backend=self.backend, **ends)[
-            :, 0, 0
-        ]
+        sizes = *self.cameras.shape, self.samples
+        return self.march(subject, *frame, *sizes, backend=self.backend, **ends)[:, 0].flatten(1)
