@@ -1,6 +1,5 @@
 """Any model on corrected views."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -10,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.calibration.alignment import Alignment, CorrectedViews, aligned
+from mvrecon.models.fingerprints import fingerprints
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CORRECTIONS, MODELS
 from mvrecon.projectors.checks import check_views
@@ -58,7 +58,7 @@ class Corrected(nn.Module):
 
     def _recalled(self, views: Float[Tensor, "b 1 m v u"]) -> CorrectedViews:
         """The corrected views, by their alignments where these are known."""
-        names = [hashlib.sha256(case.cpu().numpy().tobytes()).digest() for case in views.detach()]
+        names = fingerprints(views)
         new = [i for i, name in enumerate(names) if name not in self._known]
         if new:
             corrected = self._corrected(torch.stack([views[i] for i in new]))

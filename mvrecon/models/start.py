@@ -1,6 +1,5 @@
 """What networks begin with: a classical volume, and the scale by which they divide everything."""
 
-import hashlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
+from mvrecon.models.fingerprints import fingerprints
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import RECONSTRUCTORS
 from mvrecon.reconstruct.iterative import sirt
@@ -49,33 +49,32 @@ class ClassicalStart:
         if not isinstance(self.start, Mapping):
             A, weights = geometry.A, geometry.weights
             return sirt(A, views, self.start, weights=weights, momentum=True)
-        samples = views.split(1)
-        masks = [None] * len(samples) if geometry.mask is None else geometry.mask[:, 0]
-        volumes = []
-        for own, mask in zip(samples, masks, strict=True):
-            known = self._recalled if training else self._made
-            volumes.append(known(geometry, own, mask))
+        samples = range(len(views))
+        if not training:
+            return torch.cat([self._made(geometry, views, sample) for sample in samples])
+        names, volumes = fingerprints(views), []
+        for sample, name in zip(samples, names, strict=True):
+            volume = self._known.get(name)
+            if volume is None:
+                volume = self._made(geometry, views, sample)
+                self._keep(name, volume)
+            volumes.append(volume.to(views))
         return torch.cat(volumes)
 
-    def _recalled(self, geometry: Geometry, views: Tensor, mask: Tensor | None) -> Tensor:
-        name = hashlib.sha256(views.detach().cpu().numpy().tobytes()).digest()
-        if name in self._known:
-            return self._known[name].to(views)
-        volume = self._made(geometry, views, mask)
-        size = volume.numel() * volume.element_size()
-        if size <= self._room:
-            self._room -= size
+    def _keep(self, name: bytes, volume: Tensor) -> None:
+        if volume.nbytes <= self._room:
+            self._room -= volume.nbytes
             self._known[name] = volume.cpu()
-        return volume
 
-    def _made(self, geometry: Geometry, views: Tensor, mask: Tensor | None) -> Tensor:
-        """The reconstructor's volume of views that were scaled to a mean density of the rays of
+    def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Tensor:
+        """The reconstructor's volume of a sample's views, scaled to a mean density of the rays of
         about one before, so that a weight of its options is relative to the content.
         """
-        level = content_scale(views) / typical_chord(geometry.A.grid)
-        within = {} if mask is None else {"support": mask}
         assert isinstance(self.start, Mapping)
-        return RECONSTRUCTORS.from_config(self.start, geometry.A, views / level, **within) * level
+        own = views[sample : sample + 1]
+        level = content_scale(own) / typical_chord(geometry.A.grid)
+        within = {} if geometry.mask is None else {"support": geometry.mask[sample, 0]}
+        return RECONSTRUCTORS.from_config(self.start, geometry.A, own / level, **within) * level
 
 
 def normalised(
