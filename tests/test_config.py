@@ -197,10 +197,10 @@ def test_a_model_takes_no_options_that_an_experiment_has_for_another_one(user_co
     """
     rounds = "[{resolution: full, widths: [4], cameras: {name: rays2d}}]"
     mine = user_conf(f"defaults:\n  - override /model: cross_view\nmodel: {{rounds: {rounds}}}")
-    message = r"model.rounds of its model=cross_view; got model={}, expected .*: {}"
-    with pytest.raises(ValueError, match=message.format("world_unet", r"model.rounds=\.\.\.$")):
+    message = r"model.rounds of its model=cross_view; got model={}, expected {} on the command"
+    with pytest.raises(ValueError, match=message.format("world_unet", r"model.rounds=\.\.\.")):
         compose(*mine, "model=world_unet")
-    with pytest.raises(ValueError, match=message.format("sirt", "~model.rounds$")):
+    with pytest.raises(ValueError, match=message.format("sirt", "~model.rounds")):
         compose(*mine, "model=sirt")
     assert compose(*mine, "model=sirt", "~model.rounds")["model"] == compose("model=sirt")["model"]
     in_world = "model.rounds=[{resolution:full,widths:[4],cameras:null}]"

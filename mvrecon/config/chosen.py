@@ -41,7 +41,7 @@ def check_model_choice(
         lines = [f"model.{key}=..." if key in expected else f"~model.{key}" for key in changed]
         raise ValueError(
             f"experiment={experiment} sets {names} of its model={own}; got model={choice}, "
-            f"expected on the command line, too: {' '.join(lines)}"
+            f"expected {' '.join(lines)} on the command line, too"
         )
 
 
