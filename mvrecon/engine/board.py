@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from mvrecon.comparison.rows import rows_of
-from mvrecon.comparison.tables import cells, markdown
+from mvrecon.comparison.tables import Cells, cells, markdown
 from mvrecon.engine.callbacks import named
 from mvrecon.engine.export import file_name
 from mvrecon.engine.fit import BOARD, methods
@@ -59,7 +59,9 @@ def close(
         board.log_session({k: _plain(v) for k, v in values.items()}, figures | costs)
         if label == next(iter(table["methods"])):
             rows = list(rows_of(table, settings["name"], folder))
-            board.experiment.add_text("text/results", markdown(cells(rows, rows[0])))
+            head, body = cells(rows, rows[0])
+            narrow = Cells(head[1:], [line[1:] for line in body])  # of this run alone
+            board.experiment.add_text("text/results", markdown(narrow))
             lines = [f"    {line}" for line in overrides] or ["none"]
             board.experiment.add_text("text/overrides", "\n".join(lines))
         board.finalize("success")
