@@ -35,6 +35,20 @@ def show(parts: Sequence[Part]) -> None:
     console.print(table)
 
 
+def report(parts: Sequence[Part]) -> int:
+    """Write one line for each part that was imported; the exit status, 1 where one is broken."""
+    from rich.console import Console
+
+    lines = [
+        f"{part.kind:<15} {part.name:<22} {f'broken: {part.error}' if part.error else part.origin}"
+        for part in parts
+    ]
+    broken = sum(bool(part.error) for part in parts)
+    lines.append(f"{len(parts)} parts imported, {broken} of them broken")
+    Console(markup=False, highlight=False).print("\n".join(lines), soft_wrap=True)
+    return int(broken > 0)
+
+
 def _line(name: str, option: Option) -> str:
     """An option with its default, its type where it has none, and its text, with the unit."""
     value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
@@ -78,8 +92,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts = [
         describe(kind, name, options.check) for kind in kinds for name in REGISTRIES[kind].names()
     ]
+    if options.check:
+        return report(parts)
     show(parts)
-    return int(options.check and any(part.error for part in parts))
+    return 0
 
 
 if __name__ == "__main__":

@@ -7,10 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
 from mvrecon import compare, warmup
 from mvrecon.config import conf_dir, launch
+from mvrecon.config.errors import sentence
 from mvrecon.config.plugins import check_plugins, import_plugins, names
 from mvrecon.config.typed import check_parts
 from mvrecon.config.values import fits
@@ -67,6 +69,14 @@ def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
     assert text.startswith("mvrecon-train: ") and text.count("\n") == 1, text
     assert re.search(MISTAKES[override], text.strip()), text
     assert not list(tmp_path.iterdir())
+
+
+def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it():
+    for choice, extra in {"launcher/ray": "cluster", "sweeper/optuna": "sweep"}.items():
+        error = MissingConfigException("not in ...", f"hydra/{choice}", ["basic"])
+        assert f"hydra/{choice} is not installed; pip install 'mvrecon[{extra}]'" in sentence(error)
+    error = MissingConfigException("not in ...", "hydra/launcher/jobilb", ["basic", "joblib"])
+    assert "did you mean 'joblib'" in sentence(error)
 
 
 def test_the_traceback_is_there_where_it_is_asked_for(answer, monkeypatch: pytest.MonkeyPatch):

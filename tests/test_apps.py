@@ -75,6 +75,7 @@ def test_the_log_tells_losses_figures_and_times(run):
 
 def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
     board = EventAccumulator(str(run[0] / "cross_view_small")).Reload()
     test = EventAccumulator(
@@ -94,8 +95,16 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     text = test.Tensors("text/overrides/text_summary")[0].tensor_proto.string_val[0].decode()
     assert "seed=3" in text and "experiment=smoke" in text
     table = test.Tensors("text/results/text_summary")[0].tensor_proto.string_val[0].decode()
-    assert "| cross_view_small |" in table and "| sirt |" in table
+    assert table.startswith("| method | PSNR dB |") and "\n| sirt |" in table
     assert "hp_metric" not in tags["scalars"]
+    data = test.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    session = HParamsPluginData.FromString(data).session_start_info.hparams
+    names = {key: session[key].string_value for key in ("method", "model.name", "scene.name")}
+    assert names == {
+        "method": "cross_view_small",
+        "model.name": "cross_view",
+        "scene.name": "ellipsoids",
+    }
 
 
 def test_results_hold_every_figure_with_units_seed_and_versions(run):

@@ -190,6 +190,24 @@ def test_a_mistyped_override_is_an_error_that_names_it(override: str, message: s
     assert re.search(message, f"{error.value}{error.value.__cause__}")
 
 
+@pytest.mark.door
+def test_a_model_takes_no_options_that_an_experiment_has_for_another_one(user_conf):
+    """A model that the command line chooses in place of an experiment's own is refused the own
+    one's options, under whose file's name a table would show what it is not.
+    """
+    rounds = "[{resolution: full, widths: [4], cameras: {name: rays2d}}]"
+    mine = user_conf(f"defaults:\n  - override /model: cross_view\nmodel: {{rounds: {rounds}}}")
+    message = r"model.rounds of its model=cross_view; got model={}, expected {} on the command"
+    with pytest.raises(ValueError, match=message.format("world_unet", r"model.rounds=\.\.\.")):
+        compose(*mine, "model=world_unet")
+    with pytest.raises(ValueError, match=message.format("sirt", "~model.rounds")):
+        compose(*mine, "model=sirt")
+    assert compose(*mine, "model=sirt", "~model.rounds")["model"] == compose("model=sirt")["model"]
+    in_world = "model.rounds=[{resolution:full,widths:[4],cameras:null}]"
+    assert compose(*mine, "model=world_unet", in_world)["model"]["rounds"][0]["cameras"] is None
+    assert compose(*mine, "model=cross_view")["model"]["rounds"][0]["widths"] == [4]
+
+
 def test_an_experiment_may_add_compared_models(user_conf):
     settings = compose(*user_conf("defaults:\n  - /model@compare.sirt: sirt\nname: mine\nseed: 4"))
     assert settings["seed"] == 4

@@ -16,6 +16,7 @@ from hydra.core.override_parser.types import Override
 
 from mvrecon import compare, view
 from mvrecon.config import compose
+from mvrecon.config.typed import check_parts
 from mvrecon.parts import REGISTRIES
 from scripts import site_pages
 
@@ -90,14 +91,17 @@ def test_a_command_of_a_page_composes(page: str, command: str):
         PARSERS[app]().parse_args(options)
         return
     given = OverridesParser.create().parse_overrides([w for w in options if not w.startswith("-")])
-    compose(*map(first_value, given), config_name=app)
+    for run in {tuple(values(line)[end] for line in given) for end in (0, -1)}:
+        settings = compose(*run, config_name=app)
+        if page not in HISTORY:
+            check_parts(settings)
 
 
-def first_value(given: Override) -> str:
-    """A setting of a command line; of a sweep, its first value."""
+def values(given: Override) -> list[str]:
+    """A setting of a command line; of a sweep, with every value."""
     if not given.is_sweep_override():
-        return str(given.input_line)
-    return f"{given.get_key_element()}={next(given.sweep_string_iterator())}"
+        return [str(given.input_line)]
+    return [f"{given.get_key_element()}={value}" for value in given.sweep_string_iterator()]
 
 
 def test_pages_show_commands_of_every_app():

@@ -66,7 +66,8 @@ def test_a_plugin_that_breaks_at_import_is_named_when_checked(tmp_path, monkeypa
     assert main(["head", "--check"]) == 1
     text = " ".join(capsys.readouterr().out.split())
     assert "broken: The head 'broken' (broken_head_plugin:Head) does not import: no licence" in text
-    assert "softmax_depth" in text
+    assert "softmax_depth" in text and text.endswith("3 parts imported, 1 of them broken")
+    assert "=" not in text  # no options: a line for each part
 
 
 def test_sources_that_are_missing_or_wrong_are_said(tmp_path, monkeypatch):

@@ -30,6 +30,11 @@ FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 #: What OmegaConf adds to its messages for programmers.
 TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 
+#: Choices of Hydra's own groups that an extra of mvrecon brings.
+EXTRAS = {"joblib": "sweep", "optuna": "sweep"} | dict.fromkeys(
+    ("ray", "submitit_local", "submitit_slurm"), "cluster"
+)
+
 #: Groups whose part is an option of a model; Hydra's words for a group that a run does not take.
 OF_MODELS = {"head", "network", "reconstructor"}
 UNMATCHED = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
@@ -87,6 +92,9 @@ def sentence(error: BaseException) -> str:
     cause = error.__cause__ or error
     if isinstance(error, MissingConfigException) and error.options is not None:
         choice = PurePosixPath(str(error.missing_cfg_file))
+        if str(choice.parent).startswith("hydra/") and choice.name in EXTRAS:
+            extra = EXTRAS[choice.name]
+            return f"{choice} is not installed; pip install 'mvrecon[{extra}]' brings it"
         known = [PurePosixPath(option).name for option in error.options]
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
     if isinstance(cause, ConfigKeyError | ConfigAttributeError):

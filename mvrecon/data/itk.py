@@ -32,6 +32,9 @@ from mvrecon.geometry.grid import Grid
 IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}
 #: Bytes of a header at most.
 HEADER = 2**16
+#: Characters of a line of an NRRD header at most, comments and key/value pairs aside: ITK writes
+#: lines of 1000 beyond a buffer, which ends the process (SimpleITK 2.5.7; 500 do no harm).
+LINE = 500
 #: From ITK's world (LPS) to ours (RAS).
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: SimpleITK's names of pixel types, and numpy's.
@@ -167,13 +170,13 @@ def _data_file(path: Path) -> tuple[Path, bool]:
     packed.
     """
     with path.open("rb") as file:
-        lines = file.read(HEADER).decode("latin-1").splitlines()
+        text = file.read(HEADER).decode("latin-1")
     if IO[path.suffix.lower()] == "NrrdImageIO":
-        entries = _entries(lines[: lines.index("") if "" in lines else len(lines)], ":")
-        if not lines or not lines[0].startswith("NRRD") or {"data file", "datafile"} & set(entries):
+        entries = _entries(_nrrd_lines(path, text), ":")
+        if {"data file", "datafile"} & set(entries):
             raise Refused(f"{path}: expected NRRD with its values in the same file")
         return path, entries.get("encoding") not in ("raw",)
-    entries = _entries(lines, "=")
+    entries = _entries(text.splitlines(), "=")
     name = entries.get("elementdatafile")
     if name is None:
         raise Refused(f"{path}: expected a MetaImage header with ElementDataFile, got none")
@@ -181,6 +184,24 @@ def _data_file(path: Path) -> tuple[Path, bool]:
     if not data.is_file():
         raise FileNotFoundError(f"{path}: its values should be in {shown(name)}, which is missing")
     return data, entries.get("compresseddata", "").lower() == "true"
+
+
+def _nrrd_lines(path: Path, text: str) -> list[str]:
+    """The lines of an NRRD header, ended by an empty one, as ITK's reader in C sees them: Python's
+    own `splitlines` breaks them at other characters, too.
+    """
+    lines = [line.removesuffix("\r") for line in text.split("\n")]
+    if not lines[0].startswith("NRRD") or "" not in lines:
+        raise Refused(f"{path}: expected an NRRD header of at most {HEADER} bytes")
+    header = lines[: lines.index("")]
+    for line in header:
+        free = line.startswith("#") or (":=" in line and ": " not in line)
+        if len(line) > LINE and not free:
+            raise Refused(
+                f"{path}: expected lines of at most {LINE} characters in its header, got "
+                f"{shown(line)}"
+            )
+    return header
 
 
 def _entries(lines: Sequence[str], sign: str) -> dict[str, str]:

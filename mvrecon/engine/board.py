@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from mvrecon.comparison.rows import rows_of
-from mvrecon.comparison.tables import cells, markdown
+from mvrecon.comparison.tables import Cells, cells, markdown
 from mvrecon.engine.callbacks import named
 from mvrecon.engine.export import file_name
 from mvrecon.engine.fit import BOARD, methods
@@ -41,9 +41,9 @@ def close(
     """Log settings and test figures of every method, the result table and the run's overrides,
     where the run has a board.
 
-    A setting has a name of its own, such as camera.n_views: TensorBoard puts those that differ
-    between runs first. Beside them it shows all numbers of the folder, so that the test's have one
-    of their own.
+    A setting has the name that it has on the command line, such as camera.n_views; model.name is a
+    class, which may serve several methods. TensorBoard puts those that differ between runs first.
+    Beside them it shows all numbers of the folder, so that the test's have one of their own.
     """
     if not wanted(settings):
         return
@@ -54,13 +54,14 @@ def close(
         costs = {
             f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
         }
-        options = {key: value for key, value in model.items() if key != "name"}
-        settled = {"method": label, "model": {"": model["name"], **options}}
-        values = {".".join(filter(None, keys)): v for keys, v in leaves(settled | shared)}
+        settled = {"method": label, "model": model}
+        values = {".".join(keys): v for keys, v in leaves(settled | shared)}
         board.log_session({k: _plain(v) for k, v in values.items()}, figures | costs)
         if label == next(iter(table["methods"])):
             rows = list(rows_of(table, settings["name"], folder))
-            board.experiment.add_text("text/results", markdown(cells(rows, rows[0])))
+            head, body = cells(rows, rows[0])
+            narrow = Cells(head[1:], [line[1:] for line in body])  # of this run alone
+            board.experiment.add_text("text/results", markdown(narrow))
             lines = [f"    {line}" for line in overrides] or ["none"]
             board.experiment.add_text("text/overrides", "\n".join(lines))
         board.finalize("success")

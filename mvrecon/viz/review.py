@@ -132,7 +132,8 @@ def views(
         error = ((p - y).norm() / y.norm().clamp(min=torch.finfo(torch.float32).tiny)).item()
         panels = [Panel(y, value), Panel(p, value), Panel(p - y, apart)]
         columns.append(Column(f"camera {m}\n{error:.3f}", panels))
-    return sheet(f"{name}: NRMSE of views", columns, ("measured", "predicted", "difference"))
+    title = f"{name}: NRMSE of views{_left_out(len(columns), len(measured))}"
+    return sheet(title, columns, ("measured", "predicted", "difference"))
 
 
 def opinions(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
@@ -145,7 +146,9 @@ def opinions(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
     columns = [Column("mean", case.panels(mean, case.value(name="mean")))]
     for m in _chosen(len(volumes), CAMERAS - 1):
         columns.append(Column(f"camera {m}", case.panels(volumes[m] - mean, apart)))
-    return sheet(f"{case.name}: opinions", columns, PLANES)
+    return sheet(
+        f"{case.name}: opinions{_left_out(len(columns) - 1, len(volumes))}", columns, PLANES
+    )
 
 
 def uncertainty(case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]) -> Image:
@@ -165,13 +168,19 @@ def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
     """
     scale = Scale(0.0, 3 / len(volumes), "weight (one third: equal)")
     columns = [Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))]
-    return sheet(f"{case.name}: weights of cameras", columns, PLANES)
+    title = f"{case.name}: weights of cameras{_left_out(len(columns), len(volumes))}"
+    return sheet(title, columns, PLANES)
 
 
 def _chosen(count: int, most: int = CAMERAS) -> list[int]:
     """At most so many of the cameras, at equal steps."""
     shown = min(count, most)
     return [k * count // shown for k in range(shown)]
+
+
+def _left_out(shown: int, count: int) -> str:
+    """What a title adds where a sheet has not all cameras."""
+    return f", {shown} of {count} cameras" if shown < count else ""
 
 
 def _spread(first: Sequence, second: Sequence) -> list:

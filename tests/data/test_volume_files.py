@@ -115,6 +115,28 @@ def test_a_cut_itk_image_is_refused(ending, tmp_path):
 
 
 @pytest.mark.door
+def test_an_nrrd_header_that_would_end_the_process_or_hides_its_end_is_refused(tmp_path):
+    """An NRRD header with a line that ITK would write beyond its buffer, with an end that only some
+    programs see, or without one is refused; long comments and key/value pairs are read.
+    """
+    path = tmp_path / "a.nrrd"
+    save_volume(path, torch.rand(4, 6, 5), tilted())
+    values = read_volume(path)[0]
+    header, _, data = path.read_bytes().partition(b"\n\n")
+    for added, message in (
+        (b"kinds: " + b"A" * 1000, "lines of at most 500 characters"),
+        (b"a:=" + b"A" * 1000 + b": 1", "lines of at most 500 characters"),
+        (b"\x85\x85\ndata file: /etc/passwd", "its values in the same file"),
+        (b"#" + b"A" * 2**16, "header of at most 65536 bytes"),
+    ):
+        path.write_bytes(header + b"\n" + added + b"\n\n" + data)
+        with pytest.raises(Refused, match=rf"a\.nrrd: expected .*{message}"):
+            read_volume(path)
+    path.write_bytes(header + b"\n#" + b"A" * 1000 + b"\na:=" + b"A" * 1000 + b"\n\n" + data)
+    assert torch.equal(read_volume(path)[0], values)
+
+
+@pytest.mark.door
 def test_itk_images_that_are_no_volume_are_refused(tmp_path):
     """An ITK image of two axes, of colours, or that declares more than it holds is refused."""
     path = tmp_path / "a.mha"

@@ -54,6 +54,15 @@ def test_of_many_cameras_a_few_are_shown_with_the_nrmse_of_their_views():
     ]
 
 
+def test_a_title_says_how_many_of_the_cameras_a_sheet_has(monkeypatch):
+    monkeypatch.setattr(review, "sheet", lambda title, columns, rows: title)
+    for count, end in ((review.CAMERAS - 1, "opinions"), (8, "opinions, 7 of 8 cameras")):
+        assert review.opinions(CASE, torch.rand(count, *GRID.shape)).endswith(end)
+    views = torch.rand(80, 3, 4)
+    assert review.views(views, views).endswith("views, 8 of 80 cameras")
+    assert review.weights(CASE, torch.rand(8, *GRID.shape)).endswith("weights of cameras")
+
+
 def test_a_stack_of_slices_is_the_volume():
     truth = torch.rand(GRID.shape)
     stack = [review.slices(CASE, truth, {"x": truth}, z)[0].panels[0] for z in range(len(truth))]
