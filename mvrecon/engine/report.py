@@ -9,6 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from mvrecon.acquisition.settings import Acquisition
 from mvrecon.engine.quality import sentence
 
 WIDTH = 114
@@ -60,7 +61,9 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
     lines, got = [], results.get("acquisition")
     if got and (spoilt := _spoilt(got)):
         lines.append(f"The views' detector: {spoilt}")
-    if got and (run := results.get("acquisition_of_run", got)) != got:
+    run = results.get("acquisition_of_run", got)
+    # a run's settings leave out what is usual
+    if got and Acquisition.of(run) != Acquisition.of(got):
         lines.append(f"The run's detector was another: {_spoilt(run) or 'perfect'}")
     for label, row in results.get("methods", {}).items():
         if words := sentence(row.get("quality", {})):

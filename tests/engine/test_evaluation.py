@@ -138,6 +138,10 @@ def test_a_reader_of_the_table_learns_of_shared_cases_and_of_the_detector():
     ]
     lines = remarks({"acquisition": perfect, "acquisition_of_run": noisy})
     assert lines == ["The run's detector was another: blur_mm 2, photons 10000"]
+    whole = asdict(Acquisition.of({"disturbed": {"views": 3, "shift_px": 1.0}}))
+    short = perfect | {"disturbed": {"views": 3, "shift_px": 1.0}}
+    (line,) = remarks({"acquisition": whole, "acquisition_of_run": short})
+    assert line == "The views' detector: disturbed.views 3, disturbed.shift_px 1"
 
 
 def shown(found):
