@@ -6,6 +6,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+#: Options that belong to no model, but to the cases that any of them is given.
+OF_CASES = {"assume"}
 #: A line of the command line that chooses the main model or a part of it, sets or removes options.
 OF_MODEL = re.compile(r"[+~]*(\w+@)?model([.=]|$)")
 
@@ -36,7 +38,8 @@ def check_model_choice(
     alone = [line for line in overrides if line.startswith("hydra.") or line in of_model]
     expected = _model(compose([line for line in alone if not line.startswith("~")]))
     options = _model(config)
-    if changed := [key for key in options if options[key] != expected.get(key)]:
+    own_options = [key for key in options if key not in OF_CASES]
+    if changed := [key for key in own_options if options[key] != expected.get(key)]:
         names = ", ".join(f"model.{key}" for key in changed)
         lines = [f"model.{key}=..." if key in expected else f"~model.{key}" for key in changed]
         raise ValueError(
