@@ -1,4 +1,4 @@
-"""The error of an adapter whose library cannot be imported."""
+"""The error of an adapter, or of a plugin's part, whose library cannot be imported."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,4 +18,4 @@ def needs(package: str) -> Iterator[None]:
     except Exception as error:
         if find_spec(package) is not None:
             raise ImportError(f"{package} is installed but does not import: {error}") from error
-        raise ImportError(f"This adapter needs {package}: pip install {package}") from error
+        raise ImportError(f"This needs {package}: pip install {package}") from error

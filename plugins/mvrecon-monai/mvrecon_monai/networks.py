@@ -1,0 +1,155 @@
+"""MONAI's 3-D networks (https://monai.io), built as `Network(inputs, outputs, **options)`.
+
+Each says by `multiple` which sizes it takes; a model pads others with zeros and crops the answer.
+Normalisation is over groups of channels: MONAI's default, over each channel, fails where the
+coarsest level is a single voxel, and batches are too small for batch normalisation.
+"""
+
+from math import gcd
+from typing import Any
+
+from torch import nn
+
+from mvrecon.adapters.missing import needs
+
+#: Groups of channels in normalisation, MONAI's own choice for SegResNet; fewer where a width is no
+#: multiple of it.
+GROUPS = 8
+#: Channels of nnU-Net's widest level.
+WIDEST = 320
+
+
+def monai_basic_unet(inputs: int, outputs: int, width: int = 32) -> nn.Module:
+    """MONAI's BasicUNet, of five levels and pairs of convolutions, maps volumes to volumes.
+
+    Source: T. Falk and others, "U-Net: deep learning for cell counting, detection, and
+    morphometry", Nature Methods 2019.
+
+    Args:
+        inputs: channels in.
+        outputs: channels out.
+        width: channels of the two finest levels; the others have 2, 4 and 8 times as many.
+
+    Raises:
+        ValueError: a width that is too small.
+        ImportError: MONAI is not installed.
+    """
+    _check(width)
+    with needs("monai"):
+        from monai.networks.nets.basic_unet import (  # pyright: ignore[reportMissingImports]
+            BasicUNet,
+        )
+
+    widths = [width * times for times in (1, 1, 2, 4, 8, 1)]
+    return _sized(BasicUNet(3, inputs, outputs, widths, norm=_norm(width)), 16)
+
+
+def monai_dynunet(
+    inputs: int, outputs: int, width: int = 32, levels: int = 4, residual: bool = False
+) -> nn.Module:
+    """MONAI's DynUNet, the U-Net of nnU-Net, maps volumes to volumes.
+
+    Source: F. Isensee and others, "nnU-Net: a self-configuring method for deep learning-based
+    biomedical image segmentation", Nature Methods 2021.
+
+    Args:
+        inputs: channels in.
+        outputs: channels out.
+        width: channels of the finest level; they double with every level, up to 320 as in nnU-Net.
+        levels: scales, the finest included; at least 3.
+        residual: residual blocks in place of pairs of convolutions.
+
+    Raises:
+        ValueError: a width or a number of levels that is too small.
+        ImportError: MONAI is not installed.
+    """
+    _check(width, levels, fewest=3)
+    with needs("monai"):
+        from monai.networks.nets.dynunet import DynUNet  # pyright: ignore[reportMissingImports]
+
+    coarser = [2] * (levels - 1)
+    widths = [width * 2**level for level in range(levels)]
+    network = DynUNet(
+        spatial_dims=3,
+        in_channels=inputs,
+        out_channels=outputs,
+        kernel_size=[3] * levels,
+        strides=[1, *coarser],
+        upsample_kernel_size=coarser,
+        filters=[min(channels, max(width, WIDEST)) for channels in widths],
+        norm_name=_norm(gcd(width, WIDEST)),
+        res_block=residual,
+    )
+    return _sized(network, 2 ** (levels - 1))
+
+
+def monai_segresnet(inputs: int, outputs: int, width: int = 16) -> nn.Module:
+    """MONAI's SegResNet, residual blocks on four levels, maps volumes to volumes.
+
+    Source: A. Myronenko, "3D MRI brain tumor segmentation using autoencoder regularization",
+    BrainLes 2018; without the autoencoder.
+
+    Args:
+        inputs: channels in.
+        outputs: channels out.
+        width: channels of the finest level; they double with every level.
+
+    Raises:
+        ValueError: a width that is too small.
+        ImportError: MONAI is not installed.
+    """
+    _check(width)
+    with needs("monai"):
+        from monai.networks.nets.segresnet import (  # pyright: ignore[reportMissingImports]
+            SegResNet,
+        )
+
+    return _sized(SegResNet(3, width, inputs, outputs, norm=_norm(width)), 8)
+
+
+def monai_swin_unetr(inputs: int, outputs: int, width: int = 24) -> nn.Module:
+    """MONAI's SwinUNETR, attention in shifted windows of 7^3 patches, maps volumes to volumes.
+
+    Source: A. Hatamizadeh and others, "Swin UNETR: Swin transformers for semantic segmentation of
+    brain tumors in MRI images", BrainLes 2021.
+
+    Args:
+        inputs: channels in.
+        outputs: channels out.
+        width: channels of the finest level, a multiple of 12; they double with every level.
+
+    Raises:
+        ValueError: a width that 12 does not divide.
+        ImportError: MONAI or einops is not installed.
+    """
+    _check(width)
+    if width % 12:
+        raise ValueError(f"width must be a multiple of 12, got {width}")
+    with needs("einops"):
+        import einops  # noqa: F401  # pyright: ignore[reportMissingImports]
+    with needs("monai"):
+        from monai.networks.nets.swin_unetr import (  # pyright: ignore[reportMissingImports]
+            SwinUNETR,
+        )
+
+    network = SwinUNETR(inputs, outputs, feature_size=width, norm_name=_norm(width))
+    return _sized(network, 32)
+
+
+def _check(width: int, levels: int = 1, fewest: int = 1) -> None:
+    if width < 1 or levels < fewest:
+        raise ValueError(
+            f"Expected width of at least 1 and at least {fewest} levels, got width={width}, "
+            f"levels={levels}"
+        )
+
+
+def _norm(width: int) -> tuple[str, dict[str, Any]]:
+    """Group normalisation of levels whose channels are multiples of a width, as MONAI names it."""
+    return "GROUP", {"num_groups": gcd(GROUPS, width)}
+
+
+def _sized(network: nn.Module, multiple: int) -> nn.Module:
+    """The network, which says that it takes sizes which so many voxels divide."""
+    network.multiple = multiple  # pyright: ignore[reportArgumentType]
+    return network

@@ -1,0 +1,108 @@
+"""MONAI's networks keep the contract of networks; where MONAI is not installed they name it."""
+
+import sys
+import tomllib
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from mvrecon.models.network import network_by_name
+from mvrecon.parts import NETWORKS
+from mvrecon.testing import check_network
+
+ROOT = Path(__file__).parents[1]
+PARTS = {
+    key.partition(".")[2]: getattr(import_module(where.partition(":")[0]), where.partition(":")[2])
+    for key, where in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "entry-points"
+    ]["mvrecon.plugins"].items()
+    if key.startswith("network.")
+}
+SMALL = {
+    "monai_basic_unet": {"width": 4},
+    "monai_dynunet": {"width": 4, "levels": 3, "residual": True},
+    "monai_segresnet": {"width": 4},
+    "monai_swin_unetr": {"width": 12},
+}
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch: pytest.MonkeyPatch):
+    """The parts by name, whether the plugin is installed or only on Python's path."""
+    for name, part in PARTS.items():
+        monkeypatch.setitem(NETWORKS._parts, name, part)
+
+
+@pytest.fixture
+def monai():
+    pytest.importorskip("monai", reason="needs monai==1.6.1 (pip install monai)")
+    pytest.importorskip("einops", reason="needs einops==0.8.2 (pip install einops)")
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_contract_of_networks(name: str, monai: None):
+    check_network(name, **SMALL[name])
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_smallest_size_can_be_trained(name: str, monai: None):
+    """Of one voxel on the coarsest level, where a channel's own normalisation has no variance."""
+    network = network_by_name({"name": name, **SMALL[name]}, 1, 1, width=4)
+    network(torch.randn(1, 1, 3, 2, 5)).sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
+
+
+def test_options_reach_monai(monai: None):
+    """Channels of the levels, as the weights of the built networks have them."""
+
+    def widths(name: str, **options: int) -> set[int]:
+        weights = PARTS[name](2, 3, **options).parameters()
+        return {weight.shape[0] for weight in weights if weight.dim() == 5}
+
+    assert {6, 12, 24, 48} <= widths("monai_basic_unet", width=6)
+    assert max(widths("monai_dynunet", width=8, levels=7)) == 320
+    assert {6, 12, 24, 48} <= widths("monai_segresnet", width=6)
+    assert {24, 48, 384} <= widths("monai_swin_unetr")
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("name", PARTS)
+def test_a_missing_library_is_named_with_what_installs_it(
+    name: str, monkeypatch: pytest.MonkeyPatch
+):
+    """A network of MONAI where MONAI, or einops, is not installed says what to install."""
+    for module in [m for m in sys.modules if m.partition(".")[0] in ("monai", "einops")]:
+        monkeypatch.delitem(sys.modules, module)
+    for module in ("monai", "einops"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError, match="pip install (monai|einops)"):
+        PARTS[name](1, 1)
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("monai_basic_unet", {"width": -1}),
+        ("monai_dynunet", {"levels": 2}),
+        ("monai_segresnet", {"width": 0}),
+        ("monai_swin_unetr", {"width": 16}),
+    ],
+)
+def test_an_option_that_a_network_has_not_is_refused(name: str, options: dict[str, int]):
+    """Too few channels or levels of a network of MONAI, or channels that 12 does not divide."""
+    with pytest.raises(ValueError, match="[Ee]xpected|must be"):
+        PARTS[name](1, 1, **options)
+
+
+def test_every_network_is_configured_by_its_own_defaults():
+    folder = ROOT / "mvrecon_monai" / "conf" / "network"
+    assert {file.stem for file in folder.glob("*.yaml")} == set(PARTS) == set(SMALL)
+    for name, part in PARTS.items():
+        _, _, *options = signature(part).parameters.values()
+        expected = {"name": name} | {option.name: option.default for option in options}
+        assert yaml.safe_load((folder / f"{name}.yaml").read_text()) == expected
