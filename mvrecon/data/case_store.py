@@ -11,6 +11,7 @@ import torch
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.data.digests import of_grid, of_rig
+from mvrecon.data.hdf5_reading import reading
 from mvrecon.data.storage import dataset_in
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import Refused, blaming
@@ -92,7 +93,7 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
         "inside": (volume, "bool"),
     }
     values = {}
-    with blaming(path, "is not a case that can be read"), h5py.File(path, "r") as file:
+    with blaming(path, "is not a case that can be read"), reading(path) as file:
         expected |= {name: (volume, "float32") for name in MAPS if name in file}
         for name, kind in expected.items():
             dataset = dataset_in(path, file, name, "a case")

@@ -28,6 +28,7 @@ import numpy as np
 import torch
 
 from mvrecon.data.attenuation import UNITS, StoredUnit
+from mvrecon.data.hdf5_reading import reading
 from mvrecon.data.slabs import Slab, Slabs, planes
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.data.texts import texts_of, variable
@@ -220,7 +221,7 @@ def _opened(path: Path) -> tuple[h5py.File, Texts]:
     if not h5py.is_hdf5(path):
         raise Refused(f"{path}: not an HDF5 file; expected {EXPECTED}")
     with blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"):
-        file = h5py.File(path, "r", locking="best-effort")
+        file = reading(path)
         try:
             return file, _check(path, file)
         except Exception:

@@ -13,6 +13,7 @@ import numpy as np
 
 from mvrecon.data.events.shards import header_of
 from mvrecon.data.hdf5 import FORMAT
+from mvrecon.data.hdf5_reading import reading
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import VOLUME, Refused, blaming, check_file
@@ -45,7 +46,7 @@ def read_example(path: str | Path) -> Example:
     check_file(path, EXPECTED)
     with (
         blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
-        h5py.File(path, "r", locking="best-effort") as file,
+        reading(path) as file,
     ):
         arrays = {
             name: _read(path, file, name)
@@ -85,7 +86,7 @@ def write_view(
     """
     events = Path(events).resolve()
     _, count = header_of(events)
-    with blaming(events, "cannot be opened"), h5py.File(events, "r") as file:
+    with blaming(events, "cannot be opened"), reading(events) as file:
         parts = {"raw": raw, "label": "truth"}
         shapes = {key: dataset_in(events, file, name, raw).shape for key, name in parts.items()}
     if not 0 <= item < count or shapes["raw"] != shapes["label"]:

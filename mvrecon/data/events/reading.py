@@ -13,6 +13,7 @@ import torch
 from torch.utils.data import Dataset
 
 from mvrecon.data.events.shards import EXPECTED, NEEDED, OPTIONAL, checked, header_of
+from mvrecon.data.hdf5_reading import reading
 from mvrecon.data.storage import check_chunks
 from mvrecon.files.checks import Refused, blaming
 from mvrecon.geometry.grid import Grid
@@ -102,7 +103,7 @@ class Events(Dataset[dict[str, Any]]):
         if shard not in self._files:
             path = self.paths[shard]
             with blaming(path, "cannot be opened", f"expected {EXPECTED}"):
-                file = h5py.File(path, "r", locking="best-effort")
+                file = reading(path)
                 arrays = checked(path, file)
             self._files[shard] = file, arrays
             if shard and (kinds := self._kinds_of(shard)) != self._kinds:

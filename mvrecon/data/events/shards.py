@@ -22,6 +22,7 @@ import h5py
 import numpy as np
 
 from mvrecon.data.hdf5 import FORMAT
+from mvrecon.data.hdf5_reading import reading
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.data.texts import variable
 from mvrecon.files.atomic import written_whole
@@ -93,7 +94,7 @@ def header_of(path: Path) -> tuple[Header, int]:
     """
     with (
         blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
-        h5py.File(path, "r", locking="best-effort") as file,
+        reading(path) as file,
     ):
         return _header(path, file), len(checked(path, file)["index"])
 
@@ -138,7 +139,7 @@ def verify(path: Path) -> None:
     """
     with (
         blaming(path, "is damaged", "delete it to have it made again"),
-        h5py.File(path, "r", locking="best-effort") as file,
+        reading(path) as file,
     ):
         for array in checked(path, file).values():
             check_chunks(path, array)

@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from mvrecon.data.hdf5_reading import reading
 from mvrecon.data.itk import itk_image
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.data.storage import check_chunks, dataset_in
@@ -92,7 +93,7 @@ class Hdf5Views(ProjectionStack):
     def _opened(path: Path) -> Iterator[h5py.File]:
         with (
             blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
-            h5py.File(path, "r", locking="best-effort") as file,
+            reading(path) as file,
         ):
             yield file
 
