@@ -38,12 +38,12 @@ def check_model_choice(
     alone = [line for line in overrides if line.startswith("hydra.") or line in of_model]
     expected = _model(compose([line for line in alone if not line.startswith("~")]))
     options = _model(config)
-    own_options = [key for key in options if key not in OF_CASES]
-    if changed := [key for key in own_options if options[key] != expected.get(key)]:
-        names = ", ".join(f"model.{key}" for key in changed)
+    names = [key for key in options if key not in OF_CASES]
+    if changed := [key for key in names if options[key] != expected.get(key)]:
+        keys = ", ".join(f"model.{key}" for key in changed)
         lines = [f"model.{key}=..." if key in expected else f"~model.{key}" for key in changed]
         raise ValueError(
-            f"experiment={experiment} sets {names} of its model={own}; got model={choice}, "
+            f"experiment={experiment} sets {keys} of its model={own}; got model={choice}, "
             f"expected {' '.join(lines)} on the command line, too"
         )
 

@@ -90,8 +90,16 @@ def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outco
     seconds = time.perf_counter() - start
     volume = run.volume[0, 0].cpu()
     sigma = None if run.sigma is None else run.sigma[0, 0].cpu()
-    told = (run.misfit(), run.residuals, run.chosen, sigma, run.camera_weights)
-    return Outcome(volume, seconds, peak(), *told)
+    return Outcome(
+        volume,
+        seconds,
+        peak(),
+        view_nrmse=run.misfit(),
+        residuals=run.residuals,
+        chosen=run.chosen,
+        sigma=sigma,
+        camera_weights=run.camera_weights,
+    )
 
 
 class _Run(NamedTuple):

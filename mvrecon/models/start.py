@@ -71,10 +71,10 @@ class ClassicalStart:
         about one before, so that a weight of its options is relative to the content.
         """
         assert isinstance(self.start, Mapping)
-        own = views[sample : sample + 1]
-        level = content_scale(own) / typical_chord(geometry.A.grid)
+        case = views[sample : sample + 1]
+        level = content_scale(case) / typical_chord(geometry.A.grid)
         within = {} if geometry.mask is None else {"support": geometry.mask[sample, 0]}
-        return RECONSTRUCTORS.from_config(self.start, geometry.A, own / level, **within) * level
+        return RECONSTRUCTORS.from_config(self.start, geometry.A, case / level, **within) * level
 
 
 def normalised(

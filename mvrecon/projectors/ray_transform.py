@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.cameras.symmetry import Mirror, mirror_pairs
 from mvrecon.geometry.box import Box
-from mvrecon.geometry.grid import subdivided
+from mvrecon.geometry.grid import Grid, subdivided
 from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.integrals import LineIntegrals
@@ -91,8 +92,7 @@ class RayTransform(LineIntegrals):
         support = None if self.support is None else self.support[box.slices].cpu()
         rig = self.cameras
         cameras = rig if views is None else rig[torch.tensor(views, device=rig.source.device)]
-        options = (self.method, self.backend, self.rays_per_pixel, self.skip, support)
-        return RayTransform(self.grid.cropped(box), cameras, *options).to(self.device)
+        return self._like(self.grid.cropped(box), cameras, support, self.rays_per_pixel)
 
     def refined(self, factor: int) -> Projector:
         """The same on a finer grid, with the same options, and rays as much closer.
@@ -104,8 +104,15 @@ class RayTransform(LineIntegrals):
         if "refine" not in self.capabilities:
             return super().refined(factor)
         support = None if self.support is None else subdivided(self.support.cpu(), factor)
-        options = (self.method, self.backend, factor * self.rays_per_pixel, self.skip, support)
-        return RayTransform(self.grid.refined(factor), self.cameras, *options).to(self.device)
+        rays = factor * self.rays_per_pixel
+        return self._like(self.grid.refined(factor), self.cameras, support, rays)
+
+    def _like(
+        self, grid: Grid, cameras: Cameras, support: Bool[Tensor, "d h w"] | None, rays: int
+    ) -> "RayTransform":
+        """An operator with the same options, on another grid."""
+        options = (self.method, self.backend, rays, self.skip, support)
+        return RayTransform(grid, cameras, *options).to(self.device)
 
     def pixel_integral(self) -> PixelIntegral | None:
         """The line integral, or its mean over a pixel's rays; None with a support, which the object
