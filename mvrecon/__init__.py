@@ -34,22 +34,22 @@ if TYPE_CHECKING:
     from mvrecon.projectors.drr import Drr as Drr
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
     from mvrecon.projectors.radon import Radon as Radon
-    from mvrecon.reconstruct.bsrem import bsrem as bsrem
-    from mvrecon.reconstruct.by_name import reconstructed as reconstructed
-    from mvrecon.reconstruct.cgls import cgls as cgls
-    from mvrecon.reconstruct.filtered.fdk import fbp as fbp
-    from mvrecon.reconstruct.filtered.fdk import fdk as fdk
-    from mvrecon.reconstruct.filtered.streaming import fdk_streamed as fdk_streamed
-    from mvrecon.reconstruct.finer import finer as finer
-    from mvrecon.reconstruct.fista_tv import fista_tv as fista_tv
-    from mvrecon.reconstruct.held_out import held_out as held_out
-    from mvrecon.reconstruct.iterative import sirt as sirt
-    from mvrecon.reconstruct.mlem import mlem as mlem
-    from mvrecon.reconstruct.mlem import osem as osem
-    from mvrecon.reconstruct.os_sart import os_sart as os_sart
-    from mvrecon.reconstruct.pdhg_tv import pdhg_tv as pdhg_tv
-    from mvrecon.reconstruct.tikhonov import tikhonov as tikhonov
-    from mvrecon.reconstruct.tv_map import tv_map as tv_map
+    from mvrecon.reconstructors.bsrem import bsrem as bsrem
+    from mvrecon.reconstructors.by_name import reconstruct as reconstruct
+    from mvrecon.reconstructors.cgls import cgls as cgls
+    from mvrecon.reconstructors.filtered.fdk import fbp as fbp
+    from mvrecon.reconstructors.filtered.fdk import fdk as fdk
+    from mvrecon.reconstructors.filtered.streaming import fdk_streamed as fdk_streamed
+    from mvrecon.reconstructors.finer import finer as finer
+    from mvrecon.reconstructors.fista_tv import fista_tv as fista_tv
+    from mvrecon.reconstructors.held_out import held_out as held_out
+    from mvrecon.reconstructors.iterative import sirt as sirt
+    from mvrecon.reconstructors.mlem import mlem as mlem
+    from mvrecon.reconstructors.mlem import osem as osem
+    from mvrecon.reconstructors.os_sart import os_sart as os_sart
+    from mvrecon.reconstructors.pdhg_tv import pdhg_tv as pdhg_tv
+    from mvrecon.reconstructors.tikhonov import tikhonov as tikhonov
+    from mvrecon.reconstructors.tv_map import tv_map as tv_map
 
 __version__ = "0.1.0"
 
@@ -61,36 +61,36 @@ _DOOR = {
     "LinearOperator": "mvrecon.projectors.operator:LinearOperator",
     "Radon": "mvrecon.projectors.radon:Radon",
     "arc": "mvrecon.cameras.rigs:arc",
-    "bsrem": "mvrecon.reconstruct.bsrem:bsrem",
+    "bsrem": "mvrecon.reconstructors.bsrem:bsrem",
     "calibrated": "mvrecon.calibration.from_data:calibrated",
-    "cgls": "mvrecon.reconstruct.cgls:cgls",
+    "cgls": "mvrecon.reconstructors.cgls:cgls",
     "circular": "mvrecon.cameras.rigs:circular",
     "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.cameras.rigs:dome",
     "epipolar_line": "mvrecon.cameras.epipolar:epipolar_line",
-    "finer": "mvrecon.reconstruct.finer:finer",
-    "fista_tv": "mvrecon.reconstruct.fista_tv:fista_tv",
-    "fbp": "mvrecon.reconstruct.filtered.fdk:fbp",
-    "fdk": "mvrecon.reconstruct.filtered.fdk:fdk",
-    "fdk_streamed": "mvrecon.reconstruct.filtered.streaming:fdk_streamed",
+    "finer": "mvrecon.reconstructors.finer:finer",
+    "fista_tv": "mvrecon.reconstructors.fista_tv:fista_tv",
+    "fbp": "mvrecon.reconstructors.filtered.fdk:fbp",
+    "fdk": "mvrecon.reconstructors.filtered.fdk:fdk",
+    "fdk_streamed": "mvrecon.reconstructors.filtered.streaming:fdk_streamed",
     "from_file": "mvrecon.cameras.files:from_file",
     "from_markers": "mvrecon.calibration.markers:from_markers",
-    "held_out": "mvrecon.reconstruct.held_out:held_out",
+    "held_out": "mvrecon.reconstructors.held_out:held_out",
     "load": "mvrecon.engine.trained:load",
-    "mlem": "mvrecon.reconstruct.mlem:mlem",
-    "os_sart": "mvrecon.reconstruct.os_sart:os_sart",
-    "osem": "mvrecon.reconstruct.mlem:osem",
+    "mlem": "mvrecon.reconstructors.mlem:mlem",
+    "os_sart": "mvrecon.reconstructors.os_sart:os_sart",
+    "osem": "mvrecon.reconstructors.mlem:osem",
     "parallel": "mvrecon.cameras.rigs:parallel",
-    "pdhg_tv": "mvrecon.reconstruct.pdhg_tv:pdhg_tv",
+    "pdhg_tv": "mvrecon.reconstructors.pdhg_tv:pdhg_tv",
     "random_rig": "mvrecon.cameras.random_rigs:random_rig",
     "read_volume": "mvrecon.data.volume_files:read_volume",
-    "reconstructed": "mvrecon.reconstruct.by_name:reconstructed",
+    "reconstruct": "mvrecon.reconstructors.by_name:reconstruct",
     "save_program": "mvrecon.engine.program:save_program",
     "save_volume": "mvrecon.data.volume_files:save_volume",
     "save_weights": "mvrecon.engine.trained:save_weights",
-    "sirt": "mvrecon.reconstruct.iterative:sirt",
-    "tikhonov": "mvrecon.reconstruct.tikhonov:tikhonov",
-    "tv_map": "mvrecon.reconstruct.tv_map:tv_map",
+    "sirt": "mvrecon.reconstructors.iterative:sirt",
+    "tikhonov": "mvrecon.reconstructors.tikhonov:tikhonov",
+    "tv_map": "mvrecon.reconstructors.tv_map:tv_map",
 }
 
 

@@ -56,25 +56,25 @@ CAMERA_NETWORKS = Registry(
 )
 RECONSTRUCTORS = Registry(
     "reconstructor",
-    fbp="mvrecon.reconstruct.filtered.fdk:fbp",
-    fdk="mvrecon.reconstruct.filtered.fdk:fdk",
+    fbp="mvrecon.reconstructors.filtered.fdk:fbp",
+    fdk="mvrecon.reconstructors.filtered.fdk:fdk",
     trained="mvrecon.engine.trained_reconstructor:trained",
-    sirt="mvrecon.reconstruct.iterative:sirt",
-    os_sart="mvrecon.reconstruct.os_sart:os_sart",
-    cgls="mvrecon.reconstruct.cgls:cgls",
-    tikhonov="mvrecon.reconstruct.tikhonov:tikhonov",
-    fista_tv="mvrecon.reconstruct.fista_tv:fista_tv",
-    pdhg_tv="mvrecon.reconstruct.pdhg_tv:pdhg_tv",
-    mlem="mvrecon.reconstruct.mlem:mlem",
-    osem="mvrecon.reconstruct.mlem:osem",
-    bsrem="mvrecon.reconstruct.bsrem:bsrem",
-    tv_map="mvrecon.reconstruct.tv_map:tv_map",
-    finer="mvrecon.reconstruct.finer:finer",
+    sirt="mvrecon.reconstructors.iterative:sirt",
+    os_sart="mvrecon.reconstructors.os_sart:os_sart",
+    cgls="mvrecon.reconstructors.cgls:cgls",
+    tikhonov="mvrecon.reconstructors.tikhonov:tikhonov",
+    fista_tv="mvrecon.reconstructors.fista_tv:fista_tv",
+    pdhg_tv="mvrecon.reconstructors.pdhg_tv:pdhg_tv",
+    mlem="mvrecon.reconstructors.mlem:mlem",
+    osem="mvrecon.reconstructors.mlem:osem",
+    bsrem="mvrecon.reconstructors.bsrem:bsrem",
+    tv_map="mvrecon.reconstructors.tv_map:tv_map",
+    finer="mvrecon.reconstructors.finer:finer",
 )
 #: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
 STREAMED = Registry(
     "streamed reconstructor",
-    fdk="mvrecon.reconstruct.filtered.streaming:fdk_streamed",
+    fdk="mvrecon.reconstructors.filtered.streaming:fdk_streamed",
 )
 #: Files of views that are read as one array, by their endings: f(path) -> ProjectionStack.
 VIEW_FILES = Registry(

@@ -30,7 +30,7 @@ def warm_up() -> float:
                 A.T(A(z)).sum().backward()
         views = mv.Drr(grid, cone)(x)
         for name in ("fdk", "sirt", "fista_tv", "osem"):
-            mv.reconstructed(views, cone, grid, name)
+            mv.reconstruct(views, cone, grid, name)
     return time.perf_counter() - begin
 
 

@@ -64,8 +64,8 @@ save_png("views.png", montage.gallery(views[:4]))
 # `fdk` is the usual first look, `fista_tv` for few views; `mvrecon-list reconstructor` shows all.
 
 # %%
-volume = mv.reconstructed(views[None, None], cameras, grid, method="fdk")
-few = mv.reconstructed(views[None, None, ::6], cameras[::6], grid, method="fista_tv", iterations=40)
+volume = mv.reconstruct(views[None, None], cameras, grid, method="fdk")
+few = mv.reconstruct(views[None, None, ::6], cameras[::6], grid, method="fista_tv", iterations=40)
 residual = mv.Drr(grid, cameras)(volume)[0, 0] - views
 print(f"view NRMSE of fdk: {residual.norm() / views.norm():.2%}")
 assert residual.norm() < 0.1 * views.norm()  # with a wrong sign it is several times as much

@@ -15,7 +15,7 @@ from mvrecon.engine.module import build_projector
 from mvrecon.metrics import nrmse
 from mvrecon.parts import RECONSTRUCTORS
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.problem import Iterate
+from mvrecon.reconstructors.problem import Iterate
 
 #: Edge of the grid, and of the virtual detector, in mm.
 EDGE, DETECTOR = 180.0, 400.0

@@ -13,7 +13,7 @@ import torch
 from mvrecon.config import compose
 from mvrecon.engine import checkpoints, fit
 from mvrecon.metrics import nrmse
-from mvrecon.reconstruct.cgls import cgls
+from mvrecon.reconstructors.cgls import cgls
 from mvrecon.train import train
 
 #: Training steps at which the error is looked at: three doublings.

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
-from mvrecon.reconstruct.division import divided
+from mvrecon.reconstructors.division import divided
 
 
 class Blur(LinearOperator):

@@ -24,7 +24,7 @@ from mvrecon.cameras.field import resolution
 from mvrecon.cameras.misalignment import Misalignment, misaligned
 from mvrecon.cameras.views import check_finite
 from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
-from mvrecon.reconstruct.cgls import cgls
+from mvrecon.reconstructors.cgls import cgls
 
 OperatorOf = Callable[[Cameras], Projector]
 

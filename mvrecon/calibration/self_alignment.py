@@ -17,7 +17,7 @@ from mvrecon.calibration.unknowns import motions
 from mvrecon.cameras.views import check_finite
 from mvrecon.kernels.known import key_of, known
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.iterative import sirt, sirt_weights
+from mvrecon.reconstructors.iterative import sirt, sirt_weights
 
 #: Shifts in pixels, and gains, below which a camera counts as standing still.
 STILL_PX, STILL_GAIN = 0.03, 0.003

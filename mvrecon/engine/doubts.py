@@ -19,8 +19,8 @@ from mvrecon.metrics import nrmse
 from mvrecon.parts import PROJECTORS, RECONSTRUCTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.pixel_integral import sees_integrals
-from mvrecon.reconstruct.iterative import sirt
-from mvrecon.reconstruct.problem import kind_of_views
+from mvrecon.reconstructors.iterative import sirt
+from mvrecon.reconstructors.problem import kind_of_views
 
 #: Voxels along the grid's longest side, views, and iterations of SIRT that tell mirrored views.
 VOXELS, VIEWS, ITERATIONS = 32, 40, 8

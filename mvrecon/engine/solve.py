@@ -17,10 +17,10 @@ from mvrecon.engine.scan import Scan
 from mvrecon.files.memory import peak
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import RECONSTRUCTORS, STREAMED
-from mvrecon.reconstruct.held_out import Choice, held_out
-from mvrecon.reconstruct.left_out import left_out_residual
-from mvrecon.reconstruct.problem import Iterate
-from mvrecon.reconstruct.stopping import Curve, combined, discrepancy
+from mvrecon.reconstructors.held_out import Choice, held_out
+from mvrecon.reconstructors.left_out import left_out_residual
+from mvrecon.reconstructors.problem import Iterate
+from mvrecon.reconstructors.stopping import Curve, combined, discrepancy
 
 #: Views whose residual is computed at a time.
 BLOCK = 32

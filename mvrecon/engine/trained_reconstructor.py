@@ -12,7 +12,7 @@ from mvrecon.engine.on_case import plain
 from mvrecon.engine.on_rig import model_on
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.problem import takes
+from mvrecon.reconstructors.problem import takes
 
 #: Of the training's value range: a volume whose greatest value is not between these is told.
 USUAL = (0.05, 2.0)

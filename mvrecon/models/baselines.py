@@ -27,7 +27,7 @@ from mvrecon.models.start import (
 )
 from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.iterative import SirtWeights, correction, sirt, sirt_weights
+from mvrecon.reconstructors.iterative import SirtWeights, correction, sirt, sirt_weights
 
 
 class MeanFusion(SinglePass):

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.models.geometry import Geometry
-from mvrecon.reconstruct.iterative import inverse_sums
+from mvrecon.reconstructors.iterative import inverse_sums
 from mvrecon.registry import check_options
 
 #: The least number of counts that a pixel is taken to expect, relative to the mean of its case.

@@ -15,8 +15,8 @@ from torch.nn.functional import adaptive_max_pool3d
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.networks import MULTIPLE
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.division import divided
-from mvrecon.reconstruct.iterative import (
+from mvrecon.reconstructors.division import divided
+from mvrecon.reconstructors.iterative import (
     SirtWeights,
     correction,
     inverse_sums,

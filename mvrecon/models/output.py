@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d
 
 from mvrecon.calibration.alignment import Alignment
-from mvrecon.reconstruct.division import divided
+from mvrecon.reconstructors.division import divided
 
 
 @dataclass

@@ -25,7 +25,7 @@ from mvrecon.models.start import ClassicalStart, Start, normalised, typical_chor
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.radon import Radon
 from mvrecon.projectors.voxel_driven import images_of
-from mvrecon.reconstruct.filtered.filters import Filter
+from mvrecon.reconstructors.filtered.filters import Filter
 
 #: Projections of the full circle for each voxel along the longer side of a slice: 256 for 64.
 ANGLES = 4

@@ -11,7 +11,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.models.fingerprints import fingerprints
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import RECONSTRUCTORS
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstructors.iterative import sirt
 
 #: Iterations of SIRT with momentum, or a reconstructor as a mapping: its name and options.
 Start = int | Mapping[str, Any]

@@ -21,8 +21,8 @@ from mvrecon.engine.fit import build_module
 from mvrecon.metrics import volume_metrics
 from mvrecon.projectors.selection import ray_subset, view_subset
 from mvrecon.projectors.voxel_driven import backproject
-from mvrecon.reconstruct.iterative import sirt_weights
-from mvrecon.reconstruct.poisson import PoissonLikelihood
+from mvrecon.reconstructors.iterative import sirt_weights
+from mvrecon.reconstructors.poisson import PoissonLikelihood
 from mvrecon.testing.as_gpu import AsGpu, OnGpu
 from mvrecon.visual_hull.support import support_from_views
 

@@ -12,7 +12,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import volume_metrics
 from mvrecon.parts import PROJECTORS, SCENES
 from mvrecon.projectors.drr import Drr
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstructors.iterative import sirt
 
 GRID = Grid.centred(size=(13, 11, 9), spacing=2.0)
 SQUARE = {"pixels": [9, 15], "pixel_mm": 4.0}

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from mvrecon.data.breast import BreastSlices
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, PROJECTORS
-from mvrecon.reconstruct.total_variation import gradient
+from mvrecon.reconstructors.total_variation import gradient
 from mvrecon.scenes.analytic import generator
 from mvrecon.scenes.breast import Tissues, random_texture, waves
 

@@ -18,7 +18,7 @@ from mvrecon.engine.trained_correction import corrected_by
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of, sentences
 from mvrecon.models.corrected import Corrected
 from mvrecon.parts import PROJECTORS, SCENES
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstructors.iterative import sirt
 from tests.engine.runs import call, trained_for_a_step
 from tests.models.rig import small_rig
 

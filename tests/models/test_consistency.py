@@ -7,8 +7,8 @@ from mvrecon.models.consistency import Consistency, em_change, weighted_for_coun
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.parts import MODELS
 from mvrecon.projectors.operator import Scaled
-from mvrecon.reconstruct.mlem import mlem
-from mvrecon.reconstruct.poisson import negative_log_likelihood
+from mvrecon.reconstructors.mlem import mlem
+from mvrecon.reconstructors.poisson import negative_log_likelihood
 from mvrecon.testing import check_model
 from tests.models.cross_view.test_model import SMALL
 from tests.models.rig import small_projector

@@ -8,7 +8,7 @@ from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.models.start import ClassicalStart
 from mvrecon.parts import RECONSTRUCTORS
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstructors.iterative import sirt
 from tests.models.cross_view.test_model import blob
 from tests.models.rig import small_projector
 

@@ -12,8 +12,8 @@ from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.operator import Cropped, LinearOperator, Scaled
 from mvrecon.projectors.selection import RaySelection, ViewSelection
 from mvrecon.projectors.stacked import Stacked
-from mvrecon.reconstruct.iterative import sirt
-from mvrecon.reconstruct.mlem import mlem
+from mvrecon.reconstructors.iterative import sirt
+from mvrecon.reconstructors.mlem import mlem
 from tests.projectors.rigs import CONE, GRID
 
 

@@ -19,7 +19,7 @@ from mvrecon.models.pooling import deviation, leave_one_out, pooled
 from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.division import divided
+from mvrecon.reconstructors.division import divided
 
 #: Density by which an empty voxel counts along a ray, relative to the content's scale.
 LEAST = 0.01

@@ -10,7 +10,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.known import known
-from mvrecon.reconstruct.filtered.orbit import Orbit, orbit_of
+from mvrecon.reconstructors.filtered.orbit import Orbit, orbit_of
 
 #: A scan is a whole turn if its largest gap is at most so many median steps.
 WHOLE = 1.5

@@ -12,8 +12,8 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.models.network import network_by_name
 from mvrecon.models.start import anything, content_scale
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.filtered.fdk import fbp, fdk
-from mvrecon.reconstruct.filtered.filters import Filter
+from mvrecon.reconstructors.filtered.fdk import fbp, fdk
+from mvrecon.reconstructors.filtered.filters import Filter
 
 #: The network of a model that is given none.
 NETWORK = {"name": "unet2d"}

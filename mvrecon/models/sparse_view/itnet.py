@@ -11,8 +11,8 @@ from mvrecon.models.door import admitted
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.sparse_view.filtered import corrector, filtered, in_full_precision, scaled
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.filtered.filters import Filter
-from mvrecon.reconstruct.filtered.scan_weights import scan_of
+from mvrecon.reconstructors.filtered.filters import Filter
+from mvrecon.reconstructors.filtered.scan_weights import scan_of
 
 
 class ItNet(nn.Module):

@@ -10,7 +10,7 @@ from mvrecon.models.sparse_view.filtered import sinograms
 from mvrecon.models.start import anything, content_scale
 from mvrecon.models.unet2d import by_slices
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.iterative import SirtWeights, correction, sirt_weights
+from mvrecon.reconstructors.iterative import SirtWeights, correction, sirt_weights
 
 
 class PrimalDual(nn.Module):

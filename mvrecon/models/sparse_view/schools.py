@@ -26,8 +26,8 @@ from mvrecon.models.sparse_view.filtered import (
 )
 from mvrecon.models.start import typical_chord
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.filtered.filters import Filter
-from mvrecon.reconstruct.filtered.scan_weights import scan_of
+from mvrecon.reconstructors.filtered.filters import Filter
+from mvrecon.reconstructors.filtered.scan_weights import scan_of
 
 #: Views that a sinogram of a whole turn is continued by at both ends, for its network.
 WRAP = 8

@@ -14,9 +14,9 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.projectors.selection import ray_subset, view_subset
-from mvrecon.reconstruct.iterative import sirt
-from mvrecon.reconstruct.mlem import mlem
-from mvrecon.reconstruct.poisson import PoissonLikelihood
+from mvrecon.reconstructors.iterative import sirt
+from mvrecon.reconstructors.mlem import mlem
+from mvrecon.reconstructors.poisson import PoissonLikelihood
 from mvrecon_bench.stresses.subject import gap
 
 peers = pytest.importorskip("mvrecon_peers.base")

@@ -15,7 +15,7 @@ from mvrecon.data.attenuation import attenuation, hounsfield, tissue_at
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 from mvrecon.projectors.drr import Drr
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstructors.iterative import sirt
 from mvrecon.scenes.analytic import generator, mixed
 from mvrecon.scenes.attenuating import AttenuatingScene
 from mvrecon.scenes.sample import Rays, Sample

@@ -9,7 +9,7 @@ from mvrecon.acquisition.detector import blurred, detected
 from mvrecon.acquisition.settings import Acquisition
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.reconstruct.mlem import mlem, osem
+from mvrecon.reconstructors.mlem import mlem, osem
 from mvrecon_spect.counts import decay_factors, decaying, thinned
 from mvrecon_spect.projector import Spect
 from mvrecon_spect.scatter import blurred_share, triple_energy_window

@@ -7,9 +7,9 @@ from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.projectors.selection import RaySelection
-from mvrecon.reconstruct.iterative import sirt_weights
-from mvrecon.reconstruct.mlem import mlem
-from mvrecon.reconstruct.poisson import PoissonLikelihood
+from mvrecon.reconstructors.iterative import sirt_weights
+from mvrecon.reconstructors.mlem import mlem
+from mvrecon.reconstructors.poisson import PoissonLikelihood
 from mvrecon_spect.projector import Spect
 
 GRID = Grid.centred(size=(8, 12, 10), spacing=12.0)

@@ -13,7 +13,7 @@ from mvrecon.losses import EARLIER, ReconstructionLoss
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
-from mvrecon.reconstruct.iterative import SirtWeights, sirt, sirt_weights
+from mvrecon.reconstructors.iterative import SirtWeights, sirt, sirt_weights
 from mvrecon.testing import check_model
 from tests.models.rig import small_projector, small_rig
 

@@ -12,8 +12,8 @@ from mvrecon.models.sparse_view.itnet import ItNet, growth
 from mvrecon.models.sparse_view.primal_dual import PrimalDual, _norm_bound
 from mvrecon.parts import MODELS
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.filtered.fdk import fbp
-from mvrecon.reconstruct.power import power_norm
+from mvrecon.reconstructors.filtered.fdk import fbp
+from mvrecon.reconstructors.power import power_norm
 from mvrecon.testing import check_model
 from mvrecon.testing.projector import close
 from tests.models.sparse_view.conftest import fan, rig, stack, stirred

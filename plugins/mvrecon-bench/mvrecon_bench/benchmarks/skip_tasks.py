@@ -18,7 +18,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.reconstruct.iterative import sirt
+from mvrecon.reconstructors.iterative import sirt
 from mvrecon.visual_hull.support import support_from_views
 from mvrecon_bench.benchmarks.skip_scenes import Filled
 

@@ -4,8 +4,8 @@ import torch
 
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.projectors.operator import Projector
-from mvrecon.reconstruct.mlem import mlem
-from mvrecon.reconstruct.poisson import PoissonLikelihood
+from mvrecon.reconstructors.mlem import mlem
+from mvrecon.reconstructors.poisson import PoissonLikelihood
 from mvrecon.scenes.derenzo import derenzo
 from mvrecon_bench.stresses.case import PRECISE, Case
 from mvrecon_bench.stresses.refusals import none_of, refusal

@@ -7,8 +7,8 @@ itself: here is what such logarithms, taken elsewhere, may leave in the views.
 
 import torch
 
-from mvrecon.reconstruct.iterative import sirt, sirt_weights
-from mvrecon.reconstruct.mlem import mlem
+from mvrecon.reconstructors.iterative import sirt, sirt_weights
+from mvrecon.reconstructors.mlem import mlem
 from mvrecon.visual_hull.hull import visual_hull
 from mvrecon.visual_hull.noise import noise_threshold
 from mvrecon_bench.stresses.case import Case
