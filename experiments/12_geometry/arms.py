@@ -22,6 +22,7 @@ QUARTER = f"{{resolution: quarter, widths: [8], {CAMERAS}"
 #: What differs between the models.
 ARMS = {
     "cross_view": ("model=cross_view",),
+    "wide_cells": ("model=cross_view", "model.rounds.0.cameras.binning=9"),
     "equal_rays": ("model=cross_view", "model.rounds.0.opinions.weigh_rays=false"),
     "one_round": ("model=cross_view", f"model.{ONE}"),
     "two_rounds": ("model=cross_view", f"model.rounds=[{QUARTER}, opinions: {{}}}}, {FULL}]"),
@@ -36,6 +37,14 @@ ARMS = {
 #: These begin with SIRT on a grid twice as fine, which is made once a case and not in the pace.
 FINER = {
     f"{arm}_finer": (*ARMS[arm], "model.start={name: finer}")
+    for arm in ("cross_view", "one_round", "world_unet")
+}
+#: The same, and what the coarse grid misses is taken off the views.
+MISSED = {
+    f"{arm}_missed": (
+        *ARMS[arm],
+        "model.start={name: sirt, iterations: 25, momentum: true, finer_grid: 2}",
+    )
     for arm in ("cross_view", "one_round", "world_unet")
 }
 ALIGNED = {
@@ -66,6 +75,9 @@ CLASSICAL = {
         "model.model.reconstructor.weight=1e-4",
     ),
 }
+
+
+EVERY = ARMS | FINER | MISSED | ALIGNED | CLASSICAL
 
 
 class Regime(NamedTuple):
@@ -152,7 +164,7 @@ REGIMES = {
 
 def settings(regime: Regime, arm: str) -> list[str]:
     """The overrides of an arm in a regime."""
-    options = [*BASE, *(ARMS | FINER | ALIGNED | CLASSICAL)[arm], *regime.views]
+    options = [*BASE, *EVERY[arm], *regime.views]
     if arm in ALIGNED | CLASSICAL:  # options of the experiment's own model, which these have not
         options += ["~model.support", "~model.precision"]
     if arm in CLASSICAL:

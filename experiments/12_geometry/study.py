@@ -11,6 +11,7 @@ arm trains for the same processor time of one thread: steps = seconds / pace.
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ from pathlib import Path
 from statistics import median
 
 import torch
-from arms import ALIGNED, ARMS, CLASSICAL, FINER, REGIMES, paths, settings
+from arms import ALIGNED, ARMS, CLASSICAL, EVERY, FINER, MISSED, REGIMES, paths, settings
 
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_data, build_module
@@ -30,7 +31,14 @@ from mvrecon.files.tables import read_rows, write_rows
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
 #: What arms are compared with.
-AGAINST = ("one_round", "world_rounds", "world_unet", "world_unet_finer", "world_unet_aligned")
+AGAINST = (
+    "one_round",
+    "world_rounds",
+    "world_unet",
+    "world_unet_finer",
+    "world_unet_missed",
+    "world_unet_aligned",
+)
 
 
 def pace(options: argparse.Namespace) -> None:
@@ -78,7 +86,8 @@ def _paces() -> dict[tuple[str, str], dict[str, str]]:
 
 def steps(regime: str, arm: str, seconds: int) -> int:
     """Training steps of an arm in so many processor seconds."""
-    paces = _paces()[REGIMES[regime].pace, arm.removesuffix("_aligned").removesuffix("_finer")]
+    same = re.sub("_(aligned|finer|missed)$", "", arm)
+    paces = _paces()[REGIMES[regime].pace, same]
     return round(seconds / float(paces["seconds_per_step"]))
 
 
@@ -158,7 +167,7 @@ def curves(rows: list[dict], path: Path) -> None:
     figure, panels = plt.subplots(1, len(regimes), figsize=(4.5 * len(regimes), 3.6), squeeze=False)
     for panel, regime in zip(panels[0], regimes, strict=True):
         lines = [row for row in rows if row["regime"] == regime]
-        for arm in ARMS | FINER | ALIGNED:
+        for arm in ARMS | FINER | MISSED | ALIGNED:
             line = sorted((r["seconds"], r["psnr"]) for r in lines if r["arm"] == arm)
             if line:
                 panel.plot(*zip(*line, strict=True), "o-", label=arm)
@@ -188,7 +197,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the patients")
     parser.add_argument("--runs", type=Path, default=Path("outputs/12_geometry"))
     parser.add_argument("--regimes", nargs="+", choices=REGIMES, default=["clean", "rig"])
-    every = [*ARMS, *FINER, *ALIGNED, *CLASSICAL]
+    every = list(EVERY)
     parser.add_argument("--arms", nargs="+", choices=every, default=every)
     parser.add_argument("--seconds", type=int, default=400, help="of one thread, training")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])

@@ -92,9 +92,10 @@ class BackprojectionUNet(nn.Module):
         self.options = Options.of(type(self), options)
         _refuse_where(self.options)
         self.cropping = Cropping(projector, self.options)
-        self.start = ClassicalStart(start)
+        steps = Consistency(consistency)
+        self.start = ClassicalStart(start, counts=steps.poisson)
         self.net = network_by_name(self.options.network, 3, 1, width, zero=1)
-        self.consistency = Consistency(consistency)
+        self.consistency = steps
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         views = admitted(views, self.cropping.cameras, self.consistency.lengths)

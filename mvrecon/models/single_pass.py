@@ -65,12 +65,13 @@ class SinglePass(nn.Module):
         if fusion not in ("weighted", "mean"):
             raise ValueError(f"fusion must be 'weighted' or 'mean', got {fusion!r}")
         self.options = Options.of(type(self), options)
-        self.start = ClassicalStart(start)
+        steps = Consistency(consistency)
+        self.start = ClassicalStart(start, counts=steps.poisson)
         self.opinions = Opinions(projector, head, DepthNetwork(**(opinion or {})))
         self.cropping = Cropping(projector, self.options, self.opinions.binning)
         self.weighting = Weighting(5) if fusion == "weighted" else None
         self.refine = self._refinement(refine)
-        self.consistency = Consistency(consistency)
+        self.consistency = steps
 
     def _refinement(self, width: int) -> nn.Module | None:
         network = self.options.network

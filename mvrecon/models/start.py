@@ -1,22 +1,49 @@
 """What networks begin with: a classical volume, and the scale by which they divide everything."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import avg_pool3d
 
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, subdivided
 from mvrecon.models.fingerprints import fingerprints
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import RECONSTRUCTORS
 from mvrecon.reconstructors.iterative import sirt
 
-#: Iterations of SIRT with momentum, or a reconstructor as a mapping: its name and options.
+#: Iterations of SIRT with momentum, or a reconstructor as a mapping: its name and options, and on
+#: how many times finer a grid.
 Start = int | Mapping[str, Any]
-#: Bytes of volumes that a training keeps at most.
+#: The key of that number in the mapping.
+FINER = "finer_grid"
+#: Bytes of volumes and views that a training keeps at most.
 ROOM = 2 << 30
+
+
+class Beginning(NamedTuple):
+    """What networks begin with.
+
+    Args:
+        volume: a classical reconstruction, in the unit of (views / mm).
+        missed: the views of it on a finer grid less those of `volume`: what the grid's operator
+            misses of the views, in their unit; none without a finer grid.
+    """
+
+    volume: Float[Tensor, "b 1 d h w"]
+    missed: Float[Tensor, "b 1 m v u"] | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes of memory."""
+        return sum(part.nbytes for part in self if part is not None)
+
+    def to(self, other: Tensor) -> "Beginning":
+        """The same with the device and the dtype of another tensor."""
+        missed = None if self.missed is None else self.missed.to(other)
+        return Beginning(self.volume.to(other), missed)
 
 
 class ClassicalStart:
@@ -26,55 +53,88 @@ class ClassicalStart:
     It is not differentiated. In training another reconstructor's volume of a case is computed once
     and kept, as long as there is room: views of a training case are the same in every epoch.
 
+    On a grid n times finer, with n x n rays a pixel, the reconstructor finds x_f, and the network
+    begins with its mean x over each voxel. Under a grid of few voxels the truth itself misses its
+    views by some percent, and every step towards the data pulls there. A_f x_f - A x tells most of
+    that (it takes half of it away in study 12), so networks get the views without it.
+
     Args:
-        start: iterations of SIRT with momentum, or a reconstructor: `{name: ..., **options}`.
+        start: iterations of SIRT with momentum, or a reconstructor: `{name: ..., **options}`, with
+            `finer_grid: n` on a grid n times finer.
+        counts: whether the views are counts, which a difference of views is not.
 
     Raises:
         LookupError: an unknown name.
         TypeError: an option that the reconstructor does not have, or a mapping without a name.
+        ValueError: a finer grid that is no whole number above 0, or of counts.
     """
 
-    def __init__(self, start: Start):
+    def __init__(self, start: Start, counts: bool = False):
+        self.start, self.finer_grid = start, 1
         if isinstance(start, Mapping):
-            RECONSTRUCTORS.check(start)
-        self.start = start
-        self._known: dict[bytes, Float[Tensor, "1 1 d h w"]] = {}
+            self.start = {key: value for key, value in start.items() if key != FINER}
+            self.finer_grid = start.get(FINER, 1)
+            RECONSTRUCTORS.check(self.start)
+        if not isinstance(self.finer_grid, int) or self.finer_grid < 1:
+            raise ValueError(
+                f"Expected {FINER} of a start, a whole number of at least 1, got "
+                f"{self.finer_grid!r}"
+            )
+        if counts and self.finer_grid > 1:
+            raise ValueError(
+                f"Expected line integrals for a start with {FINER}: {self.finer_grid}, got counts "
+                f"(consistency with the noise poisson)"
+            )
+        self._known: dict[bytes, Beginning] = {}
         self._room = ROOM
 
     @torch.no_grad()
     def __call__(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
-    ) -> Float[Tensor, "b 1 d h w"]:
-        """The volumes of views within each sample's mask."""
+    ) -> Beginning:
+        """The volumes of views within each sample's mask, and what their grid misses."""
         if not isinstance(self.start, Mapping):
             A, weights = geometry.A, geometry.weights
-            return sirt(A, views, self.start, weights=weights, momentum=True)
+            return Beginning(sirt(A, views, self.start, weights=weights, momentum=True))
         samples = range(len(views))
         if not training:
-            return torch.cat([self._made(geometry, views, sample) for sample in samples])
-        names, volumes = fingerprints(views), []
+            return _batch([self._made(geometry, views, sample) for sample in samples])
+        names, cases = fingerprints(views), []
         for sample, name in zip(samples, names, strict=True):
-            volume = self._known.get(name)
-            if volume is None:
-                volume = self._made(geometry, views, sample)
-                self._keep(name, volume)
-            volumes.append(volume.to(views))
-        return torch.cat(volumes)
+            case = self._known.get(name)
+            if case is None:
+                case = self._made(geometry, views, sample)
+                self._keep(name, case)
+            cases.append(case.to(views))
+        return _batch(cases)
 
-    def _keep(self, name: bytes, volume: Tensor) -> None:
-        if volume.nbytes <= self._room:
-            self._room -= volume.nbytes
-            self._known[name] = volume.cpu()
+    def _keep(self, name: bytes, case: Beginning) -> None:
+        if case.nbytes <= self._room:
+            self._room -= case.nbytes
+            self._known[name] = case.to(torch.empty((), dtype=case.volume.dtype))
 
-    def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Tensor:
+    def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Beginning:
         """The reconstructor's volume of a sample's views, scaled to a mean density of the rays of
         about one before, so that a weight of its options is relative to the content.
         """
         assert isinstance(self.start, Mapping)
-        case = views[sample : sample + 1]
-        level = content_scale(case) / typical_chord(geometry.A.grid)
-        within = {} if geometry.mask is None else {"support": geometry.mask[sample, 0]}
-        return RECONSTRUCTORS.from_config(self.start, geometry.A, case / level, **within) * level
+        case, A, fine = views[sample : sample + 1], geometry.A, self.finer_grid
+        level = content_scale(case) / typical_chord(A.grid)
+        within = {}
+        if geometry.mask is not None:
+            within["support"] = subdivided(geometry.mask[sample, 0], fine)
+        B = A if fine == 1 else A.refined(fine)
+        x = RECONSTRUCTORS.from_config(self.start, B, case / level, **within) * level
+        if fine == 1:
+            return Beginning(x)
+        mean = avg_pool3d(x, fine)
+        return Beginning(mean, B(x) - A(mean))
+
+
+def _batch(cases: list[Beginning]) -> Beginning:
+    """One case after the other, of a batch."""
+    volumes, missed = zip(*cases, strict=True)
+    return Beginning(torch.cat(volumes), None if missed[0] is None else torch.cat(missed))
 
 
 def normalised(
@@ -85,11 +145,13 @@ def normalised(
 ) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
     """Views and their classical start, both divided by the content's scale, and that scale.
 
-    The scale of views of nothing is zero.
+    The views are without what the grid misses of them, where a finer one told it. The scale of
+    views of nothing is zero.
     """
-    x = start(geometry, views, training)
+    x, missed = start(geometry, views, training)
     scale = content_scale(x)
-    return views / scale, x / scale, scale * anything(views)
+    y = views if missed is None else views - missed
+    return y / scale, x / scale, scale * anything(views)
 
 
 def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:

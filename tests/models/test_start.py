@@ -2,17 +2,20 @@
 
 import pytest
 import torch
+from torch.nn.functional import avg_pool3d
 
+from mvrecon.geometry.grid import voxel_centres
 from mvrecon.models import start as starts
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.models.start import ClassicalStart
-from mvrecon.parts import RECONSTRUCTORS
+from mvrecon.parts import MODELS, RECONSTRUCTORS
 from mvrecon.reconstructors.iterative import sirt
 from tests.models.cross_view.test_model import blob
 from tests.models.rig import small_projector
 
 SIRT = {"name": "sirt", "iterations": 3}
+LONG = {"name": "sirt", "iterations": 25, "momentum": True}
 
 
 @pytest.fixture
@@ -33,11 +36,11 @@ def test_in_training_a_case_is_reconstructed_once_whatever_its_batch(made):
     geometry, views = whole_geometry(projector), projector(blob(projector, 3))
     views = views * torch.tensor([1.0, 2.0, 3.0])[:, None, None, None, None]
     start = ClassicalStart(SIRT)
-    first = start(geometry, views, training=True)
+    first = start(geometry, views, training=True).volume
     assert len(made) == 3
-    assert torch.equal(start(geometry, views[[2, 0]], training=True), first[[2, 0]])
+    assert torch.equal(start(geometry, views[[2, 0]], training=True).volume, first[[2, 0]])
     assert len(made) == 3
-    assert torch.equal(start(geometry, views), first) and len(made) == 6
+    assert torch.equal(start(geometry, views).volume, first) and len(made) == 6
     assert torch.allclose(first, sirt(projector, views, 3), rtol=1e-4, atol=1e-6)
 
 
@@ -64,3 +67,40 @@ def test_a_model_trains_from_a_finer_grid_and_its_start_is_that_of_evaluation(ma
     assert torch.equal(evaluated.start, trained.start)
     assert not torch.allclose(trained.start, CrossView(projector, start=3)(views).start, rtol=1e-2)
     assert len(made) == 4  # "finer" and its method, once in training and once in evaluation
+
+
+def test_a_finer_grid_tells_a_part_of_what_the_grid_misses_of_the_views():
+    projector = small_projector(8, size=24, pixels=24)
+    fine = projector.refined(4)
+    places = voxel_centres(fine.grid) - torch.tensor([1.0, -0.5, 0.3], dtype=torch.float64)
+    shells = (places.norm(dim=-1) < 16.0).float() + (places.norm(dim=-1) < 8.0).float()
+    views = fine(shells[None, None])
+    geometry, expected = whole_geometry(projector), projector(avg_pool3d(shells[None, None], 4))
+    x, missed = ClassicalStart(LONG | {"finer_grid": 2})(geometry, views)
+    assert (views - missed - expected).norm() < 0.75 * (views - expected).norm()
+    # what the volume misses of these views is what that on the finer grid misses of the measured
+    two = projector.refined(2)
+    residual = views - two(sirt(two, views, 25, momentum=True))
+    assert torch.allclose(views - missed - projector(x), residual, atol=1e-3 * views.max().item())
+
+
+def test_what_a_finer_grid_told_is_kept_with_the_volume(made):
+    projector = small_projector()
+    geometry, views = whole_geometry(projector), projector(blob(projector, 2))
+    start = ClassicalStart(SIRT | {"finer_grid": 2})
+    first, again = (start(geometry, views, training=True) for _ in range(2))
+    assert len(made) == 2
+    assert all(torch.equal(*pair) for pair in zip(first, again, strict=True))
+
+
+@pytest.mark.parametrize("number", [0, 1.5, "two"])
+def test_a_finer_grid_is_a_whole_number(number):
+    with pytest.raises(ValueError, match="whole number of at least 1"):
+        ClassicalStart(SIRT | {"finer_grid": number})
+
+
+@pytest.mark.parametrize("model", ["cross_view", "backprojection_unet"])
+def test_counts_have_no_difference_of_views(model):
+    options = {"start": SIRT | {"finer_grid": 2}, "consistency": {"steps": 1, "noise": "poisson"}}
+    with pytest.raises(ValueError, match="line integrals.* got counts"):
+        MODELS.build(model, projector=small_projector(), **options)

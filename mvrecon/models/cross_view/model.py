@@ -74,12 +74,13 @@ class CrossView(nn.Module):
         self.cropping = Cropping(projector, Options(support=support, noise=noise))
         if how.crop and support == "none":
             raise ValueError("Expected a support to crop to, got crop=True and support='none'")
-        self.crop, self.start = how.crop, ClassicalStart(start)
+        steps = Consistency(consistency)
+        self.crop, self.start = how.crop, ClassicalStart(start, counts=steps.poisson)
         self.rounds = nn.ModuleList(
             Round(projector, one, first < i, how.precision) for i, one in enumerate(options)
         )
         self.trust = nn.Parameter(torch.ones(())) if first < len(options) else None
-        self.consistency = Consistency(consistency)
+        self.consistency = steps
         self.uncertainty = Uncertainty(how.precision) if how.uncertainty else None
         self._check_memories()
 
