@@ -32,12 +32,12 @@ class Trained:
         volumes: SHA-256 of the training cases' volumes.
     """
 
-    module: ReconstructionModule
+    module: ReconstructionModule = field(repr=False)
     seconds: float
     steps: int
-    cases: list[str] | None = field(default_factory=list)
-    digests: dict[str, str] = field(default_factory=dict)
-    volumes: list[str] = field(default_factory=list)
+    cases: list[str] | None = field(default_factory=list, repr=False)
+    digests: dict[str, str] = field(default_factory=dict, repr=False)
+    volumes: list[str] = field(default_factory=list, repr=False)
 
     @torch.no_grad()
     def __call__(
