@@ -34,6 +34,8 @@ ARMS = {
     "world_rounds": ("model=world_rounds",),
     "world_unet": ("model=world_unet", f"model.{NARROW}"),
 }
+#: Models that know less of the cameras, or are published; in the whole grid.
+OTHERS = {name: (f"model={name}",) for name in ("geometry_free", "dif_net", "svct")}
 #: These begin with SIRT on a grid twice as fine, which is made once a case and not in the pace.
 FINER = {
     f"{arm}_finer": (*ARMS[arm], "model.start={name: finer}")
@@ -77,7 +79,7 @@ CLASSICAL = {
 }
 
 
-EVERY = ARMS | FINER | MISSED | ALIGNED | CLASSICAL
+EVERY = ARMS | OTHERS | FINER | MISSED | ALIGNED | CLASSICAL
 
 
 class Regime(NamedTuple):
@@ -165,9 +167,11 @@ REGIMES = {
 def settings(regime: Regime, arm: str) -> list[str]:
     """The overrides of an arm in a regime."""
     options = [*BASE, *EVERY[arm], *regime.views]
-    if arm in ALIGNED | CLASSICAL:  # options of the experiment's own model, which these have not
+    if (
+        arm in OTHERS | ALIGNED | CLASSICAL
+    ):  # options of the experiment's own model, which these have not
         options += ["~model.support", "~model.precision"]
-    if arm in CLASSICAL:
+    if arm in OTHERS | CLASSICAL:
         return options
     inside = "model.model" if arm in ALIGNED else "model"
     network = (f"support={regime.support}", "precision=auto", *regime.options)

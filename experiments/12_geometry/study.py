@@ -21,7 +21,7 @@ from pathlib import Path
 from statistics import median
 
 import torch
-from arms import ALIGNED, ARMS, CLASSICAL, EVERY, FINER, MISSED, REGIMES, paths, settings
+from arms import ARMS, CLASSICAL, EVERY, OTHERS, REGIMES, paths, settings
 
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_data, build_module
@@ -49,7 +49,9 @@ def pace(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     rows = _paces()
     cases = ("data.sizes={train: 24, val: 1, test: 1}", f"data.cache={options.runs / 'cases'}")
-    for regime, arm in product(options.regimes, (arm for arm in ARMS if arm in options.arms)):
+    for regime, arm in product(
+        options.regimes, (arm for arm in ARMS | OTHERS if arm in options.arms)
+    ):
         run = compose(*settings(REGIMES[regime], arm), *paths(options.data), *cases)
         data = build_data(run)
         data.prepare_data()
@@ -167,7 +169,7 @@ def curves(rows: list[dict], path: Path) -> None:
     figure, panels = plt.subplots(1, len(regimes), figsize=(4.5 * len(regimes), 3.6), squeeze=False)
     for panel, regime in zip(panels[0], regimes, strict=True):
         lines = [row for row in rows if row["regime"] == regime]
-        for arm in ARMS | FINER | MISSED | ALIGNED:
+        for arm in (arm for arm in EVERY if arm not in CLASSICAL):
             line = sorted((r["seconds"], r["psnr"]) for r in lines if r["arm"] == arm)
             if line:
                 panel.plot(*zip(*line, strict=True), "o-", label=arm)
