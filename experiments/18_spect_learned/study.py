@@ -178,14 +178,14 @@ def figures(volumes: torch.Tensor, data: SceneData, known: dict[str, Any]) -> di
 def methods(total: str, options: argparse.Namespace) -> dict[tuple[str, int, int], Method]:
     """What the table compares at a number of counts, by name, seconds and seed."""
     A = operator(options)
-    found: dict[tuple[str, int, int], Method] = {}
+    entries: dict[tuple[str, int, int], Method] = {}
     for name, method in tuned(total).items():
-        found[name, 0, 0] = lambda counts, method=method: method(A, counts)
+        entries[name, 0, 0] = lambda counts, method=method: method(A, counts)
     for path in sorted(options.runs.glob(f"{total}/*/*/results.json")):
         seconds, seed = path.parent.name.split("s_")
         trained = mv.load(path.parent)
-        found[path.parent.parent.name, int(seconds), int(seed)] = trained
-    return found
+        entries[path.parent.parent.name, int(seconds), int(seed)] = trained
+    return entries
 
 
 def table(options: argparse.Namespace) -> None:
