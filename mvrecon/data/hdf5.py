@@ -8,7 +8,8 @@
 
 Attributes of the file: `axes` = "z, y, x" and `units` = "HU", "1/mm" or "activity"; optional
 `orientation`, three letters that say towards which side of the patient (L or R, P or A, I or S) the
-axes x, y, z run; others (`labels`, `source`) are for the reader.
+axes x, y, z run, and `labels`, names of the structures such as "1=Brainstem,2=SpinalCord"; others
+(`source`) are for the reader.
 
 What mvrecon writes has checksums throughout, so that a damaged file is refused: of every chunk, and
 of the layout (the format of HDF5 1.10). A file that others wrote has those that they chose, often
@@ -17,8 +18,7 @@ none.
 
 import math
 import os
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,25 +27,27 @@ import h5py
 import numpy as np
 import torch
 
-from mvrecon.data.attenuation import UNITS, StoredUnit
+from mvrecon.data.attenuation import StoredUnit
+from mvrecon.data.hdf5_layout import (
+    EXPECTED,
+    LAYOUT,
+    Texts,
+    attributes_and_names,
+    check_layout,
+    check_names,
+)
 from mvrecon.data.hdf5_reading import reading
+from mvrecon.data.labels import structures_of
 from mvrecon.data.slabs import Slab, Slabs, planes
 from mvrecon.data.storage import check_chunks, dataset_in
-from mvrecon.data.texts import texts_of, variable
 from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import NAME, SPACING, Refused, blaming, check_file, plain_name, shown
+from mvrecon.files.checks import NAME, SPACING, Refused, blaming, check_file, plain_name
 
 #: Bytes of a chunk that is written, unless one plane has more.
 CHUNK = 2**25
 #: Versions of HDF5 whose format is written: the first with checksums of the layout.
 FORMAT = ("v110", "v110")
-LAYOUT = {"axes": ("z, y, x",), "units": UNITS}
-Texts = dict[str, list[str]]
 Spacing = tuple[float, float, float]
-EXPECTED = (
-    "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU (or 1/mm, activity), spacing "
-    "[n 3] in mm, id [n], axes z, y, x"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
     """
     count, names = 0, []
     attributes = {"axes": "z, y, x", "units": "HU", **attributes}
-    _check_layout(path, attributes)
+    check_layout(path, attributes)
     with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
         for key, value in attributes.items():
             text = value.encode()
@@ -101,7 +103,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
             names.append(volume.name)
         if not count:
             raise ValueError(f"{path}: expected at least one volume to write, got none")
-        _check_names(path, names)
+        check_names(path, names)
     return count
 
 
@@ -128,7 +130,7 @@ class VolumeFile:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self._open: tuple[int, h5py.File, Texts] | None = None
-        self._sound: set[int] = set()
+        self._sound: set[tuple[str, int]] = set()
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self.path, "_open": None, "_sound": set()}
@@ -164,7 +166,19 @@ class VolumeFile:
         """Towards which sides of the patient the axes x, y, z run; none where the file does not
         say.
         """
-        return next(iter(self._checked()[1].get("@orientation", [])), None)
+        return self._attribute("orientation")
+
+    @property
+    def structures(self) -> dict[str, int]:
+        """Label of each structure by its name.
+
+        Raises:
+            ValueError: no names, or names that are not as expected.
+        """
+        return structures_of(self.path, self._attribute("labels"))
+
+    def _attribute(self, name: str) -> str | None:
+        return next(iter(self._checked()[1].get(f"@{name}", [])), None)
 
     def read(self, index: int) -> Stored:
         """One volume in memory, without its labels.
@@ -179,19 +193,23 @@ class VolumeFile:
             parts[first : first + len(part)] = part
         return Stored(name, parts, spacing)
 
-    def slabs(self, index: int) -> tuple[str, Slabs, Spacing]:
-        """Name, values and spacing (z, y, x) of a volume that is read at every pass, a
+    def slabs(self, index: int, dataset: str = "ct") -> tuple[str, Slabs, Spacing]:
+        """Name, values (or labels) and spacing (z, y, x) of a volume that is read at every pass, a
         chunk at a time.
 
         Raises:
-            ValueError: its name could not be a file's; in a pass: its bytes cannot be read.
+            ValueError: its name could not be a file's; no such dataset, or one of another shape; in
+                a pass: its bytes cannot be read.
         """
         name, spacing = self._about(index)
-        shape = self._dataset("ct").shape[1:]
+        shape, known = (self._dataset(key).shape for key in (dataset, "ct"))
+        if shape != known:
+            raise Refused(f"{self.path}: expected {dataset} {known} as ct, got {shape}")
+        shape = shape[1:]
         step = planes(math.prod(shape[1:]))
 
         def passes() -> Iterator[Slab]:
-            for first, part in self._parts(index):
+            for first, part in self._parts(index, dataset):
                 for k in range(0, len(part), step):
                     yield first + k, torch.from_numpy(part[k : k + step].astype("float32"))
 
@@ -203,17 +221,17 @@ class VolumeFile:
             z, y, x = self._dataset("spacing")[index].tolist()
             return plain_name(names[index], self.path), (z, y, x)
 
-    def _parts(self, index: int) -> Iterator[tuple[int, np.ndarray]]:
+    def _parts(self, index: int, dataset: str = "ct") -> Iterator[tuple[int, np.ndarray]]:
         """Planes of a volume as they are stored, chunk by chunk, with the first one's index."""
         with blaming(self.path, f"volume {index} cannot be read"):
-            ct = self._dataset("ct")
-            if index not in self._sound:
-                check_chunks(self.path, ct, index)
-                self._sound.add(index)
-            depth = ct.chunks[1] if ct.chunks else 1
-            step = max(depth, planes(math.prod(ct.shape[2:])) // depth * depth)
-            for first in range(0, ct.shape[1], step):
-                yield first, ct[index, first : first + step]
+            values = self._dataset(dataset)
+            if (dataset, index) not in self._sound:
+                check_chunks(self.path, values, index)
+                self._sound.add((dataset, index))
+            depth = values.chunks[1] if values.chunks else 1
+            step = max(depth, planes(math.prod(values.shape[2:])) // depth * depth)
+            for first in range(0, values.shape[1], step):
+                yield first, values[index, first : first + step]
 
 
 def _opened(path: Path) -> tuple[h5py.File, Texts]:
@@ -243,9 +261,9 @@ def _check(path: Path, file: h5py.File) -> Texts:
         raise Refused(f"{path}: has {kinds}; expected numbers, floats and text")
     for dataset in (spacing, names):
         check_chunks(path, dataset)
-    texts = _texts(path, file, names)
-    _check_names(path, texts["id"])
-    _check_layout(path, {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT})
+    texts = attributes_and_names(path, file, names)
+    check_names(path, texts["id"])
+    check_layout(path, {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT})
     mm = spacing[:]
     bad = ~((mm >= SPACING[0]) & (mm <= SPACING[1])).all(axis=1)
     if bad.any():
@@ -253,37 +271,3 @@ def _check(path: Path, file: h5py.File) -> Texts:
         got = f"volume {first} has the spacing {mm[first].tolist()}"
         raise Refused(f"{path}: {got}, expected positive mm from {SPACING[0]} to {SPACING[1]}")
     return texts
-
-
-def _check_layout(path: Path | str, attributes: Mapping[str, str | None]) -> None:
-    if any(attributes[key] not in values for key, values in LAYOUT.items()):
-        got = {key: attributes[key] for key in LAYOUT}
-        raise Refused(f"{path}: has the attributes {shown(got)}, expected {LAYOUT}: {EXPECTED}")
-
-
-def _check_names(path: Path | str, names: Sequence[str]) -> None:
-    if doubled := [name for name, count in Counter(names).items() if count > 1]:
-        raise Refused(
-            f"{path}: has several volumes of the name {shown(doubled)}; expected every name once"
-        )
-
-
-def _texts(path: Path, file: h5py.File, names: h5py.Dataset) -> Texts:
-    """The attributes that are read, under "@<name>", and the names of the volumes."""
-    kinds = {key: file.attrs.get_id(key) for key in (*LAYOUT, "orientation") if key in file.attrs}
-    for key, kind in kinds.items():
-        if (
-            kind.shape != ()
-            or h5py.check_string_dtype(kind.dtype) is None
-            or kind.dtype.itemsize > 2**16
-        ):
-            raise Refused(
-                f"{path}: its attribute {key!r} is {kind.dtype} {kind.shape}, expected one short "
-                f"text"
-            )
-    short = [key for key, kind in kinds.items() if not variable(kind.dtype)]
-    fixed = {key: [bytes(file.attrs[key]).decode()] for key in short}  # type: ignore[arg-type]
-    texts = texts_of(path) if len(fixed) < len(kinds) or variable(names.dtype) else {}
-    if not variable(names.dtype):
-        texts["id"] = [name.decode() for name in names[:]]
-    return {**texts, **{f"@{key}": value for key, value in fixed.items()}}

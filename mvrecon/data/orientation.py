@@ -65,3 +65,19 @@ def right_angled(grid: Grid) -> bool:
     """Whether a grid's axes are at right angles, as ITK's images and NIfTI's qform need them."""
     axes = grid.affine[:3, :3] / grid.affine[:3, :3].norm(dim=0)
     return bool((axes.T @ axes - torch.eye(3, dtype=axes.dtype)).abs().max() <= SKEW)
+
+
+def reversed_axes(orientation: str) -> list[int]:
+    """Which axes of a volume [z y x] must be reversed so that x, y, z run to R, A, S.
+
+    Raises:
+        ValueError: letters that are not L or R, P or A, I or S, in this order.
+    """
+    if len(orientation) != 3 or any(
+        a not in pair for a, pair in zip(orientation, ("LR", "PA", "IS"), strict=True)
+    ):
+        raise ValueError(
+            f"An orientation is L or R, then P or A, then I or S, such as 'LPI'; got "
+            f"{orientation!r}"
+        )
+    return [2 - i for i, letter in enumerate(orientation) if letter in "LPI"]

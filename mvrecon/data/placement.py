@@ -17,14 +17,15 @@ TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
 
 
 class Placed(NamedTuple):
-    """A case of a file: its attenuation, and where its voxels lie in the file's world and in the
-    case's, in mm.
+    """A case of a file: its attenuation, where its voxels lie in the file's world and in the
+    case's, in mm, and whether it is mirrored left to right.
     """
 
     name: str
     mu: Slabs
     source: Grid
     grid: Grid
+    mirrored: bool = False
 
 
 def moved(

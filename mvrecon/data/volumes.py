@@ -23,6 +23,7 @@ from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, phy
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.nifti import ENDING, open_nifti
+from mvrecon.data.orientation import reversed_axes
 from mvrecon.data.placement import Placed, moved
 from mvrecon.data.resample import resample
 from mvrecon.data.slabs import Slabs
@@ -179,14 +180,16 @@ class FileScene(ABC):
         mu = hu.mapped(lambda slab: self._named(name, physical, slab, self.stored))
         seed = self.seed_of(index, seed)
         rng = generator(seed, index) if turn else None
-        if rng is not None and uniform(rng, 0, 1) < 0.5:
+        mirrored = rng is not None and uniform(rng, 0, 1) < 0.5
+        if mirrored:
             mu = mu.flipped([2])
         pivot = (
             self._pivot(name, mu, source) if self.crop == "body" or rng is not None else grid.centre
         )
         target = grid.centre if self.crop == "body" else pivot
         placed = moved(source, pivot, target, rng, self.vary == "exact")
-        return Placed(f"{name}-{seed}-{turn}" if turn else name, mu, source, placed)
+        name = f"{name}-{seed}-{turn}" if turn else name
+        return Placed(name, mu, source, placed, mirrored)
 
     def _pivot(self, name: str, mu: Slabs, source: Grid) -> Float[Tensor, "3"]:
         """World mm of the centre of the patient's box."""
@@ -207,7 +210,7 @@ class FileScene(ABC):
 
     def _above(self, threshold: float) -> float:
         """A threshold in 1/mm; of activity, zero."""
-        return 0.0 if self.unit == "activity" else threshold
+        return 0.0 if self.stored == "activity" else threshold
 
     @torch.no_grad()
     def _views(
@@ -262,25 +265,19 @@ class Hdf5Volumes(FileScene):
                 f"{self.path}: expected the scene's stored_unit to be the file's, "
                 f"{self._file.unit!r}, got {self.stored!r}"
             )
-        axes = reversed_axes(self.orientation or self._file.orientation or "RAS")
         grid = Grid.centred(size=hu.shape[::-1], spacing=spacing[::-1])
-        return name, hu.flipped(axes), grid
+        return name, hu.flipped(self._reversed()), grid
 
+    def labels(self, index: int) -> Slabs:
+        """Structures of a volume as its file labels them, its axes running to RAS.
 
-def reversed_axes(orientation: str) -> list[int]:
-    """Which axes of a volume [z y x] must be reversed so that x, y, z run to R, A, S.
+        Raises:
+            ValueError: the file has no labels.
+        """
+        return self._file.slabs(index, "label")[1].flipped(self._reversed())
 
-    Raises:
-        ValueError: letters that are not L or R, P or A, I or S, in this order.
-    """
-    if len(orientation) != 3 or any(
-        a not in pair for a, pair in zip(orientation, ("LR", "PA", "IS"), strict=True)
-    ):
-        raise ValueError(
-            f"An orientation is L or R, then P or A, then I or S, such as 'LPI'; got "
-            f"{orientation!r}"
-        )
-    return [2 - i for i, letter in enumerate(orientation) if letter in "LPI"]
+    def _reversed(self) -> list[int]:
+        return reversed_axes(self.orientation or self._file.orientation or "RAS")
 
 
 @dataclass(kw_only=True)

@@ -8,7 +8,7 @@ import mvrecon as mv
 from mvrecon.geometry.grid import subdivided
 from mvrecon.parts import RECONSTRUCTORS
 from mvrecon.testing.reconstructor import check_reconstructor
-from tests.reconstruct.methods import GRID, RIG, Dense, gap, projector, truth
+from tests.reconstructors.methods import GRID, RIG, Dense, gap, projector, truth
 
 SIRT = {"name": "sirt", "iterations": 20, "momentum": True}
 

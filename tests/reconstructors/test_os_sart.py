@@ -8,7 +8,7 @@ import torch
 from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
 from mvrecon.reconstructors.iterative import sirt
 from mvrecon.reconstructors.os_sart import os_sart
-from tests.reconstruct.methods import Dense, gap, projector, truth
+from tests.reconstructors.methods import Dense, gap, projector, truth
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 7, 12, 13, 20, 30, 64])

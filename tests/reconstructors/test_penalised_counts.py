@@ -10,7 +10,7 @@ from mvrecon.reconstructors.poisson import PoissonLikelihood
 from mvrecon.reconstructors.relative_difference import RelativeDifference
 from mvrecon.reconstructors.total_variation import total_variation, voxel_steps
 from mvrecon.reconstructors.tv_map import tv_map
-from tests.reconstruct.methods import Dense, gap, projector, truth
+from tests.reconstructors.methods import Dense, gap, projector, truth
 
 
 class Same(LinearOperator):

@@ -8,8 +8,8 @@ from mvrecon.reconstructors.held_out import held_out
 from mvrecon.reconstructors.iterative import sirt
 from mvrecon.reconstructors.stopping import Curve, combined, corner, discrepancy
 from mvrecon.reconstructors.tikhonov import tikhonov
-from tests.reconstruct.methods import NAMES, gap, projector, run, truth
-from tests.reconstruct.test_total_variation import slice_operator
+from tests.reconstructors.methods import NAMES, gap, projector, run, truth
+from tests.reconstructors.test_total_variation import slice_operator
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from mvrecon.reconstructors.total_variation import (
     tv_proximal,
 )
 from mvrecon.reconstructors.weighted_fit import WeightedFit
-from tests.reconstruct.methods import Dense, gap
+from tests.reconstructors.methods import Dense, gap
 
 STEPS = (1.5, 2.0, 0.5)
 

@@ -13,7 +13,7 @@ from mvrecon.projectors.attenuated import check_mu
 #: What a map of each case's own needs.
 OF_CASES = (
     "; each case's own map is known to mvrecon-train and mvrecon-eval alone, with a scene that "
-    "attenuates (cardiac, nema, spect_ct)"
+    "attenuates (cardiac, nema, spect_ct, spect_labels)"
 )
 
 #: 1/mm: a body's tissue is at most that of half its voxels (water at 140.5 keV 0.01536, at 70 keV

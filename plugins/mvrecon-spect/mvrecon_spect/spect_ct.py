@@ -17,8 +17,7 @@ from mvrecon.parts import CAMERAS, SCENES
 from mvrecon.projectors.drr import Drr
 from mvrecon.reconstructors.iterative import sirt
 from mvrecon.scenes.analytic import generator, mixed
-from mvrecon.scenes.attenuating import AttenuatingScene
-from mvrecon.scenes.sample import Rays, Sample
+from mvrecon.scenes.sample import Attenuating, Pooling, Rays, Sample
 
 #: Of the transmission scan and of Tc-99m, in keV.
 CT_KEV, SPECT_KEV = 70.0, 140.5
@@ -35,7 +34,7 @@ class SpectCt:
     views of the emission.
 
     Args:
-        scene: name and options of a scene with matter: cardiac, nema.
+        scene: name and options of a scene with matter: cardiac, nema, spect_labels.
         camera: name and options of the X-ray rig.
         photons: on a pixel in air.
         iterations: of SIRT.
@@ -52,14 +51,15 @@ class SpectCt:
         photons: float = 1e4,
         iterations: int = 20,
     ):
-        made = SCENES.from_config(scene)
-        if not isinstance(made, AttenuatingScene):
+        made: Any = SCENES.from_config(scene)
+        if not isinstance(made, Attenuating) or not isinstance(made, Pooling):
             raise ValueError(
-                f"Expected a scene with matter, such as cardiac or nema, got {scene['name']!r}"
+                f"Expected a scene with matter, such as cardiac, nema or spect_labels, got "
+                f"{scene['name']!r}"
             )
         if iterations < 1:
             raise ValueError(f"Expected 1 iteration or more, got {iterations}")
-        self.scene = made
+        self.scene: Any = made
         self.cameras: Cameras = CAMERAS.from_config(camera)
         self.detector, self.iterations = Acquisition(photons=photons), iterations
         self._operators: tuple[Grid, Drr, Drr] | None = None
@@ -83,7 +83,7 @@ class SpectCt:
         return self.scene.length
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
-        """The case `index` of the series `seed`, see `AttenuatingScene`, with its scan."""
+        """The case `index` of the series `seed`, with its scan."""
         sample = self.scene.sample(index, seed, grid, cameras)
         return replace(sample, mu_measured=self.measured(index, seed, grid))
 

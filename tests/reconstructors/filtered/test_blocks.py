@@ -10,7 +10,7 @@ from mvrecon.projectors.radon import Radon
 from mvrecon.reconstructors.filtered import streaming
 from mvrecon.reconstructors.filtered.fdk import fbp, fdk
 from mvrecon.reconstructors.filtered.streaming import fdk_streamed
-from tests.reconstruct.filtered.scans import CONES, VOLUME
+from tests.reconstructors.filtered.scans import CONES, VOLUME
 
 SMALL = Grid.centred(size=(5, 4, 8), spacing=3.0)
 RIG = circular(7, 60.0, 90.0, {"pixels": [9, 10], "pixel_mm": 4.0}, start_degrees=5.0)

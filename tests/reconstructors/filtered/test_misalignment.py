@@ -13,7 +13,7 @@ from mvrecon.projectors.drr import Drr
 from mvrecon.reconstructors.filtered.fdk import fdk
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
-from tests.reconstruct.filtered.scans import views_of
+from tests.reconstructors.filtered.scans import views_of
 
 GRID = Grid.centred(48, spacing=2.0)
 RIG = circular(90, 400.0, 600.0, {"pixels": [64, 64], "pixel_mm": 2.5})

@@ -14,7 +14,7 @@ from mvrecon.projectors.radon import Radon
 from mvrecon.reconstructors.filtered.fdk import fbp, fdk
 from mvrecon.reconstructors.filtered.orbit import orbit_of
 from mvrecon.reconstructors.filtered.scan_weights import scan_of
-from tests.reconstruct.filtered.scans import CONES, FAN, FANS, LINE, RAYS, SLICE, VOLUME
+from tests.reconstructors.filtered.scans import CONES, FAN, FANS, LINE, RAYS, SLICE, VOLUME
 
 
 def test_axis_isocentre_and_radius_are_those_of_the_scanner():

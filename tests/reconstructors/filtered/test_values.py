@@ -13,7 +13,7 @@ from mvrecon.projectors.radon import Radon
 from mvrecon.reconstructors.filtered.fdk import fbp, fdk
 from mvrecon.reconstructors.filtered.scan_weights import redundancy, scan_of
 from mvrecon.scenes.solids import Phantom, Solids
-from tests.reconstruct.filtered.scans import (
+from tests.reconstructors.filtered.scans import (
     CONE,
     CONES,
     FANS,
