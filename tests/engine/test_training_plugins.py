@@ -1,4 +1,4 @@
-"""What plugins bring to a training: optimisers, callbacks, loggers and terms of the loss by name."""
+"""What plugins bring to a training by name: optimisers, callbacks, loggers, terms of the loss."""
 
 import csv
 import json
