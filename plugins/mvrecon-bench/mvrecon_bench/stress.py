@@ -1,4 +1,4 @@
-"""`mvrecon-stress`: the stress plan on an operator, camera, scene, head or model, of a plugin too."""
+"""`mvrecon-stress`: the stress plan on any operator, camera, scene, head or model, also a plugin's."""
 
 from pathlib import Path
 from typing import Any
