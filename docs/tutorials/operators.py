@@ -68,11 +68,11 @@ assert away < 1e-6
 figure = Figure(figsize=(7, 3), layout="constrained")
 left, right = figure.subplots(1, 2)
 for axes, view, name in ((left, 0, "camera 0: a pixel"), (right, 2, "camera 2: its line")):
-    axes.imshow(y[0, 0, view], cmap="gray")
+    axes.imshow(y[0, 0, view].numpy(), cmap="gray")
     axes.set(title=name, xlabel="u, pixels", ylabel="v, pixels")
-left.plot(*pixel[0], "r+", markersize=12)
+left.plot(*pixel[0].tolist(), "r+", markersize=12)
 u = torch.tensor([0.0, y.shape[-1] - 1.0], dtype=torch.float64)
-right.plot(u, -(line[0] * u + line[2]) / line[1], "r")
+right.plot(u.numpy(), (-(line[0] * u + line[2]) / line[1]).numpy(), "r")
 figure.savefig("epipolar.png")
 
 # %% [markdown]
