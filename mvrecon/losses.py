@@ -100,6 +100,10 @@ class Weights:
     uncertainty: float = 0.0
 
 
+#: Names of the terms that are mvrecon's own.
+TERMS = tuple(field.name for field in fields(Weights))
+
+
 class ReconstructionLoss(nn.Module):
     """Weighted sum of the errors of the volume, of each camera's own volume (its opinion), and of
     the views that opinions predict for the other cameras.
@@ -120,11 +124,10 @@ class ReconstructionLoss(nn.Module):
         if not data_range > 0:
             raise ValueError(f"data_range must be positive, got {data_range}")
         self.data_range = data_range
-        ours = [field.name for field in fields(Weights)]
-        check_options("The loss", weights, [*ours, *LOSSES.names()])
-        brought = {name: weight for name, weight in weights.items() if name not in ours}
+        check_options("The loss", weights, [*TERMS, *LOSSES.names()])
+        brought = {name: weight for name, weight in weights.items() if name not in TERMS}
         self.brought = {name: LOSSES.get(name) for name, weight in brought.items() if weight}
-        own = {name: weight for name, weight in weights.items() if name in ours}
+        own = {name: weight for name, weight in weights.items() if name in TERMS}
         self.weights = asdict(Weights(**own)) | brought
 
     def forward(

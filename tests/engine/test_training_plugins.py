@@ -7,9 +7,11 @@ import pytest
 import torch
 
 import mvrecon.train
+from mvrecon import load, registry
 from mvrecon.config import compose
 from mvrecon.config.targets import instantiate
 from mvrecon.config.typed import check_parts
+from mvrecon.files.checks import Refused
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CALLBACKS, LOGGERS
@@ -80,9 +82,11 @@ def installed(tmp_path):
         yield
 
 
-def test_a_training_takes_the_optimiser_callback_logger_and_loss_of_a_plugin(installed, tmp_path):
+def test_a_training_takes_the_optimiser_callback_logger_and_loss_of_a_plugin(
+    installed, tmp_path, monkeypatch
+):
     """Every step has the plugin's length, its callback and logger write into the run folder, and
-    the loss is ours and half of its term.
+    the loss is ours and half of its term; without the plugin its checkpoint is refused.
     """
     settings = compose(*OPTIONS, *CHOSEN)
     check_parts(settings)
@@ -100,6 +104,9 @@ def test_a_training_takes_the_optimiser_callback_logger_and_loss_of_a_plugin(ins
     assert len(rows) == 3
     table = json.loads((tmp_path / "run" / "results.json").read_text())
     assert table["methods"][METHOD]["train_steps"] == 3
+    monkeypatch.setattr(registry, "installed", lambda: ())
+    with pytest.raises(Refused, match="No loss is named 'sum_of_volume' here; if a plugin"):
+        load(tmp_path / "run")
 
 
 @pytest.mark.door
