@@ -3,7 +3,7 @@
 The weights of a training run are those of `conf/train.yaml`.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.models.output import Reconstruction
+from mvrecon.parts import LOSSES
+from mvrecon.registry import check_options
 
 #: Weight of a round's volume relative to that of the round behind it.
 EARLIER = 0.4
@@ -98,6 +100,10 @@ class Weights:
     uncertainty: float = 0.0
 
 
+#: Names of the terms that are mvrecon's own.
+TERMS = tuple(field.name for field in fields(Weights))
+
+
 class ReconstructionLoss(nn.Module):
     """Weighted sum of the errors of the volume, of each camera's own volume (its opinion), and of
     the views that opinions predict for the other cameras.
@@ -107,7 +113,10 @@ class ReconstructionLoss(nn.Module):
 
     Args:
         data_range: value range of the volumes, in their unit.
-        weights: of `Weights`.
+        weights: of `Weights`, and of the terms that plugins bring, by their names.
+
+    Raises:
+        TypeError: a term that is not known.
     """
 
     def __init__(self, data_range: float, **weights: float):
@@ -115,7 +124,11 @@ class ReconstructionLoss(nn.Module):
         if not data_range > 0:
             raise ValueError(f"data_range must be positive, got {data_range}")
         self.data_range = data_range
-        self.weights = asdict(Weights(**weights))
+        check_options("The loss", weights, [*TERMS, *LOSSES.names()])
+        brought = {name: weight for name, weight in weights.items() if name not in TERMS}
+        self.brought = {name: LOSSES.get(name) for name, weight in brought.items() if weight}
+        own = {name: weight for name, weight in weights.items() if name in TERMS}
+        self.weights = asdict(Weights(**own)) | brought
 
     def forward(
         self, out: Reconstruction, batch: dict[str, Tensor]
@@ -139,6 +152,7 @@ class ReconstructionLoss(nn.Module):
             terms["corrected_views"] = self._corrected(out, batch["true_views"])
         if out.sigma is not None and self.weights["uncertainty"]:
             terms["uncertainty"] = self._uncertainty(out, volume, truth)
+        terms |= {name: term(out, batch, self.data_range) for name, term in self.brought.items()}
         total = sum(self.weights[name] * value for name, value in terms.items())
         return {**terms, "total": torch.as_tensor(total)}
 

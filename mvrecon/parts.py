@@ -113,6 +113,16 @@ MODELS = Registry(
     corrected="mvrecon.models.corrected:Corrected",
 )
 
+#: What a training takes by name besides its parts; of callbacks and loggers mvrecon's own and
+#: Lightning's are named by `_target_`.
+OPTIMIZERS = Registry(
+    "optimizer", adamw="torch.optim:AdamW", adam="torch.optim:Adam", sgd="torch.optim:SGD"
+)
+CALLBACKS = Registry("callback")
+LOGGERS = Registry("logger")
+#: Terms of the loss: f(out, batch, data_range) -> a scalar, by the name of their weight.
+LOSSES = Registry("loss")
+
 REGISTRIES = {
     r.kind: r
     for r in (

@@ -18,7 +18,7 @@ from hydra.errors import ConfigCompositionException, MissingConfigException
 
 from mvrecon import config
 from mvrecon.config import compose, conf_dir, help_text
-from mvrecon.config.arguments import with_paths_quoted
+from mvrecon.config.arguments import with_flag_first, with_paths_quoted
 from mvrecon.config.plugins import import_plugins
 from mvrecon.config.targets import instantiate
 from mvrecon.parts import NETWORKS
@@ -288,3 +288,14 @@ def test_a_target_of_an_allowed_library_is_built(tmp_path: Path):
         {"_target_": "lightning.pytorch.callbacks.Timer", "duration": "00:00:01:00"}, tmp_path
     )
     assert timer.time_remaining() == 60.0
+
+
+def test_the_flag_of_a_sweep_may_stand_anywhere():
+    """Hydra's own parser takes it before or behind all settings, not between two."""
+    between = ["experiment=smoke", "-m", "seed=0,1", "logger=csv"]
+    moved = with_flag_first(between)
+    assert moved == ["-m", "experiment=smoke", "seed=0,1", "logger=csv"]
+    parser = hydra._internal.utils.get_args_parser()
+    assert parser.parse_args(moved).overrides == moved[1:]
+    with pytest.raises(SystemExit):
+        parser.parse_args(between)

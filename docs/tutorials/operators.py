@@ -6,6 +6,7 @@
 
 # %%
 import torch
+from matplotlib.figure import Figure
 
 import mvrecon as mv
 from mvrecon.engine.export import save_png
@@ -47,6 +48,32 @@ source = cameras.source.clone().requires_grad_()
 moved = mv.Cameras(source, cameras.origin, cameras.u, cameras.v, cameras.shape)
 mv.Drr(grid, moved)(x).square().sum().backward()
 print(f"gradient by the position of source 0, for each mm: {source.grad[0].tolist()}")
+
+# %% [markdown]
+# ## Cameras know of each other
+#
+# What one camera sees at a pixel lies on its ray, and every other camera sees that ray as a line, the epipolar line: all that two
+# views can say of each other. Points along the ray of a pixel of camera 0 are on it, in camera 2.
+
+# %%
+pixel = torch.tensor([[27.0, 16.0]], dtype=torch.float64)  # (u, v)
+depths = torch.linspace(350.0, 450.0, 6, dtype=torch.float64)  # mm from the source
+ray = cameras[0].unproject(torch.cat([pixel.expand(6, 2), depths[:, None]], dim=1)[None])[0]
+seen = cameras[2].project(ray)[0]  # (u, v, z) of these points
+line = mv.epipolar_line(cameras, 0, 2, pixel)[0]  # a u + b v + c = 0, a^2 + b^2 = 1
+away = (seen[:, :2] @ line[:2] + line[2]).abs().max()
+print(f"the ray's points are {away:.1e} pixels off the line")
+assert away < 1e-6
+
+figure = Figure(figsize=(7, 3), layout="constrained")
+left, right = figure.subplots(1, 2)
+for axes, view, name in ((left, 0, "camera 0: a pixel"), (right, 2, "camera 2: its line")):
+    axes.imshow(y[0, 0, view].numpy(), cmap="gray")
+    axes.set(title=name, xlabel="u, pixels", ylabel="v, pixels")
+left.plot(*pixel[0].tolist(), "r+", markersize=12)
+u = torch.tensor([0.0, y.shape[-1] - 1.0], dtype=torch.float64)
+right.plot(u.numpy(), (-(line[0] * u + line[2]) / line[1]).numpy(), "r")
+figure.savefig("epipolar.png")
 
 # %% [markdown]
 # ## What is exact, and what is an approximation

@@ -20,7 +20,11 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from mvrecon.config.arguments import with_options_added, with_paths_quoted
+from mvrecon.config.arguments import (
+    with_flag_first,
+    with_options_added,
+    with_paths_quoted,
+)
 from mvrecon.config.errors import OF_MODELS, one_line
 from mvrecon.config.guard import guarded
 from mvrecon.config.plugins import check_plugins
@@ -95,7 +99,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         SystemExit: an error, or Ctrl-C.
     """
     sys.argv[1:] = arguments = with_options_added(
-        with_paths_quoted(sys.argv[1:]), OF_RUN.get(config_name, ())
+        with_paths_quoted(with_flag_first(sys.argv[1:])), OF_RUN.get(config_name, ())
     )
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))

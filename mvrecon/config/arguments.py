@@ -37,6 +37,13 @@ def with_options_added(arguments: Sequence[str], sections: Collection[str]) -> l
     ]
 
 
+def with_flag_first(arguments: Sequence[str]) -> list[str]:
+    """Arguments with the flag of a sweep before all settings: between two of them Hydra would not
+    know those behind it.
+    """
+    return sorted(arguments, key=lambda argument: argument not in ("-m", "--multirun"))
+
+
 def quoted(value: str | Sequence[str]) -> str:
     """A value in the grammar of Hydra's command line."""
     if not isinstance(value, str):

@@ -1,5 +1,5 @@
-"""Build the callbacks and loggers that a config names by `_target_`; only allowed classes, which
-write inside the run folder.
+"""Build the callbacks and loggers that a config names: allowed classes by `_target_`, those of
+installed plugins by `name`; they write inside the run folder.
 """
 
 from collections.abc import Mapping
@@ -9,34 +9,45 @@ from typing import Any
 
 from mvrecon.files.checks import shown
 from mvrecon.files.places import check_places, placed
+from mvrecon.parts import CALLBACKS
+from mvrecon.registry import Registry
 
 #: Where the classes that a `_target_` may name are defined, and what they must be.
 ALLOWED = ("lightning.pytorch", "mvrecon.engine")
 BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.loggers.Logger")
 
 
-def instantiate(node: Mapping[str, Any], folder: Path, **options: Any) -> Any:
-    """Build the callback or the logger that a node's `_target_` names, with the node's other
-    entries as options.
+def instantiate(
+    node: Mapping[str, Any], folder: Path, known: Registry = CALLBACKS, **options: Any
+) -> Any:
+    """Build the callback or the logger that a node's `_target_` names, or without one its `name`,
+    with the node's other entries as options.
 
     Args:
-        node: `_target_` and options; places among these, such as `dirpath`, are taken from
-            `folder`.
+        node: `_target_` or `name`, and options; places among these, such as `dirpath`, are taken
+            from `folder`.
         folder: the run folder, out of which nothing is written.
+        known: what plugins brought, by name; the user installed these, so that data may name them.
         options: further options, which are trusted.
 
     Raises:
+        LookupError: an unknown name.
+        TypeError: neither a target nor a name.
         PermissionError: the target is not a class of that kind that is defined below one of
             `ALLOWED`, every run has it already, or the options hold instructions of Hydra's such as
             another target, or lead out of the folder.
     """
-    entries = {key: value for key, value in node.items() if key != "_target_"}
+    key = "_target_" if "_target_" in node else "name"
+    if key not in node:
+        raise TypeError(f"A {known.kind} needs a _target_ or a name, got {shown(sorted(node))}")
+    entries = {option: value for option, value in node.items() if option != key}
     if instructions := _instructions(entries):
         raise PermissionError(
             f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain "
             f"values"
         )
-    made = _allowed(str(node["_target_"]))(**placed(entries, folder), **options)
+    make = _allowed(str(node[key])) if key == "_target_" else known.get(str(node[key]))
+    made = make(**placed(entries, folder), **options)
     check_places(made, folder)
     return made
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from mvrecon.config.values import fits, in_words, parsed
 from mvrecon.files.checks import shown
-from mvrecon.parts import REGISTRIES
+from mvrecon.parts import LOSSES, REGISTRIES
 from mvrecon.registry import check_options, hint
 from mvrecon.signatures import SECTIONS, Option, describe, options_of, parts_in
 
@@ -75,13 +75,15 @@ def _check_sections(settings: Mapping[str, Any]) -> None:
     known = {section: dict(options_of(section)) for section in SECTIONS}
     for section, types in WRITTEN.items():
         known.setdefault(section, {}).update({key: Option(type=t) for key, t in types.items()})
+    known["loss"] |= dict.fromkeys(LOSSES.names(), Option(type="float"))
+    open_ended = (*OPEN_ENDED, "loss") if settings.get("plugins") else OPEN_ENDED
     for section, options in known.items():
         node: Any = settings
         for key in section.split("."):
             node = node.get(key) if isinstance(node, Mapping) else None
         if not isinstance(node, Mapping):
             continue
-        if section not in OPEN_ENDED:
+        if section not in open_ended:
             check_options(section, node, options)
         for key, value in node.items():
             if value is not None or section != "grid":  # null: chosen by the app

@@ -12,7 +12,7 @@ from mvrecon.comparison.rows import rows_of
 from mvrecon.comparison.tables import Cells, cells, markdown
 from mvrecon.engine.callbacks import named
 from mvrecon.engine.export import file_name
-from mvrecon.engine.fit import BOARD, methods
+from mvrecon.engine.fit import is_board, methods
 from mvrecon.engine.loggers import Board
 from mvrecon.files.runs import leaves
 from mvrecon.geometry.grid import Grid
@@ -32,7 +32,7 @@ CASES, SLICES = 2, 16
 def wanted(settings: Mapping[str, Any]) -> bool:
     """Whether a run has a board."""
     loggers = (settings["logger"] or {}).values()
-    return any(node and node["_target_"] == BOARD for node in loggers)
+    return any(map(is_board, loggers))
 
 
 def close(

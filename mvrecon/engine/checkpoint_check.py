@@ -11,7 +11,8 @@ from typing import Any
 
 from mvrecon.engine.old_names import current, current_model
 from mvrecon.files.checks import TEXT, Refused, blaming, shown
-from mvrecon.parts import REGISTRIES
+from mvrecon.losses import TERMS
+from mvrecon.parts import LOSSES, REGISTRIES
 from mvrecon.signatures import parts_in
 
 #: The files that `torch.save` puts into an archive, below one folder.
@@ -79,15 +80,17 @@ def check_settings(path: Path, settings: Any) -> dict[str, Any]:
 
 
 def check_known(path: Path, settings: Mapping[str, Any]) -> None:
-    """Check that every part which a checkpoint names is there.
+    """Check that every part and every term of the loss which a checkpoint names is there.
 
     Raises:
         Refused: one is not; the message says which kind and name a plugin must bring.
     """
-    for _, kind, node in parts_in(settings):
-        if node["name"] not in REGISTRIES[kind].names():
+    named = [(kind, node["name"], REGISTRIES[kind]) for _, kind, node in parts_in(settings)]
+    named += [("loss", term, LOSSES) for term in settings.get("loss", ()) if term not in TERMS]
+    for kind, name, registry in named:
+        if name not in registry.names():
             raise Refused(
-                f"{path}: No {kind} is named {shown(node['name'])} here; if a plugin brings it, "
+                f"{path}: No {kind} is named {shown(name)} here; if a plugin brings it, "
                 f"install that plugin, or import the module that registers it (plugins=[...] on a "
                 f"command line)"
             )

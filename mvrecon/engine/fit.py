@@ -25,9 +25,15 @@ from mvrecon.engine.trained import begin_from
 from mvrecon.engine.training_memory import check_training
 from mvrecon.files.rank import world
 from mvrecon.kernels.threads import in_one_order
+from mvrecon.parts import LOGGERS
 
 #: The logger whose files are read by TensorBoard.
 BOARD = f"{Board.__module__}.{Board.__qualname__}"
+
+
+def is_board(node: Settings | None) -> bool:
+    """Whether the settings of a logger are those of the board."""
+    return bool(node) and node.get("_target_") == BOARD
 
 
 def build_data(settings: Settings) -> SceneData:
@@ -155,7 +161,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
     events = folder / method  # TensorBoard calls a run by its folder
     loggers = [
-        instantiate(node, board, save_dir=str(events if node["_target_"] == BOARD else board))
+        instantiate(node, board, LOGGERS, save_dir=str(events if is_board(node) else board))
         for node in (settings["logger"] or {}).values()
         if node
     ]

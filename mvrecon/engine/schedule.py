@@ -8,13 +8,9 @@ import torch
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
+from mvrecon.parts import OPTIMIZERS
 from mvrecon.registry import hint
 
-OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
-    "adamw": torch.optim.AdamW,
-    "adam": torch.optim.Adam,
-    "sgd": torch.optim.SGD,
-}
 SCHEDULES = ("cosine", "one_cycle", "constant")
 
 
@@ -38,14 +34,13 @@ def share(name: str, step: int, steps: int, warmup: float) -> float:
 def build_optimizer(
     parameters: Iterable[Tensor], name: str, **options: Any
 ) -> torch.optim.Optimizer:
-    """An optimiser of torch by its short name.
+    """An optimiser by its short name: one of torch's, or a plugin's.
 
     Raises:
         LookupError: an unknown name.
+        TypeError: an option that it does not have.
     """
-    if name not in OPTIMIZERS:
-        raise LookupError(f"No optimizer is named {name!r}{hint(name, OPTIMIZERS)}")
-    return OPTIMIZERS[name](parameters, **options)
+    return OPTIMIZERS.build(name, parameters, **options)
 
 
 def build_schedule(

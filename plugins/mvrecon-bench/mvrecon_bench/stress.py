@@ -1,4 +1,4 @@
-"""`mvrecon-stress`: the stress plan on any operator, camera, head or model, a plugin's included."""
+"""`mvrecon-stress`: stress plan on an operator, camera, scene, head or model, a plugin's too."""
 
 from pathlib import Path
 from typing import Any

@@ -14,7 +14,17 @@ from mvrecon_bench.stresses.subject import Subject, subject_of
 #: The files of cases, in the plan's order.
 FILES = (
     *("rays", "segments", "scales", "algebra", "accuracy", "derivatives"),
-    *("cameras", "images", "poses", "heads", "models", "model_state", "counts", "line_integrals"),
+    *(
+        "cameras",
+        "images",
+        "poses",
+        "scenes",
+        "heads",
+        "models",
+        "model_state",
+        "counts",
+        "line_integrals",
+    ),
     *("tensors", "dtypes", "values", "sizes", "repeatability", "gpu"),
 )
 

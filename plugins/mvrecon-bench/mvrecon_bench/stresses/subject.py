@@ -243,6 +243,7 @@ def _radius(grid: Grid) -> float:
 SUBJECTS = {
     "projector": "mvrecon_bench.stresses.subject:ProjectorSubject",
     "camera": "mvrecon_bench.stresses.camera_subject:CameraSubject",
+    "scene": "mvrecon_bench.stresses.scene_subject:SceneSubject",
     "head": "mvrecon_bench.stresses.learned_subjects:HeadSubject",
     "model": "mvrecon_bench.stresses.learned_subjects:ModelSubject",
 }

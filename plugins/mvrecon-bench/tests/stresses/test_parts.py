@@ -2,13 +2,16 @@
 does not do.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from mvrecon.cameras.rigs import circular
-from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
+from mvrecon.parts import CAMERAS, MODELS, PROJECTORS, SCENES
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.operator import Wrapped
+from mvrecon.scenes.ellipsoids import RandomEllipsoids
 from mvrecon_bench.stresses import plan
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import subject_of
@@ -150,3 +153,47 @@ def test_a_projector_that_blurs_keeps_the_plan_if_it_says_so(monkeypatch):
         subject = subject_of("projector", name, {}, "cpu", torch.float64)
         cases = [case for case, _ in plan.jobs([subject], (8, 20, 28)) if case.name in apart]
         assert [judge(case, subject)["verdict"] for case in cases] == [expected] * 3
+
+
+class Drifting(RandomEllipsoids):
+    """A scene that keeps count of its cases, and draws from torch's own series."""
+
+    def __init__(self):
+        super().__init__()
+        self.calls = 0
+
+    def sample(self, *arguments):
+        self.calls += 1
+        case = super().sample(*arguments)
+        return replace(case, volume=case.volume * (1 - 1e-3 * self.calls * float(torch.rand(()))))
+
+
+class Dimming(RandomEllipsoids):
+    """A scene whose views grow dim with the number of cameras, and whose finer object is denser."""
+
+    def sample(self, index, seed, grid, cameras):
+        case = super().sample(index, seed, grid, cameras)
+        return replace(case, views=case.views * (1 - 0.01 * len(cameras)))
+
+    def finer(self, index, seed, grid, cameras, factor):
+        return 2 * self.sample(index, seed, grid.refined(factor), cameras).volume
+
+
+def test_a_scene_that_is_no_pure_function_fails_and_one_that_needs_a_file_is_left_out(monkeypatch):
+    for scene in (Drifting, Dimming):
+        monkeypatch.setitem(SCENES._parts, scene.__name__, scene)
+
+    def failed(name):
+        subject = subject_of("scene", name, {}, "cpu", torch.float32)
+        rows = [judge(case, subject) for case, _ in plan.jobs([subject])]
+        return {row["case"] for row in rows if row["verdict"] == FAIL}, rows
+
+    assert failed("Drifting")[0] >= {
+        "cases in any order",
+        "a case on 1, 2 and 3 threads",
+        "random numbers of others",
+        "the contract of a scene",
+    }
+    assert failed("Dimming")[0] == {"views of each camera alone", "the object on a finer grid"}
+    _, rows = failed("nifti")
+    assert all(row["verdict"] == LEFT_OUT and "it needs path" in row["note"] for row in rows)

@@ -1,0 +1,124 @@
+"""Scenes: cases as pure functions of seed and index, truth and views of one object."""
+
+from collections.abc import Iterator
+
+import torch
+
+from mvrecon.scenes.sample import Finer, Sample
+from mvrecon.testing import check_scene
+from mvrecon.testing.scene import GRID, RIG
+from mvrecon_bench.stresses.case import Case, DoesNotApply
+from mvrecon_bench.stresses.scene_subject import SEED, SceneSubject
+from mvrecon_bench.stresses.subject import gap, greatest
+
+#: A case is float32, whatever else works in.
+SINGLE = (torch.float32,)
+#: Of the content of a truth whose values may be those at the voxels' centres.
+SAMPLED = 0.05
+#: Threads that torch may use.
+THREADS = (1, 2, 3)
+
+
+def contract(subject: SceneSubject) -> float:
+    """`mvrecon.testing.check_scene`."""
+    subject.case()  # made with what it is given, or none of this is meant for it
+    try:
+        check_scene(subject.name, **subject.coarser, **subject.options)
+    except AssertionError:
+        subject.need_whole()
+        raise
+    return 0.0
+
+
+def differing(a: Sample, b: Sample) -> int:
+    """How many of views, truth, mask and name of two cases are not the same to the last bit."""
+    pairs = [(getattr(a, what), getattr(b, what)) for what in ("views", "volume", "inside")]
+    return sum(not torch.equal(*pair) for pair in pairs) + (a.name != b.name)
+
+
+def in_any_order(subject: SceneSubject) -> float:
+    """A case after others, from a new scene, and under other random numbers: the same bits."""
+    subject.need_two()
+    first, second = subject.case(0), subject.case(1)
+    other = subject.scene()
+    torch.manual_seed(17)
+    backwards = subject.case(1, scene=other), subject.case(0, scene=other)
+    return differing(second, backwards[0]) + differing(first, backwards[1])
+
+
+def on_any_threads(subject: SceneSubject) -> float:
+    """A case on one thread and on several: the same bits."""
+    before, cases = torch.get_num_threads(), []
+    try:
+        for threads in THREADS:
+            torch.set_num_threads(threads)
+            cases.append(subject.case())
+    finally:
+        torch.set_num_threads(before)
+    return sum(differing(cases[0], case) for case in cases[1:])
+
+
+def others_random_numbers(subject: SceneSubject) -> float:
+    """Numbers that a case draws from torch's own series."""
+    subject.case()
+    state = torch.get_rng_state()
+    subject.case()
+    return float((torch.get_rng_state() != state).sum())
+
+
+def camera_by_camera(subject: SceneSubject) -> float:
+    """The views of each camera alone, and of all in another order, against those of all."""
+    together = subject.case().views
+    alone = [(subject.case(cameras=RIG[[m]]).views[:, 0], together[:, m]) for m in range(len(RIG))]
+    order = list(reversed(range(len(RIG))))
+    turned = subject.case(cameras=RIG[order]).views
+    return greatest(gap(a, b) for a, b in (*alone, (turned, together[:, order])))
+
+
+def finer_truth(subject: SceneSubject) -> float:
+    """The object on a grid of half the spacing has the truth's content (value times mm^3)."""
+    scene = subject.used
+    if not isinstance(scene, Finer):
+        raise DoesNotApply("it gives no object on a finer grid")
+    coarse = subject.case().volume  # refused here, if at all
+    fine = scene.finer(0, SEED, GRID, RIG, 2)
+    return abs(float(fine.double().sum() / 8 / coarse.double().sum()) - 1)
+
+
+def apart(subject: SceneSubject) -> float:
+    """Pairs of cases, of two indices and of two seeds, that are one and the same."""
+    subject.need_two()
+    return float(sum(torch.equal(a.volume, b.volume) for a, b in _pairs(subject)))
+
+
+def _pairs(subject: SceneSubject) -> Iterator[tuple[Sample, Sample]]:
+    first = subject.case()
+    yield first, subject.case(1)
+    if subject.used.length is None:
+        yield first, subject.used.sample(0, SEED + 1, GRID, RIG)
+
+
+CASES = (
+    Case(21, "views of each camera alone", "those of all", "scene", camera_by_camera, 1e-6, SINGLE),
+    Case(61, "the contract of a scene", "is kept", "scene", contract, dtypes=SINGLE),
+    Case(74, "cases in any order", "the same bits", "scene", in_any_order, dtypes=SINGLE),
+    Case(74, "a case on 1, 2 and 3 threads", "the same bits", "scene", on_any_threads, 0.0, SINGLE),
+    Case(
+        75,
+        "random numbers of others",
+        "none is drawn",
+        "scene",
+        others_random_numbers,
+        dtypes=SINGLE,
+    ),
+    Case(57, "two indices, two seeds", "two cases", "scene", apart, dtypes=SINGLE),
+    Case(
+        58,
+        "the object on a finer grid",
+        "the truth's content",
+        "scene",
+        finer_truth,
+        SAMPLED,
+        SINGLE,
+    ),
+)

@@ -1,0 +1,74 @@
+"""A registered scene under stress, on a small grid and rig."""
+
+import inspect
+from functools import cached_property
+from typing import Any
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.parts import SCENES
+from mvrecon.scenes.sample import Sample, Scene
+from mvrecon.testing.scene import GRID, RIG
+from mvrecon_bench.stresses.case import DoesNotApply
+from mvrecon_bench.stresses.subject import Subject
+
+#: The series of cases that is looked at.
+SEED = 3
+#: What a scene is given instead of a default whose details are finer than that grid.
+COARSER = {"well_diameters": [14, 13, 12, 11, 10, 9]}
+
+
+class SceneSubject(Subject):
+    """A scene under stress, with its defaults for all that it was not given."""
+
+    def scene(self) -> Scene:
+        """A new one.
+
+        Raises:
+            DoesNotApply: it needs an option that it was not given, such as the path of a file.
+        """
+        parameters = inspect.signature(SCENES.get(self.name)).parameters
+        for name, parameter in parameters.items():
+            given = name in self.options or parameter.default is not parameter.empty
+            if not given and parameter.kind not in (
+                parameter.VAR_POSITIONAL,
+                parameter.VAR_KEYWORD,
+            ):
+                raise DoesNotApply(
+                    f"it needs {name}; stress it as {{kind: scene, name: {self.name}, {name}: ..}}"
+                )
+        return self.build(**self.coarser)
+
+    @cached_property
+    def coarser(self) -> dict[str, Any]:
+        """The options of `COARSER` that it has and was not given."""
+        parameters = inspect.signature(SCENES.get(self.name)).parameters
+        return {key: v for key, v in COARSER.items() if key in set(parameters) - set(self.options)}
+
+    @cached_property
+    def used(self) -> Scene:
+        """One of them, for cases that need no new one."""
+        return self.scene()
+
+    def case(self, index: int = 0, cameras: Cameras = RIG, scene: Scene | None = None) -> Sample:
+        """A case of the series, on the grid and the rig of `mvrecon.testing.check_scene`.
+
+        Raises:
+            DoesNotApply: it refuses that grid, as one in true size may.
+        """
+        try:
+            return (scene or self.used).sample(index, SEED, GRID, cameras)
+        except ValueError as error:
+            if "grid" not in str(error):
+                raise
+            raise DoesNotApply(f"it refuses the plan's grid: {error}") from error
+
+    def need_whole(self) -> None:
+        """Raise DoesNotApply unless its object ends within the grid."""
+        inner = self.case().inside[0, 1:-1, 1:-1, 1:-1]
+        if self.case().inside.sum() > inner.sum():
+            raise DoesNotApply("its object reaches beyond the plan's grid of 120 mm")
+
+    def need_two(self) -> None:
+        """Raise DoesNotApply unless it has a second case."""
+        if self.used.length == 1:
+            raise DoesNotApply("it has one case")
