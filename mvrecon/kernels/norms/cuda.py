@@ -27,7 +27,7 @@ def normalised(
     shift: Float[Tensor, " c"],
     groups: int,
     eps: float,
-) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n c 2"]]:
+) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n 2 c"]]:
     """As `reference.normalised`: two kernels, and a sum of their sums."""
     features, part = rows_of(x), part_of(x)
     factors, terms = (one.detach().to(part.real).contiguous() for one in (scale, shift))
@@ -43,10 +43,10 @@ def change(
     answer: Float[Tensor, "n c *d"],
     scale: Float[Tensor, " c"],
     shift: Float[Tensor, " c"],
-    sums: Float[Tensor, "n c 2"],
+    sums: Float[Tensor, "n 2 c"],
     groups: int,
     eps: float,
-) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n c 2"]]:
+) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n 2 c"]]:
     """As `reference.change`: two kernels, and a sum of their sums."""
     features, part = rows_of(x), part_of(x)
     by = rows_of(answer).to(part.real)
@@ -82,9 +82,9 @@ def all_blocks(layer: Layer, x: Tensor) -> int:
 
 def summed(
     part: Part, name: str, layer: Layer, features: Float[Tensor, "n *d c"]
-) -> Float[Tensor, "n c 2"]:
+) -> Float[Tensor, "n 2 c"]:
     """The two sums of each item's channels, first of each thread's values, in float64."""
-    size = len(features), layer.rows, layer.channels, 2
+    size = len(features), layer.rows, 2, layer.channels
     sums = torch.empty(size, dtype=torch.float64, device=features.device)
     start(part, name, layer.put(result=sums), features, all_blocks(layer, features))
     return sums.sum(dim=1)

@@ -44,7 +44,7 @@ def _(x, answer, scale, shift, sums, groups, eps):
 def _like(x: Tensor) -> tuple[Tensor, Tensor]:
     shape = len(x), *x.shape[2:], x.shape[1]
     rows = x.new_empty(shape, dtype=arithmetic(x.dtype))
-    return rows.movedim(-1, 1), x.new_empty(*x.shape[:2], 2, dtype=torch.float64)
+    return rows.movedim(-1, 1), x.new_empty(len(x), 2, x.shape[1], dtype=torch.float64)
 
 
 @_normalised.register_fake
@@ -75,7 +75,7 @@ def _backwards(ctx, answer, _):
 
         return *pull_of(act, x, scale, shift)(answer), None, None
     by_x, back = _change(x, answer, scale, shift, sums, ctx.groups, ctx.eps)
-    by_shift, by_scale = back.sum(dim=0).to(scale.dtype).unbind(dim=1)
+    by_shift, by_scale = back.sum(dim=0).to(scale.dtype)
     return by_x.to(x.dtype), by_scale, by_shift, None, None
 
 

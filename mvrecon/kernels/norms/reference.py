@@ -24,30 +24,30 @@ def plain(
     return F.silu(torch.group_norm(x, groups, scale.to(x), shift.to(x), eps))
 
 
-def sums_of(x: Float[Tensor, "n c *d"], by: Tensor | None = None) -> Float[Tensor, "n c 2"]:
+def sums_of(x: Float[Tensor, "n c *d"], by: Tensor | None = None) -> Float[Tensor, "n 2 c"]:
     """Sums over the places: of values and their products with `by`, by default with themselves."""
     values = x.double().flatten(2)
     products = values * (values if by is None else by.double().flatten(2))
-    return torch.stack((values.sum(dim=2), products.sum(dim=2)), dim=2)
+    return torch.stack((values.sum(dim=2), products.sum(dim=2)), dim=1)
 
 
 def standardised(
-    x: Float[Tensor, "n c *d"], sums: Float[Tensor, "n c 2"], groups: int, eps: float
+    x: Float[Tensor, "n c *d"], sums: Float[Tensor, "n 2 c"], groups: int, eps: float
 ) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n c *l"]]:
     """(x - mean) per in float64, and per."""
     ones = [1] * (x.ndim - 2)
-    mean, square = averaged(sums, x, groups).unbind(dim=2)
+    mean, square = averaged(sums, x, groups).unbind(dim=1)
     per = ((square - mean.square()).clamp(min=0) + eps).rsqrt().reshape(*mean.shape, *ones)
     return (x.double() - mean.reshape(*mean.shape, *ones)) * per, per
 
 
 def averaged(
-    sums: Float[Tensor, "n c 2"], x: Float[Tensor, "n c *d"], groups: int
-) -> Float[Tensor, "n c 2"]:
+    sums: Float[Tensor, "n 2 c"], x: Float[Tensor, "n c *d"], groups: int
+) -> Float[Tensor, "n 2 c"]:
     """The mean over a group's values, for each of its channels."""
-    among = sums.unflatten(1, (groups, -1))
-    count = among.shape[2] * max(1, x[0, 0].numel())
-    return (among.sum(dim=2, keepdim=True) / count).expand_as(among).flatten(1, 2)
+    among = sums.unflatten(2, (groups, -1))
+    count = among.shape[3] * max(1, x.shape[2:].numel())
+    return (among.sum(dim=3, keepdim=True) / count).expand_as(among).flatten(2)
 
 
 def normalised(
@@ -56,7 +56,7 @@ def normalised(
     shift: Float[Tensor, " c"],
     groups: int,
     eps: float,
-) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n c 2"]]:
+) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n 2 c"]]:
     """The answer, and the sums of the features and of their squares."""
     sums = sums_of(x)
     normal, _ = standardised(x, sums, groups, eps)
@@ -69,17 +69,17 @@ def change(
     answer: Float[Tensor, "n c *d"],
     scale: Float[Tensor, " c"],
     shift: Float[Tensor, " c"],
-    sums: Float[Tensor, "n c 2"],
+    sums: Float[Tensor, "n 2 c"],
     groups: int,
     eps: float,
-) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n c 2"]]:
+) -> tuple[Float[Tensor, "n c *d"], Float[Tensor, "n 2 c"]]:
     """The change of the features by that of the answer, and of an item's shift and scale."""
     normal, per = standardised(x, sums, groups, eps)
     z = normal * along(scale, x) + along(shift, x)
     part = z.sigmoid()
     before = answer.double() * part * (1 + z * (1 - part))
     back = sums_of(before, normal)
-    even, tilt = averaged(back * scale.double()[:, None], x, groups).unbind(dim=2)
+    even, tilt = averaged(back * scale.double(), x, groups).unbind(dim=1)
     ones = [1] * (x.ndim - 2)
     even, tilt = (one.reshape(*one.shape, *ones) for one in (even, tilt))
     result = per * (before * along(scale, x) - even - normal * tilt)

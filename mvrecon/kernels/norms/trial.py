@@ -26,4 +26,4 @@ def differences(device: str, dtype: torch.dtype) -> Tried:
     change, back = cuda.change(x, y, scale, shift, sums, 3, 1e-5)
     yield "its derivative", error_of(change, by_x)
     by_items = back.sum(dim=0)
-    yield "its derivative by the layer", error_of(by_items, torch.stack((by_shift, by_scale), 1))
+    yield "its derivative by the layer", error_of(by_items, torch.stack((by_shift, by_scale)))

@@ -32,7 +32,7 @@ def answers(module, x, layer, y) -> dict[str, torch.Tensor]:
     """The answer, and its derivatives by the features and by the layer."""
     answer, sums = module.normalised(x, *layer, GROUPS, EPS)
     change, back = module.change(x, y, *layer, sums, GROUPS, EPS)
-    return {"answer": answer, "by x": change, "by the layer": back.sum(dim=0).flip(1).T}
+    return {"answer": answer, "by x": change, "by the layer": back.sum(dim=0).flip(0)}
 
 
 def torch_s(x, layer, y) -> dict[str, torch.Tensor]:
@@ -124,7 +124,9 @@ def test_the_operator_has_two_derivatives_and_is_opaque_to_the_compiler():
     assert torch.autograd.gradgradcheck(act, inputs)
     torch.library.opcheck(ops._normalised, (*inputs, GROUPS, EPS))
     compiled = torch.compile(act, backend="aot_eager", fullgraph=True)
-    gradients = [torch.autograd.grad(one(*inputs).square().sum(), inputs) for one in (act, compiled)]
+    gradients = [
+        torch.autograd.grad(one(*inputs).square().sum(), inputs) for one in (act, compiled)
+    ]
     for one, two in zip(*gradients, strict=True):
         torch.testing.assert_close(one, two)
 

@@ -7,8 +7,8 @@ struct Layer {
   const void* change;    // of what was made of them [n p c]
   const void* scale;     // [c]
   const void* shift;     // [c]
-  const double* sums;    // of features and of their squares [n c 2]
-  const double* back;    // of changes before SiLU, and of these times the normalised features [n c 2]
+  const double* sums;    // of features and of their squares [n 2 c]
+  const double* back;    // of changes before SiLU, and of these times the normalised features [n 2 c]
   void* result;
   long long values;      // p c: of an item
   double eps;
@@ -27,9 +27,9 @@ struct Walk {
   DEVICE bool counts() const { return at < step; }
   DEVICE long long start(const Layer& f) const { return item * f.values; }
   DEVICE void write(const Layer& f, double one, double two) const {
-    double* sums = (double*)f.result + 2 * (item * step + at);
+    double* sums = (double*)f.result + 2 * item * step + at + at / f.channels * f.channels;  // [n rows 2 c]
     sums[0] = one;
-    sums[1] = two;
+    sums[f.channels] = two;
   }
 };
 
@@ -39,11 +39,11 @@ template <class R> struct Channel {
   double count;
   int first;
   DEVICE Channel(const Layer& f, const Walk& walk) : first(walk.channel / f.group * f.group) {
-    const double* sums = f.sums + 2 * (walk.item * f.channels + first);
+    const double* sums = f.sums + 2 * walk.item * f.channels + first;
     double sum = 0, squares = 0;
     for (int c = 0; c < f.group; c++) {
-      sum += sums[2 * c];
-      squares += sums[2 * c + 1];
+      sum += sums[c];
+      squares += sums[f.channels + c];
     }
     count = (double)(f.values / f.channels) * f.group;
     double middle = sum / count, variance = squares / count - middle * middle;
@@ -112,14 +112,14 @@ template <class R, class S> DEVICE void change_features(const Layer& f) {
   Walk walk(f);
   if (!walk.counts()) return;
   Channel<R> channel(f, walk);
-  const double* back = f.back + 2 * (walk.item * f.channels + channel.first);
+  const double* back = f.back + 2 * walk.item * f.channels + channel.first;
   double sum = 0, moment = 0;
   for (int c = 0; c < f.group; c++) {
     double scale = ((const R*)f.scale)[channel.first + c];
-    sum += scale * back[2 * c];
-    moment += scale * back[2 * c + 1];
+    sum += scale * back[c];
+    moment += scale * back[f.channels + c];
   }
-  R even = (R)(sum / channel.count), tilt = (R)(moment / channel.count);
+  R part = (R)(1 / channel.count), even = part * (R)sum, tilt = part * (R)moment;
   const S* x = (const S*)f.features + walk.start(f);
   const R* change = (const R*)f.change + walk.start(f);
   R* result = (R*)f.result + walk.start(f);
