@@ -142,7 +142,6 @@ def test_it_checks_itself(dtype, host, monkeypatch):
     assert "its derivative differs from the reference by 1.0e-03" in str(why)
 
 
-@pytest.mark.door
 def test_without_kernels_torch_normalises(host):
     """Where the kernels cannot be started, `auto` takes torch's normalisation."""
     x = SimpleNamespace(device=torch.device("cuda:0"), shape=(1, 8, 4, 4), dtype=torch.float32)
