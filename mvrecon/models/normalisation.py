@@ -5,15 +5,18 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-#: Values from which on a GPU normalises with channels last, 16 channels of 102^3 voxels: by counts,
-#: not by a clock. It saves five transpositions, of 0.03 ms for each 2^23 values at 4 TB/s, and
-#: starts some 35 small kernels more, of 0.005 ms.
+from mvrecon.kernels.norms import ops
+from mvrecon.kernels.norms.norm import fused_on
+
+#: Values from which on a GPU without the kernels normalises with channels last, 16 channels of
+#: 102^3 voxels: by counts, not by a clock. It saves five transpositions, of 0.03 ms for each 2^23
+#: values at 4 TB/s, and starts some 35 small kernels more, of 0.005 ms.
 LARGE = 2**24
 
 
 def keeps_channels_last(x: Tensor) -> bool:
-    """Whether steps on a tensor leave channels last in memory, at the cost of more kernels."""
-    return x.is_cuda and x.numel() >= LARGE
+    """Whether steps on a tensor leave channels last in memory."""
+    return fused_on(x) or (x.is_cuda and x.numel() >= LARGE)
 
 
 def normalised_silu(norm: nn.GroupNorm, x: Float[Tensor, "n c *d"]) -> Float[Tensor, "n c *d"]:
@@ -21,8 +24,12 @@ def normalised_silu(norm: nn.GroupNorm, x: Float[Tensor, "n c *d"]) -> Float[Ten
 
     Not the layer's own call, which refuses a group of one value, of which the shift is left.
     torch's kernel for a GPU takes channels first alone: it transposes what a convolution gives with
-    channels last, twice more on the way back, and leaves the next convolution channels first.
+    channels last, twice more on the way back, and leaves the next convolution channels first. So a
+    GPU has kernels of its own, which give float32 for half precision, as under autocast.
     """
+    if fused_on(x):
+        y = ops.normalised_silu(x, norm.weight, norm.bias, norm.num_groups, norm.eps)
+        return y.to(torch.promote_types(x.dtype, norm.weight.dtype))
     if keeps_channels_last(x):
         return F.silu(in_any_order(norm, x))
     return F.silu(torch.group_norm(x, norm.num_groups, norm.weight, norm.bias, norm.eps))

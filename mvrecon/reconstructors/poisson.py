@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from mvrecon.kernels.precision import wide
@@ -59,13 +59,16 @@ class PoissonLikelihood:
         )
         measured, added = wide(self.views(counts)), self.views(_spread(background, counts))
         bins = {"counts": measured, "background": added}
-        wrong = torch.stack([(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]).tolist()
+        wrong = [(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]
+        full = (measured != 0).flatten(0, 1).any(dim=0)[None, None]
+        *wrong, rays = torch.stack([*wrong, full.sum()]).tolist()  # a GPU is asked once
         for what, bad in zip(bins, wrong, strict=True):
             if bad:
                 raise ValueError(
                     f"Expected {what} that are finite and not negative, got {bad} bins that are not"
                 )
-        self.selection, self.why = self._choose(measured, skip_zero_bins)
+        share = rays / max(1, full.numel())
+        self.selection, self.why = self._choose(full, share, skip_zero_bins)
         self.bins = A.subset(self.selection)
         self.counts, self.background = (
             self.selection(self.views.T(values)) for values in (measured, added)
@@ -74,19 +77,16 @@ class PoissonLikelihood:
         self._sensitivity: dict[torch.dtype, Tensor] = {}
 
     def _choose(
-        self, measured: Float[Tensor, "b c k v u"], skip: bool
+        self, full: Bool[Tensor, "1 1 k v u"], share: float, skip: bool
     ) -> tuple[LinearOperator, str]:
         if not skip:
             return self.views, "all bins: asked for"
         if "subset" not in self.A.capabilities:
             return self.views, f"all bins: {type(self.A).__name__} does not compute rays one by one"
-        chosen = self.views.T((measured != 0).any(dim=0, keepdim=True).any(dim=1, keepdim=True))[
-            0, 0
-        ]
-        share = int(chosen.sum()) / max(1, measured[:1, :1].numel())
         reason = f"{share:.1%} of the bins hold counts, a list of rays pays up to {LIST:.0%}"
         if share > LIST:
             return self.views, f"all bins: {reason}"
+        chosen = self.views.T(full)[0, 0]
         return RaySelection(self.A.range_shape, chosen), f"bins with counts: {reason}"
 
     def sensitivity(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:

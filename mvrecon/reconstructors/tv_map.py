@@ -14,7 +14,7 @@ from mvrecon.kernels.differences.shrinkage import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstructors.cgls import check_not_negative
-from mvrecon.reconstructors.division import divided
+from mvrecon.reconstructors.division import divided, positive_mean
 from mvrecon.reconstructors.mlem import admitted, likelihood_of_residual, unexplained, uniform
 from mvrecon.reconstructors.pdhg_tv import RELAXATION
 from mvrecon.reconstructors.poisson import PoissonLikelihood
@@ -77,9 +77,9 @@ def tv_map(
     s = plain.sensitivity(plain.counts.dtype)
     unit = uniform([plain], s)[..., :1, :1, :1]
     unit = torch.where(unit > 0, unit, 1)
-    fit = PoissonLikelihood(A, counts / unit, torch.as_tensor(background).to(unit) / unit)
+    fit = PoissonLikelihood(A, counts / unit, background / unit)
     x = admitted([fit], [s], None if start is None else start / unit)
-    level = s[s > 0].mean().item() if s.any() else 1.0
+    level = positive_mean(s, 1.0)
 
     def objective(volume: Tensor, residual: Tensor) -> Tensor:
         roughness = total_variation(volume, steps).sum(dim=1)

@@ -22,6 +22,8 @@ from mvrecon.kernels.rays.trace import METHODS
 
 KERNELS = ("store", "project", "record", "gather", "scatter", "vary")
 STORED = ((torch.float32, 1), (torch.float32, 4), (torch.bfloat16, 4))
+#: What reads numbers stored in half precision, beside the kernels along rays.
+HALF = ("warp", "norm")
 #: Patterns of instructions.
 DOUBLE, LOAD = r"\bD(?:FMA|MUL|ADD|SETP)\b|F64|64H", r"\bLDG\b"
 LOCAL, CALL, ATOMIC = r"\b(?:LDL|STL)\b", r"\bCALL\b", r"\b(?:ATOM|ATOMG|REDG?)\b"
@@ -112,9 +114,10 @@ def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
         for stored, together in STORED:
             variant = rays.Variant(single, stored, together, number)
             yield f"{method}, {stored}, {together} a ray", rays.text_of({"": variant}), KERNELS
-    for purpose, stored in (("warp", single), ("warp", half), ("look", single), ("hull", single)):
-        part = fields.Part(purpose, single, stored)
-        yield f"{purpose}, {stored}", fields.text_of({"": part}), fields.KERNELS[purpose]
+    for purpose, names in fields.KERNELS.items():
+        for stored in (single, half) if purpose in HALF else (single,):
+            part = fields.Part(purpose, single, stored)
+            yield f"{purpose}, {stored}", fields.text_of({"": part}), names
 
 
 def main() -> None:

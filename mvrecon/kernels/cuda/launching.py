@@ -6,10 +6,10 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from mvrecon.kernels.cuda.field import Field
 from mvrecon.kernels.cuda.sources import KERNELS, Part, text_of
 from mvrecon.kernels.rays.cuda import driver
 from mvrecon.kernels.rays.cuda.kernels import loaded
+from mvrecon.kernels.rays.cuda.scene import Packed
 from mvrecon.kernels.rays.cuda.sources import BLOCK
 
 #: Voxels of a volume that a kernel counts.
@@ -22,7 +22,7 @@ def kernels_of(part: Part, device: torch.device) -> dict[str, c_void_p]:
     return loaded(text_of({"": part}), KERNELS[part.purpose], device)
 
 
-def start(part: Part, name: str, field: Field, like: Tensor, across: int, down: int = 1) -> None:
+def start(part: Part, name: str, field: Packed, like: Tensor, across: int, down: int = 1) -> None:
     """Launch a kernel on `across` x `down` blocks, on the device of a tensor."""
     driver.launch(kernels_of(part, like.device)[name], field, across, down, like.device)
 

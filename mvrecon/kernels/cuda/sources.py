@@ -18,12 +18,13 @@ KERNELS = {
     "warp": ("invert", "warp", "warp_back", "warp_vary"),
     "look": ("look", "show"),
     "hull": ("judge",),
+    "norm": ("sum_features", "normalise", "sum_changes", "change_features"),
 }
 
 
 class Part(NamedTuple):
     """What is compiled at once: the kernels for one purpose, in one type of arithmetic, and of what
-    they read where that may be another (warps).
+    they read where that may be another (warps, normalisation).
     """
 
     purpose: str

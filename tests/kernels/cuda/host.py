@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from mvrecon.kernels.cuda.field import Field
+from mvrecon.kernels.cuda.layer import Layer
 from mvrecon.kernels.cuda.sources import Part, source
 from mvrecon.kernels.precision import arithmetic
 from mvrecon.kernels.rays.cuda import sources as rays
@@ -26,10 +27,22 @@ VARIANTS = {
 }
 PARTS = {
     f"_{NAMES[stored]}_{purpose}": Part(purpose, arithmetic(stored), stored)
-    for purpose, types in {"warp": (F, D, H, B), "look": (F, D), "hull": (D,)}.items()
+    for purpose, types in {
+        "warp": (F, D, H, B),
+        "look": (F, D),
+        "hull": (D,),
+        "norm": (F, D, H, B),
+    }.items()
     for stored in types
 }
 EVERY = {**VARIANTS, **PARTS}
+
+
+def packed_of(suffix: str) -> type[Packed]:
+    """The structure that kernels are launched with."""
+    if suffix in VARIANTS:
+        return Scene
+    return Layer if PARTS[suffix].purpose == "norm" else Field
 
 
 def running(packed: type[Packed]) -> str:
@@ -49,8 +62,9 @@ extern "C" const int layout_{name}[] = {{
 
 def compiled(folder: Path) -> dict[type[Packed], ctypes.CDLL]:
     """The kernels of all variants, by g++, one library for each structure."""
-    parts = "".join(part.line(suffix) for suffix, part in PARTS.items())
-    texts = {Scene: rays.text_of(VARIANTS), Field: source() + parts}
+    texts = {Scene: rays.text_of(VARIANTS), Field: source(), Layer: source()}
+    for suffix, part in PARTS.items():
+        texts[packed_of(suffix)] += part.line(suffix)
     compilers, libraries = [], {}
     for packed, text in texts.items():
         code, library = folder / f"{packed.__name__}.cpp", folder / f"{packed.__name__}.so"
@@ -84,7 +98,7 @@ class Driver:
 
     def cuModuleGetFunction(self, function, module, name: bytes) -> int:
         suffix = list(EVERY)[module.value - 1]
-        packed = Field if suffix in PARTS else Scene
+        packed = packed_of(suffix)
         code = getattr(self.libraries[packed], name.decode() + suffix)
         function._obj.value = ctypes.cast(code, c_void_p).value
         self.names[function._obj.value] = name.decode(), packed

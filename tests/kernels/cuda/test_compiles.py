@@ -77,6 +77,24 @@ def test_warps_and_back_projection_keep_all_in_registers(part, machine_code):
         assert kernels[name].loops and not count(machine_code.DOUBLE, kernels[name].loops[0]), name
 
 
+@pytest.mark.parametrize("capability", [80, 90])
+def test_normalisation_keeps_its_values_in_registers_and_float32(capability, machine_code):
+    """float64 in the loops over a group's sums alone, which read nothing else; nothing in local
+    memory, no call in a loop.
+    """
+    text, count = fields({"": Part("norm", F, B)}), machine_code.count
+    kernels = machine_code.compiled(text, capability)
+    assert kernels.keys() == set(FIELDS["norm"])
+    for name, kernel in kernels.items():
+        assert kernel.registers <= MOST // 2, (name, kernel.registers)
+        assert not count(machine_code.LOCAL + "|" + machine_code.ATOMIC, kernel.instructions), name
+        values = [loop for loop in kernel.loops if count(r"LDG\.E\.U16", loop)]
+        assert values, name
+        for loop in kernel.loops:
+            assert not count(machine_code.CALL, loop), name
+            assert loop not in values or not count(machine_code.DOUBLE, loop), name
+
+
 def test_a_mistake_is_an_error_with_the_compiler_s_words(machine_code):
     with pytest.raises(nvrtc.CompileError, match="error"):
         nvrtc.build("an error", "compute_90")

@@ -10,6 +10,7 @@ import torch
 
 from mvrecon.geometry.box import Box
 from mvrecon.kernels.cuda.field import Field
+from mvrecon.kernels.cuda.layer import Layer
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.rays.cuda.scene import Scene
@@ -149,7 +150,7 @@ def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_no
     assert set(host.streams) == {7} and host.modules == 1
 
 
-@pytest.mark.parametrize("packed", [Scene, Field])
+@pytest.mark.parametrize("packed", [Scene, Field, Layer])
 def test_the_packed_structure_is_that_of_the_source(packed, libraries):
     fields = [getattr(packed, name[0]).offset for name in packed._fields_]
     layout = (c_int * (1 + len(fields))).in_dll(libraries[packed], f"layout_{packed.__name__}")

@@ -25,7 +25,7 @@ DEVICE bool first_of_warp() { return threadIdx.x % 32 == 0; }
 #define __global__
 #define __launch_bounds__(threads)
 
-using std::ceil; using std::fabs; using std::floor; using std::fma; using std::max; using std::min; using std::sqrt;
+using std::ceil; using std::exp; using std::fabs; using std::floor; using std::fma; using std::max; using std::min; using std::sqrt;
 struct Place { int x, y; };
 static Place threadIdx, blockIdx;
 template <class R> DEVICE void add(R* to, R value) { *to += value; }

@@ -1,4 +1,5 @@
-#define ENTRY(name, kernel) extern "C" __global__ void __launch_bounds__(BLOCK) name(const Field f) { kernel(f); }
+#define ENTRY_OF(Packed, name, kernel) extern "C" __global__ void __launch_bounds__(BLOCK) name(const Packed f) { kernel(f); }
+#define ENTRY(name, kernel) ENTRY_OF(Field, name, kernel)
 #define WARP_OF(suffix, R, S)                                                                                            \
   ENTRY(invert##suffix, invert_maps)                                                                                   \
   ENTRY(warp##suffix, (warp_samples<R, S>))                                                                                 \
@@ -8,3 +9,8 @@
   ENTRY(look##suffix, look_up<R>)                                                                                      \
   ENTRY(show##suffix, show_up<R>)
 #define HULL_OF(suffix, R, S) ENTRY(judge##suffix, judge_bricks)
+#define NORM_OF(suffix, R, S)                                                                                            \
+  ENTRY_OF(Layer, sum_features##suffix, (sum_features<R, S>))                                                          \
+  ENTRY_OF(Layer, normalise##suffix, (normalise<R, S>))                                                                \
+  ENTRY_OF(Layer, sum_changes##suffix, (sum_changes<R, S>))                                                            \
+  ENTRY_OF(Layer, change_features##suffix, (change_features<R, S>))

@@ -1,0 +1,1 @@
+"""Group normalisation and SiLU as one step."""
