@@ -1,0 +1,137 @@
+"""Uptake of labelled structures: where it is, how much, and what attenuates."""
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.data.hdf5 import Stored, write_volumes
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon_spect.spect_ct import SpectCt
+from mvrecon_spect.spect_labels import SpectLabels
+
+GRID = Grid.centred(size=(14, 12, 10), spacing=8.0)
+SPACING = (4.0, 4.0, 4.0)  # z, y, x
+#: To the right and in front, in the middle.
+GLAND, TUMOUR = torch.tensor([24.0, 12.0, 0.0]), torch.tensor([-12.0, -8.0, 4.0])
+UPTAKE = {"Gland": (0.5, 1.0), "Tumour": (2.0, 3.0)}
+NAMES = "1=Gland,2=Tumour,3=Cord"
+
+
+def patient(name: str = "p", shift: float = 0.0) -> Stored:
+    """A ball of water in air with a ball of bone, a gland and a tumour, as RAS."""
+    places = voxel_centres(Grid.centred(size=(28, 24, 20), spacing=4.0), torch.float32)
+    places = places - torch.tensor([shift, 0.0, 0.0])
+    hu = torch.where(places.norm(dim=-1) < 40, 0, -1000)
+    hu[(places - torch.tensor([0.0, 0.0, -16.0])).norm(dim=-1) < 10] = 1000
+    label = torch.zeros_like(hu)
+    label[(places - GLAND).norm(dim=-1) < 9] = 1
+    label[(places - TUMOUR).norm(dim=-1) < 9] = 2
+    return Stored(name, hu.numpy().astype("int16"), SPACING, label.numpy().astype("uint8"))
+
+
+@pytest.fixture
+def path(tmp_path):
+    file = tmp_path / "labelled.h5"
+    write_volumes(file, [patient("p"), patient("q", 4.0)], labels=NAMES, orientation="RAS")
+    return str(file)
+
+
+def scene(path: str, **options) -> SpectLabels:
+    return SpectLabels(**{"path": path, "uptake": UPTAKE, "fine": 2} | options)
+
+
+def levels(case: SpectLabels, index: int = 0) -> dict[str, float]:
+    return case.parameters(index, 0, GRID)
+
+
+def test_activity_is_that_of_the_structures_of_the_body_and_none_in_air(path):
+    case = scene(path, crop="none")
+    drawn = levels(case)
+    fine = case.finer(0, 0, GRID, None, 2)[0]  # the file's own voxels
+    known = patient()
+    label, water = torch.from_numpy(known.label).long(), torch.from_numpy(known.ct) >= 0
+    table = torch.tensor([0.0, drawn["uptake_Gland"], drawn["uptake_Tumour"]])
+    body = drawn["uptake_body"] * water
+    assert torch.allclose(fine, torch.where(label > 0, table[label], body), atol=1e-5)
+    assert 0.5 <= drawn["uptake_Gland"] <= 1 and 2 <= drawn["uptake_Tumour"] <= 3
+    assert 0.05 <= drawn["uptake_body"] <= 0.15
+    truth = case.pooled(0, 0, GRID, fine[None]).volume
+    assert truth.sum().item() == pytest.approx(fine.sum().item() / 8, rel=1e-5)
+
+
+def test_what_attenuates_is_water_and_bone_at_140_kev(path):
+    mu = scene(path, crop="none").attenuation(0, 0, GRID, 2)[0]
+    hu = torch.from_numpy(patient().ct)
+    assert torch.allclose(mu[hu == 0], torch.tensor(0.01536), rtol=1e-4)
+    assert torch.allclose(mu[hu == 1000], torch.tensor(0.0295), rtol=1e-4)
+    assert mu[hu == -1000].abs().max() < 1e-6
+    assert not scene(path, attenuates=False).attenuation(0, 0, GRID).any()
+
+
+def test_a_copy_is_mirrored_with_its_structures_and_draws_other_uptakes(path):
+    case = scene(path, vary="exact")
+    copies = [case._placed(index, 0, GRID).mirrored for index in range(2, 18)]
+    assert 0 < sum(copies) < len(copies)
+    for index in (2 + copies.index(True), 2 + copies.index(False)):
+        fine = case.finer(index, 0, GRID, None, 2)[0]
+        mu = case.attenuation(index, 0, GRID, 2)[0]
+        places = voxel_centres(GRID.refined(2), torch.float32)
+        centre = (places * (mu > 0.004)[..., None]).sum(dim=(0, 1, 2)) / (mu > 0.004).sum()
+        hot = fine > 1.5
+        tumour = (places * hot[..., None]).sum(dim=(0, 1, 2)) / hot.sum() - centre
+        side = torch.tensor([-1.0 if copies[index - 2] else 1.0, 1.0, 1.0])
+        assert (tumour - side * TUMOUR).norm() < 4
+    assert levels(case, 2) != levels(case, 4)
+
+
+def test_a_case_is_a_pure_function_of_seed_and_index_whatever_came_before(path):
+    first, again = scene(path, vary="exact"), scene(path, vary="exact")
+    again.finer(3, 0, GRID, None, 2)
+    assert torch.equal(first.finer(2, 0, GRID, None, 2), again.finer(2, 0, GRID, None, 2))
+
+
+def test_an_orientation_moves_labels_with_the_values(tmp_path, path):
+    known = patient()
+    flips = {"ct": known.ct[::-1, ::-1, ::-1], "label": known.label[::-1, ::-1, ::-1]}
+    write_volumes(
+        tmp_path / "lpi.h5",
+        [Stored("p", spacing=SPACING, **flips)],
+        labels=NAMES,
+        orientation="LPI",
+    )
+    values = (scene(str(file)).finer(0, 0, GRID, None, 2) for file in (tmp_path / "lpi.h5", path))
+    assert torch.equal(*values)
+
+
+def test_spect_ct_scans_labelled_patients(path):
+    camera = {"name": "circular", "n_views": 8, "sid": 300.0, "sdd": 500.0}
+    camera["detector"] = {"pixels": [24, 24], "pixel_mm": 8.0}
+    scan = SpectCt({"name": "spect_labels", "path": path, "uptake": UPTAKE, "fine": 2}, camera)
+    measured, mu = scan.measured(0, 0, GRID), scan.attenuation(0, 0, GRID)
+    assert (measured - mu).norm() < 0.4 * mu.norm()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"uptake": {"Glnd": (0.0, 1.0)}}, "structures among Gland, Tumour, Cord, got Glnd"),
+        ({"uptake": {}}, "got none"),
+        ({"uptake": {"Gland": (-1.0, 1.0)}}, "activity of Gland, 0 or more, got -1.0 and 1.0"),
+        ({"body": (2.0, 1.0)}, "activity of body"),
+        ({"uptake": {"Gland": (0.0, np.inf)}}, "activity of Gland"),
+        ({"stored_unit": "activity"}, "file of HU or 1/mm"),
+    ],
+)
+def test_uptakes_that_cannot_be_are_refused(path, options, message):
+    with pytest.raises(ValueError, match=message):
+        scene(path, **options)
+
+
+def test_a_file_without_labels_or_names_is_refused(tmp_path):
+    known = patient()
+    write_volumes(tmp_path / "none.h5", [Stored("p", known.ct, SPACING)], labels=NAMES)
+    write_volumes(tmp_path / "unnamed.h5", [known])
+    with pytest.raises(ValueError, match="no dataset 'label'"):
+        scene(str(tmp_path / "none.h5")).finer(0, 0, GRID, None, 2)
+    with pytest.raises(ValueError, match="name each structure once"):
+        scene(str(tmp_path / "unnamed.h5"))
