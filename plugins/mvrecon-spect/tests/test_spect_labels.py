@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from mvrecon.config import compose
 from mvrecon.data.hdf5 import Stored, write_volumes
+from mvrecon.engine.evaluation import evaluate
+from mvrecon.engine.fit import build_data, build_module, methods
+from mvrecon.engine.module import build_projector
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon_spect.spect_ct import SpectCt
 from mvrecon_spect.spect_labels import SpectLabels
@@ -135,3 +139,37 @@ def test_a_file_without_labels_or_names_is_refused(tmp_path):
         scene(str(tmp_path / "none.h5")).finer(0, 0, GRID, None, 2)
     with pytest.raises(ValueError, match="name each structure once"):
         scene(str(tmp_path / "unnamed.h5"))
+
+
+@pytest.mark.filterwarnings("ignore:Rays are up to", "ignore:.*fills")
+def test_the_experiment_takes_a_step_and_judges_every_method(tmp_path):
+    file = tmp_path / "patients.h5"
+    names = "1=RightParotid,2=PTV70,3=LeftParotid,4=Larynx"
+    write_volumes(file, [patient("p"), patient("q", 4.0)], labels=names)
+    settings = compose(
+        "experiment=dcspect_labels",
+        *(f"{part}.path={file}" for part in ("scene", "test_scene")),
+        "model=cross_view_small",
+        "camera.pixels=8",
+        "camera.columns=[3]",
+        "compare.world_unet.rounds=[{resolution: full, widths: [2], cameras: null}]",
+        "compare.bsrem.reconstructor.iterations=1",
+        "data.sizes={train: 2, val: 1, test: 2}",
+        "grid.size=[8,8,8]",
+        "grid.spacing=32",
+    )
+    data = build_data(settings)
+    data.setup("fit")
+    data.setup("test")
+    rows = {
+        label: build_module(settings, config, 1.0) for label, config in methods(settings).items()
+    }
+    batch = next(iter(data.train_dataloader()))
+    loss = rows["cross_view"].terms(batch)["total"]
+    loss.backward()
+    assert loss.isfinite() and batch["mu"].max() < 0.03
+    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    judged = {label: row.own for label, row in rows.items()}
+    scores = evaluate(judged, data.test_dataloader(), A, 1.0)
+    assert set(scores) == {"cross_view", "world_unet", "osem", "bsrem"}
+    assert all(0 < s["nrmse"] < 3 for row in scores.values() for s in row)
