@@ -187,6 +187,26 @@ def test_rays_beside_the_emission_and_what_lies_behind_it_change_no_bit(method):
     assert 0 < (alone != 0).float().mean() < 0.9
 
 
+@pytest.mark.parametrize("method", ["joseph", "siddon"])
+def test_the_gradient_in_mu_is_the_same_where_rays_end_with_the_emission(method):
+    """A second volume that emits everywhere, and whose views weigh nothing, forbids to skip."""
+    grid, mu, x = scene()
+    x[..., :6] = 0
+    x[..., 9:] = 0
+    everywhere = torch.stack([x[0, 0], torch.ones(grid.shape, dtype=x.dtype)])[None]
+    mu.requires_grad_()
+    A = AttenuatedTransform(grid, rig(), mu, method=method)
+    weights = torch.rand(A(x[:, :1]).shape, dtype=x.dtype)
+    none = torch.zeros_like(weights)
+    skipped, whole = (
+        torch.autograd.grad((A(volumes) * w).sum(), mu)[0]
+        for volumes, w in ((x[:, :1], weights), (everywhere, torch.cat([weights, none], dim=1)))
+    )
+    assert A.last_backend == "cpu" and whole.any()
+    torch.testing.assert_close(skipped, whole, rtol=1e-11, atol=1e-12 * whole.abs().max().item())
+    assert not torch.autograd.grad(A(0 * x).sum(), mu)[0].any()
+
+
 def test_no_emission_is_no_counts_and_nan_is_never_skipped():
     grid, mu, x = scene(torch.float32)
     A = AttenuatedTransform(grid, rig(), mu)

@@ -117,11 +117,16 @@ def mu_vjp(
 ) -> Float[Tensor, "d h w"]:
     """The derivative of <views, project(volume, mu)> by the attenuation mu."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
-    values, count = np.ascontiguousarray(views.numpy()), len(volume)
+    emitting = Occupancy(occupancy.shape, box_of(readable(wide(volume))))
+    if not emitting.box.size:
+        return wide(mu).new_zeros(mu.shape)
+    plan = replace(plan, boxes=boxes_of(emitting))
+    space = Space(plan.rig.window, plan.rig.sizes, bounds_of(emitting))
+    values = np.ascontiguousarray(views.numpy())
 
     def spread(into: Store, copy: Copy, desk: Desk, slabs: Slabs) -> None:
-        reads, matter = plan.reads[into.near], Matter(copy.store, count)
-        bend_slabs(into, matter, copy.rig, desk, reads, values, slabs)
+        reads, emission = plan.reads[into.near], Emission(copy.store, space)
+        bend_slabs(into, emission, copy.rig, desk, reads, values, slabs)
 
     both = torch.cat([wide(volume).to(views.dtype), mu.to(views.dtype)[None]])
     made = copies(both, occupancy, plan)

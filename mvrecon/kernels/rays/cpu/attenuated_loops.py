@@ -169,10 +169,14 @@ def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
 
 
 @compiled
-def bend_slabs(store, matter, rig, desk, reads, views, slabs):
+def bend_slabs(store, emission, rig, desk, reads, views, slabs):
     """Spread into volume 0 of a store the derivative of sum(views * projections) by the
-    attenuation, of the volumes before it in its own store.
+    attenuation, which follows the volumes in the emission's store.
+
+    What lies behind the emission weakens nothing, so that rays end with it.
     """
+    source, space = emission
+    matter = Matter(source, len(views))
     steps = steps_of(rig, store, slabs.axis)
     for unit in range(len(reads.views) * max(rig.detector)):
         view, place, start, stop = walk(rig, reads.spans, unit)
@@ -183,20 +187,25 @@ def bend_slabs(store, matter, rig, desk, reads, views, slabs):
             pixel = from_centre(rig, u, v)
             if silent(views, m, v, u) or main_axis(line, pixel[0], pixel[1]) != slabs.axis:
                 continue
-            ray = trace(line, slabs.axis, store.near, pixel, rig, rig.method)
+            emits = trace(line, slabs.axis, store.near, pixel, space, rig.method)
+            if emits.first >= emits.last:
+                continue
+            ray = emits
+            if space.box != rig.box:
+                ray = trace(line, slabs.axis, store.near, pixel, rig, rig.method)
+            ascending = ascends(line, ray, pixel)
+            part = _towards(ray, (emits.first, emits.last), ascending)
             span = within(ray, slabs.low, slabs.high)
+            span = (max(span[0], part[0]), min(span[1], part[1]))
             if span[0] >= span[1]:
                 continue
-            part, ascending = (ray.first, ray.last), ascends(line, ray, pixel)
             visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
             layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
             count, path = segments_of(rig, visited[0]), desk.path
             for i in range(count):
                 path.source[i] = 0
             for n in range(len(views)):
-                integrals(
-                    Matter(matter.store, n), rig, ray, steps, desk.room, visited[0], path.emission
-                )
+                integrals(Matter(source, n), rig, ray, steps, desk.room, visited[0], path.emission)
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
                     path.source[i] += path.value[i] * path.emission[i]
