@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from statistics import median
@@ -30,6 +31,8 @@ from mvrecon.files.tables import read_rows, write_rows
 
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
+#: What a row is about.
+KEYS = ("regime", "arm", "seconds", "seed")
 #: What arms are compared with.
 AGAINST = (
     "one_round",
@@ -185,11 +188,23 @@ def curves(rows: list[dict], path: Path) -> None:
 
 
 def table(options: argparse.Namespace) -> None:
-    """Write the rows of all runs, their paired differences, and the curves."""
-    rows = collected(options.runs)
+    """Write the rows of all runs, their paired differences, and the curves; rows of runs that are
+    no longer there stay.
+    """
+    stored = [{key: _number(row[key]) for key in row} for row in read_rows(HERE / "results.csv")]
+    keyed = {tuple(row[key] for key in KEYS): row for row in (*stored, *collected(options.runs))}
+    rows = [keyed[key] for key in sorted(keyed)]
     for name, lines in (("results.csv", rows), ("paired.csv", paired(rows))):
         write_rows(HERE / name, lines)
     curves(rows, HERE / "curves.png")
+
+
+def _number(text: str) -> int | float | str:
+    """A cell of a table as the number that it shows, or else as it is."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
 
 
 def main() -> None:
