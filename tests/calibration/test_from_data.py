@@ -45,11 +45,20 @@ def measured(by: Misalignment, photons: float | None = None) -> torch.Tensor:
     return y
 
 
-@pytest.mark.parametrize(("photons", "bounds"), [(None, (0.05, 0.02)), (1e4, (0.2, 0.05))])
-def test_a_shared_offset_and_tilt_come_back(photons, bounds):
-    """To 0.05 pixels and 0.02 degrees without noise, although edges are sharp."""
+@pytest.mark.parametrize(
+    ("photons", "dtype", "bounds"),
+    [
+        (None, torch.float64, (0.01, 0.01)),
+        (None, torch.float32, (0.05, 0.05)),
+        (1e4, torch.float32, (0.2, 0.05)),
+    ],
+)
+def test_a_shared_offset_and_tilt_come_back(photons, dtype, bounds):
+    """Without noise to 0.01 pixels and degrees, although edges are sharp. In float32 the last
+    rounds stop at a tilt that depends on the processor's rounding: 0.02 to 0.03 degrees off.
+    """
     rounds: list[Round] = []
-    views = measured(shared(1.3, 0.7), photons)
+    views = measured(shared(1.3, 0.7), photons).to(dtype)
     estimate = calibrated(OPERATOR, RIG, views, monitor=rounds.append)
     by = estimate.misalignment
     assert (by.offset_px[:, 0] - 1.3).abs().max() < bounds[0]

@@ -143,12 +143,14 @@ def test_a_file_without_labels_or_names_is_refused(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:Rays are up to", "ignore:.*fills")
 def test_the_experiment_takes_a_step_and_judges_every_method(tmp_path):
-    file = tmp_path / "patients.h5"
     names = "1=RightParotid,2=PTV70,3=LeftParotid,4=Larynx"
-    write_volumes(file, [patient("p"), patient("q", 4.0)], labels=names)
+    files = {part: tmp_path / f"{part}.h5" for part in ("scene", "test_scene")}
+    for shift, (part, file) in enumerate(files.items()):
+        patients = [patient(f"{part}_{k}", 4.0 * k + shift) for k in range(3)]
+        write_volumes(file, patients, labels=names)
     settings = compose(
         "experiment=dcspect_labels",
-        *(f"{part}.path={file}" for part in ("scene", "test_scene")),
+        *(f"{part}.path={file}" for part, file in files.items()),
         "model=cross_view_small",
         "camera.pixels=8",
         "camera.columns=[3]",
