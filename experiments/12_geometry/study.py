@@ -15,6 +15,7 @@ import re
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from itertools import product
@@ -165,10 +166,12 @@ def paired(rows: list[dict]) -> list[dict]:
 
 
 def curves(rows: list[dict], path: Path) -> None:
-    """Mean PSNR against training time, a panel for each regime."""
+    """Mean PSNR against training time, a panel for each regime with several lengths."""
     import matplotlib.pyplot as plt
 
-    regimes = [name for name in REGIMES if any(r["regime"] == name for r in rows)]
+    trained = {(r["regime"], r["seconds"]) for r in rows if r["seconds"]}
+    lengths = Counter(regime for regime, _ in trained)
+    regimes = [name for name in REGIMES if lengths[name] > 1]
     figure, panels = plt.subplots(1, len(regimes), figsize=(4.5 * len(regimes), 3.6), squeeze=False)
     for panel, regime in zip(panels[0], regimes, strict=True):
         lines = [row for row in rows if row["regime"] == regime]
