@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.calibration.alignment import Alignment
+from mvrecon.parts import METRICS
 
 #: Unit of each figure.
 UNITS = {
@@ -48,7 +49,7 @@ def volume_metrics(
     data_range: float,
 ) -> dict[str, float]:
     """PSNR in dB (infinite for equal volumes), SSIM and NRMSE of one volume, over all of it and
-    inside the object.
+    inside the object; and the figures of merit of plugins, by their names.
 
     A volume of one slice has the SSIM of an image. SSIM inside is the mean of the SSIM map over the
     object's voxels. Without any voxel inside, those figures are nan.
@@ -71,7 +72,9 @@ def volume_metrics(
         raise ValueError(f"data_range must be positive, got {data_range}")
     volume, truth = volume.detach().double(), truth.double()
     similarity = ssim_map(volume, truth, data_range)
+    brought = {name: METRICS.get(name) for name in METRICS.names()}
     whole = {
+        **{name: float(f(volume, truth, inside, data_range)) for name, f in brought.items()},
         "psnr": _psnr(volume, truth, data_range),
         "ssim": similarity.mean().item(),
         "nrmse": nrmse(volume, truth),

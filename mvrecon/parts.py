@@ -122,6 +122,8 @@ CALLBACKS = Registry("callback")
 LOGGERS = Registry("logger")
 #: Terms of the loss: f(out, batch, data_range) -> a scalar, by the name of their weight.
 LOSSES = Registry("loss")
+#: Figures of merit: f(volume, truth, inside, data_range) -> a number, of all that are there.
+METRICS = Registry("metric")
 
 REGISTRIES = {
     r.kind: r

@@ -25,6 +25,7 @@ from mvrecon.engine.wrong_cameras import camera_row, cameras_of
 from mvrecon.files.memory import peak_since, restarted_peak
 from mvrecon.metrics import UNITS, mean_and_spread, view_metrics, volume_metrics
 from mvrecon.models.output import Reconstruction
+from mvrecon.parts import METRICS
 from mvrecon.projectors.operator import Projector
 from mvrecon.registry import hint
 
@@ -150,6 +151,7 @@ def results(
         "data_range": data.data_range,
         "device": device,
         "threads": torch.get_num_threads(),
+        "brought": METRICS.names(),
         "units": {**UNITS, **COSTS, "data_range": data.unit},
         "methods": {label: _row(method, scores[label]) for label, method in trained.items()},
     }
@@ -196,7 +198,10 @@ def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
         "train_seconds": method.seconds,
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
         "peak_mb": max(needed) / 2**20 if needed else None,
-        **{name: mean_and_spread([score[name] for score in scores]) for name in UNITS},
+        **{
+            name: mean_and_spread([score[name] for score in scores])
+            for name in (*METRICS.names(), *UNITS)
+        },
         **quality_row(scores),
         **camera_row(scores),
     }

@@ -32,12 +32,14 @@ def table(results: Mapping[str, Any]) -> Table:
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     shown.add_column("method\n", no_wrap=True)
     shown.add_column("parameters\n", justify="right", no_wrap=True)
-    for heading, _ in COLUMNS.values():
+    brought = {name: (f"{name}\n", "{:.4g}") for name in results.get("brought", ())}
+    columns = COLUMNS | brought
+    for heading, _ in columns.values():
         shown.add_column(heading, justify="right")
     shown.add_column("ms per\nvolume", justify="right")
     shown.add_column("training\ns", justify="right")
     for label, row in results["methods"].items():
-        cells = [_cell(row[name], form) for name, (_, form) in COLUMNS.items()]
+        cells = [_cell(row[name], form) for name, (_, form) in columns.items()]
         seconds = f"{row['train_seconds']:.0f}" if row["train_steps"] else "-"
         shown.add_row(
             label, f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds

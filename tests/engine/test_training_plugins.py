@@ -1,4 +1,6 @@
-"""What plugins bring to a training by name: optimisers, callbacks, loggers, terms of the loss."""
+"""What plugins bring to a training by name: optimisers, callbacks, loggers, terms of the loss,
+figures of merit.
+"""
 
 import csv
 import json
@@ -11,6 +13,7 @@ from mvrecon import load, registry
 from mvrecon.config import compose
 from mvrecon.config.targets import instantiate
 from mvrecon.config.typed import check_parts
+from mvrecon.engine.report import table as report
 from mvrecon.files.checks import Refused
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.output import Reconstruction
@@ -58,8 +61,14 @@ def total(out, batch, data_range):
     """Squared error of the volume's sum, relative."""
     truth = batch["volume"].sum()
     return ((out.volume.sum() - truth) / truth).square()
+
+
+def ratio(volume, truth, inside, data_range):
+    """The volume's sum by the true one."""
+    return volume.sum() / truth.sum()
 '''
 POINTS = {
+    "metric.sum_ratio": "stressed_training:ratio",
     "optimizer.signs": "stressed_training:Signs",
     "callback.steps": "stressed_training:Steps",
     "logger.second": "stressed_training:Second",
@@ -104,6 +113,9 @@ def test_a_training_takes_the_optimiser_callback_logger_and_loss_of_a_plugin(
     assert len(rows) == 3
     table = json.loads((tmp_path / "run" / "results.json").read_text())
     assert table["methods"][METHOD]["train_steps"] == 3
+    ratios = table["methods"][METHOD]["sum_ratio"]["values"]
+    assert len(ratios) == len(table["scenes"]) and all(0 < value < 5 for value in ratios)
+    assert "sum_ratio" in "".join(str(column.header) for column in report(table).columns)
     monkeypatch.setattr(registry, "installed", lambda: ())
     with pytest.raises(Refused, match="No loss is named 'sum_of_volume' here; if a plugin"):
         load(tmp_path / "run")
