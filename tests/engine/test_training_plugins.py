@@ -80,6 +80,7 @@ CHOSEN = (
     "+callbacks.steps={name: steps, dirpath: counted}",
     "+logger.second={name: second}",
     "+loss.sum_of_volume=0.5",
+    "data.sizes.test=2",
     "trainer.max_steps=3",
     "trainer.log_every_n_steps=1",
 )
@@ -115,7 +116,8 @@ def test_a_training_takes_the_optimiser_callback_logger_and_loss_of_a_plugin(
     assert table["methods"][METHOD]["train_steps"] == 3
     ratios = table["methods"][METHOD]["sum_ratio"]["values"]
     assert len(ratios) == len(table["scenes"]) and all(0 < value < 5 for value in ratios)
-    assert "sum_ratio" in "".join(str(column.header) for column in report(table).columns)
+    columns = report(table).columns
+    assert "sum_ratio" in "".join(str(column.header) for column in columns)
     monkeypatch.setattr(registry, "installed", lambda: ())
     with pytest.raises(Refused, match="No loss is named 'sum_of_volume' here; if a plugin"):
         load(tmp_path / "run")
