@@ -28,7 +28,7 @@ from arms import ARMS, CLASSICAL, EVERY, OTHERS, REGIMES, paths, settings
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_data, build_module
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.files.tables import read_rows, write_rows
+from mvrecon.files.tables import read_rows, renewed, write_rows
 
 HERE = Path(__file__).parent
 PACE = HERE / "pace.csv"
@@ -194,9 +194,9 @@ def table(options: argparse.Namespace) -> None:
     """Write the rows of all runs, their paired differences, and the curves; rows of runs that are
     no longer there stay.
     """
-    stored = [{key: _number(row[key]) for key in row} for row in read_rows(HERE / "results.csv")]
-    keyed = {tuple(row[key] for key in KEYS): row for row in (*stored, *collected(options.runs))}
-    rows = [keyed[key] for key in sorted(keyed)]
+    lines = renewed(HERE / "results.csv", collected(options.runs), KEYS)
+    rows = [{key: _number(str(line[key])) for key in line} for line in lines]
+    rows.sort(key=lambda row: [row[key] for key in KEYS])
     for name, lines in (("results.csv", rows), ("paired.csv", paired(rows))):
         write_rows(HERE / name, lines)
     curves(rows, HERE / "curves.png")
@@ -217,8 +217,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the patients")
     parser.add_argument("--runs", type=Path, default=Path("outputs/12_geometry"))
     parser.add_argument("--regimes", nargs="+", choices=REGIMES, default=["clean", "rig"])
-    every = list(EVERY)
-    parser.add_argument("--arms", nargs="+", choices=every, default=every)
+    parser.add_argument("--arms", nargs="+", choices=EVERY, default=list(EVERY))
     parser.add_argument("--seconds", type=int, default=400, help="of one thread, training")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     options = parser.parse_args()

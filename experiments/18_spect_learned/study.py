@@ -27,7 +27,7 @@ import mvrecon as mv
 from mvrecon.config import compose
 from mvrecon.data.module import TEST, SceneData
 from mvrecon.engine.fit import build_data, build_module
-from mvrecon.files.tables import read_rows, write_rows
+from mvrecon.files.tables import read_rows, renewed, write_rows
 from mvrecon.metrics import nrmse, volume_metrics
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 
@@ -189,7 +189,9 @@ def methods(total: str, options: argparse.Namespace) -> dict[tuple[str, int, int
 
 
 def table(options: argparse.Namespace) -> None:
-    """Write a row for each method, and a picture of one case at each number of counts."""
+    """Write a row for each method, and a picture of one case at each number of counts; rows of runs
+    that are no longer there stay.
+    """
     rows, pictures = [], {}
     for total in options.totals:
         data, known = cases("test", total, options)
@@ -199,7 +201,8 @@ def table(options: argparse.Namespace) -> None:
             row = {"total": total, "method": name, "seconds": seconds, "seed": seed}
             rows.append(row | figures(volumes, data, known))
             pictures[total][name] = volumes[0, 0]
-    write_rows(HERE / "results.csv", rows)
+    keys = ("total", "method", "seconds", "seed")
+    write_rows(HERE / "results.csv", renewed(HERE / "results.csv", rows, keys))
     draw(pictures, HERE / "volumes.png")
 
 

@@ -34,8 +34,10 @@ class Tissue(NamedTuple):
     bone: float
 
 
-#: By the energy in keV: of CT, about 70, and of Tc-99m.
-TISSUES = {70.0: Tissue(WATER, BONE), 140.5: Tissue(0.01536, 0.0295)}
+#: Of CT, about, and of Tc-99m, in keV.
+CT_KEV, SPECT_KEV = 70.0, 140.5
+#: By the energy in keV.
+TISSUES = {CT_KEV: Tissue(WATER, BONE), SPECT_KEV: Tissue(0.01536, 0.0295)}
 
 
 def physical(
@@ -96,6 +98,18 @@ def hounsfield(mu: Float[Tensor, "*n"], energy_kev: float = 70.0) -> Float[Tenso
     water, bone = tissue_at(energy_kev)
     above = mu - water
     return 1000 * (above.clamp(max=0) / water + above.clamp(min=0) / (bone - water))
+
+
+def at_energy(
+    mu: Float[Tensor, "*n"], measured_kev: float, energy_kev: float
+) -> Float[Tensor, "*n"]:
+    """Linear attenuation in 1/mm at an energy, from that at another, both in keV, by Hounsfield
+    units.
+
+    Raises:
+        ValueError: an energy that is not known.
+    """
+    return attenuation(hounsfield(mu, measured_kev), energy_kev)
 
 
 def tissue_at(energy_kev: float) -> Tissue:

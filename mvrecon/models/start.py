@@ -8,10 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
-from mvrecon.geometry.grid import Grid, subdivided
+from mvrecon.geometry.grid import Grid
 from mvrecon.models.fingerprints import fingerprints
 from mvrecon.models.geometry import Geometry
 from mvrecon.parts import RECONSTRUCTORS
+from mvrecon.reconstructors.finer import check_factor, on_finer_grid
 from mvrecon.reconstructors.iterative import sirt
 
 #: Iterations of SIRT with momentum, or a reconstructor as a mapping: its name and options, and on
@@ -75,11 +76,7 @@ class ClassicalStart:
             self.start = {key: value for key, value in start.items() if key != FINER}
             self.finer_grid = start.get(FINER, 1)
             RECONSTRUCTORS.check(self.start)
-        if not isinstance(self.finer_grid, int) or self.finer_grid < 1:
-            raise ValueError(
-                f"Expected {FINER} of a start, a whole number of at least 1, got "
-                f"{self.finer_grid!r}"
-            )
+        check_factor(f"{FINER} of a start", self.finer_grid)
         if counts and self.finer_grid > 1:
             raise ValueError(
                 f"Expected line integrals for a start with {FINER}: {self.finer_grid}, got counts "
@@ -120,15 +117,15 @@ class ClassicalStart:
         assert isinstance(self.start, Mapping)
         case, A, fine = views[sample : sample + 1], geometry.A, self.finer_grid
         level = content_scale(case) / typical_chord(A.grid)
-        within = {}
-        if geometry.mask is not None:
-            within["support"] = subdivided(geometry.mask[sample, 0], fine)
-        B = A if fine == 1 else A.refined(fine)
-        x = RECONSTRUCTORS.from_config(self.start, B, case / level, **within) * level
+        mask = None if geometry.mask is None else geometry.mask[sample, 0]
         if fine == 1:
-            return Beginning(x)
-        mean = avg_pool3d(x, fine)
-        return Beginning(mean, B(x) - A(mean))
+            within = {} if mask is None else {"support": mask}
+            return Beginning(
+                RECONSTRUCTORS.from_config(self.start, A, case / level, **within) * level
+            )
+        B, x = on_finer_grid(A, case / level, fine, self.start, mask)
+        mean = avg_pool3d(x * level, fine)
+        return Beginning(mean, B(x * level) - A(mean))
 
 
 def _batch(cases: list[Beginning]) -> Beginning:

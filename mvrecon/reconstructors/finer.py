@@ -1,7 +1,7 @@
 """Reconstruction on a finer grid, for a volume on the coarse one."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -14,6 +14,18 @@ from mvrecon.quantities import PositiveInt
 
 #: The method where none is given.
 SIRT = {"name": "sirt", "iterations": 25, "momentum": True}
+
+
+class Fine(NamedTuple):
+    """A reconstruction on a finer grid.
+
+    Args:
+        A: the operator of that grid.
+        volume: its voxels, in the unit of the volume.
+    """
+
+    A: LinearOperator
+    volume: Float[Tensor, "b c e i x"]
 
 
 def finer(
@@ -41,8 +53,30 @@ def finer(
             and what the method refuses.
         LookupError, TypeError: an unknown method, or an option that it does not have.
     """
-    if not isinstance(fine, int) or fine < 1:
-        raise ValueError(f"Expected fine, a whole number of at least 1, got {fine!r}")
+    check_factor("fine", fine)
+    return avg_pool3d(on_finer_grid(A, views, fine, reconstructor or SIRT, support).volume, fine)
+
+
+def on_finer_grid(
+    A: LinearOperator,
+    views: Float[Tensor, "b c m v u"],
+    fine: int,
+    reconstructor: Mapping[str, Any],
+    support: Bool[Tensor, "d h w"] | None = None,
+) -> Fine:
+    """Reconstruct by a method on a grid `fine` times finer, in the unit of the volume; see
+    `finer`.
+    """
     mask = {} if support is None else {"support": subdivided(support, fine)}
-    volume = RECONSTRUCTORS.from_config(reconstructor or SIRT, A.refined(fine), views, **mask)
-    return avg_pool3d(volume, fine)
+    B = A.refined(fine)
+    return Fine(B, RECONSTRUCTORS.from_config(reconstructor, B, views, **mask))
+
+
+def check_factor(name: str, factor: Any) -> None:
+    """Check by how many times a grid is to be finer.
+
+    Raises:
+        ValueError: no whole number above 0.
+    """
+    if not isinstance(factor, int) or factor < 1:
+        raise ValueError(f"Expected {name}, a whole number of at least 1, got {factor!r}")

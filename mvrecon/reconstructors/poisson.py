@@ -59,10 +59,10 @@ class PoissonLikelihood:
         )
         measured, added = wide(self.views(counts)), self.views(_spread(background, counts))
         bins = {"counts": measured, "background": added}
-        wrong = [(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]
+        faults = [(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]
         full = (measured != 0).flatten(0, 1).any(dim=0)[None, None]
-        *wrong, rays = torch.stack([*wrong, full.sum()]).tolist()  # a GPU is asked once
-        for what, bad in zip(bins, wrong, strict=True):
+        *faults, rays = torch.stack([*faults, full.sum()]).tolist()  # a GPU is asked once
+        for what, bad in zip(bins, faults, strict=True):
             if bad:
                 raise ValueError(
                     f"Expected {what} that are finite and not negative, got {bad} bins that are not"

@@ -11,7 +11,7 @@ from torch import Tensor
 from mvrecon.acquisition.detector import detected
 from mvrecon.acquisition.settings import Acquisition
 from mvrecon.cameras.camera import Cameras
-from mvrecon.data.attenuation import attenuation, hounsfield, tissue_at
+from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, SCENES
 from mvrecon.projectors.drr import Drr
@@ -19,8 +19,6 @@ from mvrecon.reconstructors.iterative import sirt
 from mvrecon.scenes.analytic import generator, mixed
 from mvrecon.scenes.sample import Attenuating, Pooling, Rays, Sample
 
-#: Of the transmission scan and of Tc-99m, in keV.
-CT_KEV, SPECT_KEV = 70.0, 140.5
 #: The series of the scan's noise, apart from those that draw the patients.
 SCAN = 0x63745F73
 
@@ -109,11 +107,11 @@ class SpectCt:
         """Linear attenuation of a case at 140.5 keV in 1/mm as its scan measures it."""
         fine, coarse = self._on(grid)
         mu = self.scene.attenuation(index, seed, grid, 2)
-        at_70 = attenuation(hounsfield(mu, SPECT_KEV), CT_KEV)
+        at_70 = at_energy(mu, SPECT_KEV, CT_KEV)
         noise = generator(SCAN, mixed(seed, index))
         views = detected(fine(at_70[None])[0], self.detector, self.cameras, noise)
         scanned = sirt(coarse, views[None], self.iterations, momentum=True)[0]
-        known = attenuation(hounsfield(scanned, CT_KEV), SPECT_KEV)
+        known = at_energy(scanned, CT_KEV, SPECT_KEV)
         return known.clamp(max=tissue_at(SPECT_KEV).bone)
 
     def _on(self, grid: Grid) -> tuple[Drr, Drr]:

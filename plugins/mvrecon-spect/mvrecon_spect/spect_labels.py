@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.data.attenuation import attenuation, hounsfield
+from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy
 from mvrecon.data.body import body, enclosed
 from mvrecon.data.placement import Placed
 from mvrecon.data.resample import resample
@@ -20,8 +20,6 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import generator, mixed, uniform
 from mvrecon.scenes.sample import Sample
 
-#: Of the CT, and of Tc-99m, in keV.
-CT_KEV, SPECT_KEV = 70.0, 140.5
 #: The series of the uptakes, apart from those that move the patients.
 UPTAKE = 0x75707461
 
@@ -101,10 +99,9 @@ class SpectLabels(Hdf5Volumes):
     ) -> Float[Tensor, "1 d h w"]:
         """The case's activity on `grid.refined(factor)`."""
         case = self._placed(index, seed, grid)
-        rng = generator(UPTAKE, mixed(self.seed_of(index, seed), index))
         labels = self.labels(index % self.length)
         labels = labels.flipped([2]) if case.mirrored else labels
-        activity = _activity(case, labels.whole(), self._drawn(rng))
+        activity = _activity(case, labels.whole(), self._drawn(index, seed))
         return resample(activity, case.grid, grid.refined(factor))[None]
 
     def attenuation(
@@ -115,17 +112,18 @@ class SpectLabels(Hdf5Volumes):
         if not self.attenuates:
             return torch.zeros(1, *target.shape)
         case = self._placed(index, seed, grid)
-        at_140 = case.mu.mapped(lambda mu: attenuation(hounsfield(mu, CT_KEV), SPECT_KEV))
+        at_140 = case.mu.mapped(lambda mu: at_energy(mu, CT_KEV, SPECT_KEV))
         return resample(at_140, case.grid, target)[None]
 
     def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
         """The activity of each structure of a case, and of its body."""
-        drawn = self._drawn(generator(UPTAKE, mixed(self.seed_of(index, seed), index)))
+        drawn = self._drawn(index, seed)
         names = {label: name for name, label in self._file.structures.items()} | {0: "body"}
         return {f"uptake_{names[label]}": value for label, value in drawn.items()}
 
-    def _drawn(self, rng: torch.Generator) -> dict[int, float]:
-        """The activity of each label, 0 for the body."""
+    def _drawn(self, index: int, seed: int) -> dict[int, float]:
+        """The activity of each label of a case, 0 for the body."""
+        rng = generator(UPTAKE, mixed(self.seed_of(index, seed), index))
         labels = self._file.structures
         between = {0: self.body} | {labels[name]: ends for name, ends in self.uptake.items()}
         return {label: uniform(rng, *ends) for label, ends in between.items()}

@@ -28,8 +28,8 @@ class SceneSubject(Subject):
         """
         parameters = inspect.signature(SCENES.get(self.name)).parameters
         for name, parameter in parameters.items():
-            given = name in self.options or parameter.default is not parameter.empty
-            if not given and parameter.kind not in (
+            has_value = name in self.options or parameter.default is not parameter.empty
+            if not has_value and parameter.kind not in (
                 parameter.VAR_POSITIONAL,
                 parameter.VAR_KEYWORD,
             ):
