@@ -33,8 +33,9 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     """
     import_plugins(options["plugins"])
     from mvrecon.engine import checkpoints, evaluation, export, fit, run_folder
+    from mvrecon.engine.device import device_of
 
-    device = evaluation.device_of(options["device"])
+    device = device_of(options["device"])
     run = folder_of_run(options["checkpoint"])
     described = (label for label, model in options["compare"].items() if model)
     if trained := [label for label in described if checkpoints.finished(run, label).exists()]:

@@ -10,8 +10,22 @@ from pathlib import Path
 
 from mvrecon.config.values import in_words
 from mvrecon.new_plugin import new_plugin
-from mvrecon.parts import REGISTRIES
-from mvrecon.signatures import Option, Part, describe
+from mvrecon.parts import LISTED
+from mvrecon.signatures import SECTIONS, Option, Part, describe, describe_section
+
+SETTING = "setting"
+
+
+def listed(kind: str | None = None, check: bool = False) -> list[Part]:
+    """Describe the parts of one kind, or of all with the settings that are no parts; with `check`
+    parts are imported. A kind that is a setting, too, such as the loss, has its own options last.
+    """
+    kinds = [kind] if kind else [*LISTED, SETTING]
+    names = ((k, name) for k in kinds if k != SETTING for name in LISTED[k].names())
+    parts = [describe(k, name, check) for k, name in names]
+    if not check:
+        parts += [describe_section(s) for s in SECTIONS if kind in (None, SETTING, s)]
+    return parts
 
 
 def show(parts: Sequence[Part]) -> None:
@@ -75,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="mvrecon-list", description="Lists the parts that a configuration can name."
     )
     parser.add_argument(
-        "kind", nargs="?", choices=sorted(REGISTRIES), help="only this kind of part"
+        "kind", nargs="?", choices=sorted({*LISTED, SETTING}), help="only this kind of part"
     )
     parser.add_argument(
         "--check", action="store_true", help="import every part, and say which are broken and why"
@@ -88,12 +102,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.new_plugin:
         return start_project(options.new_plugin, parser)
-    kinds = [options.kind] if options.kind else REGISTRIES
-    parts = [
-        describe(kind, name, options.check) for kind in kinds for name in REGISTRIES[kind].names()
-    ]
+    parts = listed(options.kind, options.check)
     if options.check:
         return report(parts)
+    if not parts:
+        parser.exit(message=f"No {options.kind} has a name here; a plugin may bring one.\n")
     show(parts)
     return 0
 

@@ -139,3 +139,8 @@ REGISTRIES = {
         MODELS,
     )
 }
+#: All that `mvrecon-list` shows: besides the parts that a configuration names by `name`, what a
+#: training takes by name, and readers of views.
+LISTED = REGISTRIES | {
+    r.kind: r for r in (OPTIMIZERS, CALLBACKS, LOGGERS, LOSSES, METRICS, STREAMED, VIEW_FILES)
+}

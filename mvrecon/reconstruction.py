@@ -48,8 +48,8 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.cameras import files
     from mvrecon.data.volume_files import check_ending
     from mvrecon.engine import calibrate, correction, export, run_folder, scan, solve, wrong_cameras
+    from mvrecon.engine.device import device_of
     from mvrecon.engine.doubts import doubts
-    from mvrecon.engine.evaluation import device_of
     from mvrecon.viz import cameras, review, rig
 
     if settings["unit"] not in UNITS:

@@ -6,16 +6,17 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
+from importlib.util import resolve_name
 from pathlib import Path
 from typing import Any
 
-from mvrecon.parts import REGISTRIES
+from mvrecon.parts import LISTED, REGISTRIES
 from mvrecon.registry import installed, locate
 
 #: What the apps and the models pass in, no options.
 GIVEN = {
-    *("self", "cls", "grid", "cameras", "projector", "task"),
-    *("inputs", "outputs", "A", "views", "counts"),
+    *("self", "cls", "grid", "cameras", "projector", "task", "params"),
+    *("inputs", "outputs", "A", "views", "counts", "read"),
 }
 #: Kinds of the settings that are called otherwise.
 KINDS = {"test_scene": "scene"}
@@ -62,9 +63,9 @@ def describe(kind: str, name: str, check: bool = False) -> Part:
     """
     origin = ""
     try:
-        origin = REGISTRIES[kind].origin(name)
+        origin = LISTED[kind].origin(name)
         if check:
-            REGISTRIES[kind].get(name)
+            LISTED[kind].get(name)
         module, _, attribute = origin.partition(":")
         module, node = definition(module, attribute)
     except (LookupError, ImportError, SyntaxError) as error:
@@ -83,11 +84,25 @@ def definition(module: str, name: str) -> tuple[str, Definition]:
     for node in _tree(module).body:
         if isinstance(node, Definition) and node.name == name:
             return module, node
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        if isinstance(node, ast.ImportFrom) and node.module:
             for alias in node.names:
                 if (alias.asname or alias.name) == name:
-                    return definition(node.module, alias.name)
+                    return definition(_absolute(module, node), alias.name)
     raise ImportError(f"{module} defines no class or function {name!r}")
+
+
+def _absolute(module: str, node: ast.ImportFrom) -> str:
+    """The module that `from ... import` in another names, its leading dots resolved."""
+    spec = locate(module)
+    is_package = spec is not None and spec.submodule_search_locations is not None
+    package = module if is_package else module.rpartition(".")[0]
+    return resolve_name("." * node.level + (node.module or ""), package)
+
+
+def describe_section(section: str) -> Part:
+    """A setting that is no part, one of `SECTIONS`, as a part of the kind "setting"."""
+    summary = f"The options of `{section}.` in a configuration."
+    return Part("setting", section, SECTIONS[section], summary, options_of(section))
 
 
 def options_of(section: str) -> Mapping[str, Option]:

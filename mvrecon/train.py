@@ -44,8 +44,9 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     silence_libraries()  # again: a sweep's run may be in a process of its own
     import_plugins(settings["plugins"])
     from mvrecon.engine import board, evaluation, fit, processes, run_folder
+    from mvrecon.engine.device import device_of
 
-    device = evaluation.device_of(settings["trainer"].get("accelerator", "auto"))
+    device = device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
     if rank() > 0:
         fit.fit_all(settings, data, folder)

@@ -9,7 +9,7 @@ import pytest
 
 from mvrecon import registry
 from mvrecon.listing import main
-from mvrecon.parts import REGISTRIES
+from mvrecon.parts import LISTED, REGISTRIES
 from mvrecon.signatures import GIVEN, describe
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
@@ -52,6 +52,26 @@ def test_one_kind_is_printed_alone(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         main(["haed"])
     assert "choose from" in capsys.readouterr().err
+
+
+def test_what_a_training_takes_by_name_and_settings_are_listed(capsys):
+    def text(kind: str) -> str:
+        assert main([kind]) == 0
+        return " ".join(capsys.readouterr().out.split())
+
+    assert "weight_decay=0.01" in text("optimizer")  # of AdamW, read through torch's own imports
+    assert "volume=1.0 of the mean squared error." in text("loss")
+    assert "acquisition" in text("setting") and "grid" in text("setting")
+    assert "ItkViews" in text("views")
+    with pytest.raises(SystemExit) as end:
+        main(["logger"])
+    assert end.value.code == 0
+    assert "No logger has a name here; a plugin may bring one." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", sorted(set(LISTED) - set(REGISTRIES)))
+def test_names_beside_the_parts_are_described_without_an_error(kind: str):
+    assert [p for p in (describe(kind, name) for name in LISTED[kind].names()) if p.error] == []
 
 
 def test_a_plugin_that_breaks_at_import_is_named_when_checked(tmp_path, monkeypatch, capsys):

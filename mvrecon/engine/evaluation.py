@@ -27,12 +27,8 @@ from mvrecon.metrics import UNITS, mean_and_spread, view_metrics, volume_metrics
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import METRICS
 from mvrecon.projectors.operator import Projector
-from mvrecon.registry import hint
 
 Scores = dict[str, list[dict[str, Any]]]
-#: Where evaluation can run, by Lightning's names.
-ACCELERATORS = ("auto", "cpu", "gpu", "cuda")
-
 #: Units of what a method costs.
 COSTS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
 
@@ -226,20 +222,6 @@ def seen_in_training(
     known = truths or [""] * len(names)
     pairs = zip(names, known, strict=True)
     return [name for name, truth in pairs if name in cases or truth in volumes]
-
-
-def device_of(accelerator: str) -> str:
-    """The device that evaluation runs on, for Lightning's name of an accelerator.
-
-    Raises:
-        ValueError: a name that is not known, or a GPU where torch sees none.
-    """
-    if accelerator not in ACCELERATORS:
-        raise ValueError(f"Unknown device {accelerator!r}{hint(str(accelerator), ACCELERATORS)}")
-    available = torch.cuda.is_available()
-    if accelerator in ("gpu", "cuda") and not available:
-        raise ValueError(f"Expected a GPU for device {accelerator!r}, but torch sees none here")
-    return "cuda" if accelerator != "cpu" and available else "cpu"
 
 
 def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:

@@ -12,7 +12,7 @@ from rich.console import Console
 from torch import nn
 
 from mvrecon.acquisition.settings import Acquisition
-from mvrecon.engine.evaluation import device_of, evaluate
+from mvrecon.engine.evaluation import evaluate
 from mvrecon.engine.export import save_case, save_png
 from mvrecon.engine.report import WIDTH, remarks, table
 from mvrecon.geometry.grid import Grid
@@ -148,29 +148,6 @@ def shown(found):
     text = io.StringIO()
     Console(file=text, width=WIDTH).print(table(found))
     return text.getvalue()
-
-
-@pytest.mark.door
-def test_a_device_that_there_is_not_is_refused(monkeypatch):
-    """An evaluation on a misspelt device, or on a GPU that torch does not see, is refused with the
-    known names.
-    """
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert device_of("auto") == device_of("cpu") == "cpu"
-    with pytest.raises(
-        ValueError, match="'cuad'; did you mean 'cuda'. Known: auto, cpu, cuda, gpu"
-    ):
-        device_of("cuad")
-    for name in ("gpu", "cuda"):
-        with pytest.raises(ValueError, match=f"a GPU for device '{name}'"):
-            device_of(name)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert [device_of(name) for name in ("auto", "cpu", "gpu", "cuda")] == [
-        "cuda",
-        "cpu",
-        "cuda",
-        "cuda",
-    ]
 
 
 def test_a_saved_case_keeps_axes_and_affine(tmp_path):

@@ -22,11 +22,13 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     """
     import_plugins(settings["plugins"])
     from mvrecon.engine import run_folder
+    from mvrecon.engine.device import device_of
     from mvrecon.files.atomic import claimed
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.stresses.stress import Stress
 
-    chosen = (settings["parts"], settings["cases"] or (), settings["device"], settings["dtypes"])
+    device = device_of(settings["device"])
+    chosen = (settings["parts"], settings["cases"] or (), device, settings["dtypes"])
     plan = Stress(*chosen, settings["limit_s"])
     with claimed(folder):
         run_folder.start(folder, settings)

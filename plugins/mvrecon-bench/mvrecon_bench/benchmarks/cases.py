@@ -9,6 +9,7 @@ import torch
 from mvrecon.cameras import rigs
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.cameras.dcspect80 import DETECTOR_MM, dcspect80, modules
+from mvrecon.engine.device import device_of
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import SCENES
 from mvrecon.scenes.analytic import generator
@@ -31,13 +32,13 @@ class Case:
         n: voxels along each edge.
         ratio: pixel / voxel, both at the isocentre.
         views: of the rigs that do not come with their own number.
-        device: "cpu", "cuda", or "auto": a GPU where there is one.
+        device: "cpu", "gpu" ("cuda"), or "auto": a GPU where there is one.
         dtype: in which volume and views are kept.
         threads: 0: as many as torch has.
         slices: voxels along z, about the centre, one for each row of parallel beams; 0: n.
 
     Raises:
-        ValueError: an unknown camera or dtype, or sizes that are not positive.
+        ValueError: an unknown camera, dtype or device, or sizes that are not positive.
     """
 
     scene: str = "ellipsoids"
@@ -58,10 +59,9 @@ class Case:
                 )
         if self.n < 1 or not self.ratio > 0 or self.views < 1 or min(self.threads, self.slices) < 0:
             raise ValueError(f"A benchmark's n, ratio and views must be positive, got {self}")
-        device = "cuda" if torch.cuda.is_available() else "cpu"
         settled = {
             "views": FIXED_VIEWS.get(self.camera, self.views),
-            "device": device if self.device == "auto" else self.device,
+            "device": device_of(self.device),
             "threads": self.threads or torch.get_num_threads(),
         }
         for name, value in settled.items():

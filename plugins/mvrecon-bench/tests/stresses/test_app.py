@@ -6,6 +6,7 @@ import sys
 import pytest
 
 import mvrecon_bench.stress
+from mvrecon_bench.benchmarks.cases import Case as Measured
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases import segments
 
@@ -36,3 +37,10 @@ def test_a_case_that_fails_is_told_and_ends_the_app_with_an_error(tmp_path, monk
         call(tmp_path, monkeypatch)
     assert error.value.code == 1
     assert "FAIL 6 a bad case, mvrecon float64: 3.0 > 0" in capsys.readouterr().out
+
+
+def test_the_device_has_the_words_of_the_other_apps(tmp_path):
+    with pytest.raises(ValueError, match="did you mean 'gpu'"):
+        mvrecon_bench.stress.stress({"plugins": [], "device": "gpus"}, tmp_path)
+    with pytest.raises(ValueError, match="did you mean 'gpu'"):
+        Measured(device="gpus")
