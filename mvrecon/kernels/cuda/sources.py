@@ -11,8 +11,9 @@ from mvrecon.kernels.rays.cuda.sources import FOLDER as RAYS
 from mvrecon.kernels.rays.cuda.sources import NAMES
 
 FOLDER = Path(__file__).parent / "source"
-#: Channels of a thread, as in `2_warp.cu`; voxels of a thread, as in `4_look.cu`; numbers of a map.
-PLANES, ALONG, MAP = 8, 8, 30
+#: Channels of a thread, as in `2_warp.cu`; voxels of a block along x, y and z, as in `4_look.cu`;
+#: numbers of a map.
+PLANES, TILE, MAP = 8, (16, 8, 8), 30
 #: Names of the kernels, by what they are for.
 KERNELS = {
     "warp": ("invert", "warp", "warp_back", "warp_vary"),

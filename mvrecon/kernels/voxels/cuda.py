@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.cuda.field import Field
-from mvrecon.kernels.cuda.launching import blocks, numbers_of, start
-from mvrecon.kernels.cuda.sources import ALONG, Part
+from mvrecon.kernels.cuda.launching import blocks, check_count, numbers_of, start
+from mvrecon.kernels.cuda.sources import TILE, Part
 
 
 def _field(
@@ -36,11 +36,11 @@ def look(
     """What every voxel sees in all views; see `voxels.reference.look`."""
     y = views.detach().contiguous()
     volumes = y.new_empty(len(y), *shape)
-    depth, height, width = map(int, shape)
     numbers = numbers_of(maps)
     field = _field(numbers, y, volumes, window, weighted).put(origin=y, result=volumes)
-    threads = width * height * -(-depth // ALONG)
-    start(Part("look", y.dtype), "look", field, y, blocks(threads), len(y))
+    check_count(math.prod(map(int, shape)))
+    tiles = math.prod(-(-int(n) // edge) for n, edge in zip(shape[::-1], TILE, strict=True))
+    start(Part("look", y.dtype), "look", field, y, tiles, len(y))
     return volumes
 
 

@@ -20,7 +20,7 @@ SCRIPT = Path(__file__).parents[3] / "scripts" / "gpu" / "machine_code.py"
 MOST = 128
 #: Instructions that read or write local memory, outside the loops of steps.
 ASIDE = 10
-F, B = torch.float32, torch.bfloat16
+F, D, B = torch.float32, torch.float64, torch.bfloat16
 #: Ampere and Hopper, one volume and four; a case takes two seconds.
 CASES = [
     (80, Variant(F, B, 4, SIDDON)),
@@ -65,16 +65,21 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
             assert name == "scatter" or not count(machine_code.CALL, step), name
 
 
-@pytest.mark.parametrize("part", [Part("warp", F, B), Part("look", F)], ids=str)
-def test_warps_and_back_projection_keep_all_in_registers(part, machine_code):
-    """On Hopper; float64 in no loop of a warp's channels or candidates."""
-    kernels, count = machine_code.compiled(fields({"": part}), 90), machine_code.count
+@pytest.mark.parametrize("capability", [80, 90])
+@pytest.mark.parametrize("part", [Part("warp", F, B), Part("look", F), Part("hull", D)], ids=str)
+def test_warps_back_projection_and_hull_keep_all_in_registers(part, capability, machine_code):
+    """float64 in no loop that reads values; the hull reads none, and its proofs are those of the
+    CPU, in float64.
+    """
+    text, count = fields({"": part}), machine_code.count
+    kernels = machine_code.compiled(text, capability)
     assert kernels.keys() == set(FIELDS[part.purpose])
     for name, kernel in kernels.items():
         assert kernel.registers <= MOST, (name, kernel.registers)
         assert not count(machine_code.LOCAL + "|" + machine_code.ATOMIC, kernel.instructions), name
-    for name in kernels.keys() & {"warp", "warp_back"}:
-        assert kernels[name].loops and not count(machine_code.DOUBLE, kernels[name].loops[0]), name
+        values = [loop for loop in kernel.loops if count(r"LDG\.E(?!\S*\.64)", loop)]
+        assert bool(values) == (name not in ("invert", "judge")), name
+        assert not any(count(machine_code.DOUBLE, loop) for loop in values), name
 
 
 @pytest.mark.parametrize("capability", [80, 90])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.voxels import cuda, reference
 from mvrecon.projectors.voxel_driven import image_maps
@@ -15,14 +16,18 @@ from tests.kernels.cuda.waits import Waits
 
 #: A column of a thread's voxels and a part of one, of a world that leans.
 TALL = Grid.centred(size=(5, 6, 19), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
+#: Several tiles along each axis, and more views than a block prepares at once.
+TILES = Grid.centred(size=(19, 11, 10), spacing=(1.0, 1.2, 0.9))
+MANY = circular(70, 40.0, 70.0, {"pixels": [7, 9], "pixel_mm": 4.0}, start_degrees=13.0)
+OTHERS = {"tall": (TALL, RIGS["dome"][1]), "tiles": (TILES, MANY)}
 KINDS = ["cone", "dome", "parallel", "line", "inside", "wide", "slice", "large", "dcspect80"]
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-11), (torch.float32, 3e-6)])
-@pytest.mark.parametrize("kind", [*KINDS, "tall"])
+@pytest.mark.parametrize("kind", [*KINDS, *OTHERS])
 def test_volumes_and_the_transpose_are_those_of_the_reference(kind, dtype, bound, host):
     torch.manual_seed(1)
-    grid, cameras = (TALL, RIGS["dome"][1]) if kind == "tall" else RIGS[kind]
+    grid, cameras = (RIGS | OTHERS)[kind]
     maps, window = image_maps(cameras, grid), list(cameras.ray_extent)
     y = torch.randn(2, len(cameras), *cameras.shape, dtype=dtype)
     for weighted in (False, True):

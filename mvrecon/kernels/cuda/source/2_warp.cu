@@ -33,7 +33,7 @@ template <class R> struct Cell {
       counts = counts && from_first > -1 && from_first < f.source[i];
       if (!counts) from_first = 0;
       low[i] = (int)floor(from_first);
-      part[i] = (R)(from_first - low[i]);
+      part[i] = settled((R)(from_first - low[i]));
     }
     UNROLL for (int n = 0; n < 8; n++) {
       int x = low[0] + n % 2, y = low[1] + n / 2 % 2, z = low[2] + n / 4;

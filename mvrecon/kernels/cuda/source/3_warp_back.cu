@@ -91,6 +91,7 @@ DEVICE Samples samples_near(const Field& f, const float* map, const int* voxel) 
 // A bilinear function of samples, counted from one of them: so its digits are those of a cell.
 template <class R> struct Near {
   R one, x, y, z, xz, yz;
+  Near() = default;
   DEVICE Near(const double* map, const double* under, double by, const double* p) {
     double m[6];
     UNROLL for (int i = 0; i < 6; i++) m[i] = map[i] - by * under[i];

@@ -55,9 +55,9 @@ template <class R> struct Slab {
   R one, b, c;
   DEVICE Slab(const double* row, const double* by, double times, const double* p, int axis_b, int axis_c) {
     double factor[3] = {row[0] - times * by[0], row[1] - times * by[1], row[5] - times * by[5]};
-    one = (R)(factor[0] * p[0] + factor[1] * p[1] + factor[2] * p[2] + (row[2] - times * by[2]));
-    b = (R)pick(factor, axis_b);
-    c = (R)pick(factor, axis_c);
+    one = settled((R)(factor[0] * p[0] + factor[1] * p[1] + factor[2] * p[2] + (row[2] - times * by[2])));
+    b = settled((R)pick(factor, axis_b));
+    c = settled((R)pick(factor, axis_c));
   }
   DEVICE R at(int i, int j) const { return one + (R)i * b + (R)j * c; }
 };
@@ -86,7 +86,7 @@ template <class R> DEVICE void show_up(const Field& f) {
     Slab<R> us(map, map + 12, u, p, b, c), vs(map + 6, map + 12, v, p, b, c), under(map + 12, map, 0, p, b, c);
     Slab<R> way(map + 18, map, 0, p, b, c);
     double fraction = map[18] * p[0] + map[19] * p[1] + map[23] * p[2] + map[20];
-    R begin = (R)(f.window[0] - fraction), end = (R)(f.window[1] - fraction);
+    R begin = settled((R)(f.window[0] - fraction)), end = settled((R)(f.window[1] - fraction));
     way.one = 0;
     for (int j = low_c; j <= high_c; j++)
       for (int i = low_b; i <= high_b; i++) {

@@ -10,10 +10,10 @@ struct Print {
   DEVICE Print(const Field& f, const double* view, const double* near, const double* far) : whole(true) {
     double least[3], greatest[3];
     for (int corner = 0; corner < 8; corner++) {
-      double q[3];
+      double q[3], x = corner & 1 ? far[0] : near[0], y = corner & 2 ? far[1] : near[1], z = corner & 4 ? far[2] : near[2];
       UNROLL for (int i = 0; i < 3; i++) {
         const double* row = view + 4 * i;
-        q[i] = row[0] * (corner & 1 ? far : near)[0] + row[1] * (corner & 2 ? far : near)[1] + row[2] * (corner & 4 ? far : near)[2] + row[3];
+        q[i] = row[0] * x + row[1] * y + row[2] * z + row[3];
       }
       UNROLL for (int i = 0; i < 3; i++) {
         double place = i < 2 && !f.parallel ? q[i] / q[2] : q[i];

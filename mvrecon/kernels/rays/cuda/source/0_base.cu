@@ -14,6 +14,14 @@ template <class R> DEVICE R warp_sum(R value) {
   return value;
 }
 DEVICE bool first_of_warp() { return threadIdx.x % 32 == 0; }
+// What the threads of a block make together: each one of them its part, and all of them wait for the others.
+#define SHARED __shared__
+DEVICE int part_of_thread() { return threadIdx.x; }
+DEVICE int parts_of_block() { return blockDim.x; }
+DEVICE void wait_for_block() { __syncthreads(); }
+// A number that is cast here, and not at every use again, in a loop.
+DEVICE float settled(float x) { asm volatile("" : "+f"(x)); return x; }
+DEVICE double settled(double x) { return x; }
 #else
 #include <algorithm>
 #include <cmath>
@@ -23,7 +31,7 @@ DEVICE bool first_of_warp() { return threadIdx.x % 32 == 0; }
 #define UNROLL
 #define UNROLL_BY(n)
 #define __global__
-#define __launch_bounds__(threads)
+#define __launch_bounds__(...)
 
 using std::ceil; using std::exp; using std::fabs; using std::floor; using std::fma; using std::max; using std::min; using std::sqrt;
 struct Place { int x, y; };
@@ -34,6 +42,12 @@ DEVICE void add_greatest(int* to, int value) { *to = max(*to, value); }
 // Threads run one after the other, so the sum over a warp is made by all of them.
 template <class R> DEVICE R warp_sum(R value) { return value; }
 DEVICE bool first_of_warp() { return true; }
+// And each of them makes all that its block shares.
+#define SHARED static
+DEVICE int part_of_thread() { return 0; }
+DEVICE int parts_of_block() { return 1; }
+DEVICE void wait_for_block() {}
+template <class R> DEVICE R settled(R x) { return x; }
 #endif
 
 enum { BLOCK = 128, WARP = 32 };
