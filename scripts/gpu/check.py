@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from fields import check_fields
 from measuring import Results, on_device, throughput
 
 import mvrecon as mv
@@ -244,11 +245,13 @@ def main() -> None:
         results.attempt(
             f"pose gradient {name}", lambda r=rig, y=y: pose_gradient(grid, r, x, y, device)
         )
+    cone = rigs(n)["cone"]
+    check_fields(results, grid, cone, x, build(grid, cone)(x), device)
     for name in options.modes:  # of them the stand-in serves none
         place = "cpu" if options.device == "dry" else device
         results.attempt(f"first call in {name}", lambda n=name, p=place: first_call(n, p))
     if device == "cuda":
-        A, B = (build(grid, rigs(n)["cone"], skip=skip).to(device) for skip in ("auto", "off"))
+        A, B = (build(grid, cone, skip=skip).to(device) for skip in ("auto", "off"))
         device_alone(results, A, B, x.to(device))
 
 
