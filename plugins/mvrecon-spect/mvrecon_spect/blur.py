@@ -29,7 +29,7 @@ from mvrecon.projectors.attenuated import check_mu
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.selection import ViewSelection
-from mvrecon_spect.extent import Extent, blurred, extents_of
+from mvrecon_spect.extent import Extent, blurred, blurred_whole, extents_of
 from mvrecon_spect.hole import Hole
 
 #: Layers of magnification of a view; cameras whose layers are in memory at a time.
@@ -50,8 +50,8 @@ class BlurredPinholes(Projector):
     attenuated integral), and the matched adjoint.
 
     What lies beside the detector's field blurs into it. Layers and pixels that nothing is seen in
-    are not blurred, which changes no more than a convolution's rounding. Differentiable in the
-    volume and mu; in the cameras by the reference.
+    are not blurred, which changes no more than a convolution's rounding; a GPU, for which the host
+    would wait, blurs all. Differentiable in the volume and mu; in the cameras by the reference.
 
     Args:
         grid: where the activity lies; no pinhole may stand in its box.
@@ -130,11 +130,13 @@ class BlurredPinholes(Projector):
         for part in self._parts(volume):
             rays = part.lines, part.layers, window, detector, self.method
             layers = ops.project(volume, self.mu, *rays) * part.weight[..., None]
-            extents = extents_of(layers.detach()).tolist()
-            shape = self.cameras.shape
-            for m, extent in enumerate(extents):
-                views.append(blurred(layers[:, m], part.kernels[m], Extent(*extent), shape))
-        return torch.stack(views, dim=1).unflatten(0, x.shape[:2])
+            if layers.is_cuda:  # which is not asked where something is seen
+                views.append(blurred_whole(layers, part.kernels))
+                continue
+            extents = (Extent(*extent) for extent in extents_of(layers.detach()).tolist())
+            pairs = zip(layers.unbind(dim=1), part.kernels, extents, strict=True)
+            views.append(torch.stack([blurred(*p, self.cameras.shape) for p in pairs], dim=1))
+        return torch.cat(views, dim=1).unflatten(0, x.shape[:2])
 
     def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """The matched adjoint: volumes of views.

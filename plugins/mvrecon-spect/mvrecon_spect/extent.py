@@ -69,6 +69,15 @@ def blurred(
     return F.pad(view, (left, shape[1] - right, top, shape[0] - bottom))
 
 
+def blurred_whole(
+    layers: Float[Tensor, "n m v u k"], kernels: Float[Tensor, "m k i j"]
+) -> Float[Tensor, "n m rows columns"]:
+    """Views from all pixels of their layers."""
+    planes = layers.movedim(-1, 2).flatten(1, 2)
+    images = F.conv2d(planes, kernels.flatten(0, 1)[:, None], groups=planes.shape[1])
+    return images.unflatten(1, kernels.shape[:2]).sum(dim=2)
+
+
 def _rim(wide: Bool[Tensor, " n"]) -> int:
     """How many places at each end of a symmetrical row are not true."""
     return int(wide.int().argmax())

@@ -1,0 +1,31 @@
+"""What blurred pinholes wait for on a GPU, counted by a stand-in for one: numbers that are sent
+there, and no answer.
+"""
+
+import torch
+
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.grid import Grid
+from mvrecon.testing.as_gpu import GPU, AsGpu, on_gpu
+from mvrecon_spect.blur import BlurredPinholes, Optics
+from mvrecon_spect.hole import Hole
+
+GRID = Grid.centred(size=(8, 7, 6), spacing=12.0)
+
+
+def test_blur_on_a_gpu_asks_it_nothing_and_gives_the_views_and_volumes_of_main_memory():
+    torch.manual_seed(0)
+    x, mu = torch.zeros(2, 1, *GRID.shape), 0.01 * torch.rand(*GRID.shape)
+    x[..., 2:4, 3:5, 2:5] = torch.rand(2, 1, 2, 2, 3)  # layers and pixels that nothing is seen in
+    rig = dcspect80(pixels=[9, 8])[::20]
+    A = BlurredPinholes(GRID, rig, mu, Optics(Hole(5.0), intrinsic_mm=3.0))
+    y = torch.rand(2, 1, *A.range_shape)
+    views, volumes = A(x), A.T(y)
+    with torch.no_grad(), AsGpu() as gpu:
+        A.to(GPU)
+        again, back = A(on_gpu(x)), A.T(on_gpu(y))
+        assert {why.split(", ")[-1] for _, why in gpu.waits} == {"copied from main memory"}
+        torch.testing.assert_close(again.values, views, rtol=1e-5, atol=1e-6 * views.max().item())
+        torch.testing.assert_close(
+            back.values, volumes, rtol=1e-5, atol=1e-6 * volumes.max().item()
+        )
