@@ -19,7 +19,7 @@ from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.pixel_integral import PixelIntegral
 from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.projectors.skipping import within
+from mvrecon.projectors.skipping import verify, within
 
 #: Linear attenuation in 1/mm that nothing in a patient reaches from 70 keV up (cortical bone 0.058,
 #: titanium 0.07), and that water and tissue in 1/cm exceed.
@@ -37,7 +37,7 @@ class AttenuatedTransform(RayTransform):
     segment is a slab's for "joseph", a cell's for "siddon". Differentiable in lambda, mu and, by
     the reference, the cameras. Where mu is zero it is `RayTransform` to the last bit, and costs the
     same. The CPU leaves out rays beside the box of what emits, and what lies behind it on others;
-    that changes no bit.
+    that changes no bit. `skip="off"` switches it off, "verify" compares, and all else is "auto".
 
     Convention: counts run along a ray towards growing w, see `Cameras`: to the pinhole and the
     detector behind it, or to a collimator's end plane w = 1.
@@ -82,9 +82,13 @@ class AttenuatedTransform(RayTransform):
         check_floating(volume, "a volume")
         x = volume.flatten(0, 1)
         x = wide(x if self.support is None else within(x, self.support))
-        kernels = attenuated_ops if self._compiled(volume, lines) else attenuated_reference
         rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector), self.kernel
-        return kernels.project(x, self.mu, *rays)[..., 0]
+        if not self._compiled(volume, lines):
+            return attenuated_reference.project(x, self.mu, *rays)[..., 0]
+        views = attenuated_ops.project(x, self.mu, *rays, self.skip != "off")[..., 0]
+        if self.skip == "verify":
+            verify(views, attenuated_ops.project(x, self.mu, *rays, False)[..., 0], self.skipped)
+        return views
 
     def backproject_along(
         self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]

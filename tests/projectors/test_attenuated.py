@@ -9,6 +9,8 @@ from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.rigs import parallel
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.kernels.rays.cpu import attenuated as cpu
+from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.ray_transform import RayTransform
@@ -205,6 +207,25 @@ def test_the_gradient_in_mu_is_the_same_where_rays_end_with_the_emission(method)
     assert A.last_backend == "cpu" and whole.any()
     torch.testing.assert_close(skipped, whole, rtol=1e-11, atol=1e-12 * whole.abs().max().item())
     assert not torch.autograd.grad(A(0 * x).sum(), mu)[0].any()
+
+
+def test_skipping_of_empty_emission_is_switched_off_and_verified(monkeypatch):
+    """A box that loses emission changes the views of "auto", raises with "verify", and leaves those
+    of "off" alone, and their gradients.
+    """
+    grid, mu, x = scene()
+    mu.requires_grad_()
+    skips = "auto", "off", "verify"
+    of = {skip: AttenuatedTransform(grid, rig(), mu, skip=skip) for skip in skips}
+    exact = of["auto"](x)
+    assert torch.equal(of["verify"](x), exact)
+    (by_mu,) = torch.autograd.grad(exact.sum(), mu)
+    lost = Occupancy(grid.shape, Box((0, 0, 0), (3, 3, 3)))
+    monkeypatch.setattr(cpu, "_emitting", lambda volume: lost)
+    assert torch.equal(of["off"](x), exact) and not torch.equal(of["auto"](x), exact)
+    assert torch.equal(torch.autograd.grad(of["off"](x).sum(), mu)[0], by_mu)
+    with pytest.raises(RuntimeError, match="differ from those without skipping"):
+        of["verify"](x)
 
 
 def test_no_emission_is_no_counts_and_nan_is_never_skipped():

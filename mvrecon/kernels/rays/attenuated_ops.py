@@ -26,13 +26,12 @@ def _project(
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
+    skip: bool,
 ) -> Tensor:
-    """Attenuated integrals of volumes [n d h w] as views [n m v u k]; see
-    `attenuated_reference.project`.
-    """
+    """Attenuated integrals of volumes [n d h w] as views [n m v u k]."""
     from mvrecon.kernels.rays.cpu import attenuated as cpu
 
-    return cpu.project(volume, mu, lines, layers, window, detector, method)
+    return cpu.project(volume, mu, lines, layers, window, detector, method, skip)
 
 
 @torch.library.custom_op("mvrecon::backproject_attenuated", mutates_args=(), device_types="cpu")
@@ -54,15 +53,16 @@ def _mu_vjp(
     layers: Tensor,
     window: Sequence[float],
     method: str,
+    skip: bool,
 ) -> Tensor:
     """The derivative of <views, project(volume, mu)> by the attenuation mu [d h w]."""
     from mvrecon.kernels.rays.cpu import attenuated as cpu
 
-    return cpu.mu_vjp(volume, views, mu, lines, layers, window, method).to(mu.dtype)
+    return cpu.mu_vjp(volume, views, mu, lines, layers, window, method, skip).to(mu.dtype)
 
 
 @_project.register_fake
-def _(volume, mu, lines, layers, window, detector, method):
+def _(volume, mu, lines, layers, window, detector, method, skip):
     wide = torch.float64 if volume.dtype == torch.float64 else torch.float32
     return volume.new_empty(volume.shape[0], lines.shape[0], *detector, layers.shape[1], dtype=wide)
 
@@ -73,13 +73,22 @@ def _(views, mu, lines, layers, window, method):
 
 
 @_mu_vjp.register_fake
-def _(volume, views, mu, lines, layers, window, method):
+def _(volume, views, mu, lines, layers, window, method, skip):
     return mu.new_empty(mu.shape)
 
 
 def _keep(ctx, inputs, output):
-    first, mu, lines, layers, ctx.window, *rest = inputs
-    ctx.method, ctx.dtype, ctx.detector = rest[-1], first.dtype, list(first.shape[2:4])
+    *rest, ctx.method = inputs
+    _remember(ctx, *rest)
+
+
+def _keep_project(ctx, inputs, output):
+    *rest, _, ctx.method, ctx.skip = inputs
+    _remember(ctx, *rest)
+
+
+def _remember(ctx, first, mu, lines, layers, window):
+    ctx.window, ctx.dtype, ctx.detector = window, first.dtype, list(first.shape[2:4])
     ctx.save_for_backward(first if ctx.needs_input_grad[1] else None, mu, lines, layers)
 
 
@@ -89,8 +98,8 @@ def _project_back(ctx, views):
     if ctx.needs_input_grad[0]:
         by_volume = backproject(views, mu, lines, layers, ctx.window, ctx.method).to(ctx.dtype)
     if ctx.needs_input_grad[1]:
-        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method)
-    return by_volume, by_mu, None, None, None, None, None
+        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method, ctx.skip)
+    return by_volume, by_mu, *[None] * 6
 
 
 def _backproject_back(ctx, volume):
@@ -99,11 +108,11 @@ def _backproject_back(ctx, volume):
     if ctx.needs_input_grad[0]:
         by_views = project(volume, mu, lines, layers, ctx.window, ctx.detector, ctx.method)
     if ctx.needs_input_grad[1]:
-        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method)
+        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method, True)
     return by_views, by_mu, None, None, None, None
 
 
-def _in_torch(volume, mu, lines, layers, window, detector, method):
+def _in_torch(volume, mu, lines, layers, window, detector, method, skip=True):
     rays = {
         "lines": lines,
         "layers": layers,
@@ -125,10 +134,26 @@ def _back_in_torch(views, mu, lines, layers, window, method):
     return transposed(act, (len(views), *mu.shape))
 
 
-def _vjp_in_torch(volume, views, mu, lines, layers, window, method):
+def _vjp_in_torch(volume, views, mu, lines, layers, window, method, skip):
     return bent(_in_torch(volume, mu, lines, layers, window, views.shape[2:4], method))
 
 
-project = linear(_project, _in_torch, _keep, _project_back)
+_projected = linear(_project, _in_torch, _keep_project, _project_back)
 backproject = linear(_backproject, _back_in_torch, _keep, _backproject_back)
 mu_vjp = curved(_mu_vjp, _vjp_in_torch)
+
+
+def project(
+    volume: Tensor,
+    mu: Tensor,
+    lines: Tensor,
+    layers: Tensor,
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+    skip: bool = True,
+) -> Tensor:
+    """Attenuated line integrals; see `attenuated_reference.project`, and `cpu/attenuated.py` for
+    `skip`.
+    """
+    return _projected(volume, mu, lines, layers, window, detector, method, skip)

@@ -60,11 +60,14 @@ def project(
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
+    skip: bool = True,
 ) -> Float[Tensor, "n m v u k"]:
-    """Attenuated line integrals; see `attenuated_reference.project`."""
+    """Attenuated line integrals; see `attenuated_reference.project`. `skip`: leave out what is
+    beside or behind the box of the emission.
+    """
     both = torch.cat([wide(volume), mu.to(wide(volume[:0]).dtype)[None]])
     plan, occupancy = _plan(lines, window, detector, method, mu)
-    emitting = Occupancy(occupancy.shape, box_of(readable(wide(volume))))
+    emitting = _emitting(volume) if skip else occupancy
     plan = replace(plan, boxes=boxes_of(emitting))
     space = Space(plan.rig.window, plan.rig.sizes, bounds_of(emitting))
     views = np.zeros(
@@ -114,10 +117,11 @@ def mu_vjp(
     layers: Float[Tensor, "m k"],
     window: Sequence[float],
     method: str,
+    skip: bool = True,
 ) -> Float[Tensor, "d h w"]:
     """The derivative of <views, project(volume, mu)> by the attenuation mu."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
-    emitting = Occupancy(occupancy.shape, box_of(readable(wide(volume))))
+    emitting = _emitting(volume) if skip else occupancy
     if not emitting.box.size:
         return wide(mu).new_zeros(mu.shape)
     plan = replace(plan, boxes=boxes_of(emitting))
@@ -131,6 +135,10 @@ def mu_vjp(
     both = torch.cat([wide(volume).to(views.dtype), mu.to(views.dtype)[None]])
     made = copies(both, occupancy, plan)
     return _gathered(made, spread, Spreading(1, views.numel(), layers))[0]
+
+
+def _emitting(volume: Float[Tensor, "n d h w"]) -> Occupancy:
+    return replace(Occupancy.whole(volume.shape[1:]), box=box_of(readable(wide(volume))))
 
 
 def _plan(
