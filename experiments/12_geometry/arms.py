@@ -130,6 +130,11 @@ def _fine(regime: Regime, size: int, name: str) -> Regime:
     )
 
 
+def _tuned(regime: Regime, begins: str, cases: int) -> Regime:
+    """A regime whose training begins with the weights of another, on so many cases."""
+    return regime._replace(begins=begins, views=(*regime.views, f"data.sizes.train={cases}"))
+
+
 RIG = _disturbed("views: 3, shift_px: 1.0, gain: 0.05")
 REGIMES = {
     "clean": Regime(),
@@ -162,6 +167,9 @@ REGIMES = {
     "clean_128": _fine(Regime(), 128, "clean_128"),
     "rig_128": _fine(RIG, 128, "rig_128"),
 }
+#: From 32^3 over 64^3 to 128^3, with fewer cases, since one at 128^3 takes 5 s to make.
+REGIMES["rig_64_on_the_way"] = _tuned(REGIMES["rig_64"], "rig/{arm}/400s_{seed}", 324)
+REGIMES["rig_128_tuned"] = _tuned(REGIMES["rig_128"], "rig_64_on_the_way/{arm}/400s_{seed}", 162)
 
 
 def settings(regime: Regime, arm: str) -> list[str]:

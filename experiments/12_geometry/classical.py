@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool3d
 import mvrecon as mv
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_data
-from mvrecon.files.tables import write_rows
+from mvrecon.files.tables import renewed, write_rows
 from mvrecon.metrics import volume_metrics
 
 HERE = Path(__file__).parent
@@ -59,7 +59,7 @@ def rows(options: argparse.Namespace, regime: str) -> Iterator[dict[str, Any]]:
     data.setup("fit")
     data.setup("test")
     known, unseen = list(data.val_dataloader()), list(data.test_dataloader())
-    for method, fine in ROWS:
+    for method, fine in ((method, fine) for method, fine in ROWS if fine in options.fine):
         A = mv.Drr(data.grid.refined(fine), data.cameras, rays_per_pixel=fine)
         trials = [Row(method, fine, choice) for choice in CHOICES[method]]
         best = max(trials, key=lambda row: mean(judged(row, known, A, data.data_range), "psnr"))
@@ -84,14 +84,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the patients")
     parser.add_argument("--regimes", nargs="+", choices=REGIMES, default=["clean", "rig"])
+    parser.add_argument("--fine", nargs="+", type=int, choices=(1, 2), default=[1, 2])
     parser.add_argument("--tune", type=int, default=8, help="training patients to choose on")
     options = parser.parse_args()
     options.data = options.data.resolve()
     table: list[dict[str, Any]] = []
+    path = HERE / "classical.csv"
     for regime in options.regimes:
         for row in rows(options, regime):
             table.append(row)
-            write_rows(HERE / "classical.csv", table)
+            write_rows(path, renewed(path, table, ("regime", "method", "fine")))
 
 
 if __name__ == "__main__":

@@ -15,12 +15,12 @@ import re
 import subprocess
 import sys
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 
 import torch
 from arms import ARMS, CLASSICAL, EVERY, OTHERS, REGIMES, paths, settings
@@ -166,7 +166,9 @@ def paired(rows: list[dict]) -> list[dict]:
 
 
 def curves(rows: list[dict], path: Path) -> None:
-    """Mean PSNR against training time, a panel for each regime with several lengths."""
+    """Mean PSNR over patients and seeds against training time, a panel for each regime with several
+    lengths.
+    """
     import matplotlib.pyplot as plt
 
     trained = {(r["regime"], r["seconds"]) for r in rows if r["seconds"]}
@@ -176,7 +178,10 @@ def curves(rows: list[dict], path: Path) -> None:
     for panel, regime in zip(panels[0], regimes, strict=True):
         lines = [row for row in rows if row["regime"] == regime]
         for arm in (arm for arm in EVERY if arm not in CLASSICAL):
-            line = sorted((r["seconds"], r["psnr"]) for r in lines if r["arm"] == arm)
+            seeds = defaultdict(list)
+            for row in (row for row in lines if row["arm"] == arm):
+                seeds[row["seconds"]].append(row["psnr"])
+            line = sorted((seconds, fmean(values)) for seconds, values in seeds.items())
             if line:
                 panel.plot(*zip(*line, strict=True), "o-", label=arm)
         for arm, style in zip(CLASSICAL, (":", "--", "-.", (0, (1, 4))), strict=True):
