@@ -19,7 +19,7 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
 
     A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
     where the scene is in 1/mm), and what moved it as `placement.json` if it came from a file.
-    The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`, for
+    The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`, for
     `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,
     where RTK's gantry turns about the z axis here, and every case has `projections`, see
     `export.save_greys`.
@@ -56,7 +56,7 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     unit, where = scene.unit_of_views(grid, cameras), folder / "cases"
     case_folders = []
     with run_folder.taken(folder, settings):
-        files.save(cameras, folder / "cameras.json")
+        files.save(cameras, folder / run_folder.RIG)
         if settings["rtk"]:
             # RTK's FDK weights views by their gantry angles, about the file's y: z in IEC's axes
             rtk_xml.write(cameras, folder / "geometry.xml", "IEC")
@@ -78,7 +78,7 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
 def simulate_events(settings: dict[str, Any], folder: Path) -> list[Path]:
     """Make a data set of events in `<folder>/events` and return its files.
 
-    The folder also holds `config.yaml`, `versions.txt` and the rig as `cameras.json`. A run that
+    The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`. A run that
     was stopped goes on with what is missing; the number of workers may change.
 
     Raises:
@@ -94,7 +94,7 @@ def simulate_events(settings: dict[str, Any], folder: Path) -> list[Path]:
     maker = EventMaker.of(settings)
     events = {key: value for key, value in settings["events"].items() if key != "workers"}
     with run_folder.taken(folder, {**settings, "events": events}):
-        files.save(maker.cameras, folder / "cameras.json")
+        files.save(maker.cameras, folder / run_folder.RIG)
         return write_events(folder / "events", maker, settings)
 
 

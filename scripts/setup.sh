@@ -7,7 +7,9 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 extras=${1:-io}
 state=$(cat <(pwd) pyproject.toml constraints.txt scripts/setup.sh plugins/*/pyproject.toml | cksum)
-for stamp in ".venv/installed-$extras" .venv/installed-dev; do
+stamps=(".venv/installed-$extras")
+if [ "$extras" = io ]; then stamps+=(.venv/installed-dev); fi # dev has io, but not docs
+for stamp in "${stamps[@]}"; do
     if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$state" ]; then exit 0; fi
 done
 
@@ -21,7 +23,9 @@ if [ "$python" = none ]; then
 fi
 
 echo "Setting up .venv with $("$python" --version), once; this takes some minutes ..."
-rm -f .venv/installed-*
+for stamp in .venv/installed-*; do # of other versions
+    if [ "$(cat "$stamp")" != "$state" ]; then rm "$stamp"; fi
+done
 "$python" -m venv .venv
 bin=.venv/bin
 if [ -d .venv/Scripts ]; then bin=.venv/Scripts; fi # Windows

@@ -46,6 +46,7 @@ def page(script: Path, out: Path, run: bool = True) -> str:
         run: whether its cells are run, in a folder of their own; without, nothing is printed.
     """
     parts, space = [], {"__name__": script.stem}
+    script, out = script.absolute(), out.absolute()  # the cells run in another folder
     with TemporaryDirectory() as work, chdir(work):
         for cell in cells(script):
             if cell.kind == "markdown":
@@ -91,7 +92,6 @@ def _pictures(work: Path, out: Path, tutorial: str) -> list[str]:
 
 if __name__ == "__main__":
     script, folder = map(Path, sys.argv[1:])
-    script, folder = script.absolute(), folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{script.stem}.md").write_text(page(script, folder), encoding="utf-8")
     (folder / f"{script.stem}.ipynb").write_text(notebook(script), encoding="utf-8")

@@ -71,6 +71,12 @@ def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
     assert not list(tmp_path.iterdir())
 
 
+def test_an_experiment_of_another_app_is_told_as_one(answer):
+    """Hydra alone would propose to override a part of the experiment."""
+    text = answer("experiment=smoke", app="simulate")
+    assert "experiment/smoke is for mvrecon-train: it chooses 'model', which is not here" in text
+
+
 def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it():
     for choice, extra in {"launcher/ray": "cluster", "sweeper/optuna": "sweep"}.items():
         error = MissingConfigException("not in ...", f"hydra/{choice}", ["basic"])

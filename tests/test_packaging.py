@@ -178,6 +178,21 @@ def test_the_set_up_says_which_torch_it_takes_and_how_large_it_is(
     assert (tmp_path / "installed").read_text().split() == [torch, ".[io]"]
 
 
+def test_the_set_up_installs_what_the_environment_lacks_and_that_once(root: Path, tmp_path: Path):
+    """As `bash scripts/test.sh` and then `bash scripts/site.sh` ask for it."""
+    (tmp_path / "python3.11").write_text(SHELL)
+    (tmp_path / "python3.11").chmod(0o755)
+    (tmp_path / "scripts").mkdir()
+    for name in ("constraints.txt", "pyproject.toml"):
+        (tmp_path / name).write_text("torch==1.2\n")
+    script = shutil.copy(root / "scripts" / "setup.sh", tmp_path / "scripts")
+    environment = {"PATH": f"{tmp_path}:/usr/local/bin:/usr/bin:/bin", "CPU": "yes"}
+    for extras in ("dev", "docs", "io", "dev", "docs"):
+        subprocess.run(["bash", script, extras], env=environment, timeout=900, check=True)
+    installed = (tmp_path / "installed").read_text().split()
+    assert [what for what in installed if not what.startswith("torch")] == [".[dev]", ".[docs]"]
+
+
 def test_the_set_up_takes_the_python_that_is_asked_for_or_none(root: Path, tmp_path: Path):
     for name, text in {
         "python3.11": SHELL,

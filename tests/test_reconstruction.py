@@ -102,7 +102,7 @@ def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
     stored = (
         f"views.path={scan}/views.h5",
         "camera=from_file",
-        f"camera.path={scan}/simulated/cameras.json",
+        f"camera.path={scan}/simulated/rig.json",
         f"grid.like={scan}/truth.nii.gz",
         f"out={tmp_path}/stored.nii.gz",
         f"hydra.run.dir={tmp_path}/stored",
@@ -124,7 +124,7 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
         f"out={tmp_path}/volume.nii.gz",
         f"hydra.run.dir={tmp_path}/run",
     )
-    rig = files.from_file(scan / "simulated" / "cameras.json")
+    rig = files.from_file(scan / "simulated" / "rig.json")
     files.save(rig.shifted(torch.tensor([[-2.0, 0.0]])), tmp_path / "wrong.json")
     assert call(mvrecon.reconstruction, *options) == 0
     assert re.search(
@@ -200,6 +200,7 @@ def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypa
         (("choose={every: 8}",), "does not iterate"),
         (("stop.sigma=0.1",), "does not iterate"),
         (("grid.size=[8, 8, 8]",), "grid.like"),
+        (("grid.centre=[0, 0, 8]",), "grid.size and grid.spacing with grid.centre"),
         (("camera.detector.pixels=[36, 41]",), "detector"),
         (("views.flat=50", "views.dark=100"), "flat field"),
         (("unit=kg",), "unit"),

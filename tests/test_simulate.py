@@ -69,7 +69,7 @@ def views(folder):
 
 def test_the_folder_holds_cases_rig_settings_and_versions(run):
     folder, settings = run
-    assert {"cases", "cameras.json", "config.yaml", "versions.txt"} <= {
+    assert {"cases", "config.yaml", "rig.json", "versions.txt"} <= {
         p.name for p in folder.iterdir()
     }
     measured = {"grid", "scene", "camera", "projector", "acquisition"}
@@ -111,7 +111,7 @@ def test_images_are_bright_where_much_was_met(run):
 
 def test_the_rig_comes_back_and_measures_the_same(run, tmp_path):
     folder, settings = run
-    rig, again = folder / "cameras.json", tmp_path / "again"
+    rig, again = folder / "rig.json", tmp_path / "again"
     cameras, read = (
         CAMERAS.from_config(settings["camera"]),
         CAMERAS.build("from_file", path=str(rig)),
@@ -234,6 +234,6 @@ def test_a_data_set_of_events_is_made_and_goes_on_with_other_workers(tmp_path, c
     with pytest.raises(SystemExit):
         call(folder, *options, events.replace("count:3", "count:4"))
     assert "got events.count=4, expected 3" in capsys.readouterr().err
-    assert CAMERAS.build("from_file", path=folder / "cameras.json").shape == (8, 8)
+    assert CAMERAS.build("from_file", path=folder / "rig.json").shape == (8, 8)
     with h5py.File(folder / "events" / "events-00000.h5") as file:
         assert file["truth"].shape == (2, 16, 16, 16) and file["radon"].shape == (2, 4, 16, 23)

@@ -43,3 +43,16 @@ def test_a_notebook_has_the_cells_of_its_script():
     code = "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "code")
     words = [line for line in script.read_text().splitlines() if not line.startswith("#")]
     assert code.split() == " ".join(words).split()
+
+
+def test_a_tutorial_named_from_the_current_folder_draws_into_one_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """As `bash scripts/site.sh` names its folder: the cells run in another one."""
+    monkeypatch.chdir(tmp_path)
+    Path("red.py").write_text(
+        "# %%\nfrom PIL import Image\n\nImage.new('RGB', (2, 2), 'red').save('dot.png')\n"
+    )
+    Path("pages").mkdir()
+    assert "![red_dot.png](red_dot.png)" in tutorials.page(Path("red.py"), Path("pages"))
+    assert Path("pages/red_dot.png").read_bytes().startswith(b"\x89PNG")

@@ -69,7 +69,8 @@ def close(
 
 class Slices:
     """Logs the first test scenes slice by slice on the board of a run's main method: the steps of
-    TensorBoard's slider are the numbers of the slices, from the feet to the head.
+    TensorBoard's slider are the numbers of the slices, from the feet to the head; its last step,
+    where a card opens, is the middle slice once more.
 
     Args:
         folder: of the run.
@@ -97,11 +98,12 @@ class Slices:
             for label, volume in volumes.items()
         }
         board = Board(str(self.folder / self.label / TEST))
-        step = -(-len(truth) // SLICES)
-        for z in range(step // 2, len(truth), step):
+        distance, tag = -(-len(truth) // SLICES), f"slices/{file_name(case.name)}"
+        levels = range(distance // 2, len(truth), distance)
+        middle = levels[len(levels) // 2]
+        for step, z in (*zip(levels, levels, strict=True), (len(truth), middle)):
             image = review.slices(case, truth, shown, z)
-            tag = f"slices/{file_name(case.name)}"
-            board.experiment.add_image(tag, image, z, dataformats="HWC")
+            board.experiment.add_image(tag, image, step, dataformats="HWC")
         board.finalize("success")
 
 

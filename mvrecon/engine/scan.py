@@ -15,6 +15,7 @@ from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import Corrected, MeasuredViews
 from mvrecon.data.volume_files import read_volume
+from mvrecon.engine.trained_reconstructor import grid_of_training
 from mvrecon.files.checks import Refused
 from mvrecon.files.memory import check_memory
 from mvrecon.geometry.grid import Grid
@@ -90,7 +91,7 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
         settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
             counts them from the other end (`flip_rows`); a camera's detector without pixels has
             those of the views on disk; `grid` has size, spacing and centre, or like; without
-            any of them it is `auto_grid`'s.
+            any of them it is that of a trained network's training, or `auto_grid`'s.
 
     Raises:
         ValueError: another number of cameras than of views, a rig that does not see the grid, a
@@ -101,7 +102,7 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     measured = MeasuredViews.of(Measured(**views))
     rig = CAMERAS.from_config(_with_pixels(settings["camera"], measured.stack.shape))
     cameras = measured.cameras(rig)
-    grid = _grid(settings["grid"], cameras)
+    grid = _grid(settings["grid"], settings["reconstructor"], cameras)
     seeing = int(check_rig_sees(cameras, grid).nonzero()[0, 0])
     bytes_needed = 4 * VOLUMES * math.prod(grid.shape)
     check_memory(bytes_needed, f"A reconstruction of {grid.shape} voxels")
@@ -163,16 +164,23 @@ def _with_pixels(camera: Mapping[str, Any], shape: tuple[int, int]) -> dict[str,
     return filled
 
 
-def _grid(options: Mapping[str, Any], cameras: Cameras) -> Grid:
-    if (like := options["like"]) is not None:
-        if options["size"] is not None or options["spacing"] is not None:
-            raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")
+def _grid(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Cameras) -> Grid:
+    like, size, spacing = options["like"], options["size"], options["spacing"]
+    if like is not None and (size is not None or spacing is not None):
+        raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")
+    if any(options["centre"]) and size is None:
+        raise ValueError(
+            f"Expected grid.size and grid.spacing with grid.centre={options['centre']}, got neither"
+        )
+    if like is not None:
         return read_volume(like)[1]
-    if options["size"] is None and options["spacing"] is None:
+    if size is None and spacing is None:
+        if method["name"] == "trained":  # the voxels that the network knows
+            return grid_of_training(method["checkpoint"], method.get("method"))
         return auto_grid(cameras)
-    if options["size"] is None or options["spacing"] is None:
+    if size is None or spacing is None:
         raise ValueError(
             f"Expected grid.size (voxels) and grid.spacing (mm) together, got size "
-            f"{options['size']} and spacing {options['spacing']}"
+            f"{size} and spacing {spacing}"
         )
-    return Grid.centred(size=options["size"], spacing=options["spacing"], centre=options["centre"])
+    return Grid.centred(size=size, spacing=spacing, centre=options["centre"])

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from mvrecon.data import digests
 from mvrecon.engine.on_case import plain
 from mvrecon.engine.on_rig import model_on
+from mvrecon.geometry.grid import Grid
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstructors.problem import takes
@@ -64,6 +65,16 @@ def model_for(A: Projector, checkpoint: str, method: str | None = None) -> tuple
     for difference in _differences(A, plain(module.projector), many):
         warnings.warn(f"{checkpoint} was trained with another {difference}", stacklevel=3)
     return model_on(A, module, checkpoint), module.hparams["data_range"]
+
+
+def grid_of_training(checkpoint: str, method: str | None = None) -> Grid:
+    """The grid that a trained network was trained on, in mm.
+
+    Arguments and errors as `trained`.
+    """
+    from mvrecon.engine.trained import load  # Lightning's import takes seconds
+
+    return plain(load(checkpoint, method).module.projector).grid
 
 
 def _differences(A: Projector, other: Projector, many: bool) -> list[str]:

@@ -41,16 +41,17 @@ def views(A) -> torch.Tensor:
     return A(cube)
 
 
+@pytest.mark.parametrize("named", [True, False], ids=["the grid is named", "it is the training's"])
 def test_a_checkpoint_reconstructs_a_scan_of_its_own_rig_as_its_module_does(
-    run, A, views, tmp_path
+    run, A, views, tmp_path, named
 ):
     case = save_views(tmp_path, "scan", views[0, 0], "1")
     files.save(A.cameras, tmp_path / "rig.json")
+    grid = (f"grid.size={list(A.grid.size)}", f"grid.spacing={list(A.grid.spacing)}")
     options = (
         f"views.path={case}/views.h5",
         f"camera.path={tmp_path}/rig.json",
-        f"grid.size={list(A.grid.size)}",
-        f"grid.spacing={list(A.grid.spacing)}",
+        *(grid if named else ()),
         "reconstructor=trained",
         f"reconstructor.checkpoint={run}",
         f"out={tmp_path}/volume.nii.gz",
