@@ -24,7 +24,7 @@ fi
 
 echo "Setting up .venv with $("$python" --version), once; this takes some minutes ..."
 for stamp in .venv/installed-*; do # of other versions
-    if [ "$(cat "$stamp")" != "$state" ]; then rm "$stamp"; fi
+    if [ -f "$stamp" ] && [ "$(cat "$stamp")" != "$state" ]; then rm "$stamp"; fi
 done
 "$python" -m venv .venv
 bin=.venv/bin
