@@ -7,19 +7,22 @@ enum { PRINT = 17 };
 struct Print {
   int low[2], high[2];
   bool whole;  // all of the brick is seen
-  DEVICE Print(const Field& f, const double* view, const double* near, const double* far) : whole(true) {
-    double least[3], greatest[3];
+  DEVICE Print(const Field& f, const double* view, const Twofold* near, const Twofold* far) : whole(true) {
+    Twofold map[12], ends[2][3];
+    UNROLL for (int i = 0; i < 12; i++) map[i] = twofold(view[i]);
     for (int corner = 0; corner < 8; corner++) {
-      double q[3], x = corner & 1 ? far[0] : near[0], y = corner & 2 ? far[1] : near[1], z = corner & 4 ? far[2] : near[2];
+      Twofold q[3], x = corner & 1 ? far[0] : near[0], y = corner & 2 ? far[1] : near[1], z = corner & 4 ? far[2] : near[2];
+      UNROLL for (int i = 0; i < 3; i++) q[i] = map[4 * i] * x + map[4 * i + 1] * y + map[4 * i + 2] * z + map[4 * i + 3];
       UNROLL for (int i = 0; i < 3; i++) {
-        const double* row = view + 4 * i;
-        q[i] = row[0] * x + row[1] * y + row[2] * z + row[3];
+        Twofold place = i < 2 && !f.parallel ? q[i] / q[2] : q[i];
+        if (!corner || place < ends[0][i]) ends[0][i] = place;
+        if (!corner || ends[1][i] < place) ends[1][i] = place;
       }
-      UNROLL for (int i = 0; i < 3; i++) {
-        double place = i < 2 && !f.parallel ? q[i] / q[2] : q[i];
-        least[i] = corner ? min(least[i], place) : place;
-        greatest[i] = corner ? max(greatest[i], place) : place;
-      }
+    }
+    double least[3], greatest[3];
+    UNROLL for (int i = 0; i < 3; i++) {
+      least[i] = wide(ends[0][i]);
+      greatest[i] = wide(ends[1][i]);
     }
     // such a brick may have its image anywhere
     bool across = least[2] <= 0 && greatest[2] >= 0 && !f.parallel;
@@ -42,11 +45,11 @@ DEVICE void judge_bricks(const Field& f) {
   if (at >= bricks) return;
   int brick[3];
   unravel(f.shape, (int)at, brick);
-  double near[3], far[3];
+  Twofold near[3], far[3];
   UNROLL for (int i = 0; i < 3; i++) {
     int voxels = f.voxels[i], low = brick[i] * f.edge;
-    near[i] = low - (middle(voxels) + 0.5) - f.reach;
-    far[i] = min(low + f.edge, voxels) - (middle(voxels) + 0.5) + f.reach;
+    near[i] = twofold(low - (middle(voxels) + 0.5) - f.reach);
+    far[i] = twofold(min(low + f.edge, voxels) - (middle(voxels) + 0.5) + f.reach);
   }
   int width = f.source[0] + 1, empty = 0;
   long long corners = (long long)width * (f.source[1] + 1);
