@@ -17,7 +17,8 @@ from hydra.core.override_parser.types import Override
 from mvrecon import compare, view
 from mvrecon.config import compose
 from mvrecon.config.typed import check_parts
-from mvrecon.parts import REGISTRIES
+from mvrecon.listing import SETTING
+from mvrecon.parts import LISTED
 from scripts import site_pages
 
 ROOT = Path(__file__).parents[1]
@@ -46,7 +47,7 @@ def blocks(file: Path, language: str) -> list[str]:
 @pytest.fixture
 def registries(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test registers is gone after it."""
-    for registry in REGISTRIES.values():
+    for registry in LISTED.values():
         monkeypatch.setattr(registry, "_parts", dict(registry._parts))
 
 
@@ -82,7 +83,7 @@ def test_a_command_of_a_page_composes(page: str, command: str):
     first = next(i for i, word in enumerate(words) if "mvrecon-" in word)
     app, options = words[first].rpartition("mvrecon-")[2], words[first + 1 :]
     if app == "list":
-        assert set(options) <= {*REGISTRIES, "--check", "--new-plugin", "my_plugin"}, command
+        assert set(options) <= {*LISTED, SETTING, "--check", "--new-plugin", "my_plugin"}, command
         return
     if app == "warmup":
         assert not options, command

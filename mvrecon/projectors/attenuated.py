@@ -15,6 +15,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays import attenuated_ops, attenuated_reference
+from mvrecon.kernels.rays.occupancy import DENSE
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.pixel_integral import PixelIntegral
@@ -82,12 +83,14 @@ class AttenuatedTransform(RayTransform):
         check_floating(volume, "a volume")
         x = volume.flatten(0, 1)
         x = wide(x if self.support is None else within(x, self.support))
-        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector), self.kernel
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector)
         if not self._compiled(volume, lines):
-            return attenuated_reference.project(x, self.mu, *rays)[..., 0]
-        views = attenuated_ops.project(x, self.mu, *rays, self.skip != "off")[..., 0]
+            return attenuated_reference.project(x, self.mu, *rays, self.kernel)[..., 0]
+        dense = self.kernel + DENSE
+        method = dense if self.skip == "off" else self.kernel
+        views = attenuated_ops.project(x, self.mu, *rays, method)[..., 0]
         if self.skip == "verify":
-            verify(views, attenuated_ops.project(x, self.mu, *rays, False)[..., 0], self.skipped)
+            verify(views, attenuated_ops.project(x, self.mu, *rays, dense)[..., 0], self.skipped)
         return views
 
     def backproject_along(

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mvrecon.kernels.derivatives import bent, curved, linear, transposed
 from mvrecon.kernels.rays import attenuated_reference as reference
+from mvrecon.kernels.rays.occupancy import DENSE
 
 # numba is heavy, so the kernels are imported at their first call
 
@@ -26,12 +27,11 @@ def _project(
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
-    skip: bool,
 ) -> Tensor:
     """Attenuated integrals of volumes [n d h w] as views [n m v u k]."""
     from mvrecon.kernels.rays.cpu import attenuated as cpu
 
-    return cpu.project(volume, mu, lines, layers, window, detector, method, skip)
+    return cpu.project(volume, mu, lines, layers, window, detector, method)
 
 
 @torch.library.custom_op("mvrecon::backproject_attenuated", mutates_args=(), device_types="cpu")
@@ -53,16 +53,15 @@ def _mu_vjp(
     layers: Tensor,
     window: Sequence[float],
     method: str,
-    skip: bool,
 ) -> Tensor:
     """The derivative of <views, project(volume, mu)> by the attenuation mu [d h w]."""
     from mvrecon.kernels.rays.cpu import attenuated as cpu
 
-    return cpu.mu_vjp(volume, views, mu, lines, layers, window, method, skip).to(mu.dtype)
+    return cpu.mu_vjp(volume, views, mu, lines, layers, window, method).to(mu.dtype)
 
 
 @_project.register_fake
-def _(volume, mu, lines, layers, window, detector, method, skip):
+def _(volume, mu, lines, layers, window, detector, method):
     wide = torch.float64 if volume.dtype == torch.float64 else torch.float32
     return volume.new_empty(volume.shape[0], lines.shape[0], *detector, layers.shape[1], dtype=wide)
 
@@ -73,7 +72,7 @@ def _(views, mu, lines, layers, window, method):
 
 
 @_mu_vjp.register_fake
-def _(volume, views, mu, lines, layers, window, method, skip):
+def _(volume, views, mu, lines, layers, window, method):
     return mu.new_empty(mu.shape)
 
 
@@ -83,7 +82,7 @@ def _keep(ctx, inputs, output):
 
 
 def _keep_project(ctx, inputs, output):
-    *rest, _, ctx.method, ctx.skip = inputs
+    *rest, _, ctx.method = inputs
     _remember(ctx, *rest)
 
 
@@ -98,8 +97,8 @@ def _project_back(ctx, views):
     if ctx.needs_input_grad[0]:
         by_volume = backproject(views, mu, lines, layers, ctx.window, ctx.method).to(ctx.dtype)
     if ctx.needs_input_grad[1]:
-        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method, ctx.skip)
-    return by_volume, by_mu, *[None] * 6
+        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method)
+    return by_volume, by_mu, *[None] * 5
 
 
 def _backproject_back(ctx, volume):
@@ -108,17 +107,17 @@ def _backproject_back(ctx, volume):
     if ctx.needs_input_grad[0]:
         by_views = project(volume, mu, lines, layers, ctx.window, ctx.detector, ctx.method)
     if ctx.needs_input_grad[1]:
-        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method, True)
+        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method)
     return by_views, by_mu, None, None, None, None
 
 
-def _in_torch(volume, mu, lines, layers, window, detector, method, skip=True):
+def _in_torch(volume, mu, lines, layers, window, detector, method):
     rays = {
         "lines": lines,
         "layers": layers,
         "window": window,
         "detector": detector,
-        "method": method,
+        "method": method.removesuffix(DENSE),
     }
     return partial(_act, **rays)
 
@@ -134,7 +133,7 @@ def _back_in_torch(views, mu, lines, layers, window, method):
     return transposed(act, (len(views), *mu.shape))
 
 
-def _vjp_in_torch(volume, views, mu, lines, layers, window, method, skip):
+def _vjp_in_torch(volume, views, mu, lines, layers, window, method):
     return bent(_in_torch(volume, mu, lines, layers, window, views.shape[2:4], method))
 
 
@@ -151,9 +150,8 @@ def project(
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
-    skip: bool = True,
 ) -> Tensor:
-    """Attenuated line integrals; see `attenuated_reference.project`, and `cpu/attenuated.py` for
-    `skip`.
+    """Attenuated line integrals; see `attenuated_reference.project`. Emission that is zero is left
+    out, which changes no bit, but for a method with the suffix `DENSE`.
     """
-    return _projected(volume, mu, lines, layers, window, detector, method, skip)
+    return _projected(volume, mu, lines, layers, window, detector, method)

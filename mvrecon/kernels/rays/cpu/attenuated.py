@@ -4,7 +4,7 @@ for any number of threads, as those of `operators.py`.
 A ray is read as a whole, since what lies near the detector weakens what lies behind it: volumes are
 one piece, and a thread that owns some slabs of the adjoint walks all of the rays that meet them.
 Rays beside the box of the emission, and what lies behind it on the others, change no bit and are
-left out.
+left out, but for a method with the suffix `DENSE`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +32,7 @@ from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, part_of, s
 from mvrecon.kernels.rays.cpu.plan import Plan, Scene, whole_plan_of
 from mvrecon.kernels.rays.cpu.rig import Rig, Slabs, Units, bounds_of
 from mvrecon.kernels.rays.cpu.transmission import path_of
-from mvrecon.kernels.rays.occupancy import Occupancy, boxes_of
+from mvrecon.kernels.rays.occupancy import DENSE, Occupancy, boxes_of
 from mvrecon.kernels.rays.trace import Space
 from mvrecon.kernels.threads import share
 
@@ -60,14 +60,11 @@ def project(
     window: Sequence[float],
     detector: Sequence[int],
     method: str,
-    skip: bool = True,
 ) -> Float[Tensor, "n m v u k"]:
-    """Attenuated line integrals; see `attenuated_reference.project`. `skip`: leave out what is
-    beside or behind the box of the emission.
-    """
+    """Attenuated line integrals; see `attenuated_reference.project`."""
     both = torch.cat([wide(volume), mu.to(wide(volume[:0]).dtype)[None]])
     plan, occupancy = _plan(lines, window, detector, method, mu)
-    emitting = _emitting(volume) if skip else occupancy
+    emitting = occupancy if method.endswith(DENSE) else _emitting(volume)
     plan = replace(plan, boxes=boxes_of(emitting))
     space = Space(plan.rig.window, plan.rig.sizes, bounds_of(emitting))
     views = np.zeros(
@@ -117,11 +114,10 @@ def mu_vjp(
     layers: Float[Tensor, "m k"],
     window: Sequence[float],
     method: str,
-    skip: bool = True,
 ) -> Float[Tensor, "d h w"]:
     """The derivative of <views, project(volume, mu)> by the attenuation mu."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
-    emitting = _emitting(volume) if skip else occupancy
+    emitting = occupancy if method.endswith(DENSE) else _emitting(volume)
     if not emitting.box.size:
         return wide(mu).new_zeros(mu.shape)
     plan = replace(plan, boxes=boxes_of(emitting))
@@ -144,8 +140,9 @@ def _emitting(volume: Float[Tensor, "n d h w"]) -> Occupancy:
 def _plan(
     lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str, mu: Tensor
 ) -> tuple[Plan, Occupancy]:
+    scene = Scene(lines, window, detector, method.removesuffix(DENSE))
     occupancy = Occupancy.whole(mu.shape)
-    return whole_plan_of(Scene(lines, window, detector, method), occupancy), occupancy
+    return whole_plan_of(scene, occupancy), occupancy
 
 
 def _gathered(
