@@ -74,7 +74,9 @@ def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
 def test_an_experiment_of_another_app_is_told_as_one(answer):
     """Hydra alone would propose to override a part of the experiment."""
     text = answer("experiment=smoke", app="simulate")
-    assert "experiment/smoke is for mvrecon-train: it chooses 'model', which is not here" in text
+    assert "experiment/smoke is for another app: it chooses 'model', which is not here" in text
+    text = answer("model=sirt", app="simulate")
+    assert "This app chooses no 'model'; --help shows what it chooses" in text
 
 
 def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it():

@@ -37,7 +37,7 @@ EXTRAS = {"joblib": "sweep", "optuna": "sweep"} | dict.fromkeys(
 
 #: Groups whose part is an option of a model; Hydra's words for a group that a run does not take.
 OF_MODELS = {"head", "network", "reconstructor"}
-UNMATCHED = re.compile(r"Could not override '(\w+)'\. No match in the defaults list")
+UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean to override)")
 #: Hydra's words for an experiment that chooses what the app does not have.
 FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
 
@@ -108,10 +108,12 @@ def sentence(error: BaseException) -> str:
         if inside and cause.full_key == cause.key:
             return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
-    if (part := UNMATCHED.match(str(error))) and part[1] in OF_MODELS:
-        return f"{part[1]!r} is a part of a model; to choose it: {part[1]}@model.{part[1]}=..."
+    if part := UNMATCHED.match(str(error)):
+        if part[1] in OF_MODELS:
+            return f"{part[1]!r} is a part of a model; to choose it: {part[1]}@model.{part[1]}=..."
+        return f"This app chooses no {part[1]!r}; --help shows what it chooses"
     if foreign := FOREIGN.match(str(error)):
-        return f"{foreign[1]} is for mvrecon-train: it chooses {foreign[2]!r}, which is not here"
+        return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])
