@@ -1,6 +1,7 @@
 """The attenuated ray transform: emission along rays, weakened on the way to the detector."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,13 +15,13 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
 from mvrecon.kernels.precision import wide
-from mvrecon.kernels.rays import attenuated_ops, attenuated_reference
+from mvrecon.kernels.rays import attenuated_ops, attenuated_reference, ops
 from mvrecon.kernels.rays.occupancy import DENSE
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.pixel_integral import PixelIntegral
 from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.projectors.skipping import verify, within
+from mvrecon.projectors.skipping import Skipped, verify, within
 
 #: Linear attenuation in 1/mm that nothing in a patient reaches from 70 keV up (cortical bone 0.058,
 #: titanium 0.07), and that water and tissue in 1/cm exceed.
@@ -70,6 +71,14 @@ class AttenuatedTransform(RayTransform):
         self.register_buffer("mu", mu.to(self.device), persistent=False)
         self.clear = not mu.requires_grad and not bool((mu != 0).any())
 
+    @property
+    def skipped(self) -> Skipped:
+        """Voxels that the last call skipped, and why."""
+        report = super().skipped
+        if self.clear or report.mode == "off":
+            return report
+        return replace(report, why="attenuated rays leave out what is beside or behind the box")
+
     def project_along(
         self,
         volume: Float[Tensor, "b c d h w"],
@@ -84,8 +93,12 @@ class AttenuatedTransform(RayTransform):
         x = volume.flatten(0, 1)
         x = wide(x if self.support is None else within(x, self.support))
         rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector)
+        self._last = None
         if not self._compiled(volume, lines):
             return attenuated_reference.project(x, self.mu, *rays, self.kernel)[..., 0]
+        if self.skip != "off":
+            window = lines.detach(), self.ray_extent, list(detector), self.kernel
+            self._last = ops.occupied(x.detach(), *window, "box")
         dense = self.kernel + DENSE
         method = dense if self.skip == "off" else self.kernel
         views = attenuated_ops.project(x, self.mu, *rays, method)[..., 0]

@@ -10,6 +10,7 @@ from mvrecon.cameras.rigs import parallel
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.kernels.rays.cpu import attenuated as cpu
+from mvrecon.kernels.rays.cpu.nonzero import box_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.drr import Drr
@@ -226,6 +227,19 @@ def test_skipping_of_empty_emission_is_switched_off_and_verified(monkeypatch):
     assert torch.equal(torch.autograd.grad(of["off"](x).sum(), mu)[0], by_mu)
     with pytest.raises(RuntimeError, match="differ from those without skipping"):
         of["verify"](x)
+
+
+def test_an_operator_reports_the_box_of_the_emission_that_it_skipped_beside():
+    grid, mu, x = scene()
+    x[..., :6] = 0
+    x[..., 9:] = 0
+    A = AttenuatedTransform(grid, rig(), mu)
+    A(x)
+    assert (A.skipped.mode, A.skipped.box) == ("box", box_of(x[0].numpy()))
+    assert "beside or behind" in A.skipped.why
+    dense = AttenuatedTransform(grid, rig(), mu, skip="off")
+    dense(x)
+    assert (dense.skipped.mode, dense.skipped.box) == ("off", Box.whole(grid.shape))
 
 
 def test_no_emission_is_no_counts_and_nan_is_never_skipped():
