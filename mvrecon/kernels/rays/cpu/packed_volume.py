@@ -1,9 +1,9 @@
 """Copies of volumes as the loops over rays want them: one axis contiguous, neighbours along it
 readable as a pair.
 
-Around each volume lies nothing, one voxel in front and two behind, so that no loop tests a bound: a
-ray is clipped to where its cell touches the volume, and the rounding of single precision may carry
-it half a cell further.
+Around each volume lies nothing, two voxels in front and two behind, so that no loop tests a bound:
+a ray is clipped to where its cell touches the volume, which is one voxel in front, and rounding
+carries it into the cell before that.
 """
 
 import math
@@ -13,13 +13,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled
-from mvrecon.kernels.padding import PAD, padded_shape
+from mvrecon.kernels.padding import PAD
 
 #: values [g p l] in one row, of g groups of l volumes; pairs, each value and the next as one
 #: complex number on the same memory; p, the voxels of a volume; strides in voxels of the axes (x,
 #: y, z); the contiguous axis; l.
 Store = namedtuple("Store", ["values", "pairs", "size", "strides", "near", "lanes"])
 COMPLEX = {np.dtype(np.float32): np.complex64, np.dtype(np.float64): np.complex128}
+#: Voxels of nothing in front of the volume along every axis; behind it those of `PAD`.
+FRONT = 2
 #: Edge in voxels of the tiles in which a volume is turned.
 TILE = 16
 
@@ -32,7 +34,7 @@ def empty(
     It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of an array that has
     served, if any.
     """
-    x, y, z = padded_shape(sizes)
+    x, y, z = (FRONT + size + PAD[1] for size in sizes)
     shape = (-(-count // lanes), *((z, y, x) if near == 0 else (y, x, z)), lanes)
     if memory is None or memory.size < math.prod(shape):
         return np.zeros(shape, dtype)
@@ -43,7 +45,7 @@ def empty(
 
 def part_of(padded: np.ndarray, near: int, where: tuple[slice, slice, slice]) -> np.ndarray:
     """The part of padded volumes at `where` along (x, y, z), counted without the padding."""
-    x, y, z = (slice(part.start + PAD[0], part.stop + PAD[0]) for part in where)
+    x, y, z = (slice(part.start + FRONT, part.stop + FRONT) for part in where)
     return padded[:, z, y, x] if near == 0 else padded[:, y, x, z]
 
 

@@ -7,6 +7,8 @@ import numpy as np
 from torch import Tensor
 
 from mvrecon.kernels.compiling import scalar
+from mvrecon.kernels.padding import PAD
+from mvrecon.kernels.rays.cpu.packed_volume import FRONT
 from mvrecon.kernels.rays.methods.strides import Steps
 from mvrecon.kernels.rays.occupancy import Occupancy, bricks_of_rig
 from mvrecon.kernels.rays.trace import numbered
@@ -36,7 +38,8 @@ Slabs = namedtuple("Slabs", ["axis", "low", "high"])
 def steps_of(rig, store, axis):
     """How the loops step through a store along rays of one main axis."""
     x, y, z = store.strides[0], store.strides[1], store.strides[2]
-    origin = rig.box[0] * x + rig.box[1] * y + rig.box[2] * z
+    more = FRONT - PAD[0]  # places of rays have the padding `PAD`
+    origin = (rig.box[0] - more) * x + (rig.box[1] - more) * y + (rig.box[2] - more) * z
     return Steps(store.strides[axis], store.strides[3 - axis - store.near], 1, rig.samples, origin)
 
 
