@@ -104,8 +104,8 @@ class Call:
         """Copy volumes [n d h w] of the part that there is to where rays read them."""
         scene = self.scene
         ends = zip(scene.corner, scene.part, scene.sizes, strict=True)
-        # with a voxel more on either side, and a border of one before and two behind
-        w, h, d = (min(low + count + 1, n) - max(low - 1, 0) + 3 for low, count, n in ends)
+        # with a voxel more on either side, and a border of two before and two behind
+        w, h, d = (min(low + count + 1, n) - max(low - 1, 0) + 4 for low, count, n in ends)
         runs = max(-(-w // RUN) * h * d, w * -(-h // RUN) * d)
         stores = self.new(2, w * h * d * self.together * self.groups, dtype=volume.dtype)
         self.tensors += [volume, stores]

@@ -53,13 +53,14 @@ DEVICE void survey_rig(const Scene& s) {
   if (s.frames && s.maps == 3) write_frame(line, s.frames + view * 12);
 }
 
-struct Layout { int low[3]; long long size[3], cells; };  // of a store, with a voxel of nothing before and two behind
+// Of a store: two voxels of nothing before, since rounding may move a ray along its end into the cell before, and two behind.
+struct Layout { int low[3]; long long size[3], cells; };
 DEVICE Layout layout_of(const Scene& s) {
   Layout l;
   Box box = stored_box(s);
   UNROLL for (int i = 0; i < 3; i++) {
-    l.low[i] = box.low[i];
-    l.size[i] = box.high[i] - box.low[i] + 3;
+    l.low[i] = box.low[i] - 1;
+    l.size[i] = box.high[i] - box.low[i] + 4;
   }
   l.cells = l.size[0] * l.size[1] * l.size[2];
   return l;
