@@ -35,5 +35,11 @@ ARMS = {
     "mean_fusion": MEAN,
     "mean_fusion_own": (*MEAN, "model.opinion.shared=false"),
     "cross_view": ("model=cross_view_counts",),
+    "cross_view_density": (
+        "model=cross_view_counts",
+        "model.rounds.0.opinions.head.name=density",
+    ),
+    "mean_fusion_density": (*MEAN, "head@model.head=density"),
 }
-MAIN = tuple(name for name in ARMS if name != "mean_fusion_own")
+ABLATIONS = ("mean_fusion_own", "cross_view_density", "mean_fusion_density")
+MAIN = tuple(name for name in ARMS if name not in ABLATIONS)

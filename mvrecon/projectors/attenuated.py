@@ -129,6 +129,10 @@ class AttenuatedTransform(RayTransform):
         mirror = super().mirror()
         return mirror if mirror and torch.equal(mirror.volume(self.mu), self.mu) else None
 
+    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+        """mu, where it is not zero everywhere."""
+        return None if self.clear else self.mu
+
     def pixel_integral(self) -> PixelIntegral | None:
         """None: the pixels are no plain integrals, but where nothing attenuates."""
         return super().pixel_integral() if self.clear else None

@@ -194,9 +194,8 @@ class Scaled(Wrapped):
         super().__init__(A)
         self.capabilities = A.capabilities
         self.factors = pixels if callable(pixels) else None
-        self.register_buffer(
-            "fixed_factors", pixels() if callable(pixels) else pixels, persistent=False
-        )
+        fixed = pixels() if callable(pixels) else pixels
+        self.register_buffer("fixed_factors", fixed, persistent=False)
         self.register_buffer("voxels", voxels, persistent=False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Scaled":
@@ -249,6 +248,10 @@ class Scaled(Wrapped):
         """A's own, times the pixels' factors."""
         own = self.A.pixel_integral()
         return own.weighted(self.pixels) if own and self.voxels is None else None
+
+    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+        """A's own."""
+        return self.A.attenuation()
 
     def mirror(self) -> Mirror | None:
         """A's own, where it mirrors the weights into themselves, too."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -49,4 +50,10 @@ class SaysPixelIntegral:
 
     def pixel_integral(self) -> PixelIntegral | None:
         """How a pixel is made of integrals along lines; None: otherwise, or not known."""
+        return None
+
+    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+        """What attenuates emission along a pixel's lines, in 1/mm on the grid; None: nothing, or
+        not known.
+        """
         return None

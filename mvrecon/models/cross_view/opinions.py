@@ -12,6 +12,7 @@ from torch.nn.functional import max_pool3d
 from mvrecon.models.cross_view.evidence import MAGNIFIED
 from mvrecon.models.cross_view.sampling import FixedFrusta
 from mvrecon.models.cross_view.settings import OpinionOptions
+from mvrecon.models.cross_view.transmission import Transmission
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
 from mvrecon.models.cross_view.views import Binned, means, pixels
 from mvrecon.models.networks import halved
@@ -86,6 +87,9 @@ class Opinions(nn.Module):
         self.log_strength = nn.Parameter(torch.zeros(())) if options.weigh_rays else None
         cameras = Binned.of(projector, binning).cameras
         self.inside = FixedFrusta(projector.grid.coarsened(edge), cameras, depths)
+        mu = projector.attenuation()
+        mu = None if mu is None else self._cells(mu.detach()[None, None])
+        self.transmission = Transmission(self.inside.frusta, mu)
         self.head = HEADS.from_config(options.head)
         self.weighting: PlainUNet | None = None
         if options.weighted:
@@ -118,19 +122,22 @@ class Opinions(nn.Module):
         frusta, x = self.inside.frusta, self._cells(volume)
         unit = None if sums is None else self._unit(x, sums, mask)
         prior = frusta.to_frusta(x[:, None]).expand(-1, len(frusta.step), -1, -1, -1, -1)
-        prior = prior * frusta.occupied
+        prior = self.transmission.seen(prior * frusta.occupied)
         integral = frusta.integrate(prior)
         missed = means(residual if self.of_residual else residual + projected, self.binning)
         missed = missed if unit is None else divided(missed, unit)
         missed = missed if self.of_residual else missed - integral
         density, rest = self._density(prior, integral + missed, placed)
         # The change is carried to the world, not the density: two warps would blur what x has.
-        carried = frusta.to_world(torch.cat([density - prior, *rest], dim=2))
+        emitted = self.transmission.emitted(density - prior)
+        carried = frusta.to_world(torch.cat([emitted, *rest], dim=2))
         if mask is not None:
             carried = carried * self._cells(mask.to(x.dtype), largest=True)[:, None]
         change, confidence, features = self._parts(carried)
         mean, variance, _ = leave_one_out(change, frusta.visible)
-        expected = frusta.integrate(frusta.to_frusta(mean) * frusta.occupied)
+        expected = frusta.integrate(
+            self.transmission.seen(frusta.to_frusta(mean) * frusta.occupied)
+        )
         changes = torch.cat([change, mean, deviation(variance)], dim=2)
         logits = self._logits(changes, missed - expected, x, confidence)
         fused, weights = fuse(torch.cat([change, features], dim=2), logits, frusta.visible)
@@ -166,10 +173,14 @@ class Opinions(nn.Module):
         sums: Float[Tensor, "#b 1 m v u"],
         mask: Bool[Tensor, "b 1 d h w"] | None,
     ) -> Float[Tensor, "#b 1 m r s"]:
-        """Views per line integral, from views of ones and the rays' chords of the mask."""
+        """Views per integral of what reaches the detector, from views of ones and the rays' chords
+        of the mask.
+        """
         frusta = self.inside.frusta
         ones = torch.ones_like(x[:1]) if mask is None else self._cells(mask.to(x.dtype))
-        chords = frusta.integrate(frusta.to_frusta(ones[:, None]) * frusta.occupied)
+        chords = frusta.integrate(
+            self.transmission.seen(frusta.to_frusta(ones[:, None]) * frusta.occupied)
+        )
         return torch.where(chords > 0, means(sums, self.binning) / chords.clamp_min(1e-6), 0)
 
     def _cells(
@@ -189,7 +200,7 @@ class Opinions(nn.Module):
         """The density of each frustum, and what else goes to the world."""
         frusta = self.inside.frusta
         if placed is None:
-            even = torch.ones_like(prior)
+            even = self.transmission.seen(torch.ones_like(prior))
             return self.head(torch.zeros_like(prior), even, measured, frusta), []
         logits, rest = placed.split([1, placed.shape[2] - 1], dim=2)
         return self.head(logits, prior, measured, frusta), [rest]
@@ -214,7 +225,7 @@ class Opinions(nn.Module):
             return torch.zeros_like(changes[:, :, :1])
         frusta = self.inside.frusta
         with torch.no_grad():  # a hint for the weights
-            rest = frusta.to_world(frusta.spread(unexplained))
+            rest = frusta.to_world(self.transmission.spread(frusta, unexplained))
         volumes = x[:, None].expand(-1, changes.shape[1], -1, -1, -1, -1)
         small = MAGNIFIED * torch.cat([changes, rest], dim=2)
         evidence = torch.cat([small, volumes, confidence], dim=2)

@@ -100,6 +100,10 @@ class BlurredPinholes(Projector):
         rig = self.cameras
         return any(tensor.requires_grad for tensor in (rig.source, rig.origin, rig.u, rig.v))
 
+    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+        """mu, where it is not zero everywhere."""
+        return self.mu if bool((self.mu != 0).any()) else None
+
     def magnification(self) -> Float[Tensor, "m k"]:
         """Magnification l / z of the layers of each view, at equal steps, from near to far.
 
