@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import backends
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays import attenuated_ops, attenuated_reference, ops
+from mvrecon.kernels.rays.cuda.attenuated_trial import differences
 from mvrecon.kernels.rays.occupancy import DENSE
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
@@ -94,8 +96,9 @@ class AttenuatedTransform(RayTransform):
         x = wide(x if self.support is None else within(x, self.support))
         rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector)
         self._last = None
-        if not self._compiled(volume, lines):
-            return attenuated_reference.project(x, self.mu, *rays, self.kernel)[..., 0]
+        name, kernels = self._operators(volume, lines)
+        if name != "cpu":
+            return kernels.project(x, self.mu, *rays, self.kernel)[..., 0]
         if self.skip != "off":
             window = lines.detach(), self.ray_extent, list(detector), self.kernel
             self._last = ops.occupied(x.detach(), *window, "box")
@@ -113,7 +116,7 @@ class AttenuatedTransform(RayTransform):
         if self.clear:
             return super().backproject_along(views, lines)
         rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, self.kernel
-        kernels = attenuated_ops if self._compiled(views, lines) else attenuated_reference
+        _, kernels = self._operators(views, lines)
         volumes = kernels.backproject(views[..., None], self.mu, *rays)
         return volumes if self.support is None else within(volumes, self.support)
 
@@ -143,12 +146,26 @@ class AttenuatedTransform(RayTransform):
         cameras = rig[torch.tensor(views, device=rig.source.device)]
         return AttenuatedTransform(self.grid, cameras, self.mu, **options).to(self.device)
 
-    def _compiled(self, tensor: Tensor, lines: Tensor) -> bool:
-        """Whether the CPU's kernels serve; they know no gradient in the rays."""
-        name, _ = backends.kernels_for(tensor[:, None], self.backend, self.kernel)
-        compiled = name == "cpu" and not lines.requires_grad
-        self.last_backend = "cpu" if compiled else "reference"
-        return compiled
+    def _operators(self, tensor: Tensor, lines: Tensor) -> tuple[str, ModuleType]:
+        """The back end that serves a tensor, and its operators."""
+        chosen = attenuated_kernels(tensor, self.backend, lines.requires_grad)
+        self.last_backend = chosen[0]
+        return chosen
+
+
+def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str, ModuleType]:
+    """The back end's name and its operators along attenuated rays, for a tensor; raises as
+    `kernels_for`.
+
+    Args:
+        tensor: volumes or views.
+        backend: as of `kernels_for`.
+        moving: whether a gradient by the rays is asked for, which the reference alone has.
+    """
+    name, _ = backends.kernels_for(tensor[:, None], backend, "attenuated", differences)
+    if moving or name == "reference":
+        return "reference", attenuated_reference
+    return name, attenuated_ops
 
 
 def check_mu(mu: Tensor, grid: Grid) -> None:

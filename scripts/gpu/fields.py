@@ -1,5 +1,5 @@
-"""The kernels beside those along rays on a device: warps, voxel-driven back-projection, hull,
-normalisation; part of `check.py`.
+"""The kernels beside those of plain rays on a device: attenuated rays, warps, voxel-driven
+back-projection, hull, normalisation; part of `check.py`.
 """
 
 from collections.abc import Callable
@@ -14,16 +14,25 @@ from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps
 from mvrecon.kernels.norms import trial as norms
+from mvrecon.kernels.rays.cuda import attenuated_trial as rays
 from mvrecon.kernels.rays.cuda import selfcheck
 from mvrecon.kernels.voxels import trial as voxels
 from mvrecon.kernels.warps import trial as warps
 from mvrecon.kernels.warps.warp import warp
 from mvrecon.models.normalisation import normalised_silu
+from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.visual_hull.hull import visual_hull
 
 #: What the kernels for a purpose are tried on before their first use.
-TRIED = {"warp": warps.differences, "look": voxels.differences, "norm": norms.differences}
+TRIED = {
+    "attenuated": rays.differences,
+    "warp": warps.differences,
+    "look": voxels.differences,
+    "norm": norms.differences,
+}
+#: Linear attenuation in 1/mm of attenuated rays.
+MU = 0.015
 BRICK = 4
 
 
@@ -67,6 +76,17 @@ def normalised(channels: int) -> Callable[[Tensor], Tensor]:
     return call
 
 
+def attenuated(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Tensor]:
+    """Attenuated integrals of a grid full of `MU`, or their transpose."""
+    operators, mu = {}, torch.full(grid.shape, MU)
+
+    def call(x: Tensor) -> Tensor:
+        A = operators.setdefault(x.device, AttenuatedTransform(grid, rig, mu).to(x.device))
+        return A.T(x) if back else A(x)
+
+    return call
+
+
 def same_hull(grid: mv.Grid, rig: mv.Cameras, views: Tensor, device: str) -> dict[str, Any]:
     """Bricks that differ from the CPU's, and ms on the device."""
     exact, there = visual_hull(views, rig, grid, BRICK), views.to(device)
@@ -96,6 +116,8 @@ def check_fields(
     lifted = world(x[:, None])[:, 0]
     features = torch.cat([x * (k + 1) - k for k in range(16)], dim=1)
     calls = {
+        "attenuated rays": (attenuated(grid, rig, back=False), x),
+        "attenuated rays, back": (attenuated(grid, rig, back=True), views),
         "warp to frusta": (world, x[:, None]),
         "warp to the world": (frusta, lifted),
         "back-projection": (lambda y: backproject(y, rig, grid, "distance"), views),

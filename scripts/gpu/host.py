@@ -16,7 +16,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.kernels.rays.cuda import driver, operators
-from mvrecon.kernels.rays.cuda.kernels import KERNELS
+from mvrecon.kernels.rays.cuda.sources import KERNELS
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 

@@ -114,6 +114,10 @@ def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
         for stored, together in STORED:
             variant = rays.Variant(single, stored, together, number)
             yield f"{method}, {stored}, {together} a ray", rays.text_of({"": variant}), KERNELS
+    for method in ("joseph", "siddon"):
+        variant = rays.Variant(single, single, 1, METHODS[method], attenuated=True)
+        title = f"{method}, attenuated, {single}"
+        yield title, rays.text_of({"": variant}), ("weaken", "receive", "bend")
     for purpose, names in fields.KERNELS.items():
         for stored in (single, half) if purpose in HALF else (single,):
             part = fields.Part(purpose, single, stored)

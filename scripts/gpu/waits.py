@@ -19,6 +19,7 @@ import mvrecon as mv
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_module
 from mvrecon.metrics import volume_metrics
+from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.selection import ray_subset, view_subset
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.reconstructors.iterative import sirt_weights
@@ -28,6 +29,7 @@ from mvrecon.visual_hull.support import support_from_views
 
 N, PIXELS = 24, 36
 DETECTOR = {"pixels": [PIXELS, PIXELS], "pixel_mm": 6.0}
+ATTENUATED = "attenuated rays, there and back"
 MODELS = (
     "cross_view",
     "cross_view model.support=hull",
@@ -127,8 +129,17 @@ def operator_calls() -> dict[str, Callable[[Any], Any]]:
         "voxel-driven back-projection": lambda A: backproject(Y, rig, grid, "distance"),
         "visual hull": lambda A: support_from_views(Y, rig, grid, "hull"),
         "hull of counts": lambda A: support_from_views(C, rig, grid, "hull", noise, brick=8),
+        ATTENUATED: lambda A: there(A, X),
         "cameras on the device": lambda A: mv.Drr(grid, moved(rig, OnGpu)),
     }
+
+
+def operator(what: str) -> Any:
+    """The operator of a call."""
+    grid, rig = mv.Grid.centred(N, spacing=4.0), mv.circular(6, 300.0, 450.0, DETECTOR)
+    if what == ATTENUATED:  # by water at 140 keV
+        return AttenuatedTransform(grid, rig, torch.full(grid.shape, 0.0154))
+    return mv.Drr(grid, rig)
 
 
 def there(A: Any, x: torch.Tensor) -> torch.Tensor:
@@ -150,7 +161,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     for what, call in operator_calls().items():
-        A = mv.Drr(mv.Grid.centred(N, spacing=4.0), mv.circular(6, 300.0, 450.0, DETECTOR))
+        A = operator(what)
         show(what, lambda gpu, call=call, A=A: call(gpu.put(A)), places)
     if not parser.parse_args().operators:
         show_models(places)

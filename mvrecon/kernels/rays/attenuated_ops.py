@@ -1,8 +1,8 @@
 """Attenuated projections as torch operators: opaque to `torch.compile`, with derivatives in
 emission and attenuation.
 
-The CPU has kernels for a single attenuation and rays without a gradient; all else is the
-reference's.
+CPU and CUDA devices have kernels for a single attenuation and rays without a gradient; all else is
+the reference's.
 """
 
 from collections.abc import Sequence
@@ -58,6 +58,28 @@ def _mu_vjp(
     from mvrecon.kernels.rays.cpu import attenuated as cpu
 
     return cpu.mu_vjp(volume, views, mu, lines, layers, window, method).to(mu.dtype)
+
+
+@_project.register_kernel("cuda")
+def _(volume, mu, lines, layers, window, detector, method):
+    from mvrecon.kernels.rays.cuda import attenuated as cuda
+
+    return cuda.project(volume, mu, lines, layers, window, detector, method.removesuffix(DENSE))
+
+
+@_backproject.register_kernel("cuda")
+def _(views, mu, lines, layers, window, method):
+    from mvrecon.kernels.rays.cuda import attenuated as cuda
+
+    return cuda.backproject(views, mu, lines, layers, window, method.removesuffix(DENSE))
+
+
+@_mu_vjp.register_kernel("cuda")
+def _(volume, views, mu, lines, layers, window, method):
+    from mvrecon.kernels.rays.cuda import attenuated as cuda
+
+    method = method.removesuffix(DENSE)
+    return cuda.mu_vjp(volume, views, mu, lines, layers, window, method).to(mu.dtype)
 
 
 @_project.register_fake

@@ -21,11 +21,9 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import backends
 from mvrecon.kernels.precision import wide
-from mvrecon.kernels.rays import attenuated_ops, attenuated_reference
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.projectors.attenuated import check_mu
+from mvrecon.projectors.attenuated import attenuated_kernels, check_mu
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.selection import ViewSelection
@@ -188,8 +186,7 @@ class BlurredPinholes(Projector):
 
     def _ops(self, tensor: Tensor):
         """The kernels that serve a tensor; compiled ones know no gradient in the cameras."""
-        name, _ = backends.kernels_for(tensor, self.backend, self.method)
-        return attenuated_ops if name == "cpu" and not self.pose_gradient else attenuated_reference
+        return attenuated_kernels(tensor, self.backend, self.pose_gradient)[1]
 
     def _parts(self, like: Tensor) -> Iterator["Part"]:
         """A few cameras at a time."""

@@ -16,6 +16,7 @@ from mvrecon.kernels.precision import arithmetic
 from mvrecon.kernels.rays.cuda import sources as rays
 from mvrecon.kernels.rays.cuda.scene import Packed, Scene
 from mvrecon.kernels.rays.cuda.sources import BLOCK, NAMES, Variant
+from mvrecon.kernels.rays.trace import JOSEPH, SIDDON
 
 F, D, H, B = torch.float32, torch.float64, torch.float16, torch.bfloat16
 #: Types of arithmetic and of storage, and how many volumes share a ray.
@@ -24,6 +25,11 @@ VARIANTS = {
     f"_{NAMES[stored]}_{together}_{method}": Variant(real, stored, together, method)
     for real, stored, together in TYPES
     for method in range(3)
+}
+VARIANTS |= {
+    f"_{NAMES[real]}_attenuated_{method}": Variant(real, real, 1, method, attenuated=True)
+    for real in (F, D)
+    for method in (JOSEPH, SIDDON)
 }
 PARTS = {
     f"_{NAMES[stored]}_{purpose}": Part(purpose, arithmetic(stored), stored)

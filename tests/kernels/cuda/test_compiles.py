@@ -12,7 +12,7 @@ from mvrecon.kernels.cuda.sources import KERNELS as FIELDS
 from mvrecon.kernels.cuda.sources import Part
 from mvrecon.kernels.cuda.sources import text_of as fields
 from mvrecon.kernels.rays.cuda import nvrtc
-from mvrecon.kernels.rays.cuda.sources import KERNELS, Variant, text_of
+from mvrecon.kernels.rays.cuda.sources import ATTENUATED, KERNELS, Variant, text_of
 from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR
 
 SCRIPT = Path(__file__).parents[3] / "scripts" / "gpu" / "machine_code.py"
@@ -63,6 +63,22 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
             assert not count(machine_code.DOUBLE, step), name
             # sm_80 leaves the loop of `scatter` by a conditional CALL that never returns
             assert name == "scatter" or not count(machine_code.CALL, step), name
+
+
+@pytest.mark.parametrize(("capability", "method"), [(80, SIDDON), (90, JOSEPH)])
+def test_attenuated_rays_are_in_registers_and_single_precision(capability, method, machine_code):
+    """As plain rays, but that a quotient's rare case is a call; numbers are added up whole."""
+    variant, count = Variant(F, F, 1, method, attenuated=True), machine_code.count
+    kernels = machine_code.compiled(text_of({"": variant}), capability)
+    assert kernels.keys() == set(ATTENUATED)
+    for name, kernel in kernels.items():
+        assert kernel.registers <= MOST, (name, kernel.registers)
+        assert count(machine_code.LOCAL, kernel.instructions) <= ASIDE, name
+        for loop in kernel.loops:
+            assert not count(machine_code.LOCAL + "|" + machine_code.DOUBLE, loop), name
+        added = [i for i in kernel.instructions if "ADD.64" in i and "RED" in i]
+        assert bool(added) == (name in ("receive", "bend")), name
+        assert not [i for i in kernel.instructions if "ADD.F" in i and "RED" in i], name
 
 
 @pytest.mark.parametrize("capability", [80, 90])

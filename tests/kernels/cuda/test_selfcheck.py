@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.kernels.backends import kernels_for
 from mvrecon.kernels.rays import reference
-from mvrecon.kernels.rays.cuda import driver, nvrtc, selfcheck
+from mvrecon.kernels.rays.cuda import attenuated_trial, driver, nvrtc, selfcheck
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.voxels import trial as voxel_trial
 from mvrecon.kernels.warps import trial as warp_trial
@@ -162,9 +162,14 @@ def test_a_full_memory_is_not_remembered(call, host):
     assert selfcheck.reason("cpu") is None
 
 
-@pytest.mark.parametrize(("trial", "name"), [(warp_trial, "warp_back"), (voxel_trial, "show")])
+@pytest.mark.parametrize(
+    ("trial", "name"),
+    [(warp_trial, "warp_back"), (voxel_trial, "show"), (attenuated_trial, "backproject")],
+)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_warps_and_back_projection_check_themselves(trial, name, dtype, host, monkeypatch):
+def test_warps_back_projection_and_attenuated_rays_check_themselves(
+    trial, name, dtype, host, monkeypatch
+):
     purpose, tried = trial.__name__, trial.differences
     assert selfcheck.reason("cpu", purpose, dtype, tried=tried) is None
     selfcheck.forget()

@@ -9,7 +9,7 @@ import torch
 
 from mvrecon.kernels.rays.cuda import driver, nvrtc
 from mvrecon.kernels.rays.cuda.kept import kept
-from mvrecon.kernels.rays.cuda.sources import KERNELS, Variant, text_of
+from mvrecon.kernels.rays.cuda.sources import Variant, text_of
 
 
 @cache
@@ -20,7 +20,7 @@ def kernels_of(variant: Variant, device: torch.device) -> dict[str, c_void_p]:
         OSError: no driver, no compiler.
         RuntimeError: the compiler or the driver refuses it.
     """
-    return loaded(text_of({"": variant}), KERNELS, device)
+    return loaded(text_of({"": variant}), variant.names, device)
 
 
 def loaded(text: str, names: Sequence[str], device: torch.device) -> dict[str, c_void_p]:

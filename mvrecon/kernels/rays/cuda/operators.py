@@ -43,6 +43,7 @@ class Call:
         occupancy: the part of the volume that there is.
         detector: pixels (rows, columns).
         method: of the rays.
+        attenuated: whether kernels are those of attenuated rays, a volume at a time.
     """
 
     def __init__(
@@ -53,15 +54,16 @@ class Call:
         occupancy: Occupancy,
         detector: Sequence[int],
         method: str,
+        attenuated: bool = False,
     ):
         # what costs Python a microsecond is asked for once, here and below
         count, n_views, box = values.shape[0], lines.shape[0], occupancy.box
         self.device, dtype = values.device, values.dtype
         self.method, samples = numbered(method)
         self.real = torch.float64 if dtype == torch.float64 else torch.float32
-        self.together = 1 if count == 1 else TOGETHER
+        self.together = 1 if count == 1 or attenuated else TOGETHER
         self.groups = -(-count // self.together)
-        variant = Variant(self.real, dtype, self.together, self.method)
+        variant = Variant(self.real, dtype, self.together, self.method, attenuated)
         self.kernels = kernels_of(variant, self.device)
         self.stream = driver.stream_of(self.device)
         maps = lines.detach().double().contiguous()
@@ -92,13 +94,15 @@ class Call:
         across = -(-threads // BLOCK)
         driver.launch(self.kernels[name], self.scene, across, down, self.device, self.stream)
 
-    def over_rays(self, name: str) -> None:
-        """Launch a kernel with a thread a ray, tile by tile, as `pixel_of` counts them."""
+    def over_rays(self, name: str, down: int | None = None) -> None:
+        """Launch a kernel with a thread a ray, tile by tile, as `pixel_of` counts them, for all
+        groups of volumes, or `down` of them.
+        """
         scene, (high, across) = self.scene, TILE
         if scene.rows < high or scene.columns < across:
             high = across = 1
         tiles = -(-scene.rows // high) * -(-scene.columns // across)
-        self.start(name, scene.n_views * tiles * high * across, self.groups)
+        self.start(name, scene.n_views * tiles * high * across, down or self.groups)
 
     def read(self, volume: Tensor, occupied: Tensor | None) -> None:
         """Copy volumes [n d h w] of the part that there is to where rays read them."""

@@ -28,8 +28,11 @@ class Scene(Packed):
     _fields_ = [
         *((name, c_void_p) for name in ("lines", "volumes", "stores", "views", "rays", "axes")),
         *((name, c_void_p) for name in ("values", "frames", "flags", "results", "occupied")),
+        ("layers", c_void_p),
+        ("fixed", c_double),
         ("window", c_double * 2),
         *((name, c_int * 3) for name in ("sizes", "corner", "part")),
         *((name, c_int) for name in ("n_views", "rows", "columns", "maps", "n_volumes")),
         *((name, c_int) for name in ("samples", "first_view", "views_here", "blocks_a_view")),
+        ("n_layers", c_int),
     ]

@@ -22,6 +22,8 @@ KERNELS = (
     *("survey", "store", "project", "record", "gather", "scatter", "vary"),
     *("occupy", "bound"),
 )
+#: Of attenuated rays.
+ATTENUATED = ("survey", "store", "weaken", "receive", "bend")
 #: Types of numbers as the source names them.
 NAMES = {
     torch.float32: "float",
@@ -33,19 +35,28 @@ NAMES = {
 
 class Variant(NamedTuple):
     """What a kernel is compiled for: the type of arithmetic, the type that volumes are stored in,
-    how many of them share a ray's index work, and the method's number.
+    how many of them share a ray's index work, the method's number, and whether rays are attenuated
+    (of one volume each, in the type of arithmetic).
     """
 
     real: torch.dtype
     stored: torch.dtype
     together: int
     method: int
+    attenuated: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its kernels."""
+        return ATTENUATED if self.attenuated else KERNELS
 
     def line(self, suffix: str) -> str:
         """The line that makes the kernels of a variant, whose names end so."""
-        method = next(name for name, number in METHODS.items() if number == self.method)
-        types = f"{NAMES[self.real]}, {NAMES[self.stored]}"
-        return f"VARIANT({suffix}, {types}, {self.together}, {method.upper()})\n"
+        method = next(name for name, number in METHODS.items() if number == self.method).upper()
+        real = NAMES[self.real]
+        if self.attenuated:
+            return f"ATTENUATED({suffix}, {real}, {method})\n"
+        return f"VARIANT({suffix}, {real}, {NAMES[self.stored]}, {self.together}, {method})\n"
 
 
 @cache

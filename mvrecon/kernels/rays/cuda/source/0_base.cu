@@ -8,6 +8,7 @@ DEVICE void add(float* to, float value) { atomicAdd(to, value); }
 DEVICE void add(double* to, double value) { atomicAdd(to, value); }
 DEVICE void add_bits(int* to, int bits) { atomicOr(to, bits); }
 DEVICE void add_greatest(int* to, int value) { atomicMax(to, value); }
+DEVICE void add_whole(long long* to, long long value) { atomicAdd((unsigned long long*)to, (unsigned long long)value); }
 // The sum over a warp, for its first thread.
 template <class R> DEVICE R warp_sum(R value) {
   for (int i = 16; i; i >>= 1) value += __shfl_down_sync(0xffffffffu, value, i);
@@ -33,12 +34,13 @@ DEVICE double settled(double x) { return x; }
 #define __global__
 #define __launch_bounds__(...)
 
-using std::ceil; using std::exp; using std::fabs; using std::floor; using std::fma; using std::max; using std::min; using std::sqrt;
+using std::ceil; using std::exp; using std::expm1; using std::fabs; using std::floor; using std::fma; using std::max; using std::min; using std::sqrt;
 struct Place { int x, y; };
 static Place threadIdx, blockIdx;
 template <class R> DEVICE void add(R* to, R value) { *to += value; }
 DEVICE void add_bits(int* to, int bits) { *to |= bits; }
 DEVICE void add_greatest(int* to, int value) { *to = max(*to, value); }
+DEVICE void add_whole(long long* to, long long value) { *to += value; }
 // Threads run one after the other, so the sum over a warp is made by all of them.
 template <class R> DEVICE R warp_sum(R value) { return value; }
 DEVICE bool first_of_warp() { return true; }

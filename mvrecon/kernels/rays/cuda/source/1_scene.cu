@@ -21,12 +21,14 @@ struct Scene {
   int* flags;             // [1 + m]: of all views, of each
   void* results;          // volumes [n d h w] of the part, or sums [m warps 12 k]
   int* occupied;          // voxels (z0 y0 x0 z1 y1 x1) beyond which volumes are zero, or nothing
+  const double* layers;   // [m k]: of attenuated rays
+  double fixed;           // by which their numbers are multiplied to be whole
   double window[2];       // which part of a ray counts
   int sizes[3];           // voxels of the whole along x, y, z
   int corner[3], part[3]; // the first voxel, and the voxels, of the part that there is
   int n_views, rows, columns, maps, n_volumes, samples;
   int first_view, views_here;  // of the rays that are recorded
-  int blocks_a_view;
+  int blocks_a_view, n_layers;
 };
 
 struct Box { int low[3], high[3]; };

@@ -27,6 +27,12 @@ DEVICE void write_occupied(const Scene& s) {
 }
 
 #define ENTRY(name, kernel) extern "C" __global__ void __launch_bounds__(BLOCK) name(const Scene s) { kernel(s); }
+#define ATTENUATED(suffix, R, METHOD)                                                                                  \
+  ENTRY(survey##suffix, survey_rig)                                                                                    \
+  ENTRY(store##suffix, (store_volumes<R, 1>))                                                                          \
+  ENTRY(weaken##suffix, (weaken_rays<R, METHOD>))                                                                      \
+  ENTRY(receive##suffix, (receive_rays<R, METHOD>))                                                                    \
+  ENTRY(bend##suffix, (bend_rays<R, METHOD>))
 #define VARIANT(suffix, R, T, NV, METHOD)                                                                              \
   ENTRY(survey##suffix, survey_rig)                                                                                    \
   ENTRY(store##suffix, (store_volumes<T, NV>))                                                                         \

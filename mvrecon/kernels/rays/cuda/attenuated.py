@@ -1,0 +1,131 @@
+"""The compiled operators of CUDA devices along attenuated rays: the same three as those of the CPU,
+on torch's current stream, without a wait.
+
+The adjoints add up ray by ray in whole numbers, fixed point of 63 bits, so that every run has the
+same bits. Their unit is set by bounds of what a voxel may get: a value that is not finite makes all
+of the result NaN.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.kernels.precision import wide
+from mvrecon.kernels.rays.cuda.operators import Call
+from mvrecon.kernels.rays.lines import DIRECTION, WORLD
+from mvrecon.kernels.rays.occupancy import Occupancy
+
+#: Bits of a number in fixed point, without its sign.
+BITS = 62
+
+
+def project(
+    volume: Float[Tensor, "n d h w"],
+    mu: Float[Tensor, "d h w"],
+    lines: Float[Tensor, "m 4 3 c"],
+    layers: Float[Tensor, "m k"],
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+) -> Float[Tensor, "n m v u k"]:
+    """Attenuated line integrals, in mm times the volumes' unit; see
+    `attenuated_reference.project`.
+    """
+    x = wide(volume)
+    call = _call(torch.cat([x, mu.to(x.dtype)[None]]), lines, layers, window, detector, method)
+    views = call.new(len(x), len(lines), *detector, layers.shape[1])
+    call.scene.put(views=views)
+    if len(x):
+        call.over_rays("weaken", len(x))
+    return views
+
+
+def backproject(
+    views: Float[Tensor, "n m v u k"],
+    mu: Float[Tensor, "d h w"],
+    lines: Float[Tensor, "m 4 3 c"],
+    layers: Float[Tensor, "m k"],
+    window: Sequence[float],
+    method: str,
+) -> Float[Tensor, "n d h w"]:
+    """The exact transpose of `project` in the emission, to 2^-`BITS` of its bound."""
+    y, detector = wide(views), views.shape[2:4]
+    greatest = _greatest(y) * _longest(lines, detector)
+    call = _call(mu.to(y.dtype)[None], lines, layers, window, detector, method)
+    return _whole(call, "receive", y / greatest, len(y)) * greatest
+
+
+def mu_vjp(
+    volume: Float[Tensor, "n d h w"],
+    views: Float[Tensor, "n m v u k"],
+    mu: Float[Tensor, "d h w"],
+    lines: Float[Tensor, "m 4 3 c"],
+    layers: Float[Tensor, "m k"],
+    window: Sequence[float],
+    method: str,
+) -> Float[Tensor, "d h w"]:
+    """The derivative of <views, project(volume, mu)> by the attenuation mu."""
+    x, detector = wide(volume), views.shape[2:4]
+    y, longest = views.to(x.dtype), _longest(lines, detector)
+    # what all segments of a ray send out is at most one, and so is its product with their length
+    sent = _greatest(x) * longest * (max(mu.shape) * max(1, len(x)))
+    seen = _greatest(y) * longest
+    both = torch.cat([x / sent, mu.to(x.dtype)[None]])
+    call = _call(both, lines, layers, window, detector, method)
+    return _whole(call, "bend", y / seen, 1)[0] * (sent * seen)
+
+
+def _call(
+    volumes: Tensor,
+    lines: Tensor,
+    layers: Tensor,
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+) -> Call:
+    """A call whose volumes, the last of them the attenuation, are where rays read them."""
+    part, x = Occupancy.whole(volumes.shape[1:]), volumes.detach().contiguous()
+    call = Call(x, lines, window, part, detector, method, attenuated=True)
+    call.read(x, None)
+    nodes = layers.detach().double().contiguous()
+    call.tensors.append(nodes)
+    call.scene.put(layers=nodes, n_layers=layers.shape[1])
+    return call
+
+
+def _whole(call: Call, name: str, views: Tensor, count: int) -> Float[Tensor, "n d h w"]:
+    """Volumes to which every ray adds at most one a voxel, from views."""
+    scene, y = call.scene, views.contiguous()
+    rays = scene.n_views * scene.rows * scene.columns
+    fixed = 2.0 ** (BITS - math.ceil(math.log2(max(1, rays))))
+    results = call.new(count, *scene.sizes[::-1], dtype=torch.int64, zero=True)
+    scene.put(views=y, results=results, fixed=fixed)
+    if count:
+        call.over_rays(name, count)
+    return results.to(y.dtype) / fixed
+
+
+def _greatest(values: Tensor) -> Float[Tensor, ""]:
+    """The greatest magnitude, on the device; one of zeros alone, NaN where one is not finite."""
+    greatest = values.abs().amax() if values.numel() else values.new_zeros(())
+    greatest = torch.where(greatest == 0, 1, greatest)
+    return torch.where(greatest.isfinite(), greatest, math.nan)
+
+
+def _longest(lines: Float[Tensor, "m 4 3 c"], detector: Sequence[int]) -> Float[Tensor, ""]:
+    """The greatest length in mm of a ray in a slab across its main axis; one without rays."""
+    direction, world = (_at_pixels(lines[:, i].detach(), detector) for i in (DIRECTION, WORLD))
+    return _greatest(world.norm(dim=1) / direction.abs().amax(dim=1))
+
+
+def _at_pixels(maps: Float[Tensor, "m 3 c"], detector: Sequence[int]) -> Tensor:
+    """Linear maps at every pixel, made on their device; those of single rays are constant."""
+    if maps.shape[2] == 1:
+        return maps
+    like = {"device": maps.device, "dtype": maps.dtype}
+    v, u = (torch.arange(n, **like) - (n - 1) / 2 for n in detector)
+    by_u, by_v, constant = maps[..., None, None].unbind(2)
+    return by_u * u + by_v * v[:, None] + constant

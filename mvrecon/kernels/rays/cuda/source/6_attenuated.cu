@@ -1,0 +1,256 @@
+// Attenuated rays: the last of the volumes that are stored is the attenuation. As `attenuated_reference.py`: a segment, a
+// slab for Joseph's method and a cell for Siddon's, of the optical depth m sends out exp(-A) (1 - exp(-m)) / m of its
+// emission, A the depth of those between it and the end of the ray where w is greatest.
+// A walk goes up the slabs; where the detector stands beyond the last, A is what all have less what has been passed.
+
+// A sum that loses no digit to its length (Kahan).
+template <class R> struct Long {
+  R value, lost;
+  DEVICE Long() : value(0), lost(0) {}
+  DEVICE void operator+=(R more) {
+    R y = more - lost, sum = value + y;
+    lost = (sum - value) - y;
+    value = sum;
+  }
+};
+
+// (1 - exp(-m)) / m; up to m = 1/2 its series, whose terms that are left out are below the last digit.
+template <class R> DEVICE R mean_passed(R m) {
+  if (m > (R)0.5) return -expm1(-m) / m;
+  const int terms = sizeof(R) == 4 ? 8 : 14;
+  R sum = 1;
+  UNROLL for (int k = terms; k > 1; k--) sum = 1 - m * sum * (R)(1.0 / k);
+  return sum;
+}
+
+// Its derivative.
+template <class R> DEVICE R slope_of_mean(R m) {
+  if (m > (R)0.5) return (exp(-m) * (1 + m) - 1) / (m * m);
+  const int terms = sizeof(R) == 4 ? 9 : 14;
+  R sum = 1;
+  UNROLL for (int k = terms; k > 2; k--) sum = 1 - m * sum * (R)((k - 1.0) / (k * (k - 2.0)));
+  return (R)-0.5 * sum;
+}
+
+// The part of a ray in one segment: bilinear in the cell (b, c) of slab k, or that cell alone, of so many mm.
+template <class R, int METHOD> struct Segment {
+  int k, b, c;
+  R y, z, length;
+  DEVICE R of(const Store<R, 1>& store) const {
+    const Many<R, 1>* p = store.at(k, b, c);
+    if constexpr (METHOD == SIDDON) return length * p->n[0];
+    const Many<R, 1>* q = store.farther(p);
+    R lower = p[0].n[0] + z * (p[1].n[0] - p[0].n[0]), upper = q[0].n[0] + z * (q[1].n[0] - q[0].n[0]);
+    return length * (lower + y * (upper - lower));
+  }
+};
+
+// Hands the segments of a ray, with their optical depths and s, to a visitor.
+template <class R, int METHOD, class V> struct Segments {
+  enum { AHEAD = 1 };
+  Store<R, 1> matter;
+  R length;
+  V visitor;
+  DEVICE Segments(const Scene& s, const Ray& ray, const V& visitor)
+      : matter(s, ray.axis, s.n_volumes - 1), length((R)ray.length), visitor(visitor) {}
+  DEVICE void one(const Segment<R, METHOD>& segment, R s) { visitor.segment(segment, segment.of(matter), s); }
+  DEVICE void cell(int k, R s, R share, R b, R c) {
+    int ib = (int)b, ic = (int)c;
+    one({k, ib, ic, b - (R)ib, c - (R)ic, length * share}, s);
+  }
+  DEVICE void passage(int k, R s, const Passage<R>& p) {
+    one({k, p.b0, p.c0, 0, 0, length * p.one()}, s);
+    one({k, p.b_first() ? p.b1 : p.b0, p.b_first() ? p.c0 : p.c1, 0, 0, length * (p.two() - p.one())}, s);
+    one({k, p.b1, p.c1, 0, 0, length * (p.length - p.two())}, s);
+  }
+};
+
+template <class R, int METHOD, class V> DEVICE V walked(const Scene& s, const Ray& ray, const V& visitor) {
+  Segments<R, METHOD, V> segments(s, ray, visitor);
+  walk<METHOD, R>(s, ray, segments);
+  return segments.visitor;
+}
+
+template <class R> struct Depth {
+  Long<R> all;
+  template <class G> DEVICE void segment(const G&, R m, R) { all += m; }
+};
+
+// What leaves a segment for the detector.
+template <class R> struct Passed {
+  bool ascends;  // the detector stands at the first slab
+  R all;
+  Long<R> below;
+  // The transmission from the segment's end on.
+  DEVICE R next(R m) {
+    R before = ascends ? below.value : max(all - below.value - m, (R)0);
+    below += m;
+    return exp(-before);
+  }
+};
+
+template <class R, int METHOD> DEVICE Passed<R> passed_of(const Scene& s, const Ray& ray) {
+  Passed<R> passed;
+  passed.ascends = ray.D < 0;
+  passed.all = passed.ascends ? (R)0 : walked<R, METHOD>(s, ray, Depth<R>()).all.value;
+  return passed;
+}
+
+// Layers of magnification at equal steps of 1 / w, between two of which a segment is shared out linearly.
+template <class R> struct Layers {
+  int last;
+  R way, start, first, scale;
+  DEVICE Layers(const Scene& s, const Ray& ray, Pixel p) : last(s.n_layers - 1), way((R)ray.D), start(0), first(0), scale(0) {
+    if (!last) return;
+    const double *line = s.lines + (long long)p.view * 12 * s.maps, *layers = s.layers + (long long)p.view * s.n_layers;
+    start = (R)at(s, line, 2, ray.axis, p.u - (s.columns - 1) * 0.5, p.v - (s.rows - 1) * 0.5);
+    first = (R)layers[0];
+    scale = (R)(last / (layers[last] - layers[0]));
+  }
+  DEVICE void of(R s, int& layer, R& part) const {
+    R along = min(max((way / (s - start) - first) * scale, (R)0), (R)last);
+    layer = min((int)along, last - 1);
+    part = along - (R)layer;
+  }
+  // A pixel's value in its layers, at s.
+  DEVICE R value(const R* values, R s) const {
+    if (!last) return values[0];
+    int layer;
+    R part;
+    of(s, layer, part);
+    return values[layer] + part * (values[layer + 1] - values[layer]);
+  }
+};
+
+// Adds up what is sent out: two layers at a time, which are written where a ray leaves them.
+template <class R> struct Sent {
+  Layers<R> layers;
+  Store<R, 1> emission;
+  Passed<R> passed;
+  R* into;
+  int layer;
+  Long<R> low, high;
+  DEVICE void write() {
+    into[layer] += low.value;
+    if (layers.last) into[layer + 1] += high.value;
+    low = high = Long<R>();
+  }
+  template <class G> DEVICE void segment(const G& g, R m, R s) {
+    R sent = passed.next(m) * mean_passed(m) * g.of(emission), part = 0;
+    if (layers.last) {
+      int here;
+      layers.of(s, here, part);
+      if (here != layer) {
+        write();
+        layer = here;
+      }
+      high += part * sent;
+    }
+    low += sent - part * sent;
+  }
+};
+
+template <class R, int METHOD> DEVICE void weaken_rays(const Scene& s) {
+  Pixel p = pixel_of(s);
+  if (!on_detector(s, p)) return;
+  Ray ray = ray_of<METHOD>(s, stored_box(s), p);
+  long long pixels = (long long)s.n_views * s.rows * s.columns, pixel = blockIdx.y * pixels + index_of(s, p.view, p.v, p.u);
+  R* into = (R*)s.views + pixel * s.n_layers;
+  for (int k = 0; k < s.n_layers; k++) into[k] = 0;
+  Store<R, 1> emission(s, ray.axis, blockIdx.y);
+  Sent<R> sent{Layers<R>(s, ray, p), emission, passed_of<R, METHOD>(s, ray), into, 0, {}, {}};
+  walked<R, METHOD>(s, ray, sent).write();
+}
+
+// Adds numbers to voxels in fixed point: whole numbers add up to the same bits in any order.
+template <class R> struct Fixed {
+  const Scene& s;
+  int axis, far, near;
+  R scale;
+  long long* into;
+  DEVICE void to(int k, int b, int c, R value) {
+    int place[3];
+    UNROLL for (int i = 0; i < 3; i++) place[i] = i == axis ? k : i == far ? b - 1 : c - 1;
+    UNROLL for (int i = 0; i < 3; i++) if (place[i] < 0 || place[i] >= s.sizes[i]) return;
+    add_whole(into + ((long long)place[2] * s.sizes[1] + place[1]) * s.sizes[0] + place[0], (long long)(value * scale));
+  }
+  template <int METHOD> DEVICE void to(const Segment<R, METHOD>& g, R value) {
+    if constexpr (METHOD == SIDDON) return to(g.k, g.b, g.c, value * g.length);
+    R low = value * g.length * (1 - g.y), high = value * g.length * g.y;
+    to(g.k, g.b, g.c, low * (1 - g.z));
+    to(g.k, g.b, g.c + 1, low * g.z);
+    to(g.k, g.b + 1, g.c, high * (1 - g.z));
+    to(g.k, g.b + 1, g.c + 1, high * g.z);
+  }
+};
+
+template <class R> DEVICE Fixed<R> fixed_of(const Scene& s, const Ray& ray, int volume) {
+  long long size = (long long)s.sizes[0] * s.sizes[1] * s.sizes[2];
+  return {s, ray.axis, ray.far, ray.near, settled((R)s.fixed), (long long*)s.results + volume * size};
+}
+
+template <class R> struct Received {
+  Layers<R> layers;
+  Passed<R> passed;
+  const R* values;
+  Fixed<R> into;
+  template <class G> DEVICE void segment(const G& g, R m, R s) {
+    into.to(g, passed.next(m) * mean_passed(m) * layers.value(values, s));
+  }
+};
+
+template <class R, int METHOD> DEVICE void receive_rays(const Scene& s) {
+  Pixel p = pixel_of(s);
+  if (!on_detector(s, p)) return;
+  Ray ray = ray_of<METHOD>(s, stored_box(s), p);
+  long long pixels = (long long)s.n_views * s.rows * s.columns, pixel = blockIdx.y * pixels + index_of(s, p.view, p.v, p.u);
+  const R* values = (const R*)s.views + pixel * s.n_layers;
+  Received<R> received{Layers<R>(s, ray, p), passed_of<R, METHOD>(s, ray), values, fixed_of<R>(s, ray, blockIdx.y)};
+  walked<R, METHOD>(s, ray, received);
+}
+
+// The derivative by optical depths: a segment weakens itself, and all those that stand farther from the detector.
+template <class R> struct Emitted {
+  const Scene& s;
+  Layers<R> layers;
+  int axis;
+  long long pixel, pixels;
+  template <class G> DEVICE R of(const G& g, R along) const {
+    R sum = 0;
+    for (int n = 0; n < s.n_volumes - 1; n++)
+      sum += layers.value((const R*)s.views + (n * pixels + pixel) * s.n_layers, along) * g.of(Store<R, 1>(s, axis, n));
+    return sum;
+  }
+};
+
+template <class R> struct Total {
+  Emitted<R> emitted;
+  Passed<R> passed;
+  Long<R> all;
+  template <class G> DEVICE void segment(const G& g, R m, R s) { all += passed.next(m) * mean_passed(m) * emitted.of(g, s); }
+};
+
+template <class R> struct Bent {
+  Emitted<R> emitted;
+  Passed<R> passed;
+  R all;
+  Fixed<R> into;
+  Long<R> below;
+  template <class G> DEVICE void segment(const G& g, R m, R s) {
+    R from = passed.next(m) * emitted.of(g, s), sent = from * mean_passed(m);
+    R beyond = passed.ascends ? all - below.value - sent : below.value;
+    below += sent;
+    into.to(g, from * slope_of_mean(m) - beyond);
+  }
+};
+
+template <class R, int METHOD> DEVICE void bend_rays(const Scene& s) {
+  Pixel p = pixel_of(s);
+  if (!on_detector(s, p)) return;
+  Ray ray = ray_of<METHOD>(s, stored_box(s), p);
+  long long pixels = (long long)s.n_views * s.rows * s.columns;
+  Emitted<R> emitted{s, Layers<R>(s, ray, p), ray.axis, index_of(s, p.view, p.v, p.u), pixels};
+  Passed<R> passed = passed_of<R, METHOD>(s, ray);
+  R all = walked<R, METHOD>(s, ray, Total<R>{emitted, passed, {}}).all.value;
+  walked<R, METHOD>(s, ray, Bent<R>{emitted, passed, all, fixed_of<R>(s, ray, 0), {}});
+}

@@ -1,0 +1,128 @@
+"""Attenuated rays on CUDA devices: the kernels compiled by g++ against the reference."""
+
+import math
+
+import pytest
+import torch
+
+from mvrecon.kernels.rays import attenuated_reference as reference
+from mvrecon.kernels.rays.cuda import attenuated as cuda
+from tests.kernels.cuda.scenes import RIGS, difference, scene
+from tests.kernels.cuda.waits import Waits
+
+METHODS = ("joseph", "siddon")
+PRECISIONS = [(torch.float64, 1, 1e-11), (torch.float32, 3, 3e-6)]
+#: Rigs whose rays all have one end of the volume on the detector's side, and none through voxels'
+#: edges, where the derivative by mu has two values.
+BENDS = [kind for kind in RIGS if kind != "axial"]
+
+
+def case(kind, dtype, count=1, layers=1, thickness=0.4):
+    """Volumes, views, mu, and the rays of a rig; the whole volume is `thickness` thick on average
+    along its diagonal, some voxels much more."""
+    x, _, lines, window, detector = scene(kind, dtype, count)
+    mu = torch.rand(x.shape[1:], dtype=dtype)
+    mu[..., :2] *= 8
+    mu *= thickness / (math.hypot(*RIGS[kind][0].spacing) * len(mu))
+    y = torch.randn(count, len(lines), *detector, layers, dtype=dtype)
+    nodes = torch.zeros(len(lines), 1, dtype=torch.float64)
+    if layers > 1:
+        shape = x.shape[1:]
+        w = torch.stack(list(reference.fractions(lines, detector, shape)))
+        inverse = (1 / w).unflatten(1, (len(lines), -1)).transpose(0, 1).flatten(1)
+        low, high = inverse.quantile(0.1, dim=1), inverse.quantile(0.8, dim=1)
+        nodes = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, layers).double()
+    return x, y, mu, (lines, nodes, window), detector
+
+
+@pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", RIGS)
+def test_views_and_volumes_are_those_of_the_reference(kind, method, dtype, count, bound, host):
+    x, y, mu, rays, detector = case(kind, dtype, count)
+    views = reference.project(x.double(), mu.double(), *rays, detector, method)
+    assert difference(cuda.project(x, mu, *rays, detector, method), views) < bound
+    volume = reference.backproject(y.double(), mu.double(), *rays, method)
+    assert difference(cuda.backproject(y, mu, *rays, method), volume) < bound
+
+
+@pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", BENDS)
+def test_the_derivative_by_attenuation_is_that_of_the_reference(
+    kind, method, dtype, count, bound, host
+):
+    x, y, mu, rays, detector = case(kind, dtype, count)
+    moving = mu.double().requires_grad_()
+    views = reference.project(x.double(), moving, *rays, detector, method)
+    (change,) = torch.autograd.grad((views * y).sum(), moving)
+    assert difference(cuda.mu_vjp(x, y, mu, *rays, method), change) < bound
+
+
+@pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
+@pytest.mark.parametrize("method", METHODS)
+def test_layers_of_magnification_are_those_of_the_reference(method, dtype, count, bound, host):
+    x, y, mu, rays, detector = case("dcspect80", dtype, count, layers=5)
+    moving = mu.double().requires_grad_()
+    views = reference.project(x.double(), moving, *rays, detector, method)
+    assert difference(cuda.project(x, mu, *rays, detector, method), views) < bound
+    volume = reference.backproject(y.double(), mu.double(), *rays, method)
+    assert difference(cuda.backproject(y, mu, *rays, method), volume) < bound
+    (change,) = torch.autograd.grad((views * y).sum(), moving)
+    assert difference(cuda.mu_vjp(x, y, mu, *rays, method), change) < bound
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", ["dcspect80", "cone"])
+def test_thick_matter_keeps_its_digits(kind, method, host):
+    """Up to a depth of 20, at which a ray's far end has lost all but 2e-9."""
+    x, y, mu, rays, detector = case(kind, torch.float32, thickness=10.0)
+    x = x.abs()
+    views = reference.project(x.double(), mu.double(), *rays, detector, method)
+    assert difference(cuda.project(x, mu, *rays, detector, method), views) < 3e-6
+    volume = reference.backproject(y.double(), mu.double(), *rays, method)
+    assert difference(cuda.backproject(y, mu, *rays, method), volume) < 3e-6
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_numbers_of_any_size_stay_in_fixed_point(scale, host):
+    x, y, mu, rays, _ = case("dcspect80", torch.float64, 2)
+    volume = cuda.backproject(y, mu, *rays, "joseph")
+    assert difference(cuda.backproject(scale * y, mu, *rays, "joseph"), scale * volume) < 1e-14
+    change = cuda.mu_vjp(x, y, mu, *rays, "joseph")
+    assert difference(cuda.mu_vjp(x, scale * y, mu, *rays, "joseph"), scale * change) < 1e-12
+    assert difference(cuda.mu_vjp(scale * x, y, mu, *rays, "joseph"), scale * change) < 1e-12
+
+
+def test_the_order_of_views_changes_no_bit(host):
+    """Whole numbers add up to the same in any order, as threads on a device have none."""
+    _, y, mu, (lines, nodes, window), _ = case("dome", torch.float32, 2)
+    volume = cuda.backproject(y, mu, lines, nodes, window, "joseph")
+    turned = cuda.backproject(y.flip(1), mu, lines.flip(0), nodes, window, "joseph")
+    assert torch.equal(volume, turned)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_is_no_number(bad, host):
+    x, y, mu, rays, detector = case("cone", torch.float32)
+    y[0, 0, 1, 1], x[0, 2, 2, 2] = bad, bad
+    assert cuda.backproject(y, mu, *rays, "joseph").isnan().all()
+    assert cuda.mu_vjp(x, y, mu, *rays, "joseph").isnan().all()
+    assert not cuda.project(x, mu, *rays, detector, "joseph").isfinite().all()
+
+
+def test_nothing_gives_nothing_and_nobody_waits(host):
+    x, y, mu, rays, detector = case("cone", torch.float32, 2)
+    with Waits() as waits:
+        assert cuda.project(x[:0], mu, *rays, detector, "joseph").shape == (0, *y.shape[1:])
+        views = cuda.project(0 * x, mu, *rays, detector, "joseph")
+        volume = cuda.backproject(0 * y, mu, *rays, "joseph")
+        change = cuda.mu_vjp(x, 0 * y, mu, *rays, "joseph")
+    assert waits.names == []
+    assert not views.any() and not volume.any() and not change.any()
+    assert host.launches == [
+        *("survey", "store"),
+        *("survey", "store", "weaken"),
+        *("survey", "store", "receive"),
+        *("survey", "store", "bend"),
+    ]
