@@ -17,19 +17,22 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.visual_hull.footprints import (
-    Bricks,
-    footprint_sums,
-    footprints,
-    summed_area_tables,
-)
-from mvrecon.visual_hull.hull import check_measured
-from mvrecon.visual_hull.judging import AT_ONCE
+from mvrecon.kernels.footprints import Prints
+from mvrecon.kernels.known import key_of, known
+from mvrecon.kernels.rays.cuda import selfcheck
+from mvrecon.visual_hull.footprints import prints_of, summed_area_tables
+from mvrecon.visual_hull.hull import REACH, check_measured
+from mvrecon.visual_hull.judging import AT_ONCE, counted, counted_at_once
 
 #: Views in a group whose counts are added.
 GROUP = 10
+#: Newton's steps to the bound of a Poisson mean.
+STEPS = 8
+#: Of what kernels are tried on.
+DETECTOR = {"pixels": [40, 44], "pixel_mm": 1.0}
 #: Witness views: how many noisy views must agree that a brick is empty.
 WITNESSES = 3
 
@@ -129,26 +132,52 @@ def activity_bound(
         ValueError: counts of another size than the rig's, or not whole numbers from zero; a
             sensitivity of another size or negative; a delta not between 0 and 1.
     """
-    check_measured(counts, cameras)
+    check_measured(counts, cameras, on_gpu=False)
     _check_counts(counts, sensitivity, (len(cameras), *bricks_along(grid.shape, brick)), delta)
-    lattice, sets = sensitivity.shape[1:], view_sets(len(cameras)).to(counts.device)
-    places = torch.ones(lattice, dtype=torch.bool, device=counts.device).nonzero()
-    share, expected = (
-        delta / (len(places) * len(sets)),
-        sensitivity.to(counts.device, torch.float64).flatten(1),
+    lattice, table = sensitivity.shape[1:], summed_area_tables(counts[:, 0])
+    sets, prints = _known(cameras, grid, counts)
+    n_bricks, at_once = math.prod(lattice), max(1, AT_ONCE // (len(cameras) * len(counts)))
+    share, expected = delta / (n_bricks * len(sets)), sensitivity.to(sets).flatten(1)
+    there = counts.is_cuda and not selfcheck.reason(
+        counts.device, "counts", torch.float64, 1, _tried
     )
-    cameras, table = cameras.to(counts.device), summed_area_tables(counts[:, 0])
+    counting = counted_at_once if there else counted
     bounds = []
-    for some in torch.arange(len(places), device=counts.device).split(
-        max(1, AT_ONCE // (len(cameras) * len(counts)))
-    ):
-        prints = footprints(cameras, grid, Bricks.at(places[some], brick, grid.shape))
-        n, back = (sets @ footprint_sums(table, prints).to(torch.float64)).unique(
-            return_inverse=True
-        )
-        bound = poisson_bound(n, share)[back] / (sets @ expected[:, some])
+    for first in range(0, n_bricks, at_once):
+        part = range(first, min(first + at_once, n_bricks))
+        sums = counting(table, prints, brick, REACH, grid.shape, part).to(sets)
+        bound = _bounds(sets @ sums, share) / (sets @ expected[:, part.start : part.stop])
         bounds.append(bound.amin(dim=1))
     return torch.cat(bounds, dim=-1).reshape(len(counts), *lattice)
+
+
+def _known(cameras: Cameras, grid: Grid, like: Tensor) -> tuple[Float[Tensor, "t m"], Prints]:
+    """The sets of views, and what footprints are told from, made once for a rig on a device."""
+
+    def made() -> tuple[Tensor, Prints]:
+        prints = prints_of(cameras, grid, 0.0)
+        prints = prints._replace(numbers=prints.numbers.to(like.device))
+        return view_sets(len(cameras)).to(like.device), prints
+
+    return known(cameras, ("footprints of counts", key_of(grid)), like, made)
+
+
+def _bounds(counts: Float[Tensor, "b t n"], delta: float) -> Float[Tensor, "b t n"]:
+    """`poisson_bound`, in main memory of every number once: there are few of them."""
+    if counts.is_cuda:
+        return poisson_bound(counts, delta)
+    numbers, back = counts.unique(return_inverse=True)
+    return poisson_bound(numbers, delta)[back]
+
+
+def _tried(device: str, dtype: torch.dtype) -> selfcheck.Tried:
+    """Counts in the bricks of a small grid, of three views of pixels of which no two are alike."""
+    cameras, grid = circular(3, 40.0, 70.0, DETECTOR), Grid.centred(size=(13, 12, 10), spacing=1.5)
+    views = torch.arange(3.0 * math.prod(cameras.shape), device=device)
+    table = summed_area_tables(views.reshape(1, 3, *cameras.shape))
+    _, prints = _known(cameras, grid, views)
+    rest = table, prints, 4, REACH, grid.shape, range(5, 30)
+    yield "counts", selfcheck.error_of(counted_at_once(*rest).double(), counted(*rest).double())
 
 
 def view_sets(count: int) -> Float[Tensor, "t m"]:
@@ -185,15 +214,16 @@ def poisson_bound(counts: Float[Tensor, "*n"], delta: float) -> Float[Tensor, "*
     delta quantile of chi^2 with 2 n + 2 degrees of freedom; -ln delta for n = 0. Accurate to 1e-9,
     as torch's incomplete gamma function.
 
-    Found by bisection below Chernoff's bound n + t + sqrt(t^2 + 2 n t), t = -ln delta.
+    By Newton's steps down from Chernoff's bound n + t + sqrt(t^2 + 2 n t), t = -ln delta: the
+    logarithm of the probability is a concave function of the mean, so that no step passes U.
     """
     n, t = counts.to(torch.float64), -math.log(delta)
-    low, high = torch.zeros_like(n), n + t + (t * t + 2 * n * t).sqrt()
-    for _ in range(60):
-        middle = (low + high) / 2
-        above = torch.special.gammaincc(n + 1, middle) > delta
-        low, high = torch.where(above, middle, low), torch.where(above, high, middle)
-    return high
+    U, constant = n + t + (t * t + 2 * n * t).sqrt(), (n + 1).lgamma()
+    for _ in range(STEPS):
+        below = torch.special.gammaincc(n + 1, U)
+        slope = (n * U.log() - U - constant).exp() / below
+        U = U + (below.log() + t) / slope
+    return U
 
 
 def _check_counts(
@@ -202,7 +232,7 @@ def _check_counts(
     sizes: tuple[int, ...],
     delta: float,
 ) -> None:
-    if (counts < 0).any() or (counts != counts.round()).any():
+    if ((counts < 0) | (counts != counts.round())).any():
         low, high = counts.aminmax()
         raise ValueError(
             f"Expected counts, whole numbers from 0, got values between {low:g} and {high:g}"

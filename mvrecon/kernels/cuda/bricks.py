@@ -1,4 +1,4 @@
-"""The visual hull on CUDA devices: every brick is judged by itself."""
+"""Footprints of bricks on CUDA devices: which bricks are empty, and the counts in each."""
 
 import math
 from collections.abc import Sequence
@@ -13,6 +13,8 @@ from mvrecon.kernels.cuda.launching import blocks, numbers_of, start
 from mvrecon.kernels.cuda.sources import Part
 from mvrecon.kernels.footprints import Prints, Rule
 
+PART = Part("hull", torch.float64)
+
 
 def judge(
     tables: Int[Tensor, "b m v1 u1"], prints: Prints, rule: Rule, shape: Sequence[int]
@@ -20,22 +22,45 @@ def judge(
     """The bricks of a grid of `shape` that may be other than empty, from the summed-area tables of
     the pixels that are no background; one launch.
     """
-    items, views, rows, columns = tables.shape
     counts = bricks_along(shape, rule.edge)
-    kept = torch.empty(items, *counts, dtype=torch.bool, device=tables.device)
+    kept = torch.empty(len(tables), *counts, dtype=torch.bool, device=tables.device)
     sums, numbers = tables.to(torch.int32).contiguous(), numbers_of(prints.numbers)
-    field = Field().put(
+    field = _field(sums, numbers, prints, shape, rule.edge)
+    field.put(result=kept, **rule._asdict())
+    start(PART, "judge", field, tables, blocks(math.prod(counts)), len(tables))
+    return kept
+
+
+def count(
+    tables: Int[Tensor, "b m v1 u1"],
+    prints: Prints,
+    edge: int,
+    reach: float,
+    shape: Sequence[int],
+    part: range,
+) -> Int[Tensor, "b m n"]:
+    """The counts in the footprints of some bricks of a grid of `shape`, from the views' summed-area
+    tables; one launch.
+    """
+    items, views = tables.shape[:2]
+    counts = torch.empty(items, views, len(part), dtype=torch.int64, device=tables.device)
+    sums, numbers = tables.to(torch.int64).contiguous(), numbers_of(prints.numbers)
+    field = _field(sums, numbers, prints, shape, edge)
+    field.put(result=counts, sources=part.start, items=len(part), edge=edge, reach=reach)
+    start(PART, "count", field, tables, blocks(len(part)), items)
+    return counts
+
+
+def _field(sums: Tensor, numbers: Tensor, prints: Prints, shape: Sequence[int], edge: int) -> Field:
+    """What both are launched with; tensors are to be kept until then."""
+    views, rows, columns = sums.shape[1:]
+    return Field().put(
         maps=numbers,
         origin=sums,
-        result=kept,
         window=(float(prints.window[0]), float(prints.window[1])),
         parallel=prints.parallel,
         source=(columns - 1, rows - 1, 1),
         kinds=views,
-        shape=tuple(reversed(counts)),
+        shape=tuple(reversed(bricks_along(shape, edge))),
         voxels=tuple(map(int, reversed(shape))),
-        **rule._asdict(),
     )
-    part = Part("hull", torch.float64)
-    start(part, "judge", field, tables, blocks(math.prod(counts)), items)
-    return kept

@@ -18,7 +18,7 @@ PLANES, TILE, MAP = 8, (16, 8, 8), 30
 KERNELS = {
     "warp": ("invert", "warp", "warp_back", "warp_vary"),
     "look": ("look", "show"),
-    "hull": ("judge",),
+    "hull": ("judge", "count"),
     "norm": ("sum_features", "normalise", "sum_changes", "change_features"),
 }
 

@@ -92,8 +92,8 @@ def test_warps_back_projection_and_hull_keep_all_in_registers(part, capability, 
         assert kernel.registers <= MOST, (name, kernel.registers)
         assert not count(machine_code.LOCAL + "|" + machine_code.ATOMIC, kernel.instructions), name
         values = [loop for loop in kernel.loops if count(r"LDG\.E(?!\S*\.64)", loop)]
-        assert bool(values) == (name not in ("invert", "judge")), name
-        inner = kernel.loops if name == "judge" else values
+        assert bool(values) == (name not in ("invert", *FIELDS["hull"])), name
+        inner = kernel.loops if name in FIELDS["hull"] else values
         assert not any(count(machine_code.DOUBLE, loop) for loop in inner), name
 
 

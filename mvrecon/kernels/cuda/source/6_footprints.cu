@@ -1,4 +1,4 @@
-// The visual hull: which bricks are proved empty, a thread a brick; see `visual_hull/footprints.py` and `hull.py`.
+// Footprints of bricks, a thread a brick: which are proved empty (the visual hull), and the counts in them; see `visual_hull/footprints.py` and `hull.py`.
 // A view has 17 numbers: the map [3 4] from voxels about the centre to (u w, v w, w), parallel beams to (u, v, w), how much
 // further a ray may be (u, v), the part of a ray that this takes, and how much more footprints are grown by (u, v).
 enum { PRINT = 17 };
@@ -38,29 +38,54 @@ struct Print {
   }
 };
 
+// The corners of a brick's voxels, from the grid's centre.
+struct Corners {
+  Twofold near[3], far[3];
+  DEVICE Corners(const Field& f, int flat) {
+    int brick[3];
+    unravel(f.shape, flat, brick);
+    UNROLL for (int i = 0; i < 3; i++) {
+      int voxels = f.voxels[i], low = brick[i] * f.edge;
+      near[i] = twofold(low - (middle(voxels) + 0.5) - f.reach);
+      far[i] = twofold(min(low + f.edge, voxels) - (middle(voxels) + 0.5) + f.reach);
+    }
+  }
+};
+
+// The sum over a footprint, from a table of so many columns.
+template <class T> DEVICE T sum_over(const Print& p, const T* table, int width) {
+  const T *above = table + (long long)p.low[1] * width, *below = table + (long long)p.high[1] * width;
+  return below[p.high[0]] - above[p.high[0]] - below[p.low[0]] + above[p.low[0]];
+}
+
 // Into kept [b z y x]: whether fewer views than enough prove a brick empty. From tables [b m v+1 u+1] of the pixels above and
 // left of a corner that are no background.
 DEVICE void judge_bricks(const Field& f) {
   long long at = thread_of(), bricks = size_of(f.shape);
   if (at >= bricks) return;
-  int brick[3];
-  unravel(f.shape, (int)at, brick);
-  Twofold near[3], far[3];
-  UNROLL for (int i = 0; i < 3; i++) {
-    int voxels = f.voxels[i], low = brick[i] * f.edge;
-    near[i] = twofold(low - (middle(voxels) + 0.5) - f.reach);
-    far[i] = twofold(min(low + f.edge, voxels) - (middle(voxels) + 0.5) + f.reach);
-  }
+  Corners brick(f, (int)at);
   int width = f.source[0] + 1, empty = 0;
   long long corners = (long long)width * (f.source[1] + 1);
   const int* table = (const int*)f.origin + (long long)blockIdx.y * f.kinds * corners;
   bool dark = true;
   for (int m = 0; m < f.kinds && empty < f.enough; m++, table += corners) {
-    Print p(f, f.maps + (long long)m * PRINT, near, far);
-    const int *above = table + (long long)p.low[1] * width, *below = table + (long long)p.high[1] * width;
-    bool none = below[p.high[0]] - above[p.high[0]] - below[p.low[0]] + above[p.low[0]] == 0;
+    Print p(f, f.maps + (long long)m * PRINT, brick.near, brick.far);
+    bool none = sum_over(p, table, width) == 0;
     empty += none && p.whole;
     dark = dark && none;
   }
   ((unsigned char*)f.result)[blockIdx.y * bricks + at] = empty < f.enough && (f.keep_unseen || !dark);
+}
+
+// Into sums [b m n]: the counts in the footprints of n bricks, the first of which is `sources`, from tables [b m v+1 u+1].
+DEVICE void count_bricks(const Field& f) {
+  long long at = thread_of();
+  if (at >= f.items) return;
+  Corners brick(f, f.sources + (int)at);
+  int width = f.source[0] + 1;
+  long long corners = (long long)width * (f.source[1] + 1), first = (long long)blockIdx.y * f.kinds;
+  for (int m = 0; m < f.kinds; m++) {
+    Print p(f, f.maps + (long long)m * PRINT, brick.near, brick.far);
+    ((long long*)f.result)[(first + m) * f.items + at] = sum_over(p, (const long long*)f.origin + (first + m) * corners, width);
+  }
 }

@@ -10,7 +10,9 @@
 #define LOOK_OF(suffix, R, S)                                                                                            \
   ENTRY_WITHIN(__launch_bounds__(BLOCK, 4), Field, look##suffix, look_up<R>)                                           \
   ENTRY_WITHIN(__launch_bounds__(BLOCK, 4), Field, show##suffix, show_up<R>)
-#define HULL_OF(suffix, R, S) ENTRY(judge##suffix, judge_bricks)
+#define HULL_OF(suffix, R, S)                                                                                            \
+  ENTRY(judge##suffix, judge_bricks)                                                                                   \
+  ENTRY(count##suffix, count_bricks)
 #define NORM_OF(suffix, R, S)                                                                                            \
   ENTRY_OF(Layer, sum_features##suffix, (sum_features<R, S>))                                                          \
   ENTRY_OF(Layer, normalise##suffix, (normalise<R, S>))                                                                \
