@@ -28,6 +28,8 @@ VOXELS, VIEWS, ITERATIONS = 32, 40, 8
 BETTER = 0.75
 #: View NRMSE above which a volume does not explain its views.
 POOR = 0.25
+#: View NRMSE of counts above which a volume does not explain them, by that of their noise.
+ABOVE_NOISE = 1.25
 #: Line integral that no X-ray comes through: 2e-9 of it does.
 OPAQUE = 20.0
 #: What is asked of views that fit better in another orientation than in the stored one.
@@ -57,6 +59,7 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
         device: for the comparison.
     """
     words: list[str] = []
+    limit = POOR
     orders, kind = _orders(scan), kind_of_views(RECONSTRUCTORS.get(method))
     if sees_integrals(orders[0].A):
         first, views = _read(scan, orders)
@@ -69,12 +72,15 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
                 f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
                 f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
             )
-    elif kind == "counts" and view_nrmse > POOR and not _whole(scan.measured.read(0, 1).views):
-        words.append(
-            f"expected counts, got numbers that are not whole, which the volume does not explain "
-            f"(view NRMSE {view_nrmse:.2g}); projector=drr is for line integrals"
-        )
-    if view_nrmse > POOR and not words:
+    elif kind == "counts":
+        noise = _noise_of_counts(scan.measured.read(0, 1).views)
+        limit = max(POOR, ABOVE_NOISE * (noise or 0))
+        if noise is None and view_nrmse > POOR:
+            words.append(
+                f"expected counts, got numbers that are not whole, which the volume does not "
+                f"explain (view NRMSE {view_nrmse:.2g}); projector=drr is for line integrals"
+            )
+    if view_nrmse > limit and not words:
         words.append(
             f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); look at "
             f"rig.png, and whether lengths are mm, the views whole, the grid large enough, and a "
@@ -103,6 +109,18 @@ def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
         f"expected line integrals, got whole numbers up to {view.max().item():g}; grey values want "
         f"views.kind=intensities and views.flat, counts of emission osem"
     ]
+
+
+def _noise_of_counts(view: Float[Tensor, "1 v u"]) -> float | None:
+    """NRMSE of a view's Poisson noise, where it holds counts, or counts times a factor, the least
+    value above zero, as simulated views of an activity of one do; none where it holds no counts.
+    """
+    if not (view > 0).any():
+        return 0.0
+    counts = view.double() / (1 if _whole(view) else view[view > 0].min())
+    if not torch.allclose(counts, counts.round(), rtol=1e-4, atol=0):
+        return None
+    return (counts.sum().sqrt() / counts.norm()).item()
 
 
 def _whole(view: Float[Tensor, "1 v u"]) -> bool:

@@ -115,6 +115,24 @@ def test_a_plugins_own_words_decide_what_is_doubted(views, monkeypatch):
     assert doubts(scan_of(views, "doubled"), "of_counts", 0.1) == []
 
 
+@pytest.mark.parametrize("factor", [1.0, 5.7e-5])
+@pytest.mark.parametrize("level", [0.4, 40.0])
+def test_few_counts_need_not_be_explained_better_than_their_noise_lets_them(
+    views, factor, level, monkeypatch
+):
+    """Counts as they are, and of an activity of one; what is worse than their noise is told."""
+    monkeypatch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts})
+    PROJECTORS.register("doubled")(lambda grid, cameras: 2 * Drr(grid, cameras))
+    mean = level * views / views.mean()
+    counts = torch.poisson(mean, generator=torch.Generator().manual_seed(0))
+    noise = ((counts - mean).norm() / counts.norm()).item()
+    assert (noise > 0.25) == (level < 1)
+    scan = scan_of(factor * counts, "doubled")
+    assert doubts(scan, "osem", noise) == []
+    (words,) = doubts(scan, "osem", max(0.25, noise) * 1.5)
+    assert "does not explain" in words
+
+
 @pytest.mark.parametrize("slices", [1, 12])
 def test_parallel_beams_raise_no_doubt_of_their_own(slices):
     """Reversed columns of a parallel scan are those of the object turned by half a circle."""
