@@ -7,7 +7,8 @@
     python experiments/18_spect_learned/study.py table  # results.csv, volumes.png
 
 A run is a folder of `mvrecon-train`; one that broke off goes on, one that ended is skipped. Every
-arm trains for the same processor time of one thread: steps = seconds / pace.
+arm trains for the same processor time of one thread: steps = seconds / pace; an ablation for the
+steps of the arm that it varies.
 """
 
 import argparse
@@ -145,7 +146,8 @@ def train(options: argparse.Namespace) -> None:
         folder = options.runs / total / arm / f"{options.seconds}s_{seed}"
         if (folder / "results.json").exists():
             continue
-        count = max(2, round(options.seconds / paces[arm]))
+        varied = arm.removesuffix("_density").removesuffix("_own")
+        count = max(2, round(options.seconds / paces[varied]))
         command = [sys.executable, "-m", "mvrecon.train", *settings(total, arm, options)]
         command += [f"seed={seed}", f"trainer.max_steps={count}", f"hydra.run.dir={folder}"]
         command += [f"trainer.val_check_interval={min(count, 200)}"]
