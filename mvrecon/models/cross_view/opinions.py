@@ -122,21 +122,21 @@ class Opinions(nn.Module):
         frusta, x = self.inside.frusta, self._cells(volume)
         unit = None if sums is None else self._unit(x, sums, mask)
         prior = frusta.to_frusta(x[:, None]).expand(-1, len(frusta.step), -1, -1, -1, -1)
-        prior = self.transmission.seen(prior * frusta.occupied)
+        prior = self.transmission.attenuate(prior * frusta.occupied)
         integral = frusta.integrate(prior)
         missed = means(residual if self.of_residual else residual + projected, self.binning)
         missed = missed if unit is None else divided(missed, unit)
         missed = missed if self.of_residual else missed - integral
         density, rest = self._density(prior, integral + missed, placed)
         # The change is carried to the world, not the density: two warps would blur what x has.
-        emitted = self.transmission.emitted(density - prior)
+        emitted = self.transmission.restore(density - prior)
         carried = frusta.to_world(torch.cat([emitted, *rest], dim=2))
         if mask is not None:
             carried = carried * self._cells(mask.to(x.dtype), largest=True)[:, None]
         change, confidence, features = self._parts(carried)
         mean, variance, _ = leave_one_out(change, frusta.visible)
         expected = frusta.integrate(
-            self.transmission.seen(frusta.to_frusta(mean) * frusta.occupied)
+            self.transmission.attenuate(frusta.to_frusta(mean) * frusta.occupied)
         )
         changes = torch.cat([change, mean, deviation(variance)], dim=2)
         logits = self._logits(changes, missed - expected, x, confidence)
@@ -179,7 +179,7 @@ class Opinions(nn.Module):
         frusta = self.inside.frusta
         ones = torch.ones_like(x[:1]) if mask is None else self._cells(mask.to(x.dtype))
         chords = frusta.integrate(
-            self.transmission.seen(frusta.to_frusta(ones[:, None]) * frusta.occupied)
+            self.transmission.attenuate(frusta.to_frusta(ones[:, None]) * frusta.occupied)
         )
         return torch.where(chords > 0, means(sums, self.binning) / chords.clamp_min(1e-6), 0)
 
@@ -200,7 +200,7 @@ class Opinions(nn.Module):
         """The density of each frustum, and what else goes to the world."""
         frusta = self.inside.frusta
         if placed is None:
-            even = self.transmission.seen(torch.ones_like(prior))
+            even = self.transmission.attenuate(torch.ones_like(prior))
             return self.head(torch.zeros_like(prior), even, measured, frusta), []
         logits, rest = placed.split([1, placed.shape[2] - 1], dim=2)
         return self.head(logits, prior, measured, frusta), [rest]

@@ -27,13 +27,13 @@ class Transmission(nn.Module):
         share = None if mu is None else transmissions(frusta, mu)
         self.register_buffer("share", share, persistent=False)
 
-    def seen(self, density: Float[Tensor, "b m 1 D v u"]) -> Float[Tensor, "b m 1 D v u"]:
+    def attenuate(self, density: Float[Tensor, "b m 1 D v u"]) -> Float[Tensor, "b m 1 D v u"]:
         """What reaches the detector of a density: what views measure, and heads share out."""
         return density if self.share is None else density * self.share
 
-    def emitted(self, seen: Float[Tensor, "b m 1 D v u"]) -> Float[Tensor, "b m 1 D v u"]:
+    def restore(self, values: Float[Tensor, "b m 1 D v u"]) -> Float[Tensor, "b m 1 D v u"]:
         """The density of which so much reaches the detector."""
-        return seen if self.share is None else seen / self.share
+        return values if self.share is None else values / self.share
 
     def spread(
         self, frusta: Frusta, views: Float[Tensor, "b 1 m v u"]

@@ -53,17 +53,17 @@ def test_a_density_has_the_transmission_that_its_depth_gives_it():
     torch.testing.assert_close(share[3:-2] / share[2:-3], share.new_full((27,), math.exp(size)))
 
 
-def test_seen_and_emitted_undo_each_other_and_nothing_is_divided_by_next_to_nothing():
+def test_attenuation_and_restoring_undo_each_other_and_nothing_is_divided_by_next_to_nothing():
     frusta = Frusta.of(GRID, RIGS["cone"](), 8)
     density = torch.rand(1, 3, 1, *frusta.shape)
     lead = Transmission(frusta, torch.full((1, 1, *GRID.shape), 0.1))
     assert lead.share.min() == LEAST
-    torch.testing.assert_close(lead.emitted(lead.seen(density)), density)
+    torch.testing.assert_close(lead.restore(lead.attenuate(density)), density)
     views = torch.rand(1, 1, 3, 12, 12) * (frusta.chord[:, 0, 0] > 0)
     for transmission in (lead, Transmission(frusta, None)):
         even = transmission.spread(frusta, views)
-        torch.testing.assert_close(frusta.integrate(transmission.seen(even)), views)
-    assert Transmission(frusta, None).seen(density) is density
+        torch.testing.assert_close(frusta.integrate(transmission.attenuate(even)), views)
+    assert Transmission(frusta, None).attenuate(density) is density
 
 
 def opinions_of(A, x, truth):

@@ -4,9 +4,9 @@
 // A walk goes up the slabs; where the detector stands beyond the last, A is what all have less what has been passed.
 
 // A sum that loses no digit to its length (Kahan).
-template <class R> struct Long {
+template <class R> struct Compensated {
   R value, lost;
-  DEVICE Long() : value(0), lost(0) {}
+  DEVICE Compensated() : value(0), lost(0) {}
   DEVICE void operator+=(R more) {
     R y = more - lost, sum = value + y;
     lost = (sum - value) - y;
@@ -65,22 +65,22 @@ template <class R, int METHOD, class V> struct Segments {
   }
 };
 
-template <class R, int METHOD, class V> DEVICE V walked(const Scene& s, const Ray& ray, const V& visitor) {
+template <class R, int METHOD, class V> DEVICE V visited(const Scene& s, const Ray& ray, const V& visitor) {
   Segments<R, METHOD, V> segments(s, ray, visitor);
   walk<METHOD, R>(s, ray, segments);
   return segments.visitor;
 }
 
 template <class R> struct Depth {
-  Long<R> all;
+  Compensated<R> all;
   template <class G> DEVICE void segment(const G&, R m, R) { all += m; }
 };
 
 // What leaves a segment for the detector.
-template <class R> struct Passed {
+template <class R> struct Transmission {
   bool ascends;  // the detector stands at the first slab
   R all;
-  Long<R> below;
+  Compensated<R> below;
   // The transmission from the segment's end on.
   DEVICE R next(R m) {
     R before = ascends ? below.value : max(all - below.value - m, (R)0);
@@ -89,11 +89,11 @@ template <class R> struct Passed {
   }
 };
 
-template <class R, int METHOD> DEVICE Passed<R> passed_of(const Scene& s, const Ray& ray) {
-  Passed<R> passed;
-  passed.ascends = ray.D < 0;
-  passed.all = passed.ascends ? (R)0 : walked<R, METHOD>(s, ray, Depth<R>()).all.value;
-  return passed;
+template <class R, int METHOD> DEVICE Transmission<R> transmission_of(const Scene& s, const Ray& ray) {
+  Transmission<R> transmission;
+  transmission.ascends = ray.D < 0;
+  transmission.all = transmission.ascends ? (R)0 : visited<R, METHOD>(s, ray, Depth<R>()).all.value;
+  return transmission;
 }
 
 // Layers of magnification at equal steps of 1 / w, between two of which a segment is shared out linearly.
@@ -123,20 +123,20 @@ template <class R> struct Layers {
 };
 
 // Adds up what is sent out: two layers at a time, which are written where a ray leaves them.
-template <class R> struct Sent {
+template <class R> struct Projection {
   Layers<R> layers;
   Store<R, 1> emission;
-  Passed<R> passed;
+  Transmission<R> transmission;
   R* into;
   int layer;
-  Long<R> low, high;
+  Compensated<R> low, high;
   DEVICE void write() {
     into[layer] += low.value;
     if (layers.last) into[layer + 1] += high.value;
-    low = high = Long<R>();
+    low = high = Compensated<R>();
   }
   template <class G> DEVICE void segment(const G& g, R m, R s) {
-    R sent = passed.next(m) * mean_passed(m) * g.of(emission), part = 0;
+    R sent = transmission.next(m) * mean_passed(m) * g.of(emission), part = 0;
     if (layers.last) {
       int here;
       layers.of(s, here, part);
@@ -158,12 +158,12 @@ template <class R, int METHOD> DEVICE void weaken_rays(const Scene& s) {
   R* into = (R*)s.views + pixel * s.n_layers;
   for (int k = 0; k < s.n_layers; k++) into[k] = 0;
   Store<R, 1> emission(s, ray.axis, blockIdx.y);
-  Sent<R> sent{Layers<R>(s, ray, p), emission, passed_of<R, METHOD>(s, ray), into, 0, {}, {}};
-  walked<R, METHOD>(s, ray, sent).write();
+  Projection<R> projection{Layers<R>(s, ray, p), emission, transmission_of<R, METHOD>(s, ray), into, 0, {}, {}};
+  visited<R, METHOD>(s, ray, projection).write();
 }
 
 // Adds numbers to voxels in fixed point: whole numbers add up to the same bits in any order.
-template <class R> struct Fixed {
+template <class R> struct FixedPoint {
   const Scene& s;
   int axis, far, near;
   R scale;
@@ -184,18 +184,18 @@ template <class R> struct Fixed {
   }
 };
 
-template <class R> DEVICE Fixed<R> fixed_of(const Scene& s, const Ray& ray, int volume) {
+template <class R> DEVICE FixedPoint<R> fixed_of(const Scene& s, const Ray& ray, int volume) {
   long long size = (long long)s.sizes[0] * s.sizes[1] * s.sizes[2];
   return {s, ray.axis, ray.far, ray.near, settled((R)s.fixed), (long long*)s.results + volume * size};
 }
 
-template <class R> struct Received {
+template <class R> struct Backprojection {
   Layers<R> layers;
-  Passed<R> passed;
+  Transmission<R> transmission;
   const R* values;
-  Fixed<R> into;
+  FixedPoint<R> into;
   template <class G> DEVICE void segment(const G& g, R m, R s) {
-    into.to(g, passed.next(m) * mean_passed(m) * layers.value(values, s));
+    into.to(g, transmission.next(m) * mean_passed(m) * layers.value(values, s));
   }
 };
 
@@ -205,12 +205,12 @@ template <class R, int METHOD> DEVICE void receive_rays(const Scene& s) {
   Ray ray = ray_of<METHOD>(s, stored_box(s), p);
   long long pixels = (long long)s.n_views * s.rows * s.columns, pixel = blockIdx.y * pixels + index_of(s, p.view, p.v, p.u);
   const R* values = (const R*)s.views + pixel * s.n_layers;
-  Received<R> received{Layers<R>(s, ray, p), passed_of<R, METHOD>(s, ray), values, fixed_of<R>(s, ray, blockIdx.y)};
-  walked<R, METHOD>(s, ray, received);
+  Backprojection<R> backprojection{Layers<R>(s, ray, p), transmission_of<R, METHOD>(s, ray), values, fixed_of<R>(s, ray, blockIdx.y)};
+  visited<R, METHOD>(s, ray, backprojection);
 }
 
 // The derivative by optical depths: a segment weakens itself, and all those that stand farther from the detector.
-template <class R> struct Emitted {
+template <class R> struct Source {
   const Scene& s;
   Layers<R> layers;
   int axis;
@@ -224,21 +224,21 @@ template <class R> struct Emitted {
 };
 
 template <class R> struct Total {
-  Emitted<R> emitted;
-  Passed<R> passed;
-  Long<R> all;
-  template <class G> DEVICE void segment(const G& g, R m, R s) { all += passed.next(m) * mean_passed(m) * emitted.of(g, s); }
+  Source<R> source;
+  Transmission<R> transmission;
+  Compensated<R> all;
+  template <class G> DEVICE void segment(const G& g, R m, R s) { all += transmission.next(m) * mean_passed(m) * source.of(g, s); }
 };
 
-template <class R> struct Bent {
-  Emitted<R> emitted;
-  Passed<R> passed;
+template <class R> struct Derivative {
+  Source<R> source;
+  Transmission<R> transmission;
   R all;
-  Fixed<R> into;
-  Long<R> below;
+  FixedPoint<R> into;
+  Compensated<R> below;
   template <class G> DEVICE void segment(const G& g, R m, R s) {
-    R from = passed.next(m) * emitted.of(g, s), sent = from * mean_passed(m);
-    R beyond = passed.ascends ? all - below.value - sent : below.value;
+    R from = transmission.next(m) * source.of(g, s), sent = from * mean_passed(m);
+    R beyond = transmission.ascends ? all - below.value - sent : below.value;
     below += sent;
     into.to(g, from * slope_of_mean(m) - beyond);
   }
@@ -249,8 +249,8 @@ template <class R, int METHOD> DEVICE void bend_rays(const Scene& s) {
   if (!on_detector(s, p)) return;
   Ray ray = ray_of<METHOD>(s, stored_box(s), p);
   long long pixels = (long long)s.n_views * s.rows * s.columns;
-  Emitted<R> emitted{s, Layers<R>(s, ray, p), ray.axis, index_of(s, p.view, p.v, p.u), pixels};
-  Passed<R> passed = passed_of<R, METHOD>(s, ray);
-  R all = walked<R, METHOD>(s, ray, Total<R>{emitted, passed, {}}).all.value;
-  walked<R, METHOD>(s, ray, Bent<R>{emitted, passed, all, fixed_of<R>(s, ray, 0), {}});
+  Source<R> source{s, Layers<R>(s, ray, p), ray.axis, index_of(s, p.view, p.v, p.u), pixels};
+  Transmission<R> transmission = transmission_of<R, METHOD>(s, ray);
+  R all = visited<R, METHOD>(s, ray, Total<R>{source, transmission, {}}).all.value;
+  visited<R, METHOD>(s, ray, Derivative<R>{source, transmission, all, fixed_of<R>(s, ray, 0), {}});
 }
