@@ -91,7 +91,7 @@ class OwnAttenuation(Wrapped):
 
     def __init__(self, A: Projector, options: Mapping[str, Any], attenuation: CaseAttenuation):
         super().__init__(A)
-        self.options, self.attenuation = dict(options), attenuation
+        self.options, self.maps = dict(options), attenuation
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Refused: which case?"""
@@ -107,7 +107,7 @@ class OwnAttenuation(Wrapped):
         Raises:
             ValueError: cases without the map.
         """
-        for mu in self.attenuation.maps_of(batch, self.grid):
+        for mu in self.maps.maps_of(batch, self.grid):
             settings = {**self.options, "mu": mu}
             A = PROJECTORS.from_config(settings, grid=self.grid, cameras=self.cameras)
             yield A.to(self.device), settings
