@@ -170,6 +170,12 @@ REGIMES = {
 #: From 32^3 over 64^3 to 128^3, with fewer cases, since one at 128^3 takes 5 s to make.
 REGIMES["rig_64_on_the_way"] = _tuned(REGIMES["rig_64"], "rig/{arm}/400s_{seed}", 324)
 REGIMES["rig_128_tuned"] = _tuned(REGIMES["rig_128"], "rig_64_on_the_way/{arm}/400s_{seed}", 162)
+REGIMES["rig_64_longer"] = _tuned(REGIMES["rig_64"], "rig_64_on_the_way/{arm}/400s_{seed}", 324)
+REGIMES["rig_128_longer"] = _tuned(REGIMES["rig_128"], "rig_64_longer/{arm}/800s_{seed}", 162)
+#: Networks and sizes as of rig_64.
+REGIMES["clean_64_on_the_way"] = _tuned(
+    REGIMES["clean_64"]._replace(pace="rig_64"), "clean/{arm}/200s_{seed}", 324
+)
 
 
 def settings(regime: Regime, arm: str) -> list[str]:

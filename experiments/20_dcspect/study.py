@@ -1,4 +1,4 @@
-"""What do the plugin's three experiments of SPECT show, with OSEM and BSREM tuned for each?
+"""What do the plugin's experiments of SPECT show, with OSEM and BSREM tuned for each?
 
 python experiments/20_dcspect/study.py tune   # tuned.csv: OSEM and BSREM on validation cases
 python experiments/20_dcspect/study.py table  # results.csv, volumes.png, of runs that ended
@@ -24,7 +24,7 @@ from mvrecon.metrics import nrmse
 from mvrecon.parts import RECONSTRUCTORS
 
 HERE = Path(__file__).parent
-NAMES = ("cardiac", "ct", "derenzo")
+NAMES = ("cardiac", "ct", "derenzo", "labels")
 ITERATIONS = 16
 #: Of 16 cameras, the root of their number.
 SUBSETS = 4
