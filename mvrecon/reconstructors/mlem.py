@@ -29,6 +29,10 @@ from mvrecon.reconstructors.problem import (
     without_gradient,
 )
 
+#: Part of the greatest activity below which a voxel has none: on their way to zero voxels would
+#: pass numbers with fewer digits (below 1e-38), with which a processor takes many times as long.
+GONE = 1e-25
+
 
 @takes("counts")
 @without_gradient
@@ -110,7 +114,8 @@ def _step(
     """
     most = torch.maximum(s, share)
     rest = (most - s) + part.explained(x)
-    return x * divided(rest, most, 1.0)
+    x = x * divided(rest, most, 1.0)
+    return torch.where(x < GONE * x.amax(dim=tuple(range(2, x.ndim)), keepdim=True), 0, x)
 
 
 @takes("counts")
