@@ -34,6 +34,19 @@ ARMS = {
     "world_rounds": ("model=world_rounds",),
     "world_unet": ("model=world_unet", f"model.{NARROW}"),
 }
+#: `cross_view` but for one option; these take its number of steps.
+ABLATIONS = {
+    name: ("model=cross_view", f"model.rounds.0.{option}")
+    for name, option in {
+        "uncorrected": "cameras.correct=false",
+        "own_networks": "cameras.shared=false",
+        "mean_of_opinions": "opinions.fusion=mean",
+        "view_placed": "opinions.places=view",
+        "density_head": "opinions.head.name=density",
+        "uniform_depths": "opinions.prior=uniform",
+    }.items()
+}
+ABLATIONS["frustum3d"] = ("model=cross_view_frustum3d",)
 #: Models that know less of the cameras, or are published; in the whole grid.
 OTHERS = {name: (f"model={name}",) for name in ("geometry_free", "dif_net", "svct")}
 #: These begin with SIRT on a grid twice as fine, which is made once a case and not in the pace.
@@ -79,7 +92,7 @@ CLASSICAL = {
 }
 
 
-EVERY = ARMS | OTHERS | FINER | MISSED | ALIGNED | CLASSICAL
+EVERY = ARMS | ABLATIONS | OTHERS | FINER | MISSED | ALIGNED | CLASSICAL
 
 
 class Regime(NamedTuple):
@@ -175,6 +188,9 @@ REGIMES["rig_128_longer"] = _tuned(REGIMES["rig_128"], "rig_64_longer/{arm}/800s
 #: Networks and sizes as of rig_64.
 REGIMES["clean_64_on_the_way"] = _tuned(
     REGIMES["clean_64"]._replace(pace="rig_64"), "clean/{arm}/200s_{seed}", 324
+)
+REGIMES["clean_128_tuned"] = _tuned(
+    REGIMES["clean_128"]._replace(pace="rig_128"), "clean_64_on_the_way/{arm}/400s_{seed}", 162
 )
 
 

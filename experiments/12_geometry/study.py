@@ -5,7 +5,8 @@
     python experiments/12_geometry/study.py table  # results.csv, paired.csv, curves.png
 
 A run is a folder of `mvrecon-train`; one that broke off goes on, one that ended is skipped. Every
-arm trains for the same processor time of one thread: steps = seconds / pace.
+arm trains for the same processor time of one thread, steps = seconds / pace; an ablation for the
+steps of the arm that it varies.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from pathlib import Path
 from statistics import fmean, median
 
 import torch
-from arms import ARMS, CLASSICAL, EVERY, OTHERS, REGIMES, paths, settings
+from arms import ABLATIONS, ARMS, CLASSICAL, EVERY, OTHERS, REGIMES, paths, settings
 
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_data, build_module
@@ -92,7 +93,7 @@ def _paces() -> dict[tuple[str, str], dict[str, str]]:
 
 def steps(regime: str, arm: str, seconds: int) -> int:
     """Training steps of an arm in so many processor seconds."""
-    same = re.sub("_(aligned|finer|missed)$", "", arm)
+    same = "cross_view" if arm in ABLATIONS else re.sub("_(aligned|finer|missed)$", "", arm)
     paces = _paces()[REGIMES[regime].pace, same]
     return round(seconds / float(paces["seconds_per_step"]))
 

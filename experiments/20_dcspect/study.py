@@ -24,8 +24,7 @@ from mvrecon.metrics import nrmse
 from mvrecon.parts import RECONSTRUCTORS
 
 HERE = Path(__file__).parent
-NAMES = ("cardiac", "ct", "derenzo", "labels")
-ITERATIONS = 16
+NAMES = ("cardiac", "ct", "derenzo", "derenzo_blurred", "labels")
 #: Of 16 cameras, the root of their number.
 SUBSETS = 4
 TRIALS: tuple[dict[str, Any], ...] = (
@@ -64,21 +63,23 @@ def tune(options: argparse.Namespace) -> None:
         for trial in TRIALS:
             how = {"experiment": name, "method": trial["name"], "subsets": trial["subsets"]}
             how["weight"] = trial.get("weight", "")
-            for number, error in enumerate(errors(trial, cases), 1):
+            for number, error in enumerate(errors(trial, cases, options.iterations), 1):
                 rows.append({**how, "iterations": number, "nrmse": f"{error:.4f}"})
         write_rows(HERE / "tuned.csv", rows)
 
 
-def errors(trial: dict[str, Any], cases: list[tuple[Any, torch.Tensor, torch.Tensor]]) -> Any:
+def errors(
+    trial: dict[str, Any], cases: list[tuple[Any, torch.Tensor, torch.Tensor]], iterations: int
+) -> list[float]:
     """Mean NRMSE of cases after each iteration."""
-    sums = torch.zeros(ITERATIONS)
+    sums = torch.zeros(iterations)
     for A, views, truth in cases:
         own: list[float] = []
 
         def watch(iterate: Any, own: list[float] = own, truth: torch.Tensor = truth) -> None:
             own.append(nrmse(iterate.volume[0], truth))
 
-        how = {**trial, "iterations": ITERATIONS}
+        how = {**trial, "iterations": iterations}
         RECONSTRUCTORS.from_config(how, A, views, monitor=watch)
         sums += torch.tensor(own)
     return (sums / len(cases)).tolist()
@@ -150,6 +151,7 @@ def main() -> None:
     parser.add_argument("task", choices=("tune", "table"))
     parser.add_argument("--names", nargs="+", choices=NAMES, default=NAMES)
     parser.add_argument("--runs", type=Path, default=Path("outputs/20_dcspect"))
+    parser.add_argument("--iterations", type=int, default=16, help="of tune, at most")
     options = parser.parse_args()
     options.runs = options.runs.resolve()
     {"tune": tune, "table": table}[options.task](options)
