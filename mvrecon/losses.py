@@ -73,6 +73,8 @@ class Weights:
 
     Args:
         volume: of the mean squared error.
+        common_field: of the mean squared error of the voxels that all cameras see, where more is
+            seen than what a rig is built for.
         edges: of the squared error of first differences.
         opinions: of the mean squared error of the opinions, where the cameras see.
         opinions_gain: of the squared error of each camera's opinion relative to that of the start
@@ -91,6 +93,7 @@ class Weights:
     """
 
     volume: float = 1.0
+    common_field: float = 0.0
     edges: float = 0.0
     opinions: float = 0.0
     opinions_gain: float = 0.0
@@ -137,12 +140,18 @@ class ReconstructionLoss(nn.Module):
 
         Args:
             out: of the model.
-            batch: "volume" and "views", and where `compares_views` is true of the reconstruction
-                "true_views", the truth's own views of the same cameras.
+            batch: "volume" and "views"; where `compares_views` is true of the reconstruction
+                "true_views", the truth's own views of the same cameras; and where it has a weight
+                "common_field" [1 d h w], the voxels that all cameras see.
         """
         truth, views = batch["volume"] / self.data_range, batch["views"]
         volume = out.volume / self.data_range
-        terms = {"volume": mean_where((volume - truth).square(), out.support)}
+        error = (volume - truth).square()
+        terms = {"volume": mean_where(error, out.support)}
+        if self.weights["common_field"]:
+            field = batch["common_field"].to(error.device)
+            within = field if out.support is None else out.support & field
+            terms["common_field"] = mean_where(error, within)
         if self.weights["edges"]:
             terms["edges"] = edge_difference(volume, truth, out.support)
         terms |= self._of_cameras(out, truth, views)

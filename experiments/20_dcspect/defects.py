@@ -1,7 +1,7 @@
 """Do methods keep a defect of the left ventricle: contrast in it and in the same place of healthy
 hearts, area under the ROC curve of that contrast, bias of the wall's counts.
 
-python experiments/20_dcspect/defects.py [--runs outputs/20_dcspect] [--cases 64]  # defects.csv
+python experiments/20_dcspect/defects.py [--name cardiac_heart] [--cases 64]  # defects.csv
 """
 
 import argparse
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from heart import NEAR  # and the term of the loss that runs may have
 from torchmetrics.functional.classification import binary_auroc
 
 from mvrecon.data.module import TEST, SceneData
@@ -19,13 +20,13 @@ from mvrecon.engine.evaluation import load_methods
 from mvrecon.engine.fit import build_data
 from mvrecon.engine.on_case import reconstructed
 from mvrecon.engine.run_folder import read_settings
-from mvrecon.files.tables import write_rows
+from mvrecon.files.tables import renewed, write_rows
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon_spect.metrics.contrast import count_bias, defect_contrast
 
-HERE = Path(__file__).parent
-#: Voxels of the left ventricle's wall: within so many mm of the heart's place, and so full of it.
-NEAR, FULL = 55.0, 0.65
+TABLE = Path(__file__).parent / "defects.csv"
+#: Voxels of the left ventricle's wall are so full of it.
+FULL = 0.65
 #: Share of the loss that voxels of a defect have, and those of the wall beside it at most.
 MOST, NONE = 0.6, 0.05
 #: Contrast of the defect that says where it is, or would be.
@@ -69,9 +70,10 @@ def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=Path, default=Path("outputs/20_dcspect"))
+    parser.add_argument("--name", default="cardiac", help="of the run")
     parser.add_argument("--cases", type=int, default=64, help="unseen patients")
     options = parser.parse_args()
-    folder = options.runs.resolve() / "cardiac"
+    folder = options.runs.resolve() / options.name
     run = read_settings(folder)
     run["data"]["sizes"]["test"] = options.cases
     data = build_data(run)
@@ -87,7 +89,8 @@ def main() -> None:
         lost = data.scenes["test"].parameters(index, TEST, data.grid)["defect_contrast"]
         for name, x in volumes.items():
             values[name].append({"lost": lost, **measured(x, truth, regions)})
-        write_rows(HERE / "defects.csv", [row(name, own) for name, own in values.items()])
+    rows = [{"run": options.name, **row(name, own)} for name, own in values.items()]
+    write_rows(TABLE, renewed(TABLE, rows, ("run", "method")))
 
 
 def volumes_of(case: Mapping[str, object], methods: Mapping) -> dict[str, torch.Tensor]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.culling import views_that_see
 from mvrecon.cameras.detector import detector_centre
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import unit
 
 #: Of a full set of directions: beams nearer to one direction than this have no isocentre.
@@ -48,6 +48,24 @@ def sees(cameras: Cameras, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, "m n"]:
     edge = uvz.new_tensor(cameras.shape[::-1]) - 0.5
     within = ((uvz[..., :2] >= -0.5) & (uvz[..., :2] <= edge)).all(dim=-1)
     return within & cameras.valid(uvz)
+
+
+@torch.no_grad()
+def common_field(cameras: Cameras, grid: Grid) -> Bool[Tensor, "1 d h w"]:
+    """The common field of view: the voxels whose centres all cameras see.
+
+    Raises:
+        ValueError: there is none.
+    """
+    rig, points = cameras.to("cpu"), voxel_centres(grid).reshape(-1, 3)
+    for camera in range(len(rig)):
+        points = points[sees(rig[[camera]], points)[0]]
+    if not len(points):
+        raise ValueError(f"Expected a voxel that all of {len(rig)} cameras see, got none")
+    z, y, x = grid.to_index(points).round().long().flip(-1).unbind(-1)
+    field = torch.zeros(1, *grid.shape, dtype=torch.bool)
+    field[0, z, y, x] = True
+    return field.to(cameras.source.device)
 
 
 @torch.no_grad()

@@ -156,9 +156,13 @@ class ReconstructionModule(L.LightningModule):
     def _terms(
         self, rig: OnRig | OnCases, out: Reconstruction, batch: dict[str, Any]
     ) -> dict[str, Tensor]:
-        """The loss, with the truth's own views where views are corrected towards them."""
+        """The loss, with the truth's own views where views are corrected towards them, and the
+        cameras' common field where it counts.
+        """
         if self.loss.compares_views(out):
             batch = {**batch, "true_views": rig.corrected(batch["volume"])}
+        if self.loss.weights["common_field"]:
+            batch = {**batch, "common_field": self._on_rig(batch).common_field}
         return self.loss(out, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:

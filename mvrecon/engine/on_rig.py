@@ -6,9 +6,10 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from mvrecon.cameras.field import common_field
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
@@ -41,6 +42,11 @@ class OnRig:
         config = getattr(self.model, "corrected_projector", self.projector)
         A = PROJECTORS.from_config(config, grid=self.A.grid, cameras=cameras)
         return A.to(self.A.device)
+
+    @cached_property
+    def common_field(self) -> Bool[Tensor, "1 d h w"]:
+        """The voxels that all cameras see."""
+        return common_field(self.A.cameras, self.A.grid)
 
     def by(self, name: str, views: Float[Tensor, "b 1 m v u"]) -> Reconstruction:
         """What a model without training makes of views."""
