@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.field import auto_grid, check_rig_sees, isocentre, sees
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.cameras.field import auto_grid, check_rig_sees, common_field, isocentre, sees
 from mvrecon.cameras.rigs import circular, dome, parallel
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 from tests.cameras.rigs import OPTIONS
 
@@ -57,6 +58,34 @@ def test_points_of_the_field_are_seen_and_others_are_not():
     points = torch.tensor([[0.0, 0, 0], [0, 0, 63], [0, 0, 65], [-500, 0, 0]]).double()
     assert sees(rig, points).all(dim=0).tolist() == [True, True, False, False]
     assert not sees(rig, points)[0, 3]  # in line with the detector, but behind it
+
+
+def test_the_common_field_of_dcspect80_holds_its_ball_and_little_more():
+    """All 80 pinholes see the ball of 78.41 mm; on its surface one detector ends."""
+    grid = Grid.centred(size=(44, 40, 36), spacing=5.0, centre=(3.0, -2.0, 1.0))
+    away = voxel_centres(grid).norm(dim=-1)
+    field = common_field(dcspect80(pixels=[16, 16]), grid)[0]
+    assert field[away < 78.4].all() and not field[away > 125].any()
+    assert not field[(78.4 < away) & (away < 85)].all()
+
+
+def test_the_common_field_of_a_turned_grid_is_what_every_camera_sees():
+    rig = circular(5, 400.0, 800.0, {**PLATE, "offset_mm": [20.0, 30.0]})
+    affine = Grid.centred(24, spacing=6.0).affine.clone()
+    affine[:3] = (
+        torch.cat([euler_rotation([10.0, 20.0, 30.0]).to(affine), AWAY[:, None] / 3], 1) @ affine
+    )
+    grid = Grid((24, 24, 24), affine)
+    seen = sees(rig, voxel_centres(grid).reshape(-1, 3)).all(dim=0).reshape(1, 24, 24, 24)
+    assert seen.any() and not seen.all() and torch.equal(common_field(rig, grid), seen)
+
+
+@pytest.mark.door
+def test_a_common_field_of_no_voxel_is_refused():
+    """A loss over the voxels that all cameras see is refused where there is none."""
+    rig = circular(8, 400.0, 800.0, PLATE)
+    with pytest.raises(ValueError, match="a voxel that all of 8 cameras see, got none"):
+        common_field(rig, Grid.centred(4, spacing=1.0, centre=(0, 0, 70)))
 
 
 @pytest.mark.door
