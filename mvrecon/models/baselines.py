@@ -107,7 +107,7 @@ class BackprojectionUNet(nn.Module):
         evidence = torch.cat([x0, geometry.back(y), geometry.residual(x0, y)], dim=1)
         volume = x0 + geometry.within(self.net(evidence, geometry.network_mask))
         sigma = None if self.options.sigma is None else self.options.sigma / scale
-        volume = self.consistency(geometry, volume, y, sigma, x0)
+        volume = self.consistency(geometry, volume, y, sigma)
         return Reconstruction(volume * scale, support=geometry.mask, start=x0 * scale)
 
 

@@ -9,15 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.models.bounded import within_one
 from mvrecon.models.geometry import Geometry
-from mvrecon.models.nonnegative import nonnegative
 from mvrecon.reconstructors.iterative import inverse_sums
 from mvrecon.registry import check_options
 
 #: The least number of counts that a pixel is taken to expect, relative to the mean of its case.
 LEAST = 0.01
-#: The least that expectation maximisation begins with, relative to the classical start.
-REMAINS = 0.01
 #: How many steps, or a mapping of steps, noise, rule and background.
 Steps = int | Mapping[str, Any]
 
@@ -34,8 +32,9 @@ class Consistency(nn.Module):
     The rule "em" is expectation maximisation, x + lambda_k x / s A^T (y / (A x + r) - 1) with s =
     A^T 1 (Shepp & Vardi, IEEE Trans. Med. Imaging 1 (1982) 113). Lengths up to one never lower the
     Poisson likelihood: they lie between x and the maximum of its separable surrogate. At one, and
-    without r, a step keeps the counts, <s, x> = sum(y). Lengths are kept within 0 and 1. Volumes
-    and views are cut off at zero.
+    without r, a step keeps the counts, <s, x> = sum(y). Lengths are kept within 0 and 1: a
+    longer step can empty every voxel of a ray, from where no other leads back, and learned lengths
+    would come there. Volumes and views are cut off at zero.
 
     Args:
         steps: how many; none leaves the volume as it is. Or `{steps: 3, noise: poisson, rule: em}`,
@@ -73,20 +72,15 @@ class Consistency(nn.Module):
         volume: Float[Tensor, "b 1 d h w"],
         views: Float[Tensor, "b 1 m v u"],
         sigma: Float[Tensor, "b 1 1 1 1"] | None = None,
-        start: Float[Tensor, "b 1 d h w"] | None = None,
     ) -> Float[Tensor, "b 1 d h w"]:
         """The volume after the steps.
-
-        With `start`, no voxel begins "em" with less than a hundredth of it: what a network has set
-        to zero would stay there for ever, and from next to nothing three steps multiply any error.
 
         With `sigma`, the noise of the views in their unit, a sample takes no further step once
         chi^2 per measurement, the mean of ((y - A x) / sigma)^2, is at most 1. In training every
         sample takes every step.
         """
         if self.em and len(self.lengths):
-            least = 0 if start is None else REMAINS * start.clamp_min(0)
-            volume, views = least + nonnegative(volume - least), views.clamp_min(0)
+            volume, views = volume.clamp_min(0), views.clamp_min(0)
         for number, length in enumerate(self.lengths):
             expected = geometry.A(volume)
             if self.poisson and not self.em and number == 0:
@@ -99,17 +93,10 @@ class Consistency(nn.Module):
                     break
             if self.em:
                 change = em_change(geometry, volume, views, expected, self.background)
-                volume = volume + _at_most_whole(length) * unmet * change
+                volume = volume + within_one(length) * unmet * change
             else:
                 volume = volume + length * unmet * geometry.back(residual)
         return volume
-
-
-def _at_most_whole(length: Float[Tensor, ""]) -> Float[Tensor, ""]:
-    """The length within 0 and 1: a longer step can empty every voxel of a ray, from where no other
-    leads back, and learned lengths would come there.
-    """
-    return nonnegative(1 - nonnegative(1 - length))
 
 
 def _is_em(noise: str, rule: str) -> bool:

@@ -16,7 +16,6 @@ from mvrecon.models.cross_view.evidence import MAGNIFIED
 from mvrecon.models.cross_view.unet import PlainUNet, Precision
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
-from mvrecon.models.nonnegative import nonnegative
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.pixel_aligned import at_voxels
@@ -108,7 +107,7 @@ class RadonUNet(nn.Module):
         with in_full_precision(views):
             y, start, scale = normalised(geometry, views, self.start, self.training)
             projections = self.projections(geometry, y, start)
-            volume = nonnegative(self.backprojected(projections))
+            volume = self.backprojected(projections).clamp_min(0)
         return Reconstruction(
             volume * scale,
             start=start * scale,

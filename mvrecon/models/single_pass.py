@@ -102,7 +102,7 @@ class SinglePass(nn.Module):
             features = (weights * features).sum(dim=1)
             volume = volume + self._correction(geometry, y, x0, volume, opinions, features)
         sigma = None if self.options.sigma is None else self.options.sigma / scale
-        volume = self.consistency(geometry, volume, y, sigma, x0)
+        volume = self.consistency(geometry, volume, y, sigma)
         return Reconstruction(
             volume=volume * scale,
             opinions=opinions * scale[:, None],

@@ -136,18 +136,6 @@ def test_exact_data_are_a_fixed_point_of_em_and_gradients_reach_volume_and_lengt
     assert all(g.isfinite().all() and g.any() for g in (other.grad, steps.lengths.grad))
 
 
-def test_a_volume_that_a_network_has_emptied_comes_back_and_has_a_gradient(counted):
-    """From a hundredth of the start one step has all counts again, as from the start itself."""
-    geometry, truth, counts = counted
-    steps, start = Consistency({**EM, "steps": 1}).double(), 0.5 + truth
-    emptied = torch.full_like(truth, -3.0).requires_grad_()
-    after = steps(geometry, emptied, counts, start=start)
-    torch.testing.assert_close(after, steps(geometry, start, counts), rtol=1e-9, atol=1e-12)
-    (after - truth).square().sum().backward()
-    assert emptied.grad.isfinite().all() and emptied.grad[truth > 0].any()
-    assert not steps(geometry, emptied, counts).any()  # without a start zero stays zero
-
-
 def test_learned_lengths_past_one_empty_no_ray(counted):
     """Ten times too much is cut down to the counts; a step of length 1.2 would end below zero."""
     geometry, truth, counts = counted

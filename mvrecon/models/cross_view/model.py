@@ -17,7 +17,6 @@ from mvrecon.models.cross_view.uncertainty import Uncertainty
 from mvrecon.models.cross_view.views import among_counts
 from mvrecon.models.door import admitted
 from mvrecon.models.geometry import Geometry
-from mvrecon.models.nonnegative import nonnegative
 from mvrecon.models.options import Options
 from mvrecon.models.output import Reconstruction
 from mvrecon.models.start import ClassicalStart, Start, normalised
@@ -115,7 +114,7 @@ class CrossView(nn.Module):
         trusted = geometry
         if state.ray_weights is not None and not self.consistency.poisson:
             trusted = replace(geometry, row=geometry.row * state.ray_weights)
-        volume = nonnegative(self.consistency(trusted, state.volume, y, start=x0))
+        volume = self.consistency(trusted, state.volume, y).clamp_min(0)
         sigma = None
         if self.uncertainty is not None:
             sigma = self.uncertainty(geometry, y, volume, (x0, before)) * scale
