@@ -2,7 +2,7 @@
 `dcspect_cardiac` has it.
 
 PYTHONPATH=experiments/20_dcspect mvrecon-train experiment=dcspect_cardiac plugins=[heart] \
-    +loss.heart=1 hydra.run.dir=outputs/20_dcspect/cardiac_heart
+    loss.common_field=0 +loss.heart=1 hydra.run.dir=outputs/20_dcspect/cardiac_heart
 """
 
 from torch import Tensor

@@ -26,6 +26,7 @@ TINY = (
 )
 GRIDS = {
     "dcspect_derenzo": ("grid.size=[8,8,8]", "grid.spacing=20"),
+    "dcspect_derenzo_blurred": ("grid.size=[8,8,8]", "grid.spacing=20"),
     "dcspect_cardiac": ("grid.size=[10,8,8]", "grid.spacing=32"),
     "dcspect_ct": ("grid.size=[10,8,8]", "grid.spacing=32", "scene.iterations=4"),
 }
