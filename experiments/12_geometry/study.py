@@ -37,6 +37,7 @@ PACE = HERE / "pace.csv"
 KEYS = ("regime", "arm", "seconds", "seed")
 #: What arms are compared with.
 AGAINST = (
+    "cross_view",
     "one_round",
     "world_rounds",
     "world_unet",
@@ -142,8 +143,8 @@ def collected(runs: Path) -> list[dict]:
 
 
 def paired(rows: list[dict]) -> list[dict]:
-    """Each arm less each world arm, and less `one_round`, of the same regime, length and seed,
-    patient by patient.
+    """Each arm less each world arm, `cross_view` and `one_round`, of the same regime, length and
+    seed, patient by patient.
     """
     pairs = []
     for one, other in product(rows, rows):
@@ -168,30 +169,33 @@ def paired(rows: list[dict]) -> list[dict]:
 
 def curves(rows: list[dict], path: Path) -> None:
     """Mean PSNR over patients and seeds against training time, a panel for each regime with several
-    lengths.
+    lengths; ablations are in the table alone.
     """
     import matplotlib.pyplot as plt
 
+    arms = [arm for arm in EVERY if arm not in CLASSICAL | ABLATIONS]
+    spectrum = plt.get_cmap("nipy_spectral", len(arms) + 1)
+    colours = {arm: spectrum(place) for place, arm in enumerate(arms)}
     trained = {(r["regime"], r["seconds"]) for r in rows if r["seconds"]}
     lengths = Counter(regime for regime, _ in trained)
     regimes = [name for name in REGIMES if lengths[name] > 1]
-    figure, panels = plt.subplots(1, len(regimes), figsize=(4.5 * len(regimes), 3.6), squeeze=False)
+    figure, panels = plt.subplots(1, len(regimes), figsize=(6 * len(regimes), 3.6), squeeze=False)
     for panel, regime in zip(panels[0], regimes, strict=True):
         lines = [row for row in rows if row["regime"] == regime]
-        for arm in (arm for arm in EVERY if arm not in CLASSICAL):
+        for arm in arms:
             seeds = defaultdict(list)
             for row in (row for row in lines if row["arm"] == arm):
                 seeds[row["seconds"]].append(row["psnr"])
             line = sorted((seconds, fmean(values)) for seconds, values in seeds.items())
             if line:
-                panel.plot(*zip(*line, strict=True), "o-", label=arm)
+                panel.plot(*zip(*line, strict=True), "o-", color=colours[arm], label=arm)
         for arm, style in zip(CLASSICAL, (":", "--", "-.", (0, (1, 4))), strict=True):
             level = [row["psnr"] for row in lines if row["arm"] == arm]
             if level:
                 panel.axhline(level[0], color="grey", linestyle=style, label=arm)
         panel.set(title=regime, xlabel="processor seconds of training", ylabel="PSNR in dB")
         panel.set_xscale("log")
-        panel.legend(fontsize=7)
+        panel.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
     figure.tight_layout()
     figure.savefig(path, dpi=120)
 

@@ -15,7 +15,6 @@ BASE = (
     "acquisition=counts",
     "acquisition.closed_form=false",
     "optimizer.lr=2e-3",
-    "+optimizer.betas=[0.9,0.98]",
     "callbacks=quiet",
     "logger=csv",
 )
