@@ -14,7 +14,6 @@ BASE = (
     "scene.fill=null",
     "acquisition=counts",
     "acquisition.closed_form=false",
-    "optimizer.lr=2e-3",
     "callbacks=quiet",
     "logger=csv",
 )

@@ -28,7 +28,8 @@ class Reconstruction:
         support: where the volume may differ from zero; none for everywhere.
         start: the classical reconstruction that the network began with.
         start_views: the start projected into every camera, in the unit of the views.
-        earlier: the volumes after each round but the last, of a model in rounds.
+        earlier: the volumes after each round but the last, of a model in rounds; before expectation
+            maximisation that after the last, too.
         corrected_views: the views as the cameras' networks of each round have corrected them, or
             the completed sinogram, in the unit of the views. They are of the model's
             `corrected_cameras`, if it has them, else of its rig.

@@ -136,6 +136,21 @@ def test_exact_data_are_a_fixed_point_of_em_and_gradients_reach_volume_and_lengt
     assert all(g.isfinite().all() and g.any() for g in (other.grad, steps.lengths.grad))
 
 
+@torch.no_grad()
+def test_em_hides_a_scale_and_what_is_negative_so_the_loss_sees_the_last_round_before(counted):
+    """Five times too much, and as little as none below zero, end at the same volume."""
+    geometry, truth, counts = counted
+    step, x = Consistency({**EM, "steps": 1}).double(), truth + 0.5
+    x[..., :4] = 0
+    wrong = torch.where(x > 0, 5 * x, -10)
+    torch.testing.assert_close(step(geometry, wrong, counts), step(geometry, x, counts))
+    projector, rounds = small_projector(), SMALL["M3"]
+    views = projector(volume(whole_geometry(projector)))
+    for steps, last in ((EM, 1), (COUNTED, 0)):
+        model = MODELS.build("cross_view", projector=projector, rounds=rounds, consistency=steps)
+        assert len(model(views).earlier) == len(rounds) - 1 + last
+
+
 def test_learned_lengths_past_one_empty_no_ray(counted):
     """Ten times too much is cut down to the counts; a step of length 1.2 would end below zero."""
     geometry, truth, counts = counted

@@ -115,6 +115,8 @@ class CrossView(nn.Module):
         if state.ray_weights is not None and not self.consistency.poisson:
             trusted = replace(geometry, row=geometry.row * state.ray_weights)
         volume = self.consistency(trusted, state.volume, y).clamp_min(0)
+        # expectation maximisation takes a volume's scale and what is negative away, unseen
+        earlier = volumes if self.consistency.em else volumes[:-1]
         sigma = None
         if self.uncertainty is not None:
             sigma = self.uncertainty(geometry, y, volume, (x0, before)) * scale
@@ -123,7 +125,7 @@ class CrossView(nn.Module):
             sigma=sigma,
             support=geometry.mask,
             start=x0 * scale,
-            earlier=tuple(volumes[:-1]),
+            earlier=tuple(earlier),
             corrected_views=tuple(corrected),
             row=geometry.row if corrected else None,
             **_opinions(state, scale),
