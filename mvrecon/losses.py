@@ -84,6 +84,9 @@ class Weights:
             the views.
         rounds: of the mean squared errors of the volumes after earlier rounds, each less than the
             one behind it by the factor `EARLIER`.
+        entry: of the mean squared error of the volume that enters expectation maximisation. What
+            that hides, a scale and what is negative, has no other error: networks drift there until
+            all is zero. Small, since what enters need not be the best volume.
         corrected_views: of the mean squared error of the views as the cameras' networks have
             corrected them, or of the completed sinogram, against the truth's own views A x_true,
             as mean densities along rays.
@@ -99,6 +102,7 @@ class Weights:
     opinions_gain: float = 0.0
     cross_view: float = 0.0
     rounds: float = 0.0
+    entry: float = 0.0
     corrected_views: float = 0.0
     uncertainty: float = 0.0
 
@@ -157,6 +161,9 @@ class ReconstructionLoss(nn.Module):
         terms |= self._of_cameras(out, truth, views)
         if out.earlier and self.weights["rounds"]:
             terms["rounds"] = self._rounds(out, truth)
+        if out.entry is not None and self.weights["entry"]:
+            entry = out.entry / self.data_range
+            terms["entry"] = mean_where((entry - truth).square(), out.support)
         if self.compares_views(out):
             terms["corrected_views"] = self._corrected(out, batch["true_views"])
         if out.sigma is not None and self.weights["uncertainty"]:

@@ -28,8 +28,9 @@ class Reconstruction:
         support: where the volume may differ from zero; none for everywhere.
         start: the classical reconstruction that the network began with.
         start_views: the start projected into every camera, in the unit of the views.
-        earlier: the volumes after each round but the last, of a model in rounds; before expectation
-            maximisation that after the last, too.
+        earlier: the volumes after each round but the last, of a model in rounds.
+        entry: the volume that enters expectation maximisation, which hides its scale and what is
+            negative.
         corrected_views: the views as the cameras' networks of each round have corrected them, or
             the completed sinogram, in the unit of the views. They are of the model's
             `corrected_cameras`, if it has them, else of its rig.
@@ -48,6 +49,7 @@ class Reconstruction:
     start: Float[Tensor, "b 1 d h w"] | None = None
     start_views: Float[Tensor, "b 1 m v u"] | None = None
     earlier: tuple[Float[Tensor, "b 1 d h w"], ...] = ()
+    entry: Float[Tensor, "b 1 d h w"] | None = None
     corrected_views: tuple[Float[Tensor, "b 1 n v u"], ...] = ()
     row: Float[Tensor, "#b 1 #n #v #u"] | None = None
     alignment: Alignment | None = None

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
+from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.consistency import Consistency, em_change, weighted_for_counts
 from mvrecon.models.geometry import whole_geometry
+from mvrecon.models.output import Reconstruction
 from mvrecon.parts import MODELS
 from mvrecon.projectors.operator import Scaled
 from mvrecon.reconstructors.mlem import mlem
@@ -137,18 +139,24 @@ def test_exact_data_are_a_fixed_point_of_em_and_gradients_reach_volume_and_lengt
 
 
 @torch.no_grad()
-def test_em_hides_a_scale_and_what_is_negative_so_the_loss_sees_the_last_round_before(counted):
+def test_em_hides_a_scale_and_what_is_negative_so_the_loss_sees_what_enters_it(counted):
     """Five times too much, and as little as none below zero, end at the same volume."""
     geometry, truth, counts = counted
     step, x = Consistency({**EM, "steps": 1}).double(), truth + 0.5
     x[..., :4] = 0
     wrong = torch.where(x > 0, 5 * x, -10)
     torch.testing.assert_close(step(geometry, wrong, counts), step(geometry, x, counts))
-    projector, rounds = small_projector(), SMALL["M3"]
+    projector = small_projector()
     views = projector(volume(whole_geometry(projector)))
-    for steps, last in ((EM, 1), (COUNTED, 0)):
-        model = MODELS.build("cross_view", projector=projector, rounds=rounds, consistency=steps)
-        assert len(model(views).earlier) == len(rounds) - 1 + last
+    models = [
+        MODELS.build("cross_view", projector=projector, rounds=SMALL["M3"], consistency=steps)
+        for steps in (EM, COUNTED)
+    ]
+    entry, none = (model(views).entry for model in models)
+    assert entry is not None and none is None
+    out = Reconstruction(0 * entry, entry=entry - 10)
+    error = ReconstructionLoss(1.0, entry=0.01)(out, {"volume": 0 * entry, "views": views})
+    assert float(error["total"]) == pytest.approx(0.01 * (entry - 10).square().mean().item())
 
 
 def test_learned_lengths_past_one_empty_no_ray(counted):

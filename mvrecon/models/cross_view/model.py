@@ -115,8 +115,6 @@ class CrossView(nn.Module):
         if state.ray_weights is not None and not self.consistency.poisson:
             trusted = replace(geometry, row=geometry.row * state.ray_weights)
         volume = self.consistency(trusted, state.volume, y).clamp_min(0)
-        # expectation maximisation takes a volume's scale and what is negative away, unseen
-        earlier = volumes if self.consistency.em else volumes[:-1]
         sigma = None
         if self.uncertainty is not None:
             sigma = self.uncertainty(geometry, y, volume, (x0, before)) * scale
@@ -125,7 +123,8 @@ class CrossView(nn.Module):
             sigma=sigma,
             support=geometry.mask,
             start=x0 * scale,
-            earlier=tuple(earlier),
+            earlier=tuple(volumes[:-1]),
+            entry=volumes[-1] if self.consistency.em else None,
             corrected_views=tuple(corrected),
             row=geometry.row if corrected else None,
             **_opinions(state, scale),
