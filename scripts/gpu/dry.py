@@ -77,6 +77,8 @@ def stand_in() -> None:
     AsGpu().__enter__()
     for name, value in STANDING_IN.items():
         setattr(torch.cuda, name, value)
+    # a build of torch with CUDA names an accelerator even without a driver
+    torch.accelerator.current_accelerator = lambda *_, **__: None
     allclose = torch.allclose  # C++ would compare tensors without numbers
     torch._C._InferenceMode = lambda mode: torch.no_grad()  # it takes no tensors of the stand-in
     torch.allclose = lambda a, b, **k: allclose(in_memory(a), in_memory(b), **k)
