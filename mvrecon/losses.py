@@ -14,9 +14,8 @@ from mvrecon.models.output import Reconstruction
 from mvrecon.parts import LOSSES
 from mvrecon.registry import check_options
 
-#: Weight of a round's volume relative to that of the round behind it.
-EARLIER = 0.4
-#: Of the truth's power: as much counts each start's error where opinions are compared with it.
+#: Share of the truth's power added to the error of the start, with which per-view estimates are
+#: compared.
 LEAST = 1e-6
 #: The least variance that a voxel may have, relative to the square of the value range.
 VARIANCE = 1e-12
@@ -76,34 +75,27 @@ class Weights:
         common_field: of the mean squared error of the voxels that all cameras see, where more is
             seen than what a rig is built for.
         edges: of the squared error of first differences.
-        opinions: of the mean squared error of the opinions, where the cameras see.
-        opinions_gain: of the squared error of each camera's opinion relative to that of the start
-            where this camera sees, the mean over the cameras, and the same of the weighted opinion;
-            both are 1 where every opinion is the start.
-        cross_view: of the squared error of opinions projected to the other cameras, relative to
-            the views.
-        rounds: of the mean squared errors of the volumes after earlier rounds, each less than the
-            one behind it by the factor `EARLIER`.
+        per_view: of the mean squared error of the per-view estimates, where their cameras see.
+        per_view_gain: of the squared error of each per-view estimate relative to that of the start
+            where its camera sees, the mean over the cameras, and the same of the weighted estimate;
+            both are 1 where every estimate is the start.
+        cross_view: of the squared error of each view as the other cameras' estimates predict it,
+            relative to the views.
         entry: of the mean squared error of the volume that enters expectation maximisation. What
             that hides, a scale and what is negative, has no other error: networks drift there until
             all is zero. Small, since what enters need not be the best volume.
-        corrected_views: of the mean squared error of the views as the cameras' networks have
-            corrected them, or of the completed sinogram, against the truth's own views A x_true,
-            as mean densities along rays.
         uncertainty: of the mean negative log-likelihood of the volume's error under the standard
-            deviations that the model expects, Gaussian (Nix & Weigend, IEEE ICNN 1994); it is no
-            term where the model expects none, and has no gradient in the volume.
+            deviations that the method expects, Gaussian (Nix & Weigend, IEEE ICNN 1994); it is no
+            term where the method expects none, and has no gradient in the volume.
     """
 
     volume: float = 1.0
     common_field: float = 0.0
     edges: float = 0.0
-    opinions: float = 0.0
-    opinions_gain: float = 0.0
+    per_view: float = 0.0
+    per_view_gain: float = 0.0
     cross_view: float = 0.0
-    rounds: float = 0.0
     entry: float = 0.0
-    corrected_views: float = 0.0
     uncertainty: float = 0.0
 
 
@@ -112,10 +104,10 @@ TERMS = tuple(field.name for field in fields(Weights))
 
 
 class ReconstructionLoss(nn.Module):
-    """Weighted sum of the errors of the volume, of each camera's own volume (its opinion), and of
-    the views that opinions predict for the other cameras.
+    """Weighted sum of the errors of the volume, of the per-view estimates, and of the views that
+    these predict for the other cameras.
 
-    Where a model works on a support, the means of the volumes' errors are over its voxels: all
+    Where a method has a support, the means of the volumes' errors are over its voxels: all
     others are 0 by definition, and have no gradient. The figures of merit cover the whole grid.
 
     Args:
@@ -143,10 +135,9 @@ class ReconstructionLoss(nn.Module):
         """Each term unweighted, and their weighted sum as "total".
 
         Args:
-            out: of the model.
-            batch: "volume" and "views"; where `compares_views` is true of the reconstruction
-                "true_views", the truth's own views of the same cameras; and where it has a weight
-                "common_field" [1 d h w], the voxels that all cameras see.
+            out: of the method.
+            batch: "volume" and "views"; where it has a weight "common_field" [1 d h w], the voxels
+                that all cameras see.
         """
         truth, views = batch["volume"] / self.data_range, batch["views"]
         volume = out.volume / self.data_range
@@ -159,22 +150,14 @@ class ReconstructionLoss(nn.Module):
         if self.weights["edges"]:
             terms["edges"] = edge_difference(volume, truth, out.support)
         terms |= self._of_cameras(out, truth, views)
-        if out.earlier and self.weights["rounds"]:
-            terms["rounds"] = self._rounds(out, truth)
         if out.entry is not None and self.weights["entry"]:
             entry = out.entry / self.data_range
             terms["entry"] = mean_where((entry - truth).square(), out.support)
-        if self.compares_views(out):
-            terms["corrected_views"] = self._corrected(out, batch["true_views"])
         if out.sigma is not None and self.weights["uncertainty"]:
             terms["uncertainty"] = self._uncertainty(out, volume, truth)
         terms |= {name: term(out, batch, self.data_range) for name, term in self.brought.items()}
         total = sum(self.weights[name] * value for name, value in terms.items())
         return {**terms, "total": torch.as_tensor(total)}
-
-    def compares_views(self, out: Reconstruction) -> bool:
-        """Whether corrected views of this reconstruction are compared with the truth's own."""
-        return bool(out.corrected_views and self.weights["corrected_views"])
 
     def _uncertainty(self, out: Reconstruction, volume: Tensor, truth: Tensor) -> Float[Tensor, ""]:
         assert out.sigma is not None
@@ -187,44 +170,29 @@ class ReconstructionLoss(nn.Module):
         error = volume.detach() - truth
         return mean_where((variance.log() + error.square() / variance) / 2, out.support)
 
-    def _rounds(self, out: Reconstruction, truth: Tensor) -> Float[Tensor, ""]:
-        errors = [
-            EARLIER**behind * mean_where((volume / self.data_range - truth).square(), out.support)
-            for behind, volume in enumerate(reversed(out.earlier), start=1)
-        ]
-        return torch.stack(errors).sum()
-
-    def _corrected(
-        self, out: Reconstruction, true_views: Float[Tensor, "b 1 n v u"]
-    ) -> Float[Tensor, ""]:
-        assert out.row is not None
-        weight = out.row / self.data_range
-        errors = [(weight * (views - true_views)).square().mean() for views in out.corrected_views]
-        return torch.stack(errors).mean()
-
     def _of_cameras(
         self, out: Reconstruction, truth: Tensor, views: Float[Tensor, "b 1 m v u"]
     ) -> dict[str, Float[Tensor, ""]]:
-        """The terms of the opinions, at their resolution."""
+        """The terms of the per-view estimates, at their resolution."""
         terms = {}
-        if out.opinions is not None and out.visible is not None:
-            opinions, support = out.opinions / self.data_range, out.support
+        if out.per_view is not None and out.visible is not None:
+            estimates, support = out.per_view / self.data_range, out.support
             if support is not None:
-                support = at_cells(support.to(truth.dtype), opinions) > 0
-            truth = at_cells(truth, opinions)
-            error = (opinions - truth[:, None]).square()
-            if self.weights["opinions"]:
-                terms["opinions"] = self._opinions(error, out.visible, support)
-            if self.weights["opinions_gain"]:
-                terms["opinions_gain"] = self._gain(out, error, truth, support)
-        if out.cross_views is not None and self.weights["cross_view"]:
-            views = binned_like(views, out.cross_views)
+                support = at_cells(support.to(truth.dtype), estimates) > 0
+            truth = at_cells(truth, estimates)
+            error = (estimates - truth[:, None]).square()
+            if self.weights["per_view"]:
+                terms["per_view"] = self._per_view(error, out.visible, support)
+            if self.weights["per_view_gain"]:
+                terms["per_view_gain"] = self._gain(out, error, truth, support)
+        if out.predictions is not None and self.weights["cross_view"]:
+            views = binned_like(views, out.predictions)
             power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
-            terms["cross_view"] = (out.cross_views - views).square().mean() / power
+            terms["cross_view"] = (out.predictions - views).square().mean() / power
         return terms
 
     @staticmethod
-    def _opinions(error: Tensor, visible: Tensor, support: Tensor | None) -> Float[Tensor, ""]:
+    def _per_view(error: Tensor, visible: Tensor, support: Tensor | None) -> Float[Tensor, ""]:
         if support is None:
             return (error * visible).mean() / visible.float().mean()
         return mean_where(error, visible & support[:, None])
@@ -232,7 +200,7 @@ class ReconstructionLoss(nn.Module):
     def _gain(
         self, out: Reconstruction, error: Tensor, truth: Tensor, support: Tensor | None
     ) -> Float[Tensor, ""]:
-        assert out.opinions is not None and out.visible is not None
+        assert out.per_view is not None and out.visible is not None
         visible = out.visible if support is None else out.visible & support[:, None]
         start = 0 * truth if out.start is None else at_cells(out.start / self.data_range, truth)
         before = (start - truth).square()[:, None]
@@ -248,5 +216,5 @@ class ReconstructionLoss(nn.Module):
         if out.weights is None:
             return gain
         anywhere = visible.any(dim=-5, keepdim=True)
-        fused = (out.weights * out.opinions).sum(dim=1, keepdim=True) / self.data_range
+        fused = (out.weights * out.per_view).sum(dim=1, keepdim=True) / self.data_range
         return gain + relative((fused - truth[:, None]).square(), anywhere)

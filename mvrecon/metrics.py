@@ -180,15 +180,15 @@ def coverage(error: Float[Tensor, "*n"], sigma: Float[Tensor, "*n"], share: floa
     return (error.abs() <= wide * sigma).double().mean().item()
 
 
-def opinion_spread(
-    opinions: Float[Tensor, "b m 1 d h w"], weights: Float[Tensor, "b m 1 d h w"]
+def per_view_spread(
+    estimates: Float[Tensor, "b m 1 d h w"], weights: Float[Tensor, "b m 1 d h w"]
 ) -> float:
-    """Weighted standard deviation of the cameras' opinions relative to their weighted mean, both as
-    root mean squares over voxels, without a unit.
+    """Weighted standard deviation of the per-view estimates relative to their weighted mean, both
+    as root mean squares over voxels, without a unit.
     """
-    opinions, weights = opinions.double(), weights.double()
-    mean = (weights * opinions).sum(dim=1, keepdim=True)
-    deviation = (weights * (opinions - mean).square()).sum(dim=1).sqrt()
+    estimates, weights = estimates.double(), weights.double()
+    mean = (weights * estimates).sum(dim=1, keepdim=True)
+    deviation = (weights * (estimates - mean).square()).sum(dim=1).sqrt()
     size = mean.norm().item()
     return deviation.norm().item() / size if size else 0.0
 

@@ -12,7 +12,6 @@ SCENES = Registry(
     defrise="mvrecon.scenes.defrise:Defrise",
     shepp_logan="mvrecon.scenes.shepp_logan:SheppLogan",
     mixture="mvrecon.scenes.mixture:Mixture",
-    breast="mvrecon.data.breast:BreastSlices",
     hdf5="mvrecon.data.volumes:Hdf5Volumes",
     nifti="mvrecon.data.volumes:NiftiVolume",
     volumes="mvrecon.data.volume_scene:Volumes",
@@ -44,21 +43,22 @@ HEADS = Registry(
 )
 NETWORKS = Registry(
     "network",
-    unet="mvrecon.models.networks:UNet3d",
-    unet2d="mvrecon.models.unet2d:UNet2d",
-    unet3d="mvrecon.models.published:CicekUNet3d",
-    residual_unet3d="mvrecon.models.published:ResidualUNet3d",
+    unet="mvrecon.models.network:UNet3d",
 )
-CAMERA_NETWORKS = Registry(
-    "camera_network",
-    rays2d="mvrecon.models.cross_view.rays2d:Rays2d",
-    frustum3d="mvrecon.models.cross_view.frustum3d:Frustum3d",
-)
-RECONSTRUCTORS = Registry(
-    "reconstructor",
+#: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
+#: return a volume; see `models/method.py`.
+METHODS = Registry(
+    "method",
+    cross_view="mvrecon.models.cross_view:CrossView",
+    world_unet="mvrecon.models.world_unet:WorldUNet",
+    mean_fusion="mvrecon.models.mean_fusion:MeanFusion",
+    geometry_free="mvrecon.models.geometry_free:GeometryFree",
+    aligned="mvrecon.models.aligned:Aligned",
+    uncertain="mvrecon.models.uncertain:Uncertain",
+    backprojection="mvrecon.reconstructors.iterative:backprojection",
     fbp="mvrecon.reconstructors.filtered.fdk:fbp",
     fdk="mvrecon.reconstructors.filtered.fdk:fdk",
-    trained="mvrecon.engine.trained_reconstructor:trained",
+    trained="mvrecon.engine.trained_method:TrainedMethod",
     sirt="mvrecon.reconstructors.iterative:sirt",
     os_sart="mvrecon.reconstructors.os_sart:os_sart",
     cgls="mvrecon.reconstructors.cgls:cgls",
@@ -90,29 +90,7 @@ VIEW_FILES = Registry(
 CORRECTIONS = Registry(
     "correct",
     align="mvrecon.calibration.self_alignment:self_aligned",
-    trained="mvrecon.engine.trained_correction:corrected_by",
 )
-MODELS = Registry(
-    "model",
-    cross_view="mvrecon.models.cross_view.model:CrossView",
-    single_pass="mvrecon.models.single_pass:SinglePass",
-    mean_fusion="mvrecon.models.baselines:MeanFusion",
-    backprojection_unet="mvrecon.models.baselines:BackprojectionUNet",
-    geometry_free="mvrecon.models.baselines:GeometryFree",
-    dif_net="mvrecon.models.pixel_aligned:DifNet",
-    svct="mvrecon.models.pixel_aligned:Svct",
-    radon_unet="mvrecon.models.radon_unet:RadonUNet",
-    fbp_unet="mvrecon.models.sparse_view.schools:FbpUNet",
-    sinogram_unet="mvrecon.models.sparse_view.schools:SinogramUNet",
-    dual_domain="mvrecon.models.sparse_view.schools:DualDomain",
-    itnet="mvrecon.models.sparse_view.itnet:ItNet",
-    primal_dual="mvrecon.models.sparse_view.primal_dual:PrimalDual",
-    backprojection="mvrecon.models.baselines:Backprojection",
-    sirt="mvrecon.models.baselines:Sirt",
-    classical="mvrecon.models.classical:Classical",
-    corrected="mvrecon.models.corrected:Corrected",
-)
-
 #: What a training takes by name besides its parts; of callbacks and loggers mvrecon's own and
 #: Lightning's are named by `_target_`.
 OPTIMIZERS = Registry(
@@ -133,10 +111,8 @@ REGISTRIES = {
         PROJECTORS,
         HEADS,
         NETWORKS,
-        CAMERA_NETWORKS,
-        RECONSTRUCTORS,
+        METHODS,
         CORRECTIONS,
-        MODELS,
     )
 }
 #: All that `mvrecon-list` shows: besides the parts that a configuration names by `name`, what a

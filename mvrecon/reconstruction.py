@@ -82,7 +82,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             **_row(settings, case, out),
             **outcome.row(),
             **_values(outcome.volume, settings["unit"]),
-            "doubts": doubts(case, settings["reconstructor"]["name"], outcome.view_nrmse, device),
+            "doubts": doubts(case, settings["method"]["name"], outcome.view_nrmse, device),
             "left_out": solve.left_out(case, settings, device) if settings["left_out"] else None,
             **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
         }
@@ -111,7 +111,7 @@ def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
     """What was reconstructed, from what."""
     return {
         "name": settings["name"],
-        "method": settings["reconstructor"]["name"],
+        "method": settings["method"]["name"],
         "volume": str(out),
         "unit": "HU" if settings["unit"] == "HU" else case.unit,
         "grid": {"shape": list(case.grid.shape), "spacing_mm": list(case.grid.spacing)},

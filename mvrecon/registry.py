@@ -205,5 +205,16 @@ def check_options(owner: str, options: Iterable[Any], known: Iterable[str]) -> N
             raise TypeError(f"{owner} has no option {option!r}{hint(str(option), names)}")
 
 
+def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
+    """Check the value of an option.
+
+    Raises:
+        ValueError: a value that is none of the known ones.
+    """
+    choices = list(known)
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+
+
 def _where(part: Any) -> str:
     return part if isinstance(part, str) else f"{part.__module__}:{part.__qualname__}"

@@ -123,7 +123,7 @@ def parts_in(
     for key, node in settings.items():
         if not isinstance(node, Mapping):
             continue
-        kind = "model" if path == "compare." else KINDS.get(str(key), str(key))
+        kind = "method" if path == "compare." else KINDS.get(str(key), str(key))
         if kind in REGISTRIES and isinstance(node.get("name"), str):
             yield f"{path}{key}", kind, node
         yield from parts_in(node, f"{path}{key}.")

@@ -25,7 +25,7 @@ from mvrecon.config.arguments import (
     with_options_added,
     with_paths_quoted,
 )
-from mvrecon.config.errors import OF_MODELS, one_line
+from mvrecon.config.errors import OF_METHODS, one_line
 from mvrecon.config.guard import guarded
 from mvrecon.config.plugins import check_plugins
 from mvrecon.config.quiet import silence_libraries
@@ -35,8 +35,13 @@ from mvrecon.files.checks import shown, yaml_of
 from mvrecon.registry import installed, locate
 
 VERSION_BASE = "1.3"
-#: Settings of an app that a run fills in, so that their options are not in the app's own file.
-OF_RUN = {"eval": ("acquisition", "camera", "data", "grid", "test_scene")}
+#: Settings of an app whose options need not be in its file: a method's are those of its signature,
+#: an evaluation's those of the run.
+OF_RUN = {
+    "train": ("method", "compare"),
+    "reconstruct": ("method",),
+    "eval": ("acquisition", "camera", "compare", "data", "grid", "test_scene"),
+}
 
 
 class PluginConf(SearchPathPlugin):
@@ -165,11 +170,11 @@ def help_text(config_name: str) -> str:
 
 
 def groups_of(app: Path) -> set[str]:
-    """The config groups in an app's list of defaults, and those that its models choose from."""
+    """The config groups in an app's list of defaults, and those that its methods choose from."""
     entries = yaml_of(app).get("defaults", ())
     keys = (next(iter(entry)) for entry in entries if isinstance(entry, dict))
     groups = {re.sub("^override ", "", key).partition("@")[0].strip("/") for key in keys}
-    return groups | (OF_MODELS if "model" in groups else set())
+    return groups | (OF_METHODS if "method" in groups else set())
 
 
 def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
@@ -196,13 +201,13 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
 def labelled(settings: dict[str, Any], choices: Mapping[str, str | None]) -> dict[str, Any]:
     """Settings of which a null `label` is the name of the main method's file of settings.
 
-    A class serves several such files: `world_unet` is `cross_view` without cameras' networks.
+    A class serves several such files, as `cross_view_counts`.
 
     Args:
         settings: plain.
         choices: file by config group, as Hydra has them in `hydra.runtime.choices`.
     """
-    choice = choices.get("model")
+    choice = choices.get("method")
     if not choice or settings.get("label", "") is not None:
         return settings
     return {**settings, "label": PurePosixPath(choice).name}

@@ -35,8 +35,10 @@ EXTRAS = {"joblib": "sweep", "optuna": "sweep"} | dict.fromkeys(
     ("ray", "submitit_local", "submitit_slurm"), "cluster"
 )
 
-#: Groups whose part is an option of a model; Hydra's words for a group that a run does not take.
-OF_MODELS = {"head", "network", "reconstructor"}
+#: Groups whose part is an option of a method; settings of version 0.1.0 and what replaces them.
+OF_METHODS = {"head", "network"}
+RENAMED = {"model": "method", "reconstructor": "method"}
+#: Hydra's words for a group that a run does not take.
 UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean to override)")
 #: Hydra's words for an experiment that chooses what the app does not have.
 FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
@@ -101,6 +103,9 @@ def sentence(error: BaseException) -> str:
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
     if isinstance(cause, ConfigKeyError | ConfigAttributeError):
         parent = cause.parent_node
+        old, _, rest = str(cause.full_key).partition(".")
+        if old in RENAMED:
+            return f"{cause.full_key!r} is called {RENAMED[old]}{'.' * bool(rest)}{rest} now"
         known = {str(key) for key in parent or ()} - {"hydra"}
         if not known:  # as the camera of an evaluation, which is the run's
             return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
@@ -109,8 +114,10 @@ def sentence(error: BaseException) -> str:
             return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
     if part := UNMATCHED.match(str(error)):
-        if part[1] in OF_MODELS:
-            return f"{part[1]!r} is a part of a model; to choose it: {part[1]}@model.{part[1]}=..."
+        if part[1] in RENAMED:
+            return f"{part[1]!r} is called {RENAMED[part[1]]!r} now: {RENAMED[part[1]]}=..."
+        if part[1] in OF_METHODS:
+            return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
         return f"This app chooses no {part[1]!r}; --help shows what it chooses"
     if foreign := FOREIGN.match(str(error)):
         return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"

@@ -16,7 +16,6 @@ from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
 
-from mvrecon.config.chosen import check_model_choice
 from mvrecon.files.checks import plain_name, shown, yaml_of
 from mvrecon.files.runs import leaves
 from mvrecon.registry import hint
@@ -40,7 +39,6 @@ def guarded(
         PermissionError: a file from elsewhere sets what only the command line may, or reads
             environment variables.
         LookupError: a setting that the app does not use.
-        ValueError: a model would have the options of another one.
         Refused: a YAML file that is too large, or a `name` that leads out of the folder of outputs.
     """
     # fills the registry with classes of its own, other than those that an import gives
@@ -66,7 +64,6 @@ def guarded(
                 )
             check_foreign(config, foreign, overrides, composed)
         config = _named(used(config, composed([]) if overrides else config))
-        check_model_choice(config, overrides, composed)
         if check is not None:
             check(config)
         return config

@@ -38,7 +38,7 @@ class Settings(Measurement):
     """
 
     test_scene: Any = None
-    model: Any = None
+    method: Any = None
     label: str | None = None
     compare: Any = field(default_factory=dict)
     loss: Any = field(default_factory=dict)
@@ -61,7 +61,7 @@ class ScanSettings:
     camera: Any = None
     projector: Any = None
     grid: Any = MISSING
-    reconstructor: Any = None
+    method: Any = None
     correct: Any = None
     self_calibrate: bool = False
     left_out: bool = False
@@ -76,7 +76,7 @@ class ScanSettings:
 
 @dataclass
 class Evaluation:
-    """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the model, are
+    """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the method, are
     not keys.
     """
 

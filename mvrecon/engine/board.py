@@ -18,8 +18,8 @@ from mvrecon.files.runs import leaves
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz import review
 
-#: Settings of a run that make no difference to what comes out, or whose place is taken by `model`.
-SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "model", "label")
+#: Settings of a run that make no difference to what comes out, or whose place is taken by `method`.
+SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label")
 #: Figures of the table by their names in the results; costs, and theirs.
 FIGURES = ("psnr", "ssim", "view_nrmse")
 COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
@@ -41,20 +41,20 @@ def close(
     """Log settings and test figures of every method, the result table and the run's overrides,
     where the run has a board.
 
-    A setting has the name that it has on the command line, such as camera.n_views; model.name is a
-    class, which may serve several methods. TensorBoard puts those that differ between runs first.
+    A setting has the name that it has on the command line, such as camera.n_views; method.name is a
+    class, which may serve several labels. TensorBoard puts those that differ between runs first.
     Beside them it shows all numbers of the folder, so that the test's have one of their own.
     """
     if not wanted(settings):
         return
     shared = {key: value for key, value in settings.items() if key not in SILENT}
-    for label, model in methods(dict(settings)).items():
+    for label, method in methods(dict(settings)).items():
         row, board = table["methods"][label], Board(str(folder / label / TEST))
         figures = {f"test/{name}": row[name]["mean"] for name in FIGURES}
         costs = {
             f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
         }
-        settled = {"method": label, "model": model}
+        settled = {"label": label, "method": method}
         values = {".".join(keys): v for keys, v in leaves(settled | shared)}
         board.log_session({k: _plain(v) for k, v in values.items()}, figures | costs)
         if label == next(iter(table["methods"])):

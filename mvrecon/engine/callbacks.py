@@ -19,7 +19,9 @@ from mvrecon.engine.run_folder import versions
 from mvrecon.files.memory import peak, restarted_peak
 from mvrecon.files.places import check_places
 from mvrecon.metrics import volume_metrics
+from mvrecon.models.method import build_method
 from mvrecon.models.output import Reconstruction
+from mvrecon.projectors.operator import Projector
 from mvrecon.viz import cameras, review, rig_mesh
 from mvrecon.viz.planes import Image
 
@@ -117,7 +119,7 @@ class CompileModel(L.Callback):
     def setup(self, trainer: L.Trainer, pl_module: Any, stage: str) -> None:
         """Compile in place; names of parameters stay."""
         if stage == "fit":
-            pl_module.model.compile()
+            pl_module.method.compile()
 
 
 class BoardReview(L.Callback):
@@ -127,7 +129,7 @@ class BoardReview(L.Callback):
     Args:
         every: of how many validations one is pictured.
         cases: how many of the first batch's scenes are shown.
-        baselines: training-free models shown beside ours.
+        baselines: training-free methods shown beside ours.
         label: of the method in the run's table; "": its class's name.
     """
 
@@ -195,22 +197,23 @@ class BoardReview(L.Callback):
     def _sheets(
         self, module: Any, batch: Any, out: Reconstruction, number: int, units: tuple[str, str]
     ) -> dict[str, Image]:
-        truth, top, rig = batch["volume"][number, 0], module.hparams["data_range"], module.on(batch)
+        truth, top = batch["volume"][number, 0], module.hparams["data_range"]
+        A = module.operator(batch)
         case = review.Case(batch["name"][number], module.projector.grid, top, *units)
         scored = case._replace(name=f"{case.name}: PSNR in dB, SSIM")
-        name = self.label or module.hparams["model"]["name"]
+        name = self.label or module.hparams["method"]["name"]
         label = named(name, out.volume[number], batch, number, top)
-        volumes = {label: out.volume[number, 0], **self._baselines(rig, batch, top)[number]}
+        volumes = {label: out.volume[number, 0], **self._baselines(A, batch, top)[number]}
         rim = None if out.support is None else outlined(truth, out.support[number, 0], top)
-        predicted = rig.A(out.volume)[number, 0]
+        predicted = A(out.volume)[number, 0]
         measured = batch["views"][number, 0]
         shown = {
             "planes": review.planes(scored, truth, volumes, rim),
             "mip": review.projections(scored, truth, volumes),
             "views": review.views(measured, predicted, case.name, case.unit_of_views),
         }
-        if out.opinions is not None:
-            shown["opinions"] = review.opinions(case, out.opinions[number, :, 0])
+        if out.per_view is not None:
+            shown["per_view"] = review.per_view(case, out.per_view[number, :, 0])
         if out.weights is not None:
             shown["weights"] = review.weights(case, out.weights[number, :, 0])
         if out.sigma is not None:
@@ -221,13 +224,13 @@ class BoardReview(L.Callback):
             shown["cameras"] = cameras.alignments(by.shift_px[number], by.gain[number], known)
         return shown
 
-    def _baselines(self, rig: Any, batch: Any, top: float) -> list[dict[str, Tensor]]:
+    def _baselines(self, A: Projector, batch: Any, top: float) -> list[dict[str, Tensor]]:
         """Volumes of the baselines for each case, by name and figures."""
         if not self._fixed:  # the scenes are the same at every review, so once is enough
             views = batch["views"]
             self._fixed = [{} for _ in range(min(self.cases, len(views)))]
             for name in self.baselines:
-                volumes = rig.by(name, views).volume
+                volumes = build_method({"name": name})(views, A).volume
                 for number, shown in enumerate(self._fixed):
                     shown[named(name, volumes[number], batch, number, top)] = volumes[number, 0]
         return self._fixed

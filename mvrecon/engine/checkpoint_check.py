@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mvrecon.engine.old_names import current, current_model
 from mvrecon.files.checks import TEXT, Refused, blaming, shown
 from mvrecon.losses import TERMS
 from mvrecon.parts import LOSSES, REGISTRIES
@@ -28,7 +27,7 @@ GLOBALS = re.compile(
 #: Ways of a pickle to name things that `torch.save` does not use.
 FOREIGN = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"}
 #: The hyper-parameters of a method.
-KEYS = {"geometry", "model", "loss", "optimizer", "data_range"}
+KEYS = {"geometry", "method", "loss", "optimizer", "data_range"}
 
 
 def check_archive(path: Path) -> None:
@@ -65,18 +64,19 @@ def check_archive(path: Path) -> None:
 
 def check_settings(path: Path, settings: Any) -> dict[str, Any]:
     """The hyper-parameters of a checkpoint: names and numbers under the keys of a method, and
-    nothing else; by the option names of this version.
+    nothing else.
 
     Raises:
         Refused: other keys or other values.
     """
+    if isinstance(settings, dict) and "model" in settings:
+        raise Refused(f"{path}: was written by mvrecon 0.1.0; v0.1.0 reads it")
     if not isinstance(settings, dict) or set(settings) != KEYS or not _plain(settings):
         raise Refused(
             f"{path}: has the settings {shown(settings)}; expected names and numbers for "
             f"{sorted(KEYS)}"
         )
-    geometry, model = current(settings["geometry"]), current_model(settings["model"])
-    return {**settings, "geometry": geometry, "model": model}
+    return settings
 
 
 def check_known(path: Path, settings: Mapping[str, Any]) -> None:

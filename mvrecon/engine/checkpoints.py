@@ -11,7 +11,6 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoint_check import check_archive, check_known, check_settings
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.engine.on_rig import model_on
 from mvrecon.engine.storage import read
 from mvrecon.files.checks import blaming, plain_name
 from mvrecon.geometry.grid import Grid
@@ -58,16 +57,14 @@ class Trained:
             ValueError: views that do not fit the rig, or weights that fit the rig and the grid of
                 the training alone.
         """
-        if cameras is None and grid is None:
-            return self.module(views).volume
-        known = self.module.projector
-        A = PROJECTORS.from_config(
-            self.module.hparams["geometry"]["projector"],
-            grid=known.grid if grid is None else grid,
-            cameras=known.cameras if cameras is None else cameras,
-        )
-        name = f"The trained {self.module.hparams['model']['name']}"
-        return model_on(A.to(known.device), self.module, name)(views).volume
+        A = self.module.projector
+        if cameras is not None or grid is not None:
+            A = PROJECTORS.from_config(
+                self.module.hparams["geometry"]["projector"],
+                grid=A.grid if grid is None else grid,
+                cameras=A.cameras if cameras is None else cameras,
+            ).to(A.device)
+        return self.module(views, A).volume
 
 
 def finished(folder: Path, method: str) -> Path:

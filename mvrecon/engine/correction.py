@@ -51,11 +51,8 @@ def check(settings: Mapping[str, Any]) -> None:
     correct, calibrate = settings["correct"], settings["self_calibrate"]
     if correct is not None:
         CORRECTIONS.check(correct)
-    if calibrate and (correct is None or correct["name"] == "trained"):
-        raise ValueError(
-            f"expected correct=align for self_calibrate=true, which needs shifts of cameras, got "
-            f"{correct}"
-        )
+    if calibrate and correct is None:
+        raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
 
 
 def corrected_scan(

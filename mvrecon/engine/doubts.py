@@ -16,7 +16,7 @@ from mvrecon.data.projections.region import Region
 from mvrecon.engine.coarse import coarse
 from mvrecon.engine.scan import Scan
 from mvrecon.metrics import nrmse
-from mvrecon.parts import PROJECTORS, RECONSTRUCTORS
+from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.pixel_integral import sees_integrals
 from mvrecon.reconstructors.iterative import sirt
@@ -50,17 +50,17 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
     """What speaks against a scan's reconstruction, in words, without a unit; empty for most.
 
     A projector whose `pixel_integral` says nothing, and one of weighted integrals, have doubts of
-    their volume's residual alone; a reconstructor says by `takes` what its views are.
+    their volume's residual alone; a method says by `takes` what its views are.
 
     Args:
         scan: that was reconstructed.
-        method: name of the reconstructor.
+        method: name of the method.
         view_nrmse: |y - A x| / |y| of its volume.
         device: for the comparison.
     """
     words: list[str] = []
     limit = POOR
-    orders, kind = _orders(scan), kind_of_views(RECONSTRUCTORS.get(method))
+    orders, kind = _orders(scan), kind_of_views(METHODS.get(method))
     if sees_integrals(orders[0].A):
         first, views = _read(scan, orders)
         if kind == "integrals":

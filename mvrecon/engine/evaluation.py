@@ -16,10 +16,9 @@ from torch.utils.data import DataLoader
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
-from mvrecon.engine.fit import build_module, methods, trainable
+from mvrecon.engine.fit import build_module, trainable
+from mvrecon.engine.labels import methods as methods_of
 from mvrecon.engine.module import Settings, build_projector
-from mvrecon.engine.on_case import plain, projected, reconstructed
-from mvrecon.engine.on_rig import OnRig, with_weights_of
 from mvrecon.engine.quality import quality_of, quality_row
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of
 from mvrecon.files.memory import peak_since, restarted_peak
@@ -37,38 +36,40 @@ See = Callable[[dict[str, Any], dict[str, Tensor]], None]
 
 @torch.inference_mode()
 def evaluate(
-    models: Mapping[str, nn.Module | OnRig],
+    methods: Mapping[str, nn.Module],
     batches: Iterable[dict[str, Any]],
     A: Projector,
     data_range: float,
     device: str = "cpu",
     see: See | None = None,
+    assumed: Mapping[str, Projector] | None = None,
 ) -> Scores:
     """Figures of merit, milliseconds and memory of one reconstruction ("ms"; "bytes", None where it
-    is not known), what a model tells of its own error ("quality") and what of the cameras
-    ("cameras", where it does), of each model on each scene.
+    is not known), what a method reports of its own error ("quality") and of the cameras
+    ("cameras", where it does), of each method on each scene.
 
     Args:
-        models: by label, all for the grid and the rig of `A`; `OnRig` where a method's operator may
-            be each case's own.
-        batches: test scenes, in batches of any size; the models get them one by one.
-        A: re-projects the volumes for the error of the views.
+        methods: by label.
+        batches: test scenes, in batches of any size; the methods get them one by one.
+        A: the operator that made the views.
         data_range: for PSNR and SSIM.
-        device: where the models run.
+        device: where the methods run.
         see: called with every scene and its reconstructions by label.
+        assumed: operators of methods that reconstruct by another one than A, by label.
     """
-    A = A.to(device)
-    ready = {label: _ready(model, device) for label, model in models.items()}
-    scores: Scores = {label: [] for label in models}
+    A, others = A.to(device), {k: B.to(device) for k, B in (assumed or {}).items()}
+    ready = {label: method.to(device).eval() for label, method in methods.items()}
+    scores: Scores = {label: [] for label in methods}
     for scene in (case for batch in batches for case in _singly(batch, device)):
-        volumes = {}
-        for label, model in ready.items():
+        volumes, of_case = {}, A.for_case(scene)
+        for label, method in ready.items():
+            B = others[label].for_case(scene) if label in others else of_case
             if not scores[label]:
-                reconstructed(model, scene)  # the first call compiles and fills caches
-            milliseconds, needed, out = _measured(model, scene)
+                method(scene["views"], B)  # the first call compiles and fills caches
+            milliseconds, needed, out = _measured(method, scene["views"], B)
             volume = out.volume
             figures = volume_metrics(volume[0], scene["volume"][0], scene["inside"][0], data_range)
-            figures |= view_metrics(projected(A, volume, scene), scene["views"])
+            figures |= view_metrics(of_case(volume), scene["views"])
             costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
             scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
             volumes[label] = volume
@@ -84,7 +85,7 @@ def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[st
         FileNotFoundError: a method whose training has not ended.
     """
     trained: dict[str, Trained] = {}
-    for label, model in methods(settings).items():
+    for label, model in methods_of(settings).items():
         path = finished(folder, label)
         fresh = None if path.exists() else build_module(settings, model, data_range)
         trained[label] = load(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
@@ -119,12 +120,13 @@ def results(
     for label, method in trained.items():
         known = data.digests("test", rig=not elsewhere)
         digests.compare(known, method.digests, finished(folder, label))
-    rigs = {label: method.module.own for label, method in trained.items()}
-    A = _operator(settings, () if elsewhere else rigs.values())
-    models = {
-        label: _elsewhere(settings, rig, A) if elsewhere and trained[label].steps else rig
-        for label, rig in rigs.items()
-    }
+    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    methods, assumed = {}, {}
+    for label, one in trained.items():
+        methods[label] = one.module.method
+        projector = one.module.hparams["geometry"]["projector"]
+        if projector != settings["projector"]:
+            assumed[label] = build_projector(settings["grid"], settings["camera"], projector)
     names: list[str] = []
     truths: list[str] = []
 
@@ -135,7 +137,8 @@ def results(
             see(scene, volumes)
 
     data.setup("test")
-    scores = evaluate(models, data.test_dataloader(), A, data.data_range, device, watch)
+    batches = data.test_dataloader()
+    scores = evaluate(methods, batches, A, data.data_range, device, watch, assumed)
     return {
         "name": settings["name"],
         "seed": settings["seed"],
@@ -160,36 +163,19 @@ def validation_psnr(
     settings may be chosen by.
     """
     data.setup("validate")
-    label, model = next(iter(methods(settings).items()))
+    label, model = next(iter(methods_of(settings).items()))
     path = finished(folder, label)
     module = load(path).module if path.exists() else build_module(settings, model, data.data_range)
     batches = DataLoader(data.sets["val"])
-    models = {label: module.own}
-    scores = evaluate(models, batches, module.projector, data.data_range, device)
+    methods = {label: module.method}
+    scores = evaluate(methods, batches, module.projector, data.data_range, device)
     return mean_and_spread([score["psnr"] for score in scores[label]])["mean"]
-
-
-def _operator(settings: Settings, rigs: Iterable[OnRig]) -> Projector:
-    """The operator of the test scenes: that of a method where one has it, with its geometry, or a
-    new one.
-    """
-    for rig in rigs:
-        if rig.projector == settings["projector"]:
-            return rig.A
-    return build_projector(settings["grid"], settings["camera"], settings["projector"])
-
-
-def _elsewhere(settings: Settings, rig: OnRig, A: Projector) -> OnRig:
-    """A trained model on another rig and grid, by `A` unless it takes the projector for another."""
-    if rig.projector != settings["projector"]:
-        A = build_projector(settings["grid"], settings["camera"], rig.projector)
-    return OnRig(A, with_weights_of(rig.model, rig.options, plain(A)), rig.projector, rig.options)
 
 
 def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
     needed = [score["bytes"] for score in scores if score["bytes"] is not None]
     return {
-        "parameters": sum(p.numel() for p in method.module.model.parameters() if p.requires_grad),
+        "parameters": sum(p.numel() for p in method.module.method.parameters() if p.requires_grad),
         "train_steps": method.steps,
         "train_seconds": method.seconds,
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
@@ -233,24 +219,15 @@ def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:
         }
 
 
-def _ready(model: nn.Module | OnRig, device: str) -> nn.Module | OnRig:
-    if isinstance(model, OnRig):
-        return model.ready(torch.device(device), training=False)
-    return model.to(device).eval()
-
-
 def _measured(
-    model: nn.Module | OnRig, scene: dict[str, Any]
+    method: nn.Module, views: Tensor, A: Projector
 ) -> tuple[float, int | None, Reconstruction]:
-    """Milliseconds and bytes of one reconstruction, above what was in use before, and what came
-    out.
-    """
-    views = scene["views"]
+    """Milliseconds and bytes of one reconstruction, above those in use before, and its result."""
     before = torch.cuda.memory_allocated() if views.is_cuda else restarted_peak()
     if views.is_cuda:
         torch.cuda.reset_peak_memory_stats()
     start = time.perf_counter()
-    out = reconstructed(model, scene)
+    out = method(views, A)
     if views.is_cuda:
         torch.cuda.synchronize()
     milliseconds = 1e3 * (time.perf_counter() - start)

@@ -16,13 +16,11 @@ from mvrecon.engine.graph import check_graph
 from mvrecon.engine.labels import methods
 from mvrecon.engine.loggers import Board, MetricsFile
 from mvrecon.engine.module import ReconstructionModule, Settings
-from mvrecon.engine.on_case import OwnAttenuation
 from mvrecon.engine.processes import Environment
 from mvrecon.engine.progress import StepProgress, tell
 from mvrecon.engine.storage import DurableCheckpoints, previous, read_newest, remove
 from mvrecon.engine.survival import KeepLast, RandomNumbers, remembered
 from mvrecon.engine.trained import begin_from
-from mvrecon.engine.training_memory import check_training
 from mvrecon.files.rank import world
 from mvrecon.kernels.threads import in_one_order
 from mvrecon.parts import LOGGERS
@@ -53,7 +51,7 @@ def build_data(settings: Settings) -> SceneData:
     return SceneData(scenes, measurement, seed=settings["seed"], **settings["data"])
 
 
-def build_module(settings: Settings, model: Settings, data_range: float) -> ReconstructionModule:
+def build_module(settings: Settings, method: Settings, data_range: float) -> ReconstructionModule:
     """A method of a run, with fresh weights.
 
     Its key `assume` has options of the projector that are this method's alone: what it takes the
@@ -63,14 +61,14 @@ def build_module(settings: Settings, model: Settings, data_range: float) -> Reco
         TypeError: an assumption that is no mapping.
     """
     geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
-    model = dict(model)
-    if not isinstance(assumed := model.pop("assume", None) or {}, Mapping):
+    method = dict(method)
+    if not isinstance(assumed := method.pop("assume", None) or {}, Mapping):
         raise TypeError(f"Expected options of the projector for assume, got {assumed!r}")
     geometry["projector"] = {**geometry["projector"], **assumed}
     if rigs := settings["data"].get("rigs", 0):
         geometry["rigs"] = rigs
     return ReconstructionModule(
-        geometry, model, settings["loss"], settings["optimizer"], data_range
+        geometry, method, settings["loss"], settings["optimizer"], data_range
     )
 
 
@@ -96,8 +94,8 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
 
     Raises:
         FloatingPointError: a loss that is not finite.
-        ValueError: a step that does not fit into memory, or of which no CUDA graph can be made;
-            weights of `init_from` that are not this method's.
+        ValueError: a step of which no CUDA graph can be made; weights of
+            `init_from` that are not this method's.
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
         SystemExit: SIGTERM came; the checkpoint of that step is written.
     """
@@ -110,13 +108,8 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     if not trainable(module):
         return
     if settings["trainer"].get("graph"):
-        own_operators = isinstance(module.projector, OwnAttenuation)
-        check_graph(settings["trainer"], models[method], settings["data"], own_operators)
+        check_graph(settings["trainer"], models[method], settings["data"], module.projector)
         module.as_graph()
-    accelerator = settings["trainer"].get("accelerator", "auto")
-    needed = check_training(module, data.loading.batch_size, accelerator)
-    if needed is not None:
-        tell(f"{method}: a step keeps about {needed / 2**30:.2f} GiB")
     begun = last.exists() or previous(last).exists()
     weights = settings.get("init_from")
     if weights and not begun and method == next(iter(models)):

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from mvrecon.projectors.operator import Projector
+
 #: Steps before a capture, in which kernels are compiled and memory is set up; as torch advises.
 WARM_UP = 3
 
@@ -31,36 +33,32 @@ Capture = Callable[[Callable[[], Pass]], tuple[Callable[[], None], Pass]]
 
 def check_graph(
     trainer: Mapping[str, Any],
-    model: Mapping[str, Any],
+    method: Mapping[str, Any],
     data: Mapping[str, Any],
-    own_operators: bool = False,
+    A: Projector,
 ) -> None:
     """Refuse a training of which no CUDA graph can be made.
 
     Args:
         trainer: settings of the trainer.
-        model: name and options of the model.
+        method: name and options of the method.
         data: settings of the data.
-        own_operators: whether each case has an operator of its own.
+        A: the operator of the run.
 
     Raises:
         ValueError: no GPU, several of them, scaled losses, several rigs, cases with
-            operators of their own, or a model whose sizes depend on its views.
+            operators of their own, or a method whose sizes depend on its views.
     """
     precision = str(trainer.get("precision", "32-true"))
-    # cross_view keeps to a support on the whole grid; other models crop to it
-    support = "none" if model["name"] == "cross_view" else model.get("support") or "none"
     gpu = trainer.get("accelerator", "auto") != "cpu" and torch.cuda.is_available()
     reasons = {
         "a GPU, got a training on a CPU": not gpu,
         f"one device, got trainer.devices={trainer.get('devices')}": trainer.get("devices", 1) != 1,
         f"gradients that are not scaled, got trainer.precision={precision}": precision[:2] == "16",
         f"one rig, got data.rigs={data.get('rigs')}": bool(data.get("rigs")),
-        "one operator for all cases, got a projector.mu of each case": own_operators,
-        "sizes that do not depend on views, got model.crop=true": bool(model.get("crop")),
-        f"sizes that do not depend on views, got model.support={support}": support != "none",
-        "a model that does not align views on the host, got corrected": model["name"]
-        == "corrected",
+        "one operator for all cases, got one of each case's own": A.per_case,
+        "sizes that do not depend on views, got method.crop=true": bool(method.get("crop")),
+        "a method that does not align views on the host, got aligned": method["name"] == "aligned",
     }
     if wrong := [reason for reason, applies in reasons.items() if applies]:
         raise ValueError(

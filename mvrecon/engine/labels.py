@@ -5,19 +5,19 @@ from mvrecon.files.checks import plain_name
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
-    """The models of a run's result table by label: the main one first, under `label` or, where the
+    """The methods of a run's result table by label: the main one first, under `label` or, where the
     settings have none, its class's name; then those of `compare` that are not null.
 
     Raises:
-        ValueError: the main model's label is taken twice, or a label is no plain name: files are
+        ValueError: the main method's label is taken twice, or a label is no plain name: files are
             called by it. "truth" is refused: its file is the truth's own.
     """
-    main = settings["model"]
+    main = settings["method"]
     label = settings.get("label") or main["name"]
     others = {label: model for label, model in settings["compare"].items() if model}
     if label in others:
         raise ValueError(
-            f"compare holds {label!r}, which is the main model's own label; give this one another "
+            f"compare holds {label!r}, which is the main method's own label; give this one another "
             f"by label=..., or leave the other out by compare.{label}=null"
         )
     labelled = {label: main, **others}

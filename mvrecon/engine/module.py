@@ -1,4 +1,4 @@
-"""One model in training, as a LightningModule: its loss, figures of merit and optimiser."""
+"""One method in training, as a LightningModule: its loss, figures of merit and optimiser."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,20 +6,21 @@ from typing import Any
 import lightning.pytorch as L
 from torch import Tensor
 
+from mvrecon.cameras.field import common_field
 from mvrecon.data.rigs import camera_of
 from mvrecon.engine.finite import FiniteLoss
 from mvrecon.engine.graph import GraphedLoss
 from mvrecon.engine.means import Means
-from mvrecon.engine.on_case import CaseAttenuation, OnCases, OwnAttenuation, on_cases, plain
-from mvrecon.engine.on_rig import OnRig, with_weights_of
 from mvrecon.engine.quality import quality_of
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.engine.wrong_cameras import TRUTH
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.metrics import camera_metrics, view_metrics, volume_metrics
+from mvrecon.models.geometry import kept
+from mvrecon.models.method import build_method
 from mvrecon.models.output import Reconstruction
-from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
+from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 
 Settings = dict[str, Any]
@@ -28,17 +29,13 @@ Settings = dict[str, Any]
 def build_projector(
     grid: Mapping[str, Any], camera: Mapping[str, Any], projector: Mapping[str, Any]
 ) -> Projector:
-    """The projector of a grid (options of `Grid.centred`) and a rig (name and options); where its
-    mu is that of each case, `OwnAttenuation`.
-    """
-    rig, attenuation = CAMERAS.from_config(camera), CaseAttenuation.of(projector)
-    settings = dict(projector) if attenuation is None else {**projector, "mu": None}
-    A = PROJECTORS.from_config(settings, grid=Grid.centred(**grid), cameras=rig)
-    return A if attenuation is None else OwnAttenuation(A, projector, attenuation)
+    """The projector of a grid (options of `Grid.centred`) and a rig (name and options)."""
+    cameras = CAMERAS.from_config(camera)
+    return PROJECTORS.from_config(projector, grid=Grid.centred(**grid), cameras=cameras)
 
 
 class ReconstructionModule(L.LightningModule):
-    """A model, its loss and its optimiser, all from plain dicts of names and numbers.
+    """A method, its loss and its optimiser, all from plain dicts of names and numbers.
 
     So a checkpoint loads with torch's defaults. `mvrecon.load(path)` looks through it first;
     Lightning's own way of loading does not (SECURITY.md).
@@ -46,7 +43,7 @@ class ReconstructionModule(L.LightningModule):
     Args:
         geometry: `grid`, `camera` and `projector`; where the training cases are of many rigs, their
             number as `rigs`.
-        model: name and options of the model.
+        method: name and options of the method.
         loss: weights of `ReconstructionLoss`.
         optimizer: name and options, and `schedule` with its `warmup`.
         data_range: value range of the volumes, in their unit.
@@ -55,7 +52,7 @@ class ReconstructionModule(L.LightningModule):
     def __init__(
         self,
         geometry: Settings,
-        model: Settings,
+        method: Settings,
         loss: Settings,
         optimizer: Settings,
         data_range: float,
@@ -63,50 +60,40 @@ class ReconstructionModule(L.LightningModule):
         super().__init__()
         self.save_hyperparameters(logger=False)
         self.projector = self._projector(0)
-        self.model = MODELS.from_config(model, projector=plain(self.projector))
-        rig = OnRig(self.projector, self.model, geometry["projector"], model)
-        self._rigs = {0: rig}  # no module: a checkpoint has the weights once
+        self.method = build_method(method)
+        self._operators: dict[int, Projector] = {}  # of training rigs; no modules of this one
         self.loss = ReconstructionLoss(data_range, **loss)
-        self._finite = FiniteLoss(model["name"])
+        self._finite = FiniteLoss(method["name"])
         #: What computes the loss and its gradients in training instead of `terms`; none for those.
         self.graph: GraphedLoss | None = None
         self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
 
-    def forward(self, views: Tensor, **case: Tensor) -> Reconstruction:
-        """Reconstruct; see the model.
+    def forward(self, views: Tensor, A: Projector | None = None) -> Reconstruction:
+        """The reconstruction of views [b 1 m v u] by the method; see there.
 
         Args:
-            views: as the model takes them.
-            case: where the projector's mu is that of each case, "mu" or "mu_measured" [b 1 d h w]
-                in 1/mm.
+            views: in the operator's unit.
+            A: the operator that made them; None: that of the run.
         """
-        if not isinstance(self.projector, OwnAttenuation):
-            return self.model(views)
-        return self.on({"views": views, **case}).model(views)
-
-    @property
-    def own(self) -> OnRig:
-        """The model on its own rig."""
-        return self._rigs[0]
+        return self.method(views, self.projector if A is None else A)
 
     def _projector(self, rig: int) -> Projector:
         geometry = self.hparams["geometry"]
         camera = camera_of(geometry["camera"], rig)
         return build_projector(geometry["grid"], camera, geometry["projector"])
 
-    def _on_rig(self, batch: dict[str, Any]) -> OnRig:
-        """The model on the rig of a batch: its own, or a training rig by its number."""
+    def _rig(self, batch: dict[str, Any]) -> Projector:
+        """The operator of a batch's rig: the run's own, or that of a training rig by its number."""
         rig = int(batch["rig"][0]) if "rig" in batch else 0
-        if rig not in self._rigs:
-            A, options = self._projector(rig), self.hparams["model"]
-            model = with_weights_of(self.model, options, plain(A))
-            self._rigs[rig] = OnRig(A, model, self.hparams["geometry"]["projector"], options)
-        # its own moves with the module
-        return self._rigs[rig].ready(self.device, self.training) if rig else self._rigs[rig]
+        if not rig:
+            return self.projector
+        if rig not in self._operators:
+            self._operators[rig] = self._projector(rig)
+        return self._operators[rig].to(self.device)
 
-    def on(self, batch: dict[str, Any]) -> OnRig | OnCases:
-        """The model on the rig of a batch, by the operators of its cases where these differ."""
-        return on_cases(self._on_rig(batch), batch)
+    def operator(self, batch: dict[str, Any]) -> Projector:
+        """The operator that made the views of a batch."""
+        return self._rig(batch).for_case(batch)
 
     def on_train_start(self) -> None:
         """Set the learning rate by the schedule: a training that was lengthened goes on with that
@@ -150,29 +137,24 @@ class ReconstructionModule(L.LightningModule):
 
     def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """The terms of the loss of a batch."""
-        rig = self.on(batch)
-        return self._terms(rig, rig.model(batch["views"]), batch)
+        return self._terms(self.method(batch["views"], self.operator(batch)), batch)
 
-    def _terms(
-        self, rig: OnRig | OnCases, out: Reconstruction, batch: dict[str, Any]
-    ) -> dict[str, Tensor]:
-        """The loss, with the truth's own views where views are corrected towards them, and the
-        cameras' common field where it counts.
-        """
-        if self.loss.compares_views(out):
-            batch = {**batch, "true_views": rig.corrected(batch["volume"])}
+    def _terms(self, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """The loss, with the cameras' common field where it has a weight."""
         if self.loss.weights["common_field"]:
-            batch = {**batch, "common_field": self._on_rig(batch).common_field}
+            A = self._rig(batch)
+            field = kept(A, "common field", lambda: common_field(A.cameras, A.grid))
+            batch = {**batch, "common_field": field}
         return self.loss(out, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
         """Judge a batch by the loss and the figures of merit; hand the reconstruction on to the
         board.
         """
-        rig = self.on(batch)
-        out = rig.model(batch["views"])
-        terms = {f"loss_{name}": value for name, value in self._terms(rig, out, batch).items()}
-        predicted = rig.A(out.volume)
+        A = self.operator(batch)
+        out = self.method(batch["views"], A)
+        terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
+        predicted = A(out.volume)
         figures = [
             volume_metrics(volume, truth, inside, self.hparams["data_range"])
             | view_metrics(view, measured)

@@ -11,46 +11,48 @@ from torch.export import ExportedProgram
 
 from mvrecon.engine.trained import load
 from mvrecon.files.atomic import written_whole
+from mvrecon.projectors.operator import Projector
 
 #: Ending of such files, as torch has it.
 ENDING = ".pt2"
 
 
 class Volume(nn.Module):
-    """The volume alone of a model's reconstruction, in the unit of (views / mm)."""
+    """A method on one operator, from views to the volume in the unit of (views / mm)."""
 
-    def __init__(self, model: nn.Module):
+    def __init__(self, method: nn.Module, A: Projector):
         super().__init__()
-        self.model = model
+        self.method, self.A = method, A
 
     def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 d h w"]:
-        return self.model(views).volume
+        return self.method(views, self.A).volume
 
 
-def exported(model: nn.Module, views: Float[Tensor, "b 1 m v u"]) -> ExportedProgram:
-    """The program that a model runs, from views to the volume in the unit of (views / mm).
+def exported(method: nn.Module, A: Projector, views: Float[Tensor, "b 1 m v u"]) -> ExportedProgram:
+    """The program that a method runs, from views to the volume in the unit of (views / mm).
 
     It is for this number of samples, this rig and this grid, and does not check that its views are
     finite. Its projections are mvrecon's own operators (`torch.ops.mvrecon`): who loads it must
     have imported `mvrecon.projectors.torch_ops`.
 
     Args:
-        model: in evaluation, as `eval()` leaves it.
+        method: in evaluation, as `eval()` leaves it.
+        A: the operator.
         views: of the shape, dtype and device that the program shall take; of any values.
 
     Raises:
-        ValueError: a model whose steps depend on the values of its views, as with a support told
+        ValueError: a method whose steps depend on the values of its views, as with a support told
             from them, or which makes its filters or its geometry anew for each call.
     """
     try:
         with torch.no_grad(), warnings.catch_warnings():
             # an operator's last plan, which is no part of the program
             warnings.filterwarnings("ignore", "The tensor attribute .* was assigned during export")
-            return torch.export.export(Volume(model), (views,), strict=False)
+            return torch.export.export(Volume(method, A), (views,), strict=False)
     except RuntimeError as error:  # of many classes, all of them torch's
         why = str(error).strip().partition("\n")[0]
         raise ValueError(
-            f"{type(model).__name__} is no fixed sequence of steps, which torch.export asks for "
+            f"{type(method).__name__} is no fixed sequence of steps, which torch.export asks for "
             f"(expected a network without a support from the views, such as cross_view with "
             f"support=none): {why}"
         ) from error
@@ -78,7 +80,8 @@ def save_program(
     if batch < 1:
         raise ValueError(f"Expected a batch of at least one sample, got {batch}")
     module = load(run, method).module
-    program = exported(module.model, torch.ones(batch, 1, *module.projector.range_shape))
+    A = module.projector
+    program = exported(module.method, A, torch.ones(batch, 1, *A.range_shape))
     whole = io.BytesIO()
     torch.export.save(program, whole)
     with written_whole(path) as part:

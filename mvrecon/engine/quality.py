@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from mvrecon.losses import binned_like
-from mvrecon.metrics import auc, coverage, mean_and_spread, nrmse, opinion_spread
+from mvrecon.metrics import auc, coverage, mean_and_spread, nrmse, per_view_spread
 from mvrecon.models.output import Reconstruction
 
 #: Percent of the voxels that intervals should cover.
@@ -15,7 +15,7 @@ SHARES = (68, 95)
 #: Figures that a method has without the truth, and how a line of words calls them.
 WITHOUT_TRUTH = {
     "predicted_nrmse": "sigma",
-    "opinion_spread": "spread of opinions",
+    "per_view_spread": "spread of per-view estimates",
     "cross_view_nrmse": "views predicted by the other cameras",
     "view_nrmse": "view NRMSE",
 }
@@ -23,9 +23,9 @@ WITHOUT_TRUTH = {
 
 def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float]:
     """What a reconstruction tells of its own error, without a unit: the NRMSE that its standard
-    deviation predicts, the spread of its opinions, and how well these predict the other cameras'
-    views; how many of the voxels inside the object its intervals cover; and the AUC by which the
-    weights of its cameras tell those whose views are wrong.
+    deviation predicts, the spread of its per-view estimates, and how well these predict the other
+    cameras' views; how many of the voxels inside the object its intervals cover; and the AUC by
+    which the weights of its cameras tell those whose views are wrong.
     """
     figures = {}
     if out.sigma is not None:
@@ -33,13 +33,13 @@ def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float
         inside = scene["inside"]
         off = (out.volume - scene["volume"])[inside], out.sigma[inside]
         figures |= {f"coverage_{share}": coverage(*off, share / 100) for share in SHARES}
-    if out.opinions is not None and out.weights is not None:
-        figures["opinion_spread"] = opinion_spread(out.opinions, out.weights)
+    if out.per_view is not None and out.weights is not None:
+        figures["per_view_spread"] = per_view_spread(out.per_view, out.weights)
     if out.camera_weights is not None and "wrong" in scene:
         figures["wrong_cameras_auc"] = auc(-out.camera_weights, scene["wrong"])
-    if out.cross_views is not None:
-        views = binned_like(scene["views"], out.cross_views).expand_as(out.cross_views)
-        figures["cross_view_nrmse"] = nrmse(out.cross_views, views)
+    if out.predictions is not None:
+        views = binned_like(scene["views"], out.predictions).expand_as(out.predictions)
+        figures["cross_view_nrmse"] = nrmse(out.predictions, views)
     return figures
 
 

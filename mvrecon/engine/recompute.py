@@ -21,7 +21,7 @@ class Recompute(L.Callback):
     def setup(self, trainer: L.Trainer, pl_module: Any, stage: str) -> None:
         """Replace the blocks' forward; names of parameters stay."""
         if stage == "fit":
-            for block in blocks(pl_module.model):
+            for block in blocks(pl_module.method):
                 block.forward = partial(checkpoint, block.forward, use_reentrant=False)
 
 

@@ -18,7 +18,6 @@ from mvrecon import __version__
 from mvrecon.cameras import files
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
-from mvrecon.engine.old_names import current
 from mvrecon.files.atomic import claimed, written_whole
 from mvrecon.files.checks import Refused, blaming, shown, text_of, yaml_of
 from mvrecon.files.places import of_weights
@@ -70,7 +69,7 @@ def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> No
                 f"{folder} holds {', '.join(work)} of another run without its {file}; {remedy}"
             )
         return
-    expected = current(yaml_of(folder / file))
+    expected = yaml_of(folder / file)
     plain = yaml.safe_load(yaml.safe_dump(dict(settings)))
     if changed := differences(plain, expected):
         raise ValueError(
@@ -152,15 +151,19 @@ def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """The settings that a run was started with, by the option names of this version.
+    """The settings that a run was started with.
 
     Raises:
         FileNotFoundError: the folder is no run folder.
+        Refused: the run is of version 0.1.0.
     """
     path = folder / SETTINGS
     if not path.is_file():
         raise FileNotFoundError(f"Expected a run folder with {SETTINGS} in it, got {folder}")
-    return current(yaml_of(path))
+    settings = yaml_of(path)
+    if isinstance(settings, dict) and ("model" in settings or "reconstructor" in settings):
+        raise Refused(f"{path}: was written by mvrecon 0.1.0; v0.1.0 reads it")
+    return settings
 
 
 def anchored(value: Any) -> Any:

@@ -15,7 +15,7 @@ from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import Corrected, MeasuredViews
 from mvrecon.data.volume_files import read_volume
-from mvrecon.engine.trained_reconstructor import grid_of_training
+from mvrecon.engine.trained_method import grid_of_training
 from mvrecon.files.checks import Refused
 from mvrecon.files.memory import check_memory
 from mvrecon.geometry.grid import Grid
@@ -102,7 +102,7 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     measured = MeasuredViews.of(Measured(**views))
     rig = CAMERAS.from_config(_with_pixels(settings["camera"], measured.stack.shape))
     cameras = measured.cameras(rig)
-    grid = _grid(settings["grid"], settings["reconstructor"], cameras)
+    grid = _grid(settings["grid"], settings["method"], cameras)
     seeing = int(check_rig_sees(cameras, grid).nonzero()[0, 0])
     bytes_needed = 4 * VOLUMES * math.prod(grid.shape)
     check_memory(bytes_needed, f"A reconstruction of {grid.shape} voxels")

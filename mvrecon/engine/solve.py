@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
 
+import torch
 from jaxtyping import Float
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -15,8 +15,8 @@ from torch import Tensor
 
 from mvrecon.engine.scan import Scan
 from mvrecon.files.memory import peak
-from mvrecon.models.output import Reconstruction
-from mvrecon.parts import RECONSTRUCTORS, STREAMED
+from mvrecon.models.method import build_method
+from mvrecon.parts import METHODS, STREAMED
 from mvrecon.reconstructors.held_out import Choice, held_out
 from mvrecon.reconstructors.left_out import left_out_residual
 from mvrecon.reconstructors.problem import Iterate
@@ -58,27 +58,27 @@ class Outcome:
 
 
 def check(settings: Mapping[str, Any]) -> None:
-    """Check the settings `reconstructor`, `stop` and `choose` before any view is read.
+    """Check the settings `method`, `stop` and `choose` before any view is read.
 
     Raises:
         LookupError, TypeError: no such method, or no such option of it.
         ValueError: a rule to stop or to choose for a method that does not iterate.
     """
-    name = settings["reconstructor"]["name"]
-    RECONSTRUCTORS.check(settings["reconstructor"])
+    name = settings["method"]["name"]
+    METHODS.check(settings["method"])
     ruled = settings["choose"] or settings["stop"]["sigma"] is not None
     if ruled and not _iterates(name):
         raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")
 
 
 def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outcome:
-    """The volume of a scan by the method that the settings `reconstructor`, `stop` and `choose`
+    """The volume of a scan by the method that the settings `method`, `stop` and `choose`
     describe.
 
     Raises:
         ValueError: what the method raises.
     """
-    name, options = settings["reconstructor"]["name"], dict(settings["reconstructor"])
+    name, options = settings["method"]["name"], dict(settings["method"])
     del options["name"]
     start = time.perf_counter()
     if name in STREAMED.names():
@@ -86,7 +86,7 @@ def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outco
     elif _iterates(name):
         run = _iterated(scan, settings, options, device)
     else:
-        run = _direct(scan, name, options, device)
+        run = _direct(scan, settings["method"], device)
     seconds = time.perf_counter() - start
     volume = run.volume[0, 0].cpu()
     sigma = None if run.sigma is None else run.sigma[0, 0].cpu()
@@ -135,29 +135,31 @@ class _Runs:
 
 def left_out(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> list[float]:
     """The relative error of each view as the method predicts it from the others."""
-    options = dict(settings["reconstructor"])
-    method = partial(RECONSTRUCTORS.build, options.pop("name"), **options)
+    method = build_method(settings["method"]).to(device)
     views = scan.measured.whole().views[None, None].to(device)
-    return left_out_residual(method, scan.operator().to(device), views)[0].tolist()
+    return left_out_residual(lambda A, y: method(y, A).volume, scan.operator().to(device), views)[
+        0
+    ].tolist()
 
 
 def _iterated(
     scan: Scan, settings: Mapping[str, Any], options: dict[str, Any], device: str
 ) -> _Run:
-    name, rule = settings["reconstructor"]["name"], settings["choose"]
+    name, rule = settings["method"]["name"], settings["choose"]
     A, views = scan.posed(device)
-    most, chosen = options.get("iterations"), {}
+    parameters = signature(METHODS.get(name)).parameters
+    most, chosen = options.get("iterations", parameters["iterations"].default), {}
     trials = 0 if not rule else len(rule.get("weights") or [None])
     with bar(name, most and most * (1 + trials)) as advance:
         runs = _Runs(advance, most)
         if rule:
             options["monitor"] = runs
-            choice = held_out(RECONSTRUCTORS.get(name), A, views, options=options, **rule)
+            choice = held_out(METHODS.get(name), A, views, options=options, **rule)
             volume, chosen = choice.volume, _choice_row(choice)
         else:
             sigma = settings["stop"]["sigma"]
             monitor = runs if sigma is None else combined(runs, discrepancy(sigma))
-            volume = RECONSTRUCTORS.build(name, A, views, monitor=monitor, **options)
+            volume = METHODS.build(name, A, views, monitor=monitor, **options)
     residuals, size = runs.curve.residuals, views.norm().item()
     last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
     return _Run(volume, lambda: _share(last, size), residuals, chosen)
@@ -170,25 +172,20 @@ def _choice_row(choice: Choice) -> dict[str, Any]:
     return {"iterations": choice.iterations[0], "weight": weight, "trials": trials}
 
 
-def _direct(scan: Scan, name: str, options: dict[str, Any], device: str) -> _Run:
+def _direct(scan: Scan, method: Mapping[str, Any], device: str) -> _Run:
     """A method that does not iterate, with all views in memory."""
     whole = scan.measured.whole()
     A, views = scan.operator().to(device), whole.views[None, None].to(device)
-    outputs: list[Reconstruction] = []
-    if "watch" in signature(RECONSTRUCTORS.get(name)).parameters:
-        options["watch"] = outputs.append
-    volume = RECONSTRUCTORS.build(name, A, views, **options)
+    with torch.no_grad():
+        out = build_method(method).to(device)(views, A)
     mask = whole.mask.to(device)
 
     def misfit() -> float:
-        rest = (views - A(volume))[0, 0]
+        rest = (views - A(out.volume))[0, 0]
         return _share(rest[mask].norm().item(), views[0, 0][mask].norm().item())
 
-    if not outputs:
-        return _Run(volume, misfit)
-    (out,) = outputs
     weights = [] if out.camera_weights is None else out.camera_weights[0].tolist()
-    return _Run(volume, misfit, sigma=out.sigma, camera_weights=weights)
+    return _Run(out.volume, misfit, sigma=out.sigma, camera_weights=weights)
 
 
 def _share(rest: float, whole: float) -> float:
@@ -226,7 +223,7 @@ def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
 
 def _iterates(name: str) -> bool:
     """Whether a method shows its iterates to a monitor."""
-    parameters = signature(RECONSTRUCTORS.get(name)).parameters.values()
+    parameters = signature(METHODS.get(name)).parameters.values()
     return any(p.name == "monitor" or p.kind is p.VAR_KEYWORD for p in parameters)
 
 

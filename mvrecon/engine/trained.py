@@ -7,7 +7,6 @@ from mvrecon.engine import checkpoints, weights_file
 from mvrecon.engine.checkpoints import Trained
 from mvrecon.engine.labels import methods
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.engine.on_rig import differences
 from mvrecon.engine.run_folder import read_settings
 from mvrecon.engine.weights_file import ENDING
 from mvrecon.files.places import of_weights, shipped_weights
@@ -69,17 +68,23 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
 
     Args:
         path: as that of `load`: a run (its main method), a checkpoint or a file of weights.
-        module: the method, of the same model.
+        module: with the same method.
 
     Raises:
-        ValueError: weights of another model, or which belong to another rig or grid; what `load`
+        ValueError: weights of another method; what `load`
             raises.
     """
-    weights = load(path).module.model.state_dict()
-    if differing := differences(weights, module.model.state_dict()):
+    weights = load(path).module.method.state_dict()
+    own = module.method.state_dict()
+    differing = [
+        name
+        for name in {**weights, **own}
+        if name not in weights or name not in own or weights[name].shape != own[name].shape
+    ]
+    if differing:
         raise ValueError(
-            f"init_from={path}: expected weights of the same model, of whatever rig and grid; got "
-            f"{len(differing)} that are not those of {module.hparams['model']['name']!r}, "
+            f"init_from={path}: expected weights of the same method, of whatever rig and grid; got "
+            f"{len(differing)} that are not those of {module.hparams['method']['name']!r}, "
             f"{differing[0]} among them"
         )
-    module.model.load_state_dict(weights)
+    module.method.load_state_dict(weights)

@@ -95,7 +95,7 @@ class Consistency(nn.Module):
                 change = em_change(geometry, volume, views, expected, self.background)
                 volume = volume + within_one(length) * unmet * change
             else:
-                volume = volume + length * unmet * geometry.back(residual)
+                volume = volume + length * unmet * geometry.direction(residual)
         return volume
 
 
@@ -152,5 +152,5 @@ def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]
     row = reached / expected.maximum(least)
     chords = torch.where(reached, 1 / torch.where(reached, geometry.row, 1), 0)
     sums = geometry.A.T(row * chords)
-    column = torch.cat([inverse_sums(one) for one in sums.split(1)]) * (geometry.column > 0)
+    column = inverse_sums(sums) * (geometry.column > 0)
     return replace(geometry, row=row, column=column)

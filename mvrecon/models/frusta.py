@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
@@ -20,9 +20,6 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import Spans, enclosed, grid_lattice, lattice_maps
 from mvrecon.kernels.warps.warp import warp
 
-#: Of a voxel: a smaller share is a rounding error, of a bin and a voxel at equal places.
-TOUCH = 1e-5
-
 
 @dataclass(frozen=True, eq=False)
 class Frusta:
@@ -30,8 +27,6 @@ class Frusta:
 
     Of each camera it holds images and rows, no volume: what has a value for every bin or voxel is
     made where it is asked for.
-
-    Convention: the sample's axis b of `occupied` is there only where it depends on the sample.
 
     Args:
         frusta_from_world: where each voxel lies in each frustum, float64.
@@ -41,10 +36,6 @@ class Frusta:
         bins: bins inside the grid's box, ahead of the source.
         thickness: mm of depth of a bin.
         slant: mm of ray per mm of depth.
-        n_depths: depth bins of the frusta over the whole grid.
-        first: where these are a part of larger frusta, the index (depth, row, column) of each
-            camera's first bin in them, on the CPU.
-        touching: bins that touch the mask of a sample; none: all.
     """
 
     frusta_from_world: Float[Tensor, "m 1 5 2 3"]
@@ -54,16 +45,13 @@ class Frusta:
     bins: Spans
     thickness: Float[Tensor, "m D"]
     slant: Float[Tensor, "m v u"]
-    n_depths: int
-    first: Int[Tensor, "m 3"] | None = None
-    touching: Bool[Tensor, "b m 1 D v u"] | None = None
 
     @classmethod
     def of(cls, grid: Grid, cameras: Cameras, depth: int) -> "Frusta":
         """Frusta cut tightly to what each camera sees of a grid's box.
 
         Args:
-            grid: the region of interest, and where `to_world` puts its volumes.
+            grid: the region of interest, and where `to_volume` puts its volumes.
             cameras: the rig; its detector's pixels are the frusta's rows and columns.
             depth: number of depth bins.
         """
@@ -82,7 +70,6 @@ class Frusta:
             bins=replace(bins, end=bins.end * ahead),
             thickness=(edges[:, 1:] - edges[:, :-1]).abs().float(),
             slant=slant.float(),
-            n_depths=depth,
         )
 
     @property
@@ -101,15 +88,12 @@ class Frusta:
         return self.voxels.mask
 
     @property
-    def occupied(self) -> Bool[Tensor, "*b m 1 D v u"]:
-        """Bins that may be other than zero: those inside the grid's box, ahead of the source, and
-        with a mask those that touch it.
-        """
-        inside = self.bins.mask
-        return inside if self.touching is None else inside & self.touching
+    def occupied(self) -> Bool[Tensor, "m 1 D v u"]:
+        """Bins that may be other than zero: those inside the grid's box, ahead of the source."""
+        return self.bins.mask
 
     @property
-    def chord(self) -> Float[Tensor, "*m 1 1 v u"]:
+    def chord(self) -> Float[Tensor, "m 1 1 v u"]:
         """Length in mm of each ray's occupied bins."""
         return (self.occupied * self.step).sum(dim=-3, keepdim=True)
 
@@ -119,9 +103,8 @@ class Frusta:
         device = slant.device
         names = ("frusta_from_world", "world_from_frusta", "edges", "voxels", "bins")
         moved = {name: getattr(self, name).to(device) for name in names}
-        touching = None if self.touching is None else self.touching.to(device)
         thickness = self.thickness.to(slant)
-        return replace(self, slant=slant, thickness=thickness, touching=touching, **moved)
+        return replace(self, slant=slant, thickness=thickness, **moved)
 
     def spread(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b m c D v u"]:
         """Uniform lift: each pixel's integral spread evenly along its ray's occupied bins."""
@@ -132,52 +115,22 @@ class Frusta:
         """Each camera's own view of its own frustum: the sum along every ray, exactly."""
         return (frusta * self.step).sum(dim=3).transpose(1, 2)
 
-    def pixels(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m r s"]:
-        """The part of every view that the frusta have; all of it, unless they are a part of larger
-        ones.
-        """
-        if self.first is None:
-            return views
-        _, rows, columns = self.shape
-        parts = zip(views.unbind(2), self.first.tolist(), strict=True)
-        return torch.stack(
-            [view[..., v : v + rows, u : u + columns] for view, (_, v, u) in parts], 2
-        )
+    def depths(self, like: Tensor) -> Float[Tensor, "D 1 1"]:
+        """The depth of each bin, from -1 to 1."""
+        ramp = torch.linspace(-1, 1, self.shape[0], device=like.device, dtype=like.dtype)
+        return ramp[:, None, None]
 
-    def depths(self, like: Tensor) -> Float[Tensor, "*m D 1 1"]:
-        """The bins' depth, from -1 to 1 in the frusta over the whole grid."""
-        if self.first is None:
-            ramp = torch.linspace(-1, 1, self.n_depths, device=like.device, dtype=like.dtype)
-            return ramp[:, None, None]
-        count, own = self.shape[0], {"device": like.device, "dtype": like.dtype}
-        # each made on the device, for nothing is copied there
-        index = torch.stack([torch.arange(z, z + count, **own) for z, *_ in self.first.tolist()])
-        return (2 * index / max(1, self.n_depths - 1) - 1)[:, None, :, None, None]
-
-    def to_world(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
+    def to_volume(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
         """Each frustum's density at the voxels of the grid; zero where the camera does not see."""
         return warp(frusta, self.frusta_from_world, self.voxels.shape)[:, :, 0]
 
     def to_frusta(self, volumes: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m c D v u"]:
-        """World volumes at the bins of the frusta, one volume for each camera (or one for all, m =
+        """Volumes at the bins of the frusta, one volume for each camera (or one for all, m =
         1).
         """
         if volumes.shape[1] == 1:
             return warp(volumes, self.world_from_frusta, self.shape)[:, 0]
         return warp(volumes, self.world_from_frusta.transpose(0, 1), self.shape)[:, :, 0]
-
-    def touched(self, mask: Bool[Tensor, "b 1 d h w"]) -> Bool[Tensor, "b m 1 D v u"]:
-        """Every bin that reads a voxel of the mask, or that one reads: none that holds a part of it
-        is left out.
-        """
-        with torch.inference_mode(False), torch.enable_grad():
-            volume = mask.to(self.slant.dtype, copy=True)[:, None]
-            m = len(self.slant)
-            bins = self.slant.new_zeros(len(mask), m, 1, *self.shape, requires_grad=True)
-            (read,) = torch.autograd.grad(
-                self.to_world(bins), bins, volume.expand(-1, m, -1, -1, -1, -1)
-            )
-        return (self.to_frusta(volume) > TOUCH) | (read > TOUCH)
 
 
 def maps_between(

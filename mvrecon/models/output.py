@@ -1,4 +1,4 @@
-"""What every model returns."""
+"""What a method returns."""
 
 from dataclasses import dataclass
 
@@ -12,52 +12,40 @@ from mvrecon.reconstructors.division import divided
 
 @dataclass
 class Reconstruction:
-    """A reconstructed volume, and how it came about where the model can tell.
+    """A reconstructed volume, and what else its method reports.
+
+    Per-view quantities have the resolution of the method's frusta, in cells of voxels or pixels.
 
     Args:
         volume: in the unit of (views / mm).
-        opinions: each camera's own volume; like `visible` and `weights` in cells of 2 x 2 x 2 or
-            4 x 4 x 4 voxels where they have half or a quarter of the resolution.
-        visible: which voxels each camera's frustum holds.
-        weights: how much each camera counts at each voxel; they sum to one over the cameras that
-            see it.
-        cross_views: opinion m projected into camera n, in the unit of the views; of a model in
-            rounds what the opinions of all others together predict for camera n, m = 1, in cells of
-            pixels.
-        sigma: standard deviation of the error that the model expects of each voxel of the volume.
-        support: where the volume may differ from zero; none for everywhere.
-        start: the classical reconstruction that the network began with.
-        start_views: the start projected into every camera, in the unit of the views.
-        earlier: the volumes after each round but the last, of a model in rounds.
-        entry: the volume that enters expectation maximisation, which hides its scale and what is
-            negative.
-        corrected_views: the views as the cameras' networks of each round have corrected them, or
-            the completed sinogram, in the unit of the views. They are of the model's
-            `corrected_cameras`, if it has them, else of its rig.
-        row: R, the inverse row sums of A, or of one typical chord, in 1/mm, where views are
-            corrected.
-        alignment: what was wrong with each camera, where views were aligned before.
+        per_view: each camera's own estimate of the volume.
+        visible: voxels inside each camera's frustum.
+        weights: of each camera at each voxel; they sum to one over the cameras that see it.
+        predictions: what the estimates of all other cameras predict of each camera's view, in the
+            unit of the views.
+        sigma: standard deviation of the error of each voxel, in the unit of the volume.
+        support: voxels that may differ from zero; None: all.
+        start: the classical reconstruction that a network began with.
+        entry: the volume that enters expectation maximisation, which hides its scale and its
+            negative values.
+        alignment: shift and gain of each camera, of views that were aligned before.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
-    opinions: Float[Tensor, "b m 1 d h w"] | None = None
+    per_view: Float[Tensor, "b m 1 d h w"] | None = None
     visible: Bool[Tensor, "m 1 d h w"] | None = None
     weights: Float[Tensor, "b m 1 d h w"] | None = None
-    cross_views: Float[Tensor, "b m n v u"] | None = None
+    predictions: Float[Tensor, "b 1 m v u"] | None = None
     sigma: Float[Tensor, "b 1 d h w"] | None = None
     support: Bool[Tensor, "b 1 d h w"] | None = None
     start: Float[Tensor, "b 1 d h w"] | None = None
-    start_views: Float[Tensor, "b 1 m v u"] | None = None
-    earlier: tuple[Float[Tensor, "b 1 d h w"], ...] = ()
     entry: Float[Tensor, "b 1 d h w"] | None = None
-    corrected_views: tuple[Float[Tensor, "b 1 n v u"], ...] = ()
-    row: Float[Tensor, "#b 1 #n #v #u"] | None = None
     alignment: Alignment | None = None
 
     @property
     def camera_weights(self) -> Float[Tensor, "b m"] | None:
-        """How much each camera counts over the object, without a unit: the mean of its weights, in
-        which a voxel counts by its density; they sum to one. None where cameras are not weighed.
+        """The density-weighted mean of each camera's weights over the volume; they sum to one. None
+        without weights.
         """
         if self.weights is None:
             return None

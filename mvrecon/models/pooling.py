@@ -1,19 +1,13 @@
-"""Statistics over cameras: mean and variance of M volumes in the world, and the same with one
-camera left out.
+"""Statistics over cameras: mean and variance of M volumes, the same with one camera left out, and
+the weighted mean.
 
 Every statistic is a sum over cameras, so it does not depend on their order, costs 2M warps instead
 of M(M-1), and leaving one camera out is a subtraction.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import max_pool3d
-
-from mvrecon.models.networks import MULTIPLE
-
-#: Edge in voxels of the bricks that are refined or not; crops keep them in place.
-BRICK = MULTIPLE
 
 
 def pooled(
@@ -56,13 +50,13 @@ def deviation(variance: Tensor) -> Tensor:
     return (variance + 1e-6).sqrt()
 
 
-def disagreement(spread: Float[Tensor, "b 1 d h w"], tolerance: float) -> Bool[Tensor, "b 1 d h w"]:
-    """Bricks of 4 voxels in which the opinions' standard deviation passes a tolerance somewhere,
-    and the bricks around them.
+def fuse(
+    volumes: Float[Tensor, "b m 1 d h w"], logits: Float[Tensor, "b m 1 d h w"], visible: Tensor
+) -> tuple[Float[Tensor, "b 1 d h w"], Float[Tensor, "b m 1 d h w"]]:
+    """The weighted mean over the cameras that see a voxel, and its weights; zero where none does.
+
+    Zero logits give the plain mean. The result is equivariant to a permutation of the cameras.
     """
-    with torch.no_grad():
-        bricks = (max_pool3d(spread, BRICK, ceil_mode=True) > tolerance).to(spread.dtype)
-        near = max_pool3d(bricks, 3, stride=1, padding=1) > 0
-    for axis, size in enumerate(spread.shape[2:], start=2):
-        near = near.repeat_interleave(BRICK, dim=axis).narrow(axis, 0, size)
-    return near
+    # Finite, not -inf: a voxel that no camera sees must not turn into NaN.
+    weights = torch.where(visible, logits, torch.finfo(logits.dtype).min).softmax(dim=1) * visible
+    return (weights * volumes).sum(dim=1), weights

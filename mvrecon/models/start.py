@@ -11,12 +11,12 @@ from torch.nn.functional import avg_pool3d
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.fingerprints import fingerprints
 from mvrecon.models.geometry import Geometry
-from mvrecon.parts import RECONSTRUCTORS
+from mvrecon.parts import METHODS
 from mvrecon.reconstructors.finer import check_factor, on_finer_grid
 from mvrecon.reconstructors.iterative import sirt
 
-#: Iterations of SIRT with momentum, or a reconstructor as a mapping: its name and options, and on
-#: how many times finer a grid.
+#: Iterations of SIRT with momentum, or a classical method: its name and options, and on how many
+#: times finer a grid.
 Start = int | Mapping[str, Any]
 #: The key of that number in the mapping.
 FINER = "finer_grid"
@@ -48,25 +48,25 @@ class Beginning(NamedTuple):
 
 
 class ClassicalStart:
-    """The volume that a network begins with, by SIRT with momentum or another reconstructor, in the
+    """The volume that a network begins with, by SIRT with momentum or another method, in the
     unit of (views / mm).
 
-    It is not differentiated. In training another reconstructor's volume of a case is computed once
+    It is not differentiated. In training another method's volume of a case is computed once
     and kept, as long as there is room: views of a training case are the same in every epoch.
 
-    On a grid n times finer, with n x n rays a pixel, the reconstructor finds x_f, and the network
+    On a grid n times finer, with n x n rays a pixel, that method finds x_f, and the network
     begins with its mean x over each voxel. Under a grid of few voxels the truth itself misses its
     views by some percent, and every step towards the data pulls there. A_f x_f - A x tells most of
     that (it takes half of it away in study 12), so networks get the views without it.
 
     Args:
-        start: iterations of SIRT with momentum, or a reconstructor: `{name: ..., **options}`, with
-            `finer_grid: n` on a grid n times finer.
+        start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`,
+            with `finer_grid: n` on a grid n times finer.
         counts: whether the views are counts, which a difference of views is not.
 
     Raises:
         LookupError: an unknown name.
-        TypeError: an option that the reconstructor does not have, or a mapping without a name.
+        TypeError: an option that the method does not have, or a mapping without a name.
         ValueError: a finer grid that is no whole number above 0, or of counts.
     """
 
@@ -75,7 +75,7 @@ class ClassicalStart:
         if isinstance(start, Mapping):
             self.start = {key: value for key, value in start.items() if key != FINER}
             self.finer_grid = start.get(FINER, 1)
-            RECONSTRUCTORS.check(self.start)
+            METHODS.check(self.start)
         check_factor(f"{FINER} of a start", self.finer_grid)
         if counts and self.finer_grid > 1:
             raise ValueError(
@@ -89,7 +89,7 @@ class ClassicalStart:
     def __call__(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
     ) -> Beginning:
-        """The volumes of views within each sample's mask, and what their grid misses."""
+        """The volumes of views within each sample's support, and what their grid misses."""
         if not isinstance(self.start, Mapping):
             A, weights = geometry.A, geometry.weights
             return Beginning(sirt(A, views, self.start, weights=weights, momentum=True))
@@ -111,18 +111,16 @@ class ClassicalStart:
             self._known[name] = case.to(torch.empty((), dtype=case.volume.dtype))
 
     def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Beginning:
-        """The reconstructor's volume of a sample's views, scaled to a mean density of the rays of
+        """The method's volume of a sample's views, scaled to a mean density of the rays of
         about one before, so that a weight of its options is relative to the content.
         """
         assert isinstance(self.start, Mapping)
-        case, A, fine = views[sample : sample + 1], geometry.A, self.finer_grid
+        case, A, fine = views[sample : sample + 1], geometry.A.of_sample(sample), self.finer_grid
         level = content_scale(case) / typical_chord(A.grid)
-        mask = None if geometry.mask is None else geometry.mask[sample, 0]
+        mask = None if geometry.support is None else geometry.support[sample, 0]
         if fine == 1:
             within = {} if mask is None else {"support": mask}
-            return Beginning(
-                RECONSTRUCTORS.from_config(self.start, A, case / level, **within) * level
-            )
+            return Beginning(METHODS.from_config(self.start, A, case / level, **within) * level)
         B, x = on_finer_grid(A, case / level, fine, self.start, mask)
         mean = avg_pool3d(x * level, fine)
         return Beginning(mean, B(x * level) - A(mean))
@@ -148,7 +146,7 @@ def normalised(
     x, missed = start(geometry, views, training)
     scale = content_scale(x)
     y = views if missed is None else views - missed
-    return y / scale, x / scale, scale * anything(views)
+    return y / scale, x / scale, scale * nonzero(views)
 
 
 def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:
@@ -176,9 +174,9 @@ def typical_chord(grid: Grid) -> float:
     return max(grid.shape) * min(grid.spacing)
 
 
-def anything(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:
-    """One where views show anything, zero where they show nothing: f(0) = 0. NaN where a value is
-    not finite, which `check_finite` does not tell of a GPU's views.
+def nonzero(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:
+    """One for views with any non-zero value, zero for others, so that f(0) = 0; NaN where a value
+    is not finite, which is not checked on a GPU.
     """
     values = views.flatten(1)
     shown = values.any(dim=1).to(views.dtype)

@@ -4,7 +4,7 @@ A subclass of `LinearOperator` gives the shapes, A x and A^T y. Its parts (`subs
 `with_support`) always work: by default the whole operator is computed.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, overload
 
 import torch
@@ -86,6 +86,25 @@ class LinearOperator(SaysPixelIntegral, Refinable):
     def mirror(self) -> Mirror | None:
         """A plane of symmetry, A(F x) = G(A x); None where none is known."""
         return None
+
+    #: Whether each sample of a batch has an operator of its own.
+    per_sample = False
+
+    def of_sample(self, index: int) -> "LinearOperator":
+        """The operator of one sample of a batch."""
+        return self
+
+    #: Whether `for_case` gives an operator of each case's own.
+    per_case = False
+
+    def for_case(self, case: Mapping[str, Any]) -> "LinearOperator":
+        """The operator of the cases of a batch, where it depends on a case, as with an attenuation
+        map; by default the operator itself.
+
+        Args:
+            case: a batch of the data set, by name.
+        """
+        return self
 
 
 class Projector(nn.Module, LinearOperator):
@@ -298,3 +317,41 @@ class Cropped(Wrapped):
         index = torch.tensor(self.views, device=y.device)
         whole = y.new_zeros(*y.shape[:2], *self.A.range_shape).index_copy(2, index, y)
         return self.A.adjoint(whole)[..., *self.box.slices]
+
+
+class PerSample(Wrapped):
+    """A batch of operators of the same shapes, one for each sample.
+
+    A single volume or view is taken by all of them.
+
+    Args:
+        operators: of the samples.
+    """
+
+    per_sample = True
+
+    def __init__(self, operators: Sequence[Any]):
+        super().__init__(operators[0])
+        self.operators = nn.ModuleList(operators)
+
+    def of_sample(self, index: int) -> Any:
+        return self.operators[index]
+
+    def forward(self, x: Float[Tensor, "#b c *n"]) -> Float[Tensor, "b c *m"]:
+        return self._each(x, lambda A, one: A(one))
+
+    def adjoint(self, y: Float[Tensor, "#b c *m"]) -> Float[Tensor, "b c *n"]:
+        return self._each(y, lambda A, one: A.T(one))
+
+    def _each(self, values: Tensor, apply: Callable[[Any, Tensor], Tensor]) -> Tensor:
+        samples = values.expand(len(self.operators), *values.shape[1:]).split(1)
+        return torch.cat([apply(A, one) for A, one in zip(self.operators, samples, strict=True)])
+
+    def attenuation(self) -> Float[Tensor, "b d h w"] | None:
+        """The maps of the samples."""
+        maps = [A.attenuation() for A in self.operators]
+        return None if any(mu is None for mu in maps) else torch.stack(maps)
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """That of the first sample, which attenuation does not change."""
+        return self.A.pixel_integral()

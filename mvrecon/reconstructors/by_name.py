@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS, RECONSTRUCTORS
+from mvrecon.parts import PROJECTORS
 
 
 def reconstruct(
@@ -37,4 +37,4 @@ def reconstruct(
     """
     name = "radon" if cameras.parallel else "drr"
     A = PROJECTORS.build(name, grid=grid, cameras=cameras).to(views.device)
-    return RECONSTRUCTORS.build(method, A, views, **options)
+    return METHODS.build(method, A, views, **options)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from mvrecon.geometry.grid import subdivided
-from mvrecon.parts import RECONSTRUCTORS
+from mvrecon.parts import METHODS
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.quantities import PositiveInt
 
@@ -32,7 +32,7 @@ def finer(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     fine: PositiveInt = 2,
-    reconstructor: Mapping[str, Any] | None = None,
+    method: Mapping[str, Any] | None = None,
     support: Bool[Tensor, "d h w"] | None = None,
 ) -> Float[Tensor, "b c d h w"]:
     """Reconstruct by another method on a finer grid, with rays as much closer, and average its
@@ -45,7 +45,7 @@ def finer(
         A: the operator, with the capability "refine".
         views: in the operator's unit.
         fine: voxels along each axis in one of the grid's, and rays each way in one of a pixel's.
-        reconstructor: name and options of the method; None: 25 iterations of SIRT with momentum.
+        method: name and options of the method; None: 25 iterations of SIRT with momentum.
         support: the voxels of the grid that may be anything but zero.
 
     Raises:
@@ -54,14 +54,14 @@ def finer(
         LookupError, TypeError: an unknown method, or an option that it does not have.
     """
     check_factor("fine", fine)
-    return avg_pool3d(on_finer_grid(A, views, fine, reconstructor or SIRT, support).volume, fine)
+    return avg_pool3d(on_finer_grid(A, views, fine, method or SIRT, support).volume, fine)
 
 
 def on_finer_grid(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     fine: int,
-    reconstructor: Mapping[str, Any],
+    method: Mapping[str, Any],
     support: Bool[Tensor, "d h w"] | None = None,
 ) -> Fine:
     """Reconstruct by a method on a grid `fine` times finer, in the unit of the volume; see
@@ -69,7 +69,7 @@ def on_finer_grid(
     """
     mask = {} if support is None else {"support": subdivided(support, fine)}
     B = A.refined(fine)
-    return Fine(B, RECONSTRUCTORS.from_config(reconstructor, B, views, **mask))
+    return Fine(B, METHODS.from_config(method, B, views, **mask))
 
 
 def check_factor(name: str, factor: Any) -> None:

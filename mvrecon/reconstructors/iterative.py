@@ -50,8 +50,21 @@ def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> SirtW
 def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """1 / sums of an operator's rows or columns, zero where a ray or voxel is empty."""
     # a ray that grazes a corner would otherwise be weighted by the inverse of a rounding error
-    counts = sums > 1e-6 * sums.max()
+    counts = sums > 1e-6 * sums.flatten(1).amax(1).view(-1, *[1] * (sums.ndim - 1))
     return torch.where(counts, 1 / torch.where(counts, sums, 1), 0)
+
+
+@torch.no_grad()
+def backprojection(
+    A: LinearOperator, views: Float[Tensor, "b c m v u"]
+) -> Float[Tensor, "b c d h w"]:
+    """The back-projection of the mean density along each ray, C A^T R y, in the unit of the volume.
+
+    Raises:
+        ValueError: views of another shape, or not finite.
+    """
+    problem = posed(backprojection, A, views, {})
+    return correction(A, problem.views, sirt_weights(A, problem.views.dtype))
 
 
 def correction(

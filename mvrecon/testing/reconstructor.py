@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mvrecon.parts import RECONSTRUCTORS
+from mvrecon.parts import METHODS
 from mvrecon.projectors.operator import Projector
 from mvrecon.testing.model import check_refusals
 from mvrecon.testing.projector import close
@@ -33,7 +33,7 @@ def check_reconstructor(name: str, A: Projector, seed: int = 0, **options: Any) 
     x = torch.rand(2, 1, *A.grid.shape, generator=rng, dtype=torch.float64)
 
     def solve(views: Tensor) -> Tensor:
-        return RECONSTRUCTORS.build(name, A, views, **options)
+        return METHODS.build(name, A, views, **options)
 
     for dtype in (torch.float64, torch.float32):
         views = A(x.to(dtype))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.geometry.box import Box, bounds
+from mvrecon.geometry.box import Box, bounds, filled
 from mvrecon.geometry.grid import Grid
 from mvrecon.visual_hull.footprints import ray_gap
 from mvrecon.visual_hull.hull import expand, thin_witnesses, visual_hull
@@ -111,6 +111,30 @@ def hull_mask(
     brick = brick_edge(grid)
     bricks, _ = _bricks(views, _with_frusta(cameras), grid, brick, dict(noise or {}), True)
     return expand(bricks, brick, grid.shape)
+
+
+def support_masks(
+    views: Float[Tensor, "b 1 m v u"],
+    cameras: Cameras | ExplicitRays,
+    grid: Grid,
+    kind: str = "hull",
+    noise: Mapping[str, Any] | None = None,
+) -> Bool[Tensor, "b 1 d h w"]:
+    """The support of each sample, by its own views: its visual "hull", that hull's "box", or by
+    "auto" the hull where its box is small, else all of the grid.
+
+    Args:
+        views, cameras, grid, noise: as of `support_from_views`.
+        kind: "hull", "box" or "auto".
+    """
+    hull = hull_mask(views, cameras, grid, noise)
+    if kind == "hull":
+        return hull
+    box = filled(bounds(hull[:, 0]), hull.shape[2:])[:, None]
+    if kind == "box":
+        return box
+    small = box.flatten(1).sum(dim=1) < WORTH * hull[0].numel()
+    return hull | ~small.view(-1, 1, 1, 1, 1)
 
 
 def _with_frusta(cameras: Cameras | ExplicitRays) -> Cameras:

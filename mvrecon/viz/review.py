@@ -1,5 +1,5 @@
-"""What is looked at in a review, a sheet each: planes, projections, slices, views, opinions and
-weights of cameras, with fixed scales of values.
+"""The sheets of a review: planes, projections, slices, views, per-view estimates and weights of
+cameras, with fixed scales of values.
 
 Convention: [d h w] = (z, y, x); letters at the edges say where the patient's right (R), left (L),
 front (A), back (P), head (H) and feet (F) are.
@@ -136,18 +136,20 @@ def views(
     return sheet(title, columns, ("measured", "predicted", "difference"))
 
 
-def opinions(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
+def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
     """Three middle planes of the mean of the cameras' volumes, and of how each camera's own differs
     from it, to scale.
 
     The mean from 0 to the range; a difference to an eighth of it, blue to red.
     """
-    mean, apart = volumes.mean(dim=0), case.error(1 / 8, "opinion - mean")
+    mean, apart = volumes.mean(dim=0), case.error(1 / 8, "estimate - mean")
     columns = [Column("mean", case.panels(mean, case.value(name="mean")))]
     for m in _chosen(len(volumes), CAMERAS - 1):
         columns.append(Column(f"camera {m}", case.panels(volumes[m] - mean, apart)))
     return sheet(
-        f"{case.name}: opinions{_left_out(len(columns) - 1, len(volumes))}", columns, PLANES
+        f"{case.name}: per-view estimates{_left_out(len(columns) - 1, len(volumes))}",
+        columns,
+        PLANES,
     )
 
 

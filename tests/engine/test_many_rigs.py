@@ -11,7 +11,7 @@ import mvrecon.eval
 from mvrecon.config import compose
 from mvrecon.engine import fit, run_folder
 from mvrecon.engine.on_rig import with_weights_of
-from mvrecon.engine.trained_reconstructor import trained
+from mvrecon.engine.trained_method import trained
 from mvrecon.files import places
 from mvrecon.parts import MODELS, PROJECTORS
 from tests.cameras.rigs import OPTIONS

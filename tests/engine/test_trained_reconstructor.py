@@ -15,7 +15,7 @@ import mvrecon.reconstruction
 from mvrecon.cameras import files
 from mvrecon.data.volume_files import read_volume
 from mvrecon.engine.export import save_views
-from mvrecon.engine.trained_reconstructor import trained
+from mvrecon.engine.trained_method import trained
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
 from tests.engine.runs import call, trained_for_a_step

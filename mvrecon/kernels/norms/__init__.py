@@ -1,1 +1,0 @@
-"""Group normalisation and SiLU as one step."""

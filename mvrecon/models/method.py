@@ -1,0 +1,52 @@
+"""Methods: `method(views, A) -> Reconstruction`, whether classical or learned.
+
+A registered method is a class of modules, which are called as `module(views, A)`, or a function
+`f(A, views, **options)` that returns a volume.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvrecon.models.output import Reconstruction
+from mvrecon.parts import METHODS
+from mvrecon.projectors.checks import check_views
+from mvrecon.projectors.operator import Projector
+
+
+class Solver(nn.Module):
+    """A classical method with its options; nothing to train.
+
+    Args:
+        solve: f(A, views, **options), which returns a volume.
+        options: of the function.
+    """
+
+    def __init__(self, solve: Callable[..., Tensor], options: Mapping[str, Any]):
+        super().__init__()
+        self.solve, self.options = solve, dict(options)
+
+    @torch.no_grad()
+    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+        check_views(views, A.cameras)
+        cases = [(A, views)] if not A.per_sample else [
+            (A.of_sample(i), one) for i, one in enumerate(views.split(1))
+        ]  # fmt: skip
+        return Reconstruction(torch.cat([self.solve(A, y, **self.options) for A, y in cases]))
+
+
+def build_method(config: Mapping[str, Any]) -> nn.Module:
+    """A method by name and options, `{"name": ..., **options}`.
+
+    Raises:
+        LookupError: an unknown name.
+        TypeError: no name, or an option that the method does not have.
+    """
+    METHODS.check(config)
+    name, options = config["name"], {k: v for k, v in config.items() if k != "name"}
+    part = METHODS.get(name)
+    return part(**options) if inspect.isclass(part) else Solver(part, options)
