@@ -1,20 +1,22 @@
-"""Linear attenuation on a grid, in 1/mm, from a tensor, a number or a file."""
+"""Linear attenuation on a grid, in 1/mm: from a tensor, a number or a file, or of each case."""
 
 import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.data.resample import resample
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.attenuated import check_mu
+from mvrecon.registry import check_options
 
-#: What a map of each case's own needs.
-OF_CASES = (
-    "; each case's own map is known to mvrecon-train and mvrecon-eval alone, with a scene that "
-    "attenuates (cardiac, nema, spect_ct, spect_labels)"
-)
+#: Values of the option `mu` that name a map of each case, and its key in a batch.
+MAPS = {"case": "mu", "measured": "mu_measured"}
 
 #: 1/mm: a body's tissue is at most that of half its voxels (water at 140.5 keV 0.01536, at 70 keV
 #: 0.0192; lung in 1/cm, 0.04, is more), and at least that where it is densest.
@@ -35,12 +37,11 @@ def attenuation_on(
         UserWarning: values that a patient has not, as of another unit.
 
     Raises:
-        TypeError: no tensor, number or path, such as the name of a map of each case.
+        TypeError: no tensor, number or path.
         ValueError: values that cannot be attenuation in 1/mm, a tensor of another shape, or a map
             whose matter all lies outside of the grid.
     """
-    if isinstance(mu, str | Path) and str(mu) not in ("case", "measured"):
-        from mvrecon.data.resample import resample
+    if isinstance(mu, str | Path):
         from mvrecon.data.volume_files import read_volume
         from mvrecon_spect.files.interfile_volume import read_mu
 
@@ -58,7 +59,7 @@ def attenuation_on(
             )
         return on_grid
     if not isinstance(mu, Tensor | float | int):
-        raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}{OF_CASES}")
+        raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}")
     values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))
     check_mu(values, grid)
     _doubt(values, "mu")
@@ -86,3 +87,57 @@ def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:
 def _point(place: Float[Tensor, "3"]) -> str:
     """A place as words, (x, y, z) in mm."""
     return f"({', '.join(f'{x:g}' for x in place.tolist())}) mm"
+
+
+@dataclass(frozen=True)
+class CaseAttenuation:
+    """Linear attenuation in 1/mm that each case brings.
+
+    Args:
+        name: key of the map in a batch, "mu" or "mu_measured".
+        shift_mm: misplacement of the map against the case, along (x, y, z).
+    """
+
+    name: str
+    shift_mm: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, mu: Any) -> "CaseAttenuation | None":
+        """From the option `mu`: "case", "measured", or `{of: case, shift_mm: [x, y, z]}`; None for
+        any other value.
+
+        Raises:
+            TypeError: a mapping with other keys.
+            ValueError: an unknown map, or a shift that is not three finite numbers.
+        """
+        if not isinstance(mu, Mapping):
+            return cls(MAPS[mu]) if isinstance(mu, str) and mu in MAPS else None
+        check_options("projector.mu", mu, ("of", "shift_mm"))
+        name = mu.get("of", "case")
+        shift = tuple(float(step) for step in mu.get("shift_mm", cls.shift_mm))
+        if name not in MAPS or len(shift) != 3 or not torch.tensor(shift).isfinite().all():
+            raise ValueError(
+                f"Expected projector.mu of case or measured, and a shift_mm of three finite "
+                f"numbers, got {dict(mu)}"
+            )
+        return cls(MAPS[name], shift)
+
+    def maps_of(self, batch: Mapping[str, Any], grid: Grid) -> list[Float[Tensor, "d h w"]]:
+        """The shifted maps of the cases of a batch, in 1/mm.
+
+        Raises:
+            ValueError: cases without the map.
+        """
+        if self.name not in batch:
+            scenes = {"mu": "cardiac or nema", "mu_measured": "spect_ct"}[self.name]
+            raise ValueError(
+                f"Expected cases with {self.name!r} for this projector.mu, as of the scene "
+                f"{scenes}, got {sorted(batch)}"
+            )
+        maps = [mu[0].cpu() for mu in batch[self.name]]
+        if not any(self.shift_mm):
+            return maps
+        affine = grid.affine.clone()
+        affine[:3, 3] += torch.tensor(self.shift_mm, dtype=affine.dtype)
+        moved = Grid(grid.shape, affine)
+        return [resample(mu, moved, grid).clamp_min(0) for mu in maps]
