@@ -13,6 +13,7 @@ from mvrecon.engine.checkpoint_check import check_archive, check_known, check_se
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.on_rig import model_on
 from mvrecon.engine.storage import read
+from mvrecon.engine.unfamiliar import warn_of_geometry, warn_of_values
 from mvrecon.files.checks import blaming, plain_name
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
@@ -54,20 +55,27 @@ class Trained:
             cameras: another rig; None: that of the training.
             grid: another grid of the volume; None: that of the training.
 
+        Warns:
+            UserWarning: another grid or range of values than in training, or another rig where it
+                was trained on one.
+
         Raises:
             ValueError: views that do not fit the rig, or weights that fit the rig and the grid of
                 the training alone.
         """
-        if cameras is None and grid is None:
-            return self.module(views).volume
-        known = self.module.projector
-        A = PROJECTORS.from_config(
-            self.module.hparams["geometry"]["projector"],
-            grid=known.grid if grid is None else grid,
-            cameras=known.cameras if cameras is None else cameras,
-        )
-        name = f"The trained {self.module.hparams['model']['name']}"
-        return model_on(A.to(known.device), self.module, name)(views).volume
+        model, name = self.module, f"The trained {self.module.hparams['model']['name']}"
+        if cameras is not None or grid is not None:
+            known = self.module.projector
+            A = PROJECTORS.from_config(
+                self.module.hparams["geometry"]["projector"],
+                grid=known.grid if grid is None else grid,
+                cameras=known.cameras if cameras is None else cameras,
+            )
+            warn_of_geometry(A, self.module, name)
+            model = model_on(A.to(known.device), self.module, name)
+        volume = model(views).volume
+        warn_of_values(volume, self.module.hparams["data_range"], name)
+        return volume
 
 
 def finished(folder: Path, method: str) -> Path:

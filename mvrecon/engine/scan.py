@@ -21,6 +21,7 @@ from mvrecon.files.memory import check_memory
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
+from mvrecon.projectors.pixel_integral import sees_integrals
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
 VOLUMES = 3
@@ -112,7 +113,7 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
         check_unit(unit, scan, seeing)
         return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
     A, largest = _coarse(scan, seeing)
-    emits = A.pixel_integral() is None and 0 < largest < LINE
+    emits = not sees_integrals(A) and 0 < largest < LINE
     return replace(scan, unit=EMISSION) if emits else scan
 
 

@@ -45,7 +45,8 @@ class Spect(Scaled):
         cameras: pinholes, each with its detector behind it and at a right angle to its axis.
         diameter_mm: the pinholes' diameter, or the sides (u, v) of rectangular ones.
         mu: linear attenuation in 1/mm: a tensor on the grid, a number for all of the grid, or the
-            path of a volume in 1/mm, which is resampled. None: none.
+            path of a volume in 1/mm, which is resampled, and attenuates beyond the grid, too. None:
+            none.
         blur: whether the pinholes' images and `intrinsic_mm`, the detector's own FWHM in mm, blur.
         intrinsic_mm: see `blur`.
         options: of the edge, as in `Hole` (collimator_mu, opening_degrees, acceptance_degrees,
@@ -77,13 +78,13 @@ class Spect(Scaled):
         edge = {name: options.pop(name) for name in EDGE if name in options}
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
-        matter = None if mu is None else attenuation_on(grid, mu)
-        optics = Optics(hole, float(intrinsic_mm))
+        matter, beyond = (None, None) if mu is None else attenuation_on(grid, mu)
+        optics = Optics(hole, float(intrinsic_mm), beyond)
         if blur and blurs(grid, cameras, optics):
             super().__init__(BlurredPinholes(grid, cameras, matter, optics, **options))
         else:
             A = _sharp(grid, cameras, matter, options)
-            super().__init__(A, partial(hole.weight, cameras))
+            super().__init__(A, partial(optics.weight, cameras))
         self.hole, self.diameter_mm = hole, diameter_mm
 
 
