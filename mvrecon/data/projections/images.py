@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -64,7 +65,7 @@ class ImageFiles(ProjectionStack):
 
 def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -> ImageFiles:
     """The images of a folder in the order of their numbers, without dark and flat fields: the
-    InstanceNumber of DICOM images where each has its own, else the numbers in their names.
+    InstanceNumber of DICOM images, else the numbers in their names.
 
     Args:
         folder: whose images are views; those whose names begin with dark or flat are none, unless
@@ -72,13 +73,18 @@ def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -
         pattern: of the names of the views, such as "scan_*.tif"; none: all images.
         gaps: see `ordered`.
 
+    Warns:
+        UserWarning: DICOM images without InstanceNumbers, or all of the same; see `ordered`.
+
     Raises:
-        Refused: no image, too many, or of several formats.
+        Refused: no image, too many, or of several formats; DICOM images of several series, or only
+            some of which have an InstanceNumber of their own; see `ordered`.
     """
     images = _images(folder, pattern)
     views = [file for file in images if not FIELD.match(file.name)] or images
     _check_kind(folder, views, f" named {pattern}" if pattern else "")
-    return ImageFiles(by_number(_instances(views), gaps) or ordered(views, gaps))
+    by_instance = _by_instance(views, gaps) if _ending(views[0]) == "DICOM" else []
+    return ImageFiles(by_instance or ordered(views, gaps))
 
 
 def field_files(folder: Path, field: str) -> list[Path]:
@@ -113,17 +119,39 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
         raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
 
 
-def _instances(files: Sequence[Path]) -> dict[Path, int]:
-    """InstanceNumber of DICOM images that have one."""
-    if _ending(files[0]) != "DICOM":
-        return {}
-    numbers = {}
+def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
+    """DICOM images of one series in the order of their InstanceNumbers; none where these tell no
+    order: there are none, or all are the same.
+    """
+    numbers: dict[Path, int | None] = {}
+    series = set()
     for file in files:
         with blaming(file, "has an InstanceNumber that cannot be read"):
-            if (number := header_of(file).get("InstanceNumber")) is None:
-                return {}
-            numbers[file] = int(number)
-    return numbers
+            dataset = header_of(file)
+            number = dataset.get("InstanceNumber")
+            numbers[file] = None if number is None else int(number)
+            series.add(dataset.get("SeriesInstanceUID"))
+    folder = files[0].parent
+    if 1 < len(series) < len(files):  # some detectors make each exposure a series of its own
+        raise Refused(
+            f"{folder}: expected DICOM projections of one series, got {len(series)} series in "
+            f"{len(files)} files; choose by pattern=..."
+        )
+    counts = Counter(numbers.values())
+    if len(counts) == 1 and len(files) > 1:
+        warnings.warn(
+            f"{folder}: DICOM projections have no InstanceNumbers of their own; they are in the "
+            f"order of the numbers in their names",
+            stacklevel=2,
+        )
+        return []
+    if None in counts or max(counts.values()) > 1:
+        number, count = max(counts.items(), key=lambda item: (item[0] is None, item[1]))
+        raise Refused(
+            f"{folder}: expected an InstanceNumber of its own for each view, got {number} in "
+            f"{count} files"
+        )
+    return by_number(numbers, gaps)  # type: ignore[arg-type]
 
 
 def _ending(file: Path) -> str:
