@@ -157,3 +157,19 @@ def test_a_scene_of_one_file_has_one_case(tmp_path):
     save_volume(tmp_path / "liver.mha", torch.full(grid.shape, 40.0), grid)
     scene = Volumes(path=str(tmp_path / "liver.mha"))
     assert scene.length == 1 and scene.case(0)[0] == "liver"
+
+
+@pytest.mark.parametrize("field", ["space units", "units"])
+def test_lengths_of_an_nrrd_are_in_the_unit_of_its_header(field, tmp_path):
+    path, grid = tmp_path / "a.nrrd", tilted()
+    save_volume(path, torch.rand(grid.shape), grid)
+    head, values = path.read_bytes().split(b"\n\n", 1)
+    for unit, mm in (("mm", 1), ("um", 1e-3), ("cm", 10), ("m", 1e3)):
+        line = f"\n{field}: " + " ".join([f'"{unit}"'] * 3)
+        path.write_bytes(head + line.encode() + b"\n\n" + values)
+        affine = read_volume(path)[1].affine
+        assert torch.allclose(affine[:3], mm * grid.affine[:3])
+    for units in ('"parsec" "parsec" "parsec"', '"mm" "mm" "um"'):
+        path.write_bytes(head + f"\n{field}: {units}".encode() + b"\n\n" + values)
+        with pytest.raises(Refused, match="expected one unit of length for all axes"):
+            read_volume(path)

@@ -1,7 +1,9 @@
 """Projections as images: a folder of TIFF, PNG or DICOM files, or one file of several pages."""
 
 import re
+import struct
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,9 +19,26 @@ from mvrecon.files.checks import EDGE, Refused, blaming, check_file
 
 #: Formats of Pillow by a file's ending.
 PILLOW = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
-#: Pixel types by Pillow's mode, and by the bits and the sign that a TIFF declares.
+#: Pixel types by Pillow's mode, and those that a TIFF declares by its SampleFormat and bits where
+#: the mode is that of another type.
 MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4", "F": "f4"}
-WHITE_IS_ZERO, PHOTOMETRIC = 0, 262
+TIFF = {(1, 32): "u4", (2, 8): "i1", (2, 16): "i2"}
+#: Tags of TIFF. Not every version of Pillow turns images by their Orientation.
+BITS, PHOTOMETRIC, ORIENTATION, SAMPLE_FORMAT = 258, 262, 274, 339
+WHITE_IS_ZERO, UPPER_LEFT = 0, 1
+#: Passes of a plain and of an interlaced PNG: first column and row, and their steps.
+PLAIN, INTERLACED = (
+    [(0, 0, 1, 1)],
+    [
+        (0, 0, 8, 8),
+        (4, 0, 8, 8),
+        (0, 4, 4, 8),
+        (2, 0, 4, 4),
+        (0, 2, 2, 4),
+        (1, 0, 2, 2),
+        (0, 1, 1, 2),
+    ],
+)
 #: How names of dark and flat fields begin that lie among the views.
 FIELD = re.compile(r"(dark|flat)", re.IGNORECASE)
 
@@ -194,9 +213,14 @@ def header(file: Path) -> Header:
 
 
 def _head(file: Path, image: Any, pages: int) -> Header:
-    kind = MODES.get(image.mode)
+    kind = _type(image)
     columns, rows = image.size
     tags = getattr(image, "tag_v2", {})
+    if (turned := tags.get(ORIENTATION, UPPER_LEFT)) != UPPER_LEFT:
+        raise Refused(
+            f"{file}: expected the first pixel at the upper left (Orientation 1), got {turned}; "
+            f"store it without that tag, and say views.flip_rows or flip_columns"
+        )
     if kind is None or max(rows, columns) > EDGE:
         raise Refused(
             f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got {rows} x "
@@ -213,10 +237,38 @@ def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
             values = pixels_of(file)
             yield from values.reshape(-1, *values.shape[-2:])[first:last]
             return
+        if PILLOW[file.suffix.lower()] == "PNG":
+            _check_rows(file)
         with _opened(file) as image:
             for page in range(first, last):
                 image.seek(page)
-                yield np.asarray(image)
+                yield np.asarray(image).astype(_type(image), copy=False)
+
+
+def _type(image: Any) -> str | None:
+    """Type of the pixels as they are stored; none where they are no grey values."""
+    kind, tags = MODES.get(image.mode), getattr(image, "tag_v2", {})
+    stored = tags.get(SAMPLE_FORMAT, (1,))[0], tags.get(BITS, (1,))[0]
+    return kind and TIFF.get(stored, kind)
+
+
+def _check_rows(file: Path) -> None:
+    """Refuse a PNG of grey values that ends before its last row: Pillow leaves the rest zero."""
+    data = file.read_bytes()
+    columns, rows, bits, interlaced = struct.unpack_from(">IIB3xB", data, 16)
+    sizes = [
+        (len(range(y, rows, down)), len(range(x, columns, right)))
+        for x, y, right, down in (INTERLACED if interlaced else PLAIN)
+    ]
+    needed = sum(m * (1 + (n * bits + 7) // 8) for m, n in sizes if n)  # a byte before each row
+    stream, got, place = zlib.decompressobj(), 0, 8
+    while got < needed and place + 8 <= len(data):
+        size, name = struct.unpack_from(">I4s", data, place)
+        if name == b"IDAT":
+            got += len(stream.decompress(data[place + 8 : place + 8 + size], needed - got))
+        place += size + 12
+    if got < needed:
+        raise Refused(f"{file}: expected {needed} bytes of {rows} x {columns} pixels, got {got}")
 
 
 @contextmanager

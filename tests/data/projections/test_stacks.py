@@ -1,9 +1,16 @@
 """Whatever form a scan has on disk, its views are the same numbers in the same order."""
 
+import struct
+import zlib
+
+import h5py
 import numpy as np
 import pytest
+import SimpleITK as sitk
 import torch
+from PIL import Image as Pillow
 
+from mvrecon.data.projections.images import INTERLACED, PLAIN
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.order import ordered
 from mvrecon.files import memory
@@ -35,6 +42,67 @@ def test_pixels_of_other_types_keep_their_values(kind, tmp_path):
         (tmp_path / form).mkdir()
         stack = open_projections(FORMS[form](tmp_path / form, values))
         assert np.array_equal(stack.read(0, VIEWS).numpy(), values.astype("f4"))
+
+
+@pytest.mark.parametrize("kind", ["i1", "u1", "i2", "u2", "i4", "u4", "f4"])
+def test_a_tiff_of_any_type_keeps_its_values_and_its_greatest_one(kind, tmp_path):
+    """SimpleITK writes the TIFF and reads it, as the second reader."""
+    ends = [-2.5, 7.25] if kind == "f4" else [np.iinfo(kind).min, np.iinfo(kind).max]
+    values = np.array([[0, 1, 2], [3, *ends]], kind)
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / "a.tif"))
+    assert np.array_equal(sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "a.tif"))), values)
+    stack = open_projections(tmp_path / "a.tif")
+    assert np.array_equal(stack.read(0, 1)[0].numpy(), values.astype("f4"))
+    assert stack.top == (None if kind == "f4" else ends[1])
+
+
+@pytest.mark.parametrize("interlaced", [False, True])
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+def test_a_png_without_its_last_rows_is_refused(kind, interlaced, tmp_path):
+    values = np.full((6, 5), 200, kind)
+    path, passes = tmp_path / "a.png", INTERLACED if interlaced else PLAIN
+    parts = [values[y::down, x::right] for x, y, right, down in passes]
+    rows = [b"\0" + row.astype(f">{kind}").tobytes() for part in parts for row in part if row.size]
+    for count in (len(rows), len(rows) - 1):
+        path.write_bytes(png(values, b"".join(rows[:count]), interlaced))
+        if count == len(rows):
+            assert np.array_equal(np.asarray(Pillow.open(path)), values)
+            assert np.array_equal(open_projections(path).read(0, 1)[0].numpy(), values)
+            continue
+        with pytest.raises(Refused, match="expected .* bytes of 6 x 5 pixels, got"):
+            open_projections(path).read(0, 1)
+
+
+def png(values, raw, interlaced):
+    """A PNG of the size of some values, of these bytes."""
+    rows, columns = values.shape
+    head = struct.pack(">IIBBBBB", columns, rows, 8 * values.itemsize, 0, 0, 0, interlaced)
+    parts = [(b"IHDR", head), (b"IDAT", zlib.compress(raw)), (b"IEND", b"")]
+    chunks = (
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("turned", range(2, 9))
+def test_a_tiff_that_is_turned_by_its_orientation_is_refused(turned, tmp_path):
+    """A TIFF whose Orientation turns or mirrors it is refused."""
+    Pillow.fromarray(grey()[0]).save(tmp_path / "a.tif", tiffinfo={274: turned})
+    with pytest.raises(Refused, match=f"upper left .Orientation 1., got {turned}"):
+        open_projections(tmp_path / "a.tif")
+    Pillow.fromarray(grey()[0]).save(tmp_path / "a.tif", tiffinfo={274: 1})
+    assert np.array_equal(open_projections(tmp_path / "a.tif").read(0, 1)[0].numpy(), grey()[0])
+
+
+@pytest.mark.parametrize("layout", [{}, {"chunks": (1, 6, 8)}])
+def test_a_views_h5_that_was_not_written_is_refused(layout, tmp_path):
+    with h5py.File(tmp_path / "views.h5", "w") as file:
+        file.create_dataset("views", (3, 6, 8), "f4", **layout)
+        file["padding"] = np.zeros(10_000)
+    with pytest.raises(Refused, match="0 of its 576 bytes|for the chunk"):
+        open_projections(tmp_path / "views.h5").read(0, 3)
 
 
 @pytest.mark.parametrize("ending", ["mha", "npy"])
