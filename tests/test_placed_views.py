@@ -87,7 +87,7 @@ def test_a_spacing_or_an_origin_that_contradicts_the_rig_is_refused(name, tmp_pa
         open_scan(options)
     for offset in ([3.0, -3.75], [2.0, -4.5], [0.0, 0.0]):
         options["camera"]["detector"] = {**PLATE, "offset_mm": offset}
-        with pytest.raises(Refused, match=r"offset_mm \(3.0, -4.5\) \(v, u\) by .*origin, got"):
+        with pytest.raises(Refused, match=r"offset_mm \[3, -4.5\] \(v, u\) by .*origin, got"):
             open_scan(options)
 
 

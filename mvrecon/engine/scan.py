@@ -196,9 +196,10 @@ def _check_offset(
         abs(a - b) > OFFSET * pixel
         for a, b, pixel in zip(got, expected.offset_mm, expected.pixel_mm, strict=True)
     ):
+        down, right = expected.offset_mm
         raise Refused(
-            f"{views.options.path}: expected the detector's offset_mm {expected.offset_mm} (v, u) "
-            f"by the file's origin, got {got}"
+            f"{views.options.path}: expected the detector's offset_mm [{down:g}, {right:g}] (v, u) "
+            f"by the file's origin, got [{got[0]:g}, {got[1]:g}]"
         )
 
 
