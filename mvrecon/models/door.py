@@ -6,7 +6,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.views import check_finite
-from mvrecon.projectors.checks import check, check_floating
+from mvrecon.projectors.checks import check_floating, check_measured
 
 
 def admitted(views: Tensor, cameras: Cameras, weights: Tensor) -> Float[Tensor, "b 1 m v u"]:
@@ -23,12 +23,9 @@ def admitted(views: Tensor, cameras: Cameras, weights: Tensor) -> Float[Tensor, 
             f"Expected a model of float32 or float64, got {weights.dtype}; for less use "
             f"torch.autocast"
         )
-    check(views, "views [b 1 m v u]", (len(cameras), *cameras.shape), weights.device)
-    if views.shape[1] != 1 or not len(views):
-        raise ValueError(
-            f"Expected views [b 1 m v u] of at least one sample and one channel, got "
-            f"{tuple(views.shape)}"
-        )
+    check_measured(views, "views [b 1 m v u]", (len(cameras), *cameras.shape), weights.device)
+    if views.shape[1] != 1:
+        raise ValueError(f"Expected views [b 1 m v u] of one channel, got {tuple(views.shape)}")
     check_floating(views, "views")
     check_finite(views, on_gpu=False)  # see `consistency.anything`
     return views.to(weights.dtype)

@@ -118,6 +118,14 @@ def test_a_grid_needs_one_size_and_its_spacing():
         Grid.centred(4)
 
 
+@pytest.mark.parametrize("convert", [lambda x: x, torch.Tensor.numpy])
+def test_a_grid_keeps_its_own_affine(convert):
+    affine = torch.eye(4, dtype=torch.float64)
+    grid = Grid((2, 2, 2), convert(affine))
+    affine[:3] *= 5
+    assert grid.spacing == (1.0, 1.0, 1.0)
+
+
 def test_left_handed_and_flat_grids_are_refused():
     for diagonal in ([-1.0, 1, 1, 1], [0.0, 1, 1, 1]):
         with pytest.raises(ValueError, match="right-handed"):

@@ -274,3 +274,15 @@ def test_attenuation_of_another_grid_and_sampled_rays_are_refused():
         AttenuatedTransform(grid, rig(), mu[1:])
     with pytest.raises(ValueError, match="joseph"):
         AttenuatedTransform(grid, rig(), mu, method="trilinear")
+
+
+def test_attenuation_that_is_filled_in_later_counts():
+    grid, mu, x = scene()
+    own = torch.zeros_like(mu)
+    A = AttenuatedTransform(grid, rig(), own)
+    assert torch.equal(A(x), Drr(grid, rig())(x))
+    own.copy_(mu)
+    assert torch.equal(A(x), AttenuatedTransform(grid, rig(), mu)(x))
+    assert torch.equal(A.cropped(Box.whole(grid.shape), [1])(x), A(x)[:, :, [1]])
+    A.mu.zero_()
+    assert torch.equal(A(x), Drr(grid, rig())(x)) and A.attenuation() is None
