@@ -71,7 +71,6 @@ def test_spacing_and_origin_of_projections_are_the_detector_of_rtk(ending, tmp_p
 
 
 @pytest.mark.parametrize("name", ["circular", "rtk_xml"])
-@pytest.mark.door
 def test_a_spacing_or_an_origin_that_contradicts_the_rig_is_refused(name, tmp_path):
     """A detector whose pixel_mm or offset_mm is not that of the views' MHA is refused."""
     rtk_xml.write(circular(4, 200.0, 300.0, PLATE), tmp_path / "rig.xml")
@@ -120,7 +119,6 @@ def test_an_image_that_nobody_placed_states_nothing(tmp_path):
         open_scan(settings(path, rtk(tmp_path / "rig.xml")))
 
 
-@pytest.mark.door
 def test_views_whose_file_mirrors_them_are_refused(tmp_path):
     """Views in an MHA whose direction mirrors rows or columns are refused."""
     path = stack(tmp_path / "a.mha", torch.ones(4, 30, 36), (1.5, 2.0), (0.0, 0.0), (-1, 1))

@@ -154,7 +154,6 @@ def test_rigs_of_volumes_whose_names_have_dots_lie_side_by_side(scan, tmp_path):
     assert rigs[0] / rigs[1] == pytest.approx(9 / 8.9)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -180,7 +179,6 @@ def test_a_run_that_would_write_to_its_own_rig_is_refused(scan, tmp_path, name, 
     assert rig.read_bytes() == before
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("place", ["file/volume.nii.gz", "folder.nii.gz"])
 def test_a_place_that_cannot_be_written_is_refused_first(
     scan, tmp_path, place, monkeypatch, capsys
@@ -236,7 +234,6 @@ def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
     assert torch.equal(read_volume(again["volume"])[0], first)
 
 
-@pytest.mark.door
 def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypatch, capsys):
     """A reconstruction that fails in the middle leaves neither settings nor pictures nor a volume,
     and another with other settings may have its folder.
@@ -254,7 +251,6 @@ def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypa
     assert (tmp_path / "run" / "volume.nii.gz").is_file()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -281,7 +277,6 @@ def test_settings_that_do_not_fit_are_refused_and_leave_no_volume(
     assert not list(tmp_path.rglob("*.nii.gz"))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("method", ["fdk", "sirt"])
 def test_saturated_pixels_are_told_by_every_way_of_reading(scan, tmp_path, method):
     """A scan with saturated pixels is told with their number, streamed or read as a whole."""
@@ -298,7 +293,6 @@ def test_saturated_pixels_are_told_by_every_way_of_reading(scan, tmp_path, metho
         )
 
 
-@pytest.mark.door
 def test_fewer_views_than_cameras_are_refused(scan, tmp_path, capsys):
     """A scan with another number of views than of cameras is an error that gives both."""
     short = tmp_path / "projections"
@@ -317,7 +311,6 @@ def test_fewer_views_than_cameras_are_refused(scan, tmp_path, capsys):
     assert "one camera for each of 39 views" in said and "got 40 cameras; is a view missing" in said
 
 
-@pytest.mark.door
 def test_a_grid_larger_than_memory_is_refused_with_its_size(scan, tmp_path, capsys):
     """A grid that does not fit into memory is an error that says how large it is."""
     options = ("grid.like=null", "grid.size=[40000, 40000, 40000]", "grid.spacing=0.01")
@@ -325,7 +318,6 @@ def test_a_grid_larger_than_memory_is_refused_with_its_size(scan, tmp_path, caps
     assert "GiB" in capsys.readouterr().err
 
 
-@pytest.mark.door
 def test_line_integrals_are_no_counts(scan, monkeypatch):
     """Line integrals given as counts, and counts given as line integrals, are refused."""
 

@@ -97,7 +97,6 @@ def test_a_folder_that_is_no_clone_is_refused(openkbp, tmp_path):
         openkbp.prepare(tmp_path, tmp_path / "data")
 
 
-@pytest.mark.door
 def test_patients_without_a_ct_are_named_and_nothing_is_written(root, tmp_path, run_python):
     """A patient without `ct.csv` is named, the exit status is not zero, and no file is written
     unless told to skip.

@@ -101,7 +101,6 @@ def test_hounsfield_units_come_back_from_attenuation():
     assert hounsfield(torch.tensor([0.0, WATER])).tolist() == [-1000, 0]
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("ending", ["mha", "nrrd"])
 def test_a_cut_itk_image_is_refused(ending, tmp_path):
     """An MHA or NRRD volume that is cut short is refused with its name, wherever it is cut."""
@@ -114,7 +113,6 @@ def test_a_cut_itk_image_is_refused(ending, tmp_path):
             read_volume(path)
 
 
-@pytest.mark.door
 def test_an_nrrd_header_that_would_end_the_process_or_hides_its_end_is_refused(tmp_path):
     """An NRRD header with a line that ITK would write beyond its buffer, with an end that only some
     programs see, or without one is refused; long comments and key/value pairs are read.
@@ -136,7 +134,6 @@ def test_an_nrrd_header_that_would_end_the_process_or_hides_its_end_is_refused(t
     assert torch.equal(read_volume(path)[0], values)
 
 
-@pytest.mark.door
 def test_itk_images_that_are_no_volume_are_refused(tmp_path):
     """An ITK image of two axes, of colours, or that declares more than it holds is refused."""
     path = tmp_path / "a.mha"

@@ -108,7 +108,6 @@ def test_weights_in_a_file_are_the_trained_ones_and_fit_a_rig_never_seen(
         mv.load("theirs")
 
 
-@pytest.mark.door
 def test_a_flipped_bit_or_a_foreign_file_of_weights_is_refused(run, tmp_path):
     """Weights with a flipped bit, without a description or cut short are refused."""
     path = mv.save_weights(run, tmp_path / "ours.safetensors")
@@ -125,7 +124,6 @@ def test_a_flipped_bit_or_a_foreign_file_of_weights_is_refused(run, tmp_path):
         mv.save_weights(run, tmp_path / "ours.bin")
 
 
-@pytest.mark.door
 def test_no_bit_of_a_file_of_weights_is_outside_its_checksum(run, tmp_path):
     """A bit that flips anywhere in a file of weights, its description among it, is noticed."""
     path = mv.save_weights(run, tmp_path / "ours.safetensors")

@@ -108,7 +108,6 @@ def test_the_loaded_method_and_the_reconstructor_warn_in_the_same_words(run, A, 
     assert told("The trained cross_view", lambda: loaded(views, A.cameras, A.grid)) == []
 
 
-@pytest.mark.door
 def test_a_network_made_for_its_own_cameras_refuses_another_number_of_views(run, A, views):
     """A network whose weights belong to one rig is not applied to another number of views."""
     other = PROJECTORS.build("drr", grid=A.grid, cameras=A.cameras[:3])

@@ -253,7 +253,6 @@ def test_no_emission_is_no_counts_and_nan_is_never_skipped():
     assert A(one * torch.nan)[seen].isnan().all()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("value", "told"),
     [(0.15, "1/cm"), (-0.01, "zero or more"), (torch.nan, "finite")],
@@ -266,7 +265,6 @@ def test_impossible_attenuation_is_refused(value, told):
         AttenuatedTransform(grid, rig(), mu)
 
 
-@pytest.mark.door
 def test_attenuation_of_another_grid_and_sampled_rays_are_refused():
     """Attenuation of another grid, or along rays of samples, is refused."""
     grid, mu, _ = scene()

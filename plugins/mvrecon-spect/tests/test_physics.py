@@ -191,7 +191,6 @@ def test_a_map_that_ends_with_the_grid_or_before_it_has_nothing_beyond(tmp_path)
         assert torch.equal(weight, Hole().weight(cameras))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "told"),
     [
@@ -213,7 +212,6 @@ def test_impossible_options_are_refused(options, told):
         Spect(grid, cameras, **options)
 
 
-@pytest.mark.door
 def test_a_pinhole_in_the_object_is_refused():
     """A pinhole inside the grid of the activity is refused."""
     with pytest.raises(ValueError, match="pinhole 0 in it"):

@@ -288,7 +288,6 @@ BAD = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", BAD)
 def test_a_file_of_stir_that_does_not_fit_is_refused(tmp_path: Path, name: str):
     """A pinhole system of STIR whose files do not fit each other, their size or unit is refused."""
@@ -301,7 +300,6 @@ def test_a_file_of_stir_that_does_not_fit_is_refused(tmp_path: Path, name: str):
         read_stir(*files(tmp_path))
 
 
-@pytest.mark.door
 def test_counts_of_interfile_are_in_a_plain_file_beside_it(tmp_path: Path):
     """Interfile counts are read from a plain file beside the header, and refused where negative."""
     inside, outside = tmp_path / "scan", tmp_path / "elsewhere"

@@ -85,7 +85,6 @@ def png(values, raw, interlaced):
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("turned", range(2, 9))
 def test_a_tiff_that_is_turned_by_its_orientation_is_refused(turned, tmp_path):
     """A TIFF whose Orientation turns or mirrors it is refused."""
@@ -150,7 +149,6 @@ def test_decimals_in_names_decide_the_order(tmp_path):
         assert ordered(paths[::-1]) == paths
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     "names",
     [
@@ -189,7 +187,6 @@ def test_the_instance_number_of_dicom_views_decides_their_order(tmp_path):
         assert torch.equal(open_projections(tmp_path).read(0, VIEWS), expected)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("number", [2, None])
 def test_dicom_views_of_which_one_has_no_number_of_its_own_are_refused(number, tmp_path):
     """DICOM projections with an InstanceNumber twice, or without one in some files, are refused."""
@@ -200,7 +197,6 @@ def test_dicom_views_of_which_one_has_no_number_of_its_own_are_refused(number, t
         open_projections(tmp_path)
 
 
-@pytest.mark.door
 def test_two_dicom_series_are_no_scan(tmp_path):
     """DICOM projections of two series in one folder are refused until a pattern names one; series
     of a single exposure each are one scan.
@@ -219,7 +215,6 @@ def test_two_dicom_series_are_no_scan(tmp_path):
     assert torch.equal(whole.read(0, VIEWS), torch.from_numpy(grey().astype("f4")))
 
 
-@pytest.mark.door
 def test_a_dicom_view_that_is_missing_by_its_instance_number_is_refused(tmp_path):
     """DICOM projections among whose InstanceNumbers one is missing are refused, but with gaps."""
     for k, view in enumerate(grey()):
