@@ -53,7 +53,6 @@ def test_a_marker_is_where_nifti_says_in_every_picture(marked):
     assert {"view 0", "cameras", "rays", "grid"} <= {o.name for o in plot.objects}
 
 
-@pytest.mark.door
 def test_a_page_loads_nothing_from_elsewhere(marked):
     """A page that mvrecon-view writes loads nothing: it has no address of a program, style or
     picture, and its policy forbids any.

@@ -129,7 +129,6 @@ def test_nothing_is_misaligned_by_nothing():
     assert torch.allclose(rig.origin, RIG.origin) and torch.allclose(rig.u, RIG.u)
 
 
-@pytest.mark.door
 def test_what_views_cannot_tell_is_not_fitted():
     """Unknown or doubled freedoms, a single view, parallel beams and views that are not finite or
     of another rig are refused by a calibration.

@@ -106,7 +106,6 @@ def test_the_front_leaves_out_what_another_method_beats_in_both(sweep):
     assert [row.method for row in front] == ["unet", "ours"]
 
 
-@pytest.mark.door
 def test_a_table_from_elsewhere_is_refused_or_only_shown(tmp_path, capsys):
     """A file of results that is damaged is refused by name, and one with markup in a label shows it
     as text.

@@ -51,7 +51,6 @@ def test_results_are_strict_json_with_versions(tmp_path):
     assert found["versions"]["mvrecon"] and found["command"]
 
 
-@pytest.mark.door
 def test_the_version_of_torch_tells_its_build(monkeypatch):
     """A run's versions tell the build of torch, which the metadata of an installed wheel leaves
     out.

@@ -45,9 +45,10 @@ class Spect(Scaled):
         cameras: pinholes, each with its detector behind it and at a right angle to its axis.
         diameter_mm: the pinholes' diameter, or the sides (u, v) of rectangular ones.
         mu: linear attenuation in 1/mm: a tensor on the grid, a number for all of the grid, or the
-            path of a volume in 1/mm, which is resampled; or "case" or "measured", the map that each
-            case of a training or an evaluation brings, or `{of: case, shift_mm: [x, y, z]}`: then
-            `for_case` gives the operator of a batch. None: none.
+            path of a volume in 1/mm, which is resampled, and attenuates beyond the grid, too; or
+            "case" or "measured", the map that each case of a training or an evaluation brings, or
+            `{of: case, shift_mm: [x, y, z]}`: then `for_case` gives the operator of a batch. None:
+            none.
         blur: whether the pinholes' images and `intrinsic_mm`, the detector's own FWHM in mm, blur.
         intrinsic_mm: see `blur`.
         options: of the edge, as in `Hole` (collimator_mu, opening_degrees, acceptance_degrees,
@@ -79,18 +80,19 @@ class Spect(Scaled):
         edge = {name: options.pop(name) for name in EDGE if name in options}
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
-        attenuation = CaseAttenuation.of(mu)
-        matter = None if mu is None or attenuation else attenuation_on(grid, mu)
-        build = partial(type(self), blur=blur, intrinsic_mm=intrinsic_mm, **edge, **options)
-        optics = Optics(hole, float(intrinsic_mm))
+        attenuation, build = CaseAttenuation.of(mu), partial(type(self), **edge, **options)
+        matter, beyond = (None, None) if mu is None or attenuation else attenuation_on(grid, mu)
+        optics = Optics(hole, float(intrinsic_mm), beyond)
         if blur and blurs(grid, cameras, optics):
-            super().__init__(BlurredPinholes(grid, cameras, matter, optics, **options))
+            A, weight = BlurredPinholes(grid, cameras, matter, optics, **options), None
         else:
-            A = _sharp(grid, cameras, matter, options)
-            super().__init__(A, partial(hole.weight, cameras))
+            A, weight = _sharp(grid, cameras, matter, options), partial(optics.weight, cameras)
+        super().__init__(OfCases(A) if attenuation else A, weight)
         self.hole, self.diameter_mm = hole, diameter_mm
         self.case_attenuation, self.per_case = attenuation, attenuation is not None
-        self._with_map = partial(build, grid, cameras, diameter_mm)
+        self._with_map = partial(
+            build, grid, cameras, diameter_mm, blur=blur, intrinsic_mm=intrinsic_mm
+        )
 
     def for_case(self, case: Mapping[str, Any]) -> LinearOperator:
         """The operators of the cases of a batch with their own attenuation.

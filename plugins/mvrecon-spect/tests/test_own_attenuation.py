@@ -114,7 +114,6 @@ def test_a_scan_measures_the_attenuation_of_its_patient():
     assert torch.equal(again.mu_measured, known[0])
 
 
-@pytest.mark.door
 def test_attenuation_that_no_case_brings_is_refused():
     """A projector that wants each case's attenuation refuses cases without, and to act without."""
     batch, module = batch_of("dcspect_derenzo"), module_of("dcspect_cardiac", "osem")
