@@ -8,6 +8,7 @@ NIfTI).
 import math
 import re
 from html import escape
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,7 @@ def reduced(
 
     Voxels at the far ends that make no whole block are left out.
     """
-    factor = math.ceil((volume.numel() / voxels) ** (1 / 3))
+    factor = next(k for k in count(1) if math.prod(n // min(k, n) for n in volume.shape) <= voxels)
     if factor == 1:
         return volume, grid
     blocks = [min(factor, n) for n in volume.shape]
