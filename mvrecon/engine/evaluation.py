@@ -7,6 +7,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, methods, trainable
 from mvrecon.engine.module import Settings, build_projector
-from mvrecon.engine.on_case import plain, projected, reconstructed
+from mvrecon.engine.on_case import plain, projected, reconstructed, singly
 from mvrecon.engine.on_rig import OnRig, with_weights_of
 from mvrecon.engine.quality import quality_of, quality_row
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of
@@ -62,7 +63,8 @@ def evaluate(
     A = A.to(device)
     ready = {label: _ready(model, device) for label, model in models.items()}
     scores: Scores = {label: [] for label in models}
-    for scene in (case for batch in batches for case in _singly(batch, device)):
+    for case in chain.from_iterable(map(singly, batches)):
+        scene = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
         volumes = {}
         for label, model in ready.items():
             if not scores[label]:
@@ -226,15 +228,6 @@ def seen_in_training(
     known = truths or [""] * len(names)
     pairs = zip(names, known, strict=True)
     return [name for name, truth in pairs if name in cases or truth in volumes]
-
-
-def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:
-    for i in range(len(batch["views"])):
-        alone = {key: value[i : i + 1] for key, value in batch.items()}
-        yield {
-            key: value.to(device) if isinstance(value, Tensor) else value
-            for key, value in alone.items()
-        }
 
 
 def _ready(model: nn.Module | OnRig, device: str) -> nn.Module | OnRig:
