@@ -1,7 +1,7 @@
 """What every model returns."""
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Self
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -55,7 +55,7 @@ class Reconstruction:
     row: Float[Tensor, "#b 1 #n #v #u"] | None = None
     alignment: Alignment | None = None
 
-    def split(self) -> list["Reconstruction"]:
+    def split(self) -> list[Self]:
         """The reconstruction of each case of the batch."""
         count = len(self.volume)
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d, max_pool3d
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz.planes import LETTERS
 from mvrecon.viz.rig_mesh import COLOURS, Segments, box, segments
@@ -107,7 +107,7 @@ def reduced(
     if factor == 1:
         return volume, grid
     blocks = [min(factor, n) for n in volume.shape]
-    whole = tuple(n - n % block for n, block in zip(volume.shape, blocks, strict=True))
+    whole = three(n - n % block for n, block in zip(volume.shape, blocks, strict=True))
     pooled = (max_pool3d if most else avg_pool3d)(volume[None, None].float(), blocks)[0, 0]
     return pooled, grid.cropped(Box((0, 0, 0), whole)).coarsened(factor)
 

@@ -1,7 +1,7 @@
 """Figures of a validation: means over its cases, of which a failed one cannot be left out."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import lightning.pytorch as L
 import pytest
@@ -12,6 +12,7 @@ from mvrecon.config import compose
 from mvrecon.engine import fit
 from mvrecon.engine.checkpoints import load
 from mvrecon.engine.module import ReconstructionModule
+from mvrecon.engine.on_case import joined
 
 CORRECTED = (
     "experiment=smoke",
@@ -97,3 +98,20 @@ def test_weights_that_fail_in_a_case_are_not_the_best_even_if_they_are_perfect_i
     settings["trainer"] |= {"val_check_interval": 1, "num_sanity_val_steps": 0}
     fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     assert load(tmp_path / "best" / "best.ckpt").steps in (1, 3)
+
+
+def test_a_batch_split_into_its_cases_is_the_batch_joined_again(validation):
+    module, cases = validation
+    batch = next(iter(DataLoader(cases, 3)))
+    with torch.no_grad():
+        out = module.model(batch["views"])
+    parts = out.split()
+    assert len(parts) == 3 and all(len(part.volume) == 1 for part in parts)
+    again = joined(parts)
+    for field in fields(out):
+        one, other = getattr(out, field.name), getattr(again, field.name)
+        if field.name == "alignment":
+            one, other = one.tensors(), other.tensors()
+        elif field.name == "row":  # the same for all cases
+            one = one.expand_as(other)
+        torch.testing.assert_close(other, one, rtol=0, atol=0)
