@@ -1,5 +1,6 @@
 """One model in training, as a LightningModule: its loss, figures of merit and optimiser."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,14 +11,14 @@ from mvrecon.data.rigs import camera_of
 from mvrecon.engine.finite import FiniteLoss
 from mvrecon.engine.graph import GraphedLoss
 from mvrecon.engine.means import Means
-from mvrecon.engine.on_case import CaseAttenuation, OnCases, OwnAttenuation, on_cases, plain
+from mvrecon.engine.on_case import CaseAttenuation, OnCases, OwnAttenuation, on_cases, plain, singly
 from mvrecon.engine.on_rig import OnRig, with_weights_of
 from mvrecon.engine.quality import quality_of
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.engine.wrong_cameras import TRUTH
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.metrics import camera_metrics, view_metrics, volume_metrics
+from mvrecon.metrics import camera_metrics, case_metrics
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
@@ -70,7 +71,7 @@ class ReconstructionModule(L.LightningModule):
         self._finite = FiniteLoss(model["name"])
         #: What computes the loss and its gradients in training instead of `terms`; none for those.
         self.graph: GraphedLoss | None = None
-        self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
+        self._means = Means()
 
     def forward(self, views: Tensor, **case: Tensor) -> Reconstruction:
         """Reconstruct; see the model.
@@ -166,36 +167,38 @@ class ReconstructionModule(L.LightningModule):
         return self.loss(out, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
-        """Judge a batch by the loss and the figures of merit; hand the reconstruction on to the
-        board.
+        """Judge a batch by the loss and each of its cases by the figures of merit; hand the
+        reconstruction on to the board.
         """
         rig = self.on(batch)
         out = rig.model(batch["views"])
         terms = {f"loss_{name}": value for name, value in self._terms(rig, out, batch).items()}
         predicted = rig.A(out.volume)
-        figures = [
-            volume_metrics(volume, truth, inside, self.hparams["data_range"])
-            | view_metrics(view, measured)
-            for volume, truth, inside, view, measured in zip(
-                out.volume, batch["volume"], batch["inside"], predicted, batch["views"], strict=True
-            )
-        ]
-        means = {name: predicted.new_tensor([f[name] for f in figures]) for name in figures[0]}
-        values = {name: predicted.new_tensor(q) for name, q in quality_of(out, batch).items()}
-        means |= {f"quality_{name}": value.expand(len(predicted)) for name, value in values.items()}
-        if out.alignment is not None and "gain" in batch:
-            known = camera_metrics(out.alignment, *(batch[key] for key in TRUTH))
-            values = {name: predicted.new_tensor(value) for name, value in known.items()}
-            means |= {f"cameras_{name}": v.expand(len(predicted)) for name, v in values.items()}
-        if out.support is not None:
-            means["support_fraction"] = out.support.flatten(1).float().mean(dim=1)
-        self._losses.update({name: value.expand(len(predicted)) for name, value in terms.items()})
-        self._figures.update(means)
+        self._means.update({name: value.expand(len(predicted)) for name, value in terms.items()})
+        for one, view, case in zip(out.split(), predicted, singly(batch), strict=True):
+            figures = self._figures(one, view, case)
+            failed = math.isnan(figures["nrmse"])
+            # without an object in the scene, nan is no figure; of a volume that has failed, it is
+            told = {k: [v] if failed or not math.isnan(v) else [] for k, v in figures.items()}
+            self._means.update({name: view.new_tensor(value) for name, value in told.items()})
         return {"out": out}
+
+    def _figures(
+        self, out: Reconstruction, views: Tensor, case: dict[str, Any]
+    ) -> dict[str, float]:
+        """Everything that judges the reconstruction of one case and its views."""
+        figures = case_metrics(out.volume[0], views, case, self.hparams["data_range"])
+        figures |= {f"quality_{name}": value for name, value in quality_of(out, case).items()}
+        if out.alignment is not None and "gain" in case:
+            known = camera_metrics(out.alignment, *(case[key] for key in TRUTH))
+            figures |= {f"cameras_{name}": value for name, value in known.items()}
+        if out.support is not None:
+            figures["support_fraction"] = out.support.float().mean().item()
+        return figures
 
     def on_validation_epoch_end(self) -> None:
         """Log the means over the cases of all processes."""
-        for name, value in (self._losses.compute() | self._figures.compute()).items():
+        for name, value in self._means.compute().items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr", sync_dist=True)  # equal already
 
     def configure_optimizers(self) -> Any:

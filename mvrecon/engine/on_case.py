@@ -180,6 +180,12 @@ def plain(A: Projector) -> Projector:
     return A.A if isinstance(A, OwnAttenuation) else A
 
 
+def singly(batch: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The cases of a batch, each as a batch of one."""
+    count = len(batch["views"])
+    return [{key: value[i : i + 1] for key, value in batch.items()} for i in range(count)]
+
+
 def joined(parts: Iterable[Reconstruction]) -> Reconstruction:
     """Reconstructions of single cases as that of a batch."""
     outs, together = list(parts), {}
