@@ -190,8 +190,8 @@ def calibrated(
     left_out = (problem.left_out(nominal, iterations), problem.left_out(values, iterations))
     if left_out[1] > left_out[0]:
         warnings.warn(
-            f"The fitted rig predicts left-out views with an error of {left_out[1]:.5g}, the nominal "
-            f"rig with {left_out[0]:.5g}: the nominal rig is kept",
+            f"The nominal rig predicts left-out views with an error of {left_out[0]:.5g}, the "
+            f"fitted one with {left_out[1]:.5g}: the nominal rig is kept",
             stacklevel=3,
         )
         values, kept = nominal, list(free)
