@@ -23,14 +23,14 @@ from mvrecon.reconstructors.problem import (
     Watch,
     check_iterations,
     check_start,
+    declares,
     supported,
-    takes,
     without_gradient,
 )
 from mvrecon.reconstructors.total_variation import total_variation, voxel_steps
 
 
-@takes("counts")
+@declares(views="counts", iterates=True)
 @without_gradient
 def tv_map(
     A: LinearOperator,
