@@ -38,7 +38,6 @@ def test_the_order_of_the_cameras_changes_nothing(name, cone):
     assert torch.allclose(again, volume, atol=1e-5 * volume.abs().max())
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", SMALL)
 def test_explicit_rays_are_refused(name, cone):
     """Features of views at voxels refuse explicit rays, which have no image."""

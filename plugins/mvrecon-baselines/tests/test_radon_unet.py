@@ -76,7 +76,6 @@ def test_both_networks_learn_from_projections_alone_and_end_to_end(weights, cone
         assert loss(out, batch)["completed_views"].item() < 1e-12
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("options", [{"angles": 7}, {"angles": 2}, {"features": 0}])
 def test_projections_that_there_are_not_are_refused(options):
     """A method of ideal projections refuses an odd number of angles, fewer than 4, and no
@@ -86,7 +85,6 @@ def test_projections_that_there_are_not_are_refused(options):
         RadonUNet(2, **options)
 
 
-@pytest.mark.door
 def test_another_number_of_cameras_is_refused(cone):
     """A network whose channels are cameras refuses another number of them."""
     A = cone()

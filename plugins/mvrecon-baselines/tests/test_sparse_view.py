@@ -158,7 +158,6 @@ def test_a_few_steps_on_the_error_of_completed_views_pass_linear_interpolation(A
     assert errors[-1] < 0.6 * errors[0]
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", ["fbp_unet", "sinogram_unet", "dual_domain", "itnet"])
 def test_a_rig_without_filtered_back_projection_is_refused(name, fan):
     """A method of filtered back-projection refuses a rig whose angles do not suffice."""
@@ -167,14 +166,12 @@ def test_a_rig_without_filtered_back_projection_is_refused(name, fan):
         build_method({"name": name})(torch.ones(1, 1, *A.range_shape), A)
 
 
-@pytest.mark.door
 def test_an_operator_with_weights_is_refused(A):
     """A method of filtered back-projection refuses an operator of weighted integrals."""
     with pytest.raises(ValueError, match="plain line integrals"):
         SinogramUNet(factor=2)(torch.ones(1, 1, *A.range_shape), 2 * A)
 
 
-@pytest.mark.door
 def test_a_factor_below_one_is_refused():
     """A number of views below the measured one is refused."""
     with pytest.raises(ValueError, match="at least 1 for views, got 0"):

@@ -39,7 +39,6 @@ def test_the_bound_of_the_norm_is_above_the_norm_and_near_it(rig, request):
     assert 1 <= norm_bound(A).item() / power_norm(A) < 1.5
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("name", "options"),
     [

@@ -54,7 +54,6 @@ def test_a_training_step_waits_for_nothing(name):
         assert not gpu.waits
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", ["dif_net", "fbp_unet", "primal_dual"])
 def test_views_that_are_not_finite_give_a_volume_of_nan_on_a_gpu(name):
     """Views on a GPU that are not finite, which are not checked there, give a volume of NaN."""

@@ -243,7 +243,6 @@ def test_parallel_beams_have_rays_too():
     assert volume.isfinite().all() and volume.any()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [

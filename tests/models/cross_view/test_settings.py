@@ -6,7 +6,6 @@ from mvrecon.models.cross_view.model import CrossView
 from tests.models.rig import small_projector
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
