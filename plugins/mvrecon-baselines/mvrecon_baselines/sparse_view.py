@@ -59,7 +59,7 @@ class FbpUNet(nn.Module):
         return Reconstruction(volume * scale, start=start * scale)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class CompletedViews(Reconstruction):
     """A reconstruction by filtered back-projection of views that a network has completed.
 
@@ -68,8 +68,8 @@ class CompletedViews(Reconstruction):
         dense: the operator of all angles.
     """
 
-    completed: Float[Tensor, "b 1 n v u"] | None = None
-    dense: Projector | None = None
+    completed: Float[Tensor, "b 1 n v u"]
+    dense: Projector
 
 
 def completed_views(
@@ -78,7 +78,7 @@ def completed_views(
     """Loss term: the mean squared error of completed views as mean densities along a chord of the
     grid's edge, relative to the data range; zero for other methods.
     """
-    if not isinstance(out, CompletedViews) or out.completed is None or out.dense is None:
+    if not isinstance(out, CompletedViews):
         return out.volume.new_zeros(())
     error = out.completed - out.dense(batch["volume"])
     return (error / (typical_chord(out.dense.grid) * data_range)).square().mean()
