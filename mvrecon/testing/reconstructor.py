@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mvrecon.parts import METHODS
 from mvrecon.projectors.operator import Projector
-from mvrecon.testing.model import check_refusals
+from mvrecon.testing.method import check_refusals
 from mvrecon.testing.projector import close
 
 #: Relative, of float32 sums of some thousand products a voxel.

@@ -1,7 +1,5 @@
 """3-D U-Nets of the literature, at their published sizes by default: of Cicek and others, and the
 residual one of Lee and others in the form of pytorch-3dunet.
-
-Both are plain networks [n i d h w] to [n o d h w]; they know nothing of grids or masks.
 """
 
 from itertools import count
@@ -13,6 +11,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.models.unet import trimmed
+from mvrecon.registry import check_choice
+
 Norm = Literal["batch", "group", "none"]
 Padding = Literal["valid", "same"]
 
@@ -22,7 +23,7 @@ GROUPS = 8
 
 
 class CicekUNet3d(nn.Module):
-    """3-D U-Net of Cicek and others maps volumes of some channels to volumes of others.
+    """The 3-D U-Net of Cicek and others.
 
     Two 3x3x3 convolutions, normalisation and ReLU at every level; channels double before each
     max-pooling; 2x2x2 up-convolutions without bias; skips are concatenated. With its defaults, 3
@@ -38,8 +39,8 @@ class CicekUNet3d(nn.Module):
         width: channels of the first convolution.
         levels: scales, the finest included.
         norm: "batch" as published, "group" where a batch is small, or "none".
-        padding: "valid" as published, whose answer is smaller by a border, or "same" for an answer
-            of the input's size, whatever that is.
+        padding: "valid" as published, whose output lacks a border, or "same" for an output of the
+            input's size, whatever that is.
 
     Raises:
         ValueError: an unknown norm or padding, no level; at the call, with "valid", a size whose
@@ -56,9 +57,8 @@ class CicekUNet3d(nn.Module):
         padding: Padding = "valid",
     ):
         super().__init__()
-        check_choices(width, levels, norm)
-        if padding not in get_args(Padding):
-            raise ValueError(f"padding must be 'valid' or 'same', got {padding!r}")
+        check_options(width, levels, norm)
+        check_choice("padding", padding, get_args(Padding))
         self.padding: Padding = padding
         first = [inputs, *(width * 2**level for level in range(1, levels))]
         last = [width * 2 ** (level + 1) for level in range(levels)]
@@ -88,7 +88,6 @@ class CicekUNet3d(nn.Module):
         ]
 
     def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o e j x"]:
-        """Answer of the network; with "valid", of the middle of its input alone."""
         if self.padding == "valid":
             for size in x.shape[2:]:
                 valid_size(size, len(self.down))
@@ -101,18 +100,16 @@ class CicekUNet3d(nn.Module):
         for level in reversed(range(len(self.up))):
             x = self.expand[level](x)
             if self.padding == "same":
-                x = x[
-                    ..., : skips[level].shape[2], : skips[level].shape[3], : skips[level].shape[4]
-                ]
+                x = trimmed(x, skips[level].shape[2:])
             x = self.up[level](torch.cat([middle(skips[level], x.shape[2:]), x], dim=1))
         return self.last(x)
 
 
 class ResidualUNet3d(nn.Module):
-    """Residual 3-D U-Net of Lee and others maps volumes of some channels to volumes of others.
+    """The residual 3-D U-Net of Lee and others.
 
     One residual block at every level, after a 1x1x1 convolution to the level's channels;
-    max-pooling between; 3x3x3 up-convolutions, whose answers are added to the skips. Layers and
+    max-pooling between; 3x3x3 up-convolutions, whose outputs are added to the skips. Layers and
     their order are those of pytorch-3dunet's `ResidualUNet3D`: normalisation, convolution, ReLU,
     the last ReLU behind the sum. Any spatial size: an up-convolution gives its skip's size, where
     pytorch-3dunet repeats nearest voxels.
@@ -135,7 +132,7 @@ class ResidualUNet3d(nn.Module):
         self, inputs: int, outputs: int, width: int = 64, levels: int = 5, norm: Norm = "group"
     ):
         super().__init__()
-        check_choices(width, levels, norm)
+        check_options(width, levels, norm)
         widths = [width * 2**level for level in range(levels)]
         self.down = nn.ModuleList(
             ResidualBlock(a, b, norm) for a, b in zip([inputs, *widths], widths, strict=False)
@@ -148,7 +145,6 @@ class ResidualUNet3d(nn.Module):
         self.last = nn.Conv3d(width, outputs, 1)
 
     def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o d h w"]:
-        """Answer of the network."""
         skips: list[Tensor] = []
         for level, block in enumerate(self.down):
             if level:
@@ -162,7 +158,7 @@ class ResidualUNet3d(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Residual block adds two normalised 3x3x3 convolutions to its input."""
+    """Two normalised 3x3x3 convolutions with a residual path around them."""
 
     def __init__(self, inputs: int, outputs: int, norm: Norm):
         super().__init__()
@@ -182,14 +178,14 @@ class ResidualBlock(nn.Module):
 
 
 def normalisation(norm: Norm, channels: int) -> nn.Module:
-    """Normalisation layer of so many channels."""
+    """A normalisation layer."""
     if norm == "batch":
         return nn.BatchNorm3d(channels)
     return nn.GroupNorm(gcd(GROUPS, channels), channels) if norm == "group" else nn.Identity()
 
 
-def check_choices(width: int, levels: int, norm: str) -> None:
-    """Check refuses a U-Net without channels or levels, and an unknown normalisation.
+def check_options(width: int, levels: int, norm: str) -> None:
+    """Refuse a U-Net without channels or levels, and an unknown normalisation.
 
     Raises:
         ValueError: one of them.
@@ -198,8 +194,7 @@ def check_choices(width: int, levels: int, norm: str) -> None:
         raise ValueError(
             f"A U-Net needs at least one channel and one level, got width={width}, levels={levels}"
         )
-    if norm not in get_args(Norm):
-        raise ValueError(f"norm must be one of {', '.join(get_args(Norm))}, got {norm!r}")
+    check_choice("norm", norm, get_args(Norm))
 
 
 def pooled(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
@@ -215,7 +210,7 @@ def middle(x: Float[Tensor, "n c d h w"], size: torch.Size) -> Float[Tensor, "n 
 
 
 def valid_size(size: int, levels: int) -> int:
-    """Size of the answer along an axis, in voxels, where no convolution pads.
+    """Size of the output along an axis, in voxels, where no convolution pads.
 
     Args:
         size: of the input, in voxels.

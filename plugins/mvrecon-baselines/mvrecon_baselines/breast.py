@@ -1,20 +1,27 @@
 """Breast-like slices: a texture of random waves, thresholded into fibroglandular tissue and fat,
 within skin, with small bright specks.
 
-Everything is a function of the place and of the case's random numbers, not of a grid: the same case
+Everything is a function of position and of the case's random numbers, not of a grid: the same case
 on a finer grid is the same object.
 """
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from mvrecon.scenes.analytic import uniform
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.scenes.analytic import generator, uniform
+from mvrecon.scenes.sample import Sample
 
+#: Attenuation in 1/mm of fat, of glands and skin, and of the brightest microcalcification.
+ADIPOSE, FIBROGLANDULAR, BRIGHTEST = 0.0194, 0.0233, 0.026
 #: The texture's period, in radii of the breast: opposite sides do not repeat.
 PERIOD = 2.5
 #: Spectral power falls with frequency to this power (Reiser and Nishikawa, Med. Phys. 37, 2010).
@@ -29,19 +36,85 @@ SPECK = (0.006, 0.015)
 POINTS = 64
 
 
-@dataclass(frozen=True)
-class Tissues:
-    """Attenuation of the tissues in 1/mm.
+@dataclass(frozen=True, kw_only=True)
+class BreastSlices:
+    """Breast-like slices in 1/mm, without end: fat, fibroglandular tissue, skin, bright specks.
+
+    As in the AAPM challenge on sparse-view CT (Sidky and Pan, Med. Phys. 49, 2022), whose views are
+    noise-free integrals of the pixels themselves: `fine: 1` gives views that a volume on the grid
+    explains exactly, with the projector's own `method`. From a finer grid no volume does.
 
     Args:
-        adipose: fat.
-        fibroglandular: glands and skin.
-        speck: the brightest microcalcification.
+        field: radius of the breast as a fraction of the grid's shorter edge across z.
+        detail: periods of the texture's finest wave across the breast's diameter.
+        edge_mm: width of the tissues' boundaries; 0 for steps, so that the gradient is sparse.
+        specks: number in a slice, from and to.
+        fine: views are projected from a grid so many times finer, and the truth is its mean.
+        method: of the projector that makes the views.
+
+    Raises:
+        ValueError: numbers out of range.
     """
 
-    adipose: float = 0.0194
-    fibroglandular: float = 0.0233
-    speck: float = 0.026
+    field: float = 0.45
+    detail: int = 12
+    edge_mm: float = 0.0
+    specks: tuple[int, int] = (5, 20)
+    fine: int = 1
+    method: str = "joseph"
+
+    unit: ClassVar[str] = "1/mm"
+    length: ClassVar[int | None] = None
+
+    def __post_init__(self) -> None:
+        least, most = self.specks
+        if not 0 < self.field <= 0.5:
+            raise ValueError(
+                f"The field must be a fraction in (0, 0.5] of the grid's edge, got {self.field}"
+            )
+        if self.detail < 1 or self.fine < 1 or not self.edge_mm >= 0 or not 0 <= least <= most:
+            raise ValueError(
+                f"Expected detail and fine of at least 1, edge_mm of at least 0 and specks as "
+                f"(from, to), got {self.detail}, {self.fine}, {self.edge_mm} and {self.specks}"
+            )
+
+    @property
+    def data_range(self) -> float:
+        """The fixed range of values that PSNR and SSIM refer to."""
+        return BRIGHTEST
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Sample:
+        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
+        volume = self.finer(index, seed, grid, cameras, self.fine)
+        with torch.no_grad():
+            A = RayTransform(grid.refined(self.fine), cameras, method=self.method)
+            views = A(volume[None])[0]
+        truth = F.avg_pool3d(volume, self.fine)
+        return Sample(views, truth, truth > 0, f"breast-{seed}-{index}")
+
+    def finer(
+        self, index: int, seed: int, grid: Grid, cameras: Cameras, factor: int
+    ) -> Float[Tensor, "1 d h w"]:
+        """The case's attenuation on `grid.refined(factor)`, at the centres of its voxels.
+
+        Slices are as thick as those of `grid`: nothing changes within one.
+        """
+        rng = generator(seed, index)
+        texture = random_texture(rng, self.detail)
+        x_mm, y_mm, z_mm = grid.spacing
+        depth, height, width = grid.shape
+        radius = self.field * min(height * y_mm, width * x_mm)
+        y, x = (
+            centred(n * factor) * step / (factor * radius)
+            for n, step in ((height, y_mm), (width, x_mm))
+        )
+        edge = self.edge_mm / radius
+        slices = [
+            slice_values(texture, random_specks(rng, self.specks), y, x, z, edge)
+            for z in (centred(depth) * z_mm / radius).tolist()
+        ]
+        volume = torch.stack(slices).to(torch.float32).repeat_interleave(factor, dim=0)
+        return volume[None]
 
 
 class Specks(NamedTuple):
@@ -50,7 +123,7 @@ class Specks(NamedTuple):
     Args:
         centres: (x, y).
         radii: of the discs.
-        brightness: part of the way from fibroglandular tissue to the brightest speck.
+        brightness: part of the way from fibroglandular tissue to the brightest.
     """
 
     centres: Float[Tensor, "n 2"]
@@ -129,7 +202,6 @@ def random_specks(rng: torch.Generator, count: tuple[int, int]) -> Specks:
 def slice_values(
     texture: Texture,
     specks: Specks,
-    tissues: Tissues,
     y: Float[Tensor, " h"],
     x: Float[Tensor, " w"],
     z: float,
@@ -140,7 +212,6 @@ def slice_values(
     Args:
         texture: where fibroglandular tissue is.
         specks: of this slice.
-        tissues: attenuation in 1/mm.
         y: of the slice's rows, in radii of the breast.
         x: of its columns.
         z: of the slice.
@@ -150,11 +221,10 @@ def slice_values(
     value, slope = waves(texture, y, x, z)
     body, fat, inner = (ramp(limit - radius, edge) for limit in (1.0, 1.0 - SKIN, INNER))
     gland = ramp((value - texture.threshold) / slope.clamp_min(1e-12), edge) * inner
-    gap = tissues.fibroglandular - tissues.adipose
-    mu = body * tissues.fibroglandular - fat * gap * (1 - gland)
+    mu = body * FIBROGLANDULAR - fat * (FIBROGLANDULAR - ADIPOSE) * (1 - gland)
     for centre, size, brightness in zip(*specks, strict=True):
         disc = ramp(size - torch.hypot(y[:, None] - centre[1], x - centre[0]), edge) * fat
-        target = tissues.fibroglandular + brightness * (tissues.speck - tissues.fibroglandular)
+        target = FIBROGLANDULAR + brightness * (BRIGHTEST - FIBROGLANDULAR)
         mu = torch.lerp(mu, target.expand_as(mu), disc)
     return mu
 
@@ -164,3 +234,8 @@ def ramp(distance: Float[Tensor, "*n"], edge: float) -> Float[Tensor, "*n"]:
     if edge == 0:
         return (distance > 0).to(distance.dtype)
     return (distance / edge + 0.5).clamp(0, 1)
+
+
+def centred(count: int) -> Float[Tensor, " n"]:
+    """Indices of cells counted from their middle."""
+    return torch.arange(count, dtype=torch.float64) - (count - 1) / 2

@@ -1,14 +1,15 @@
-"""Checks that every model must pass."""
+"""Checks that every learned method must pass."""
 
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.models.method import build_method
 from mvrecon.models.output import Reconstruction
-from mvrecon.parts import MODELS
 from mvrecon.projectors.operator import Projector
 from mvrecon.testing.projector import close
 
@@ -16,39 +17,42 @@ from mvrecon.testing.projector import close
 TOLERANCE = 1e-5
 
 
-def check_model(name: str, projector: Projector, seed: int = 0, **options: Any) -> None:
-    """Raise AssertionError unless the named model keeps its promises for views of this projector.
+def check_method(name: str, A: Projector, seed: int = 0, **options: Any) -> None:
+    """Raise AssertionError unless the named method keeps its promises for views of this operator.
 
     A finite volume of the grid's shape and of the views' dtype, the same bits when it is called
     twice; a multiple of the views gives that multiple of the volume, views of zero a volume of
     zero; a sample's volume depends neither on the other samples of its batch nor on their order;
     gradients of the volume reach every parameter; views of another shape, or with a value that is
-    not finite, are refused by a ValueError that speaks of views. All of this with random weights,
+    not finite, are refused by a ValueError that names the views. All of this with random weights,
     so that layers that start at zero take part.
 
     Args:
-        name: of the model.
-        projector: what it is built with; at least two cameras.
+        name: of the method.
+        A: the operator; at least two cameras.
         seed: of weights and volumes.
-        options: of the model.
+        options: of the method.
     """
     torch.manual_seed(seed)
-    model = MODELS.build(name, projector=projector, **options).eval()
+    module = build_method({"name": name, **options}).eval()
+    method = partial(module, A=A)
     with torch.no_grad():
-        for parameter in model.parameters():
+        for parameter in module.parameters():
             parameter += 0.1 * torch.randn_like(parameter)
-        views = projector(torch.rand(2, 1, *projector.grid.shape))
-        _check_volume(model, views, projector.grid.shape)
-        _check_scale(model, views)
-        _check_batch(model, views)
-        check_refusals(model, views)
-    check_gradients(model, model(views).volume)
+        views = A(torch.rand(2, 1, *A.grid.shape))
+        _check_volume(method, views, A.grid.shape)
+        _check_scale(method, views)
+        _check_batch(method, views)
+        check_refusals(method, views)
+    check_gradients(module, method(views).volume)
 
 
 def _check_volume(
-    model: nn.Module, views: Float[Tensor, "2 1 m v u"], shape: tuple[int, ...]
+    method: Callable[[Tensor], Reconstruction],
+    views: Float[Tensor, "2 1 m v u"],
+    shape: tuple[int, ...],
 ) -> None:
-    out = model(views)
+    out = method(views)
     assert isinstance(out, Reconstruction), f"expected a Reconstruction, got {type(out).__name__}"
     expected = (2, 1, *shape)
     assert out.volume.shape == expected, (
@@ -58,25 +62,29 @@ def _check_volume(
         f"the volume of {views.dtype} views is {out.volume.dtype}"
     )
     assert out.volume.isfinite().all(), "the volume is not finite"
-    assert torch.equal(model(views).volume, out.volume), "not the same bits when called twice"
+    assert torch.equal(method(views).volume, out.volume), "not the same bits when called twice"
 
 
-def _check_scale(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
-    volume = model(views).volume
+def _check_scale(
+    method: Callable[[Tensor], Reconstruction], views: Float[Tensor, "2 1 m v u"]
+) -> None:
+    volume = method(views).volume
     for factor in (2.0**-10, 2.0**10):
-        multiple = model(factor * views).volume
+        multiple = method(factor * views).volume
         assert close(multiple / factor, volume, TOLERANCE), f"f({factor} y) is not {factor} f(y)"
-    assert not model(torch.zeros_like(views)).volume.any(), (
+    assert not method(torch.zeros_like(views)).volume.any(), (
         "views of zero do not give a volume of zero"
     )
 
 
-def _check_batch(model: nn.Module, views: Float[Tensor, "2 1 m v u"]) -> None:
-    volume = model(views).volume
-    assert close(model(views.flip(0)).volume.flip(0), volume, TOLERANCE), (
+def _check_batch(
+    method: Callable[[Tensor], Reconstruction], views: Float[Tensor, "2 1 m v u"]
+) -> None:
+    volume = method(views).volume
+    assert close(method(views.flip(0)).volume.flip(0), volume, TOLERANCE), (
         "the order of a batch changes its volumes"
     )
-    assert close(model(views[1:]).volume, volume[1:], TOLERANCE), (
+    assert close(method(views[1:]).volume, volume[1:], TOLERANCE), (
         "a volume depends on the others of its batch"
     )
 

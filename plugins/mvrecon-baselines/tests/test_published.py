@@ -5,8 +5,8 @@ reach.
 import pytest
 import torch
 
-from mvrecon.models.published import valid_size
 from mvrecon.parts import NETWORKS
+from mvrecon_baselines.published import valid_size
 
 NORMS = (torch.nn.BatchNorm3d, torch.nn.GroupNorm)
 SMALL = {
@@ -92,7 +92,7 @@ def test_a_size_that_cannot_be_halved_is_refused_with_the_next_that_can():
     ("options", "message"),
     [
         ({"norm": "layer"}, "norm must be one of batch, group, none, got 'layer'"),
-        ({"padding": "reflect"}, "padding must be 'valid' or 'same', got 'reflect'"),
+        ({"padding": "reflect"}, "padding must be one of valid, same, got 'reflect'"),
         ({"levels": 0}, "got width=32, levels=0"),
     ],
 )

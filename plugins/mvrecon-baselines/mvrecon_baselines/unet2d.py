@@ -1,36 +1,35 @@
-"""A U-Net of slices: of a volume's slices one by one, or of the sinograms of a detector's rows."""
+"""A 2-D U-Net on the slices of volumes, or on the sinograms of a detector's rows."""
 
 from collections.abc import Callable
 from math import gcd
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.networks import GROUPS
-from mvrecon.models.normalisation import normalised_silu
+#: Groups of channels in group normalisation; fewer where a width is no multiple of it.
+GROUPS = 4
 
 
 class UNet2d(nn.Module):
-    """2-D U-Net maps the slices of volumes of some channels to slices of others, one by one.
+    """2-D U-Net that maps the slices of volumes one by one.
 
-    Ronneberger and others (MICCAI 2015) with group normalisation, SiLU, means for pooling, bilinear
-    interpolation upwards and additive skips. Any size; slices do not know of one another.
+    Ronneberger and others (MICCAI 2015) with group normalisation, SiLU, mean pooling, bilinear
+    interpolation upwards and additive skips. Any size.
 
     Args:
         inputs: channels in.
-        outputs: channels out; a last 1x1 convolution without bias makes them.
+        outputs: channels out, by a last 1x1 convolution without bias.
         width: channels of the finest level; each coarser level has twice as many.
         levels: scales, the finest included.
+        zero: so many of the first outputs start at exactly zero.
 
     Raises:
         ValueError: no channel, or no level.
     """
 
-    takes_mask = True
-
-    def __init__(self, inputs: int, outputs: int, width: int = 32, levels: int = 4):
+    def __init__(self, inputs: int, outputs: int, width: int = 32, levels: int = 4, zero: int = 0):
         super().__init__()
         if min(width, levels) < 1:
             raise ValueError(
@@ -45,13 +44,10 @@ class UNet2d(nn.Module):
         self.reduce = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
         self.up = nn.ModuleList(ConvBlock2d(a, a) for a, _ in pairs)
         self.last = nn.Conv2d(width, outputs, 1, bias=False)
+        nn.init.zeros_(self.last.weight[:zero])
 
-    def forward(
-        self, x: Float[Tensor, "n i d h w"], mask: Bool[Tensor, "n 1 d h w"] | None = None
-    ) -> Float[Tensor, "n o d h w"]:
-        """Answer; with a mask, zero outside it."""
-        answer = by_slices(self._slices, x)
-        return answer if mask is None else answer * mask
+    def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o d h w"]:
+        return by_slices(self._slices, x)
 
     def _slices(self, x: Float[Tensor, "n i h w"]) -> Float[Tensor, "n o h w"]:
         skips: list[Tensor] = []
@@ -74,9 +70,9 @@ class ConvBlock2d(nn.Module):
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
+        groups = gcd(GROUPS, outputs)
         self.first = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
         self.second = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
-        groups = gcd(GROUPS, outputs)
         self.first_norm = nn.GroupNorm(groups, outputs)
         self.second_norm = nn.GroupNorm(groups, outputs)
 
@@ -85,9 +81,16 @@ class ConvBlock2d(nn.Module):
         return x + normalised_silu(self.second_norm, self.second(x))
 
 
+def normalised_silu(norm: nn.GroupNorm, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+    """SiLU of group normalisation; not by the layer's own call, which refuses a group of one
+    value.
+    """
+    return F.silu(torch.group_norm(x, norm.num_groups, norm.weight, norm.bias, norm.eps))
+
+
 def by_slices(
     network: Callable[[Tensor], Tensor], x: Float[Tensor, "n i d h w"]
 ) -> Float[Tensor, "n o d h w"]:
-    """Answer of a 2-D network for the slices of volumes."""
+    """Apply a 2-D network to the slices of volumes."""
     slices = x.transpose(1, 2).flatten(0, 1).contiguous(memory_format=torch.channels_last)
     return network(slices).unflatten(0, (len(x), x.shape[2])).transpose(1, 2)
