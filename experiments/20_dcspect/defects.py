@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import torch
 from heart import NEAR  # and the term of the loss that runs may have
+from mvrecon.engine.on_case import reconstructed
 from torchmetrics.functional.classification import binary_auroc
 
 from mvrecon.data.module import TEST, SceneData
 from mvrecon.engine.evaluation import load_methods
 from mvrecon.engine.fit import build_data
-from mvrecon.engine.on_case import reconstructed
 from mvrecon.engine.run_folder import read_settings
 from mvrecon.files.tables import renewed, write_rows
 from mvrecon.geometry.grid import voxel_centres

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from mvrecon.engine.on_case import OwnAttenuation, reconstructed
 
 from mvrecon.config import compose
 from mvrecon.engine.evaluation import load_methods
 from mvrecon.engine.fit import build_data, methods
 from mvrecon.engine.module import build_projector
-from mvrecon.engine.on_case import OwnAttenuation, reconstructed
 from mvrecon.engine.run_folder import read_settings
 from mvrecon.files.tables import read_rows, write_rows
 from mvrecon.metrics import nrmse

@@ -4,13 +4,13 @@ import warnings
 
 import pytest
 import torch
+from mvrecon.engine.on_rig import with_weights_of
 from torch.nn.utils import parameters_to_vector
 
 import mvrecon as mv
 import mvrecon.eval
 from mvrecon.config import compose
 from mvrecon.engine import fit, run_folder
-from mvrecon.engine.on_rig import with_weights_of
 from mvrecon.engine.trained_method import trained
 from mvrecon.files import places
 from mvrecon.files.checks import Refused

@@ -4,9 +4,8 @@ step.
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
-
 from mvrecon.models.networks import ConvBlock, UNet3d, upsampled
+from torch import Tensor
 
 
 def pooled(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from mvrecon.models.cropping import Cropping
+from mvrecon.models.crops import cropped_geometry
+from mvrecon.models.options import Options
+from mvrecon.models.single_pass import SinglePass
 
 from mvrecon.cameras.camera import VECTORS, Cameras
 from mvrecon.cameras.rigs import circular
@@ -12,11 +16,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models import cropping, crops
-from mvrecon.models.cropping import Cropping
-from mvrecon.models.crops import cropped_geometry
 from mvrecon.models.geometry import whole_geometry
-from mvrecon.models.options import Options
-from mvrecon.models.single_pass import SinglePass
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.ray_transform import RayTransform
 from tests.models.rig import small_rig

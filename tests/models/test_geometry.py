@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 import torch
+from mvrecon.models.crops import cropped_geometry
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from mvrecon.geometry.box import Box
-from mvrecon.models.crops import cropped_geometry
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.projectors.ray_transform import RayTransform
 from tests.models.rig import small_rig

@@ -3,7 +3,6 @@
 import pytest
 import torch
 import torch.nn.functional as F
-
 from mvrecon.models.networks import halved
 
 SHAPES = [(4, 6, 8), (5, 6, 7), (2, 3, 3)]

@@ -7,8 +7,8 @@ from functools import partial
 import pytest
 import torch
 import torch.nn.functional as F
-
 from mvrecon.models.networks import ALONE, ConvBlock, UNet3d, convolution
+
 from tests.models.dense import net_on
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}

@@ -4,9 +4,9 @@ door.
 
 import pytest
 import torch
+from mvrecon.models.networks import halved
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.networks import halved
 from mvrecon.parts import CAMERAS, MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from tests.models.rig import small_projector

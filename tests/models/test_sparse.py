@@ -5,9 +5,9 @@ masked in.
 import pytest
 import torch
 import torch.nn.functional as F
-
 from mvrecon.models.networks import upsampled
 from mvrecon.models.sparse import convolved, doubled, group_norm, halved, pyramid, voxels_of
+
 from tests.models.dense import normalised, pooled
 
 

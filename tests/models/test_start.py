@@ -2,11 +2,11 @@
 
 import pytest
 import torch
+from mvrecon.models.cross_view.model import CrossView
 from torch.nn.functional import avg_pool3d
 
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon.models import start as starts
-from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.geometry import whole_geometry
 from mvrecon.models.start import ClassicalStart
 from mvrecon.parts import MODELS, RECONSTRUCTORS

@@ -6,12 +6,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from mvrecon.models.weighting import fuse
 
 from mvrecon.geometry.lattice import enclosed
 from mvrecon.kernels.warps.reference import normalised_places
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.pooling import leave_one_out, pooled
-from mvrecon.models.weighting import fuse
 from mvrecon.parts import HEADS
 from tests.projectors.cases import Case
 from tests.properties.strategies import SEEDS, cases, real, volumes

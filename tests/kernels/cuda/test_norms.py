@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from mvrecon.kernels.norms import cuda, ops, reference, trial
 
 from mvrecon.kernels.backends import kernels_for
-from mvrecon.kernels.norms import cuda, ops, reference, trial
 from mvrecon.kernels.rays.cuda import selfcheck
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits

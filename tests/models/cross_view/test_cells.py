@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-from torch.nn.functional import pixel_unshuffle
-
 from mvrecon.models.cross_view.cells import from_cells, padded, to_cells, trimmed
+from torch.nn.functional import pixel_unshuffle
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 6, 12), (2, 3, 6, 12, 18)])

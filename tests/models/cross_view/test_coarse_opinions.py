@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
-
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.cross_view.opinions import FASTER
 from mvrecon.models.cross_view.step import Measured, State
+
 from mvrecon.models.geometry import whole_geometry
 from tests.models.cross_view.test_model import blob
 from tests.models.cross_view.test_opinions import CHOICES

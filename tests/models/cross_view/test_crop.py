@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-
 from mvrecon.models.cross_view.model import CrossView
+
 from tests.models.cross_view.test_model import SMALL, stirred
 from tests.models.rig import small_projector
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 import yaml
+from mvrecon.models.cross_view.model import CrossView
 
 from mvrecon.config import conf_dir
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import EARLIER, ReconstructionLoss
-from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.reconstructors.iterative import SirtWeights, sirt, sirt_weights

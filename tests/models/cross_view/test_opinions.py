@@ -6,15 +6,15 @@ from dataclasses import replace
 import pytest
 import torch
 import yaml
-from torch.utils._python_dispatch import TorchDispatchMode
-
-from mvrecon.config import conf_dir
-from mvrecon.geometry.grid import Grid
 from mvrecon.models.cross_view.evidence import Evidence
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.cross_view.rays2d import Rays2d
 from mvrecon.models.cross_view.settings import ROUNDS, RoundOptions
 from mvrecon.models.cross_view.views import means
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from mvrecon.config import conf_dir
+from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.testing import check_model
 from tests.models.cross_view.test_model import blob

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from mvrecon.models.cross_view.model import CrossView
 
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.output import Reconstruction
 from tests.models.cross_view.test_model import blob
 from tests.models.cross_view.test_opinions import CHOICES

@@ -1,8 +1,8 @@
 """Options of rounds and opinions that make no sense are refused."""
 
 import pytest
-
 from mvrecon.models.cross_view.model import CrossView
+
 from tests.models.rig import small_projector
 
 

@@ -4,14 +4,14 @@ import math
 
 import pytest
 import torch
-
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import circular, parallel
-from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.cross_view.opinions import Opinions
 from mvrecon.models.cross_view.settings import OpinionOptions
 from mvrecon.models.cross_view.transmission import LEAST, Transmission, transmissions
+
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.models.frusta import Frusta
 from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.drr import Drr

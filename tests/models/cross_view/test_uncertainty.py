@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from mvrecon.models.cross_view.model import CrossView
 
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.cross_view.model import CrossView
 from mvrecon.models.output import Reconstruction
 from tests.models.cross_view.test_model import SMALL, blob
 from tests.models.rig import small_projector

@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-
-from mvrecon.models.cross_view import unet
 from mvrecon.models.cross_view.unet import Block, PlainUNet, arithmetic
 from mvrecon.models.networks import convolution
+
+from mvrecon.models.cross_view import unet
 
 
 @pytest.mark.parametrize("sizes", [(1, 1), (5, 7), (1, 1, 1), (3, 1, 6)])

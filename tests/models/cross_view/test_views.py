@@ -1,9 +1,9 @@
 """What the cameras' networks look at: samples along rays, and cells of pixels."""
 
 import torch
-
 from mvrecon.models.cross_view.sampling import RaySamples
 from mvrecon.models.cross_view.views import Binned, among_counts, means
+
 from mvrecon.models.frusta import Frusta
 from mvrecon.parts import PROJECTORS
 from tests.models.rig import small_projector, small_rig

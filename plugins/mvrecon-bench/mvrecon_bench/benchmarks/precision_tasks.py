@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from mvrecon.models.networks import UNet3d
 from torch import Tensor, nn
 
 from mvrecon.engine.checkpoints import load
 from mvrecon.metrics import volume_metrics
-from mvrecon.models.networks import UNet3d
 from mvrecon.parts import MODELS, PROJECTORS, SCENES
 from mvrecon.projectors.integrals import METHODS
 from mvrecon.scenes.voxelise import voxelise

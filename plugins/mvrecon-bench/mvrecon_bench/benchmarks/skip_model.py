@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from mvrecon.models.networks import MULTIPLE
 from torch import Tensor
 
 from mvrecon.engine.checkpoints import load
 from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import volume_metrics
-from mvrecon.models.networks import MULTIPLE
 from mvrecon.parts import MODELS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.visual_hull.support import Support, support_from_views

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
+from mvrecon.models.weighting import fuse
 from torch import Tensor
 
 from mvrecon.models.frusta import Frusta
-from mvrecon.models.weighting import fuse
 from mvrecon.testing import check_head
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.learned_subjects import GRID, HeadSubject, small_rig
