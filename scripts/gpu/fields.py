@@ -20,7 +20,7 @@ from mvrecon.kernels.voxels import trial as voxels
 from mvrecon.kernels.warps import trial as warps
 from mvrecon.kernels.warps.warp import warp
 from mvrecon.models.normalisation import normalised_silu
-from mvrecon.projectors.attenuated import AttenuatedTransform
+from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.visual_hull.hull import visual_hull
 

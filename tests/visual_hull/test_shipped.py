@@ -23,9 +23,9 @@ def shipped(kind: str) -> dict[str, dict[str, Any]]:
 
 
 SCENE, RIG = shipped("scene"), shipped("camera")
-#: A slice goes on beyond every detector, and a torso or a phantom as wide as the grid fills it: no
-#: view bounds them in a volume.
-for unbounded in ("breast", "cardiac", "defrise", "nema"):
+#: A slice goes on beyond every detector, and a phantom as wide as the grid fills it: no view bounds
+#: them in a volume.
+for unbounded in ("breast", "defrise"):
     del SCENE[unbounded]
 #: For a grid of 16^3: its rays are farther apart than the voxels below.
 del RIG["circular_small"]

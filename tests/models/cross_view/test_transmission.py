@@ -13,7 +13,7 @@ from mvrecon.models.cross_view.opinions import Opinions
 from mvrecon.models.cross_view.settings import OpinionOptions
 from mvrecon.models.cross_view.transmission import LEAST, Transmission, transmissions
 from mvrecon.models.frusta import Frusta
-from mvrecon.projectors.attenuated import AttenuatedTransform
+from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon.projectors.drr import Drr
 
 WATER = 0.01536
