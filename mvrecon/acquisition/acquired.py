@@ -208,7 +208,10 @@ class Acquired:
             return source_of(None, grid, cameras, acquisition.fine)
         acts = any(values is not None for values in maps.values())
         make = source_of if acquisition.closed_form and not acts else projection_of
-        return make({**projector, **maps}, grid, cameras, acquisition.fine)
+        source = make({**projector, **maps}, grid, cameras, acquisition.fine)
+        if isinstance(source, Projection) and not isinstance(self.scene, Mapped):
+            source.operator.for_case({})  # refuses cases without the maps that it needs
+        return source
 
 
 def source_of(

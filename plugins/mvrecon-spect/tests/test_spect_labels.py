@@ -151,11 +151,11 @@ def test_the_experiment_takes_a_step_and_judges_every_method(tmp_path):
     settings = compose(
         "experiment=dcspect_labels",
         *(f"{part}.path={file}" for part, file in files.items()),
-        "model=cross_view_small",
+        "method=cross_view_small",
         "camera.pixels=8",
         "camera.columns=[3]",
-        "compare.world_unet.rounds=[{resolution: full, widths: [2], cameras: null}]",
-        "compare.bsrem.reconstructor.iterations=1",
+        "compare.world_unet.widths=[2]",
+        "compare.bsrem.iterations=1",
         "data.sizes={train: 2, val: 1, test: 2}",
         "grid.size=[8,8,8]",
         "grid.spacing=32",
@@ -171,7 +171,7 @@ def test_the_experiment_takes_a_step_and_judges_every_method(tmp_path):
     loss.backward()
     assert loss.isfinite() and batch["mu"].max() < 0.03
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
-    judged = {label: row.own for label, row in rows.items()}
+    judged = {label: row.method for label, row in rows.items()}
     scores = evaluate(judged, data.test_dataloader(), A, 1.0)
     assert set(scores) == {"cross_view", "world_unet", "osem", "bsrem"}
     assert all(0 < s["nrmse"] < 3 for row in scores.values() for s in row)
