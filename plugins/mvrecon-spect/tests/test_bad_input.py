@@ -125,7 +125,7 @@ def test_water_bone_and_air_raise_no_doubt(recwarn: pytest.WarningsRecorder):
     [
         (["camera=circular", "projector=spect"], "extent 'behind', got 'segment'"),
         (["camera=dcspect80", "projector=spect", "projector.mu=0.15"], "is it in 1/cm"),
-        (["camera=dcspect80", "projector=spect", "projector.mu=case"], "as of the scene cardiac or nema"),
+        (["camera=dcspect80", "projector=spect", "projector.mu=case"], "the scene cardiac or nema"),
         (["camera=dcspect80", "projector=spect", "projector.diameter_mm=a"], "positive mm, got a"),
     ],
 )
