@@ -12,6 +12,7 @@ from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.events.making import EventMaker
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import generator
+from mvrecon.scenes.mixture import Mixture
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.scenes.attenuating import attenuated_integrals
 from mvrecon_spect.scenes.cardiac import RandomCardiac
@@ -45,6 +46,15 @@ def test_a_patient_s_own_matter_attenuates_his_views():
 def test_the_scene_s_matter_makes_the_views_whatever_the_reconstruction_takes_it_for():
     wrong = Acquired(RandomCardiac(), {**SPECT, "mu": 0.05}).sample(5, 0, GRID, RIG)
     assert torch.equal(wrong.views, seen(RandomCardiac()).views)
+
+
+def test_a_patient_of_a_mixture_attenuates_the_views_as_alone():
+    mixture = Mixture([{"name": "cardiac"}, {"name": "derenzo", "unit": "activity"}])
+    patient = Acquired(mixture, SPECT).sample(4, 0, GRID, RIG)
+    alone = Acquired(RandomCardiac(), SPECT).sample(4, 0, GRID, RIG)
+    assert torch.equal(patient.views, alone.views)
+    assert torch.equal(patient.maps["mu"], alone.maps["mu"])
+    assert not Acquired(mixture, SPECT).sample(1, 0, GRID, RIG).maps
 
 
 def test_views_from_the_finer_grid_are_near_those_in_closed_form():
