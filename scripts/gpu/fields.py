@@ -20,9 +20,9 @@ from mvrecon.kernels.rays.cuda import selfcheck
 from mvrecon.kernels.voxels import trial as voxels
 from mvrecon.kernels.warps import trial as warps
 from mvrecon.kernels.warps.warp import warp
-from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.visual_hull.hull import visual_hull
+from mvrecon_spect.attenuated import AttenuatedTransform
 
 #: What the kernels for a purpose are tried on before their first use.
 TRIED = {

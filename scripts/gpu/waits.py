@@ -19,13 +19,13 @@ import mvrecon as mv
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_module
 from mvrecon.metrics import volume_metrics
-from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.selection import ray_subset, view_subset
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.reconstructors.iterative import sirt_weights
 from mvrecon.reconstructors.poisson import PoissonLikelihood
 from mvrecon.testing.as_gpu import AsGpu, OnGpu
 from mvrecon.visual_hull.support import support_from_views
+from mvrecon_spect.attenuated import AttenuatedTransform
 
 N, PIXELS = 24, 36
 DETECTOR = {"pixels": [PIXELS, PIXELS], "pixel_mm": 6.0}

@@ -91,7 +91,7 @@ class SpectLabels(Hdf5Volumes):
             avg_pool3d(fine[None], factor)[0],
             enclosed(body(mu, TISSUE))[None],
             case.name,
-            mu=self.attenuation(index, seed, grid),
+            maps=self.maps(index, seed, grid),
         )
 
     def finer(
@@ -104,16 +104,16 @@ class SpectLabels(Hdf5Volumes):
         activity = _activity(case, labels.whole(), self._drawn(index, seed))
         return resample(activity, case.grid, grid.refined(factor))[None]
 
-    def attenuation(
+    def maps(
         self, index: int, seed: int, grid: Grid, factor: int = 1
-    ) -> Float[Tensor, "1 d h w"]:
-        """Linear attenuation of a case at 140.5 keV in 1/mm on `grid.refined(factor)`."""
+    ) -> dict[str, Float[Tensor, "1 d h w"]]:
+        """Linear attenuation "mu" of a case at 140.5 keV in 1/mm on `grid.refined(factor)`."""
         target = grid.refined(factor) if factor > 1 else grid
         if not self.attenuates:
-            return torch.zeros(1, *target.shape)
+            return {"mu": torch.zeros(1, *target.shape)}
         case = self._placed(index, seed, grid)
         at_140 = case.mu.mapped(lambda mu: at_energy(mu, CT_KEV, SPECT_KEV))
-        return resample(at_140, case.grid, target)[None]
+        return {"mu": resample(at_140, case.grid, target)[None]}
 
     def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
         """The activity of each structure of a case, and of its body."""

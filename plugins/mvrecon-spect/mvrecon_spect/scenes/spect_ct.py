@@ -17,7 +17,7 @@ from mvrecon.parts import CAMERAS, SCENES
 from mvrecon.projectors.drr import Drr
 from mvrecon.reconstructors.iterative import sirt
 from mvrecon.scenes.analytic import generator, mixed
-from mvrecon.scenes.sample import Attenuating, Pooling, Rays, Sample
+from mvrecon.scenes.sample import Mapped, Pooling, Rays, Sample
 
 #: The series of the scan's noise, apart from those that draw the patients.
 SCAN = 0x63745F73
@@ -50,7 +50,7 @@ class SpectCt:
         iterations: int = 20,
     ):
         made: Any = SCENES.from_config(scene)
-        if not isinstance(made, Attenuating) or not isinstance(made, Pooling):
+        if not isinstance(made, Mapped) or not isinstance(made, Pooling):
             raise ValueError(
                 f"Expected a scene with matter, such as cardiac, nema or spect_labels, got "
                 f"{scene['name']!r}"
@@ -82,14 +82,13 @@ class SpectCt:
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
         """The case `index` of the series `seed`, with its scan."""
-        sample = self.scene.sample(index, seed, grid, cameras)
-        return replace(sample, mu_measured=self.measured(index, seed, grid))
+        return self._scanned(self.scene.sample(index, seed, grid, cameras), index, seed, grid)
 
-    def attenuation(
+    def maps(
         self, index: int, seed: int, grid: Grid, factor: int = 1
-    ) -> Float[Tensor, "1 d h w"]:
-        """Linear attenuation of a case in 1/mm on `grid.refined(factor)`."""
-        return self.scene.attenuation(index, seed, grid, factor)
+    ) -> dict[str, Float[Tensor, "1 d h w"]]:
+        """The true linear attenuation of a case in 1/mm on `grid.refined(factor)`."""
+        return self.scene.maps(index, seed, grid, factor)
 
     def finer(
         self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
@@ -99,14 +98,17 @@ class SpectCt:
 
     def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
         """The case without views, its truth averaged from the values on a finer grid, its scan."""
-        sample = self.scene.pooled(index, seed, grid, fine)
-        return replace(sample, mu_measured=self.measured(index, seed, grid))
+        return self._scanned(self.scene.pooled(index, seed, grid, fine), index, seed, grid)
+
+    def _scanned(self, sample: Sample, index: int, seed: int, grid: Grid) -> Sample:
+        scan = {"mu_measured": self.measured(index, seed, grid)}
+        return replace(sample, maps={**sample.maps, **scan})
 
     @torch.no_grad()
     def measured(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "1 d h w"]:
         """Linear attenuation of a case at 140.5 keV in 1/mm as its scan measures it."""
         fine, coarse = self._on(grid)
-        mu = self.scene.attenuation(index, seed, grid, 2)
+        mu = self.scene.maps(index, seed, grid, 2)["mu"]
         at_70 = at_energy(mu, SPECT_KEV, CT_KEV)
         noise = generator(SCAN, mixed(seed, index))
         views = detected(fine(at_70[None])[0], self.detector, self.cameras, noise)

@@ -10,10 +10,9 @@ import torch
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.cardiac import LUNG, WATER, RandomCardiac
-from mvrecon.scenes.heart import Defect, Heart, Uptake
 from mvrecon.scenes.solids import Phantom
 from mvrecon.scenes.voxelise import voxelise
+from mvrecon_spect.scenes.cardiac import LUNG, WATER, Defect, Heart, RandomCardiac, Uptake
 
 GRID = Grid.centred((64, 64, 64), 5.0, centre=(40, -40, 0))
 #: Numbers without a defect: a share 0 of cases.
@@ -67,11 +66,11 @@ def test_organs_do_not_overlap_and_attenuate_as_water_and_lung():
     for index in range(4):
         volume = voxelise(WELL.phantom(generator(1, index), GRID), GRID, 2)
         assert volume.min() >= 0 and volume.max() <= 1 + 1e-6
-        mu = WELL.attenuation(index, 1, GRID)
+        mu = WELL.maps(index, 1, GRID)["mu"]
         levels = [(mu - level).abs() < 1e-6 for level in (0.0, LUNG, WATER)]
         assert all(level.float().mean() > 0.02 for level in levels)
         assert (mu[0][volume == 0] < WATER).all() and mu.max() <= WATER + 1e-6
-    assert not RandomCardiac(attenuates=False).attenuation(0, 1, GRID).any()
+    assert not RandomCardiac(attenuates=False).maps(0, 1, GRID)["mu"].any()
 
 
 def test_half_of_the_cases_have_a_defect():

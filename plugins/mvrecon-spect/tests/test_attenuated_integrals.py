@@ -5,9 +5,9 @@ import torch
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.attenuated import attenuated_integrals
-from mvrecon.scenes.cardiac import RandomCardiac
 from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon_spect.scenes.attenuating import attenuated_integrals
+from mvrecon_spect.scenes.cardiac import RandomCardiac
 
 GRID = Grid.centred((64, 64, 64), 5.0, centre=(40, -40, 0))
 

@@ -3,11 +3,12 @@ import math
 import pytest
 import torch
 
+from mvrecon.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.scenes.analytic import generator, render
-from mvrecon.scenes.ventricle import RandomVentricle, ventricle
 from mvrecon.scenes.voxelise import voxelise
+from mvrecon_spect.scenes.ventricle import RandomVentricle, ventricle
 
 #: 4/3 pi (a b c - (a - w)(b - w)(c - w)) in mm^3.
 WALL = 4 / 3 * math.pi * (32 * 32 * 45 - 22 * 22 * 35)
@@ -55,11 +56,12 @@ def test_voxels_hold_the_mass_of_the_wall_and_an_empty_cavity():
     assert (volume[z - 2 : z + 3, y - 2 : y + 3, x - 2 : x + 3] == 0).all()
 
 
-def test_exact_views_hold_the_mass_too(rig):
+def test_exact_views_hold_the_mass_too():
     """A parallel view's rays, 5/3 mm apart, add up to the wall's volume; the cavity is of the
     object, and empty.
     """
     grid = Grid.centred((24, 24, 24), 5.0)
+    rig = parallel(2, detector={"pixels": [72, 72], "pixel_mm": 5 / 3})
     sample = render(ventricle(euler_degrees=(20, 50, 0)), grid, rig, "heart")
     for view in sample.views[0]:
         assert view.sum().item() * (5 / 3) ** 2 == pytest.approx(WALL, rel=5e-3)

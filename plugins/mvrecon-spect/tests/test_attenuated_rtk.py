@@ -6,7 +6,7 @@ import torch
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.projectors.attenuated import AttenuatedTransform
+from mvrecon_spect.attenuated import AttenuatedTransform
 
 itk = pytest.importorskip("itk", reason="itk-rtk is not installed")
 rtk = getattr(itk, "RTK", None)

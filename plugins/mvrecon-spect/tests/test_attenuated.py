@@ -12,10 +12,10 @@ from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.kernels.rays.cpu import attenuated as cpu
 from mvrecon.kernels.rays.cpu.nonzero import box_of
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.projectors.selection import ray_subset, view_subset
+from mvrecon_spect.attenuated import AttenuatedTransform
 
 MU = 0.01536
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.quantities import PositiveFloat
-from mvrecon.scenes.attenuating import AttenuatingScene
 from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon_spect.scenes.attenuating import AttenuatingScene
 
 #: Diameters of the six spheres in mm, and the radius of the circle that their centres lie on.
 DIAMETERS, CIRCLE = (10.0, 13.0, 17.0, 22.0, 28.0, 37.0), 57.2
