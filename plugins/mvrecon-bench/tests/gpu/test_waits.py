@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from mvrecon.testing.as_gpu import GPU, AsGpu, OnGpu, on_gpu
 
 from mvrecon.config import compose
 from mvrecon.engine.callbacks import Clock
@@ -11,7 +12,6 @@ from mvrecon.engine.finite import FiniteLoss
 from mvrecon.engine.fit import build_data
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.parts import MODELS, RECONSTRUCTORS
-from mvrecon.testing.as_gpu import GPU, AsGpu, OnGpu, on_gpu
 from mvrecon.visual_hull.support import hull_mask
 
 DETECTOR = {"pixels": [12, 12], "pixel_mm": 5.0}

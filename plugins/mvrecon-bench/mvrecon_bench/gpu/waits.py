@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from check import VECTORS
 from measuring import reason
+from mvrecon.testing.as_gpu import AsGpu, OnGpu
 
 import mvrecon as mv
 from mvrecon.config import compose
@@ -24,7 +25,6 @@ from mvrecon.projectors.selection import ray_subset, view_subset
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.reconstructors.iterative import sirt_weights
 from mvrecon.reconstructors.poisson import PoissonLikelihood
-from mvrecon.testing.as_gpu import AsGpu, OnGpu
 from mvrecon.visual_hull.support import support_from_views
 
 N, PIXELS = 24, 36

@@ -7,19 +7,19 @@ from typing import Any
 
 import torch
 from measuring import Results, throughput
+from mvrecon.kernels.norms import trial as norms
+from mvrecon.models.normalisation import normalised_silu
 from torch import Tensor, nn
 
 import mvrecon as mv
 from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps
-from mvrecon.kernels.norms import trial as norms
 from mvrecon.kernels.rays.cuda import attenuated_trial as rays
 from mvrecon.kernels.rays.cuda import selfcheck
 from mvrecon.kernels.voxels import trial as voxels
 from mvrecon.kernels.warps import trial as warps
 from mvrecon.kernels.warps.warp import warp
-from mvrecon.models.normalisation import normalised_silu
 from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.visual_hull.hull import visual_hull

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-
 from mvrecon.testing.as_gpu import AsGpu, in_memory
 
 PROPERTIES = SimpleNamespace(
