@@ -102,7 +102,7 @@ def method_task(settings: Mapping[str, Any], device: str) -> Task:
 
 
 def _run(net: nn.Module, x: Tensor, precision: str, *others: Any) -> Callable[[], Tensor]:
-    """A network in a precision, with what else it takes; halves are stored, and computed in float32 but for autocast."""
+    """A network in a precision; halves are stored, and computed in float32 but for autocast."""
     stored, auto = PRECISIONS[precision]
     kept = stored if stored == torch.float64 else torch.float32
     own, operand = deepcopy(net).to(kept), x.to(stored).to(kept)

@@ -1,7 +1,7 @@
 """Is the GPU back end right: the machine, the self-check, agreement with the CPU, where it waits.
 About 2 minutes.
 
-    python scripts/gpu/check.py --out FOLDER [--device cuda] [--n 48]
+    python -m mvrecon_bench.gpu.check --out FOLDER [--device cuda] [--n 48]
 """
 
 import argparse
@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fields import check_fields
-from measuring import Results, on_device, throughput
 
 import mvrecon as mv
 from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.integrals import METHODS
 from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon_bench.gpu.fields import check_fields
+from mvrecon_bench.gpu.measuring import Results, on_device, throughput
 
 PACKAGES = ("torch", "triton", "numpy", "numba", "llvmlite", "lightning", "kornia")
 SKIPS = ("off", "auto", "box")

@@ -1,6 +1,6 @@
 """What several runs of `learn.py` measured, in one file.
 
-python scripts/gpu/collect.py FOLDER OUT.json
+python -m mvrecon_bench.gpu.collect FOLDER OUT.json
 """
 
 import argparse

@@ -12,7 +12,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from mvrecon.testing.as_gpu import AsGpu, in_memory
+
+from mvrecon_bench.gpu.as_gpu import AsGpu, in_memory
 
 PROPERTIES = SimpleNamespace(
     name="stand-in", major=9, minor=0, multi_processor_count=1, total_memory=2**20

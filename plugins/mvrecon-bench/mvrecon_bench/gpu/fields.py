@@ -1,15 +1,12 @@
 """The kernels beside those of plain rays on a device: attenuated rays, warps, voxel-driven
-back-projection, hull, normalisation; part of `check.py`.
+back-projection, hull; part of `check.py`.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from measuring import Results, throughput
-from mvrecon.kernels.norms import trial as norms
-from mvrecon.models.normalisation import normalised_silu
-from torch import Tensor, nn
+from torch import Tensor
 
 import mvrecon as mv
 from mvrecon.cameras.frusta import frusta_lattice
@@ -23,13 +20,13 @@ from mvrecon.kernels.warps.warp import warp
 from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.visual_hull.hull import visual_hull
+from mvrecon_bench.gpu.measuring import Results, throughput
 
 #: What the kernels for a purpose are tried on before their first use.
 TRIED = {
     "attenuated": rays.differences,
     "warp": warps.differences,
     "look": voxels.differences,
-    "norm": norms.differences,
 }
 #: Linear attenuation in 1/mm of attenuated rays.
 MU = 0.015
@@ -58,22 +55,11 @@ def agreement(call: Callable[[Tensor], Tensor], x: Tensor, device: str) -> dict[
 
 
 def warped(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Tensor]:
-    """Values of the world's grid in the rig's frusta, or back."""
+    """Values of the grid in the rig's frusta, or back."""
     frusta = frusta_lattice(rig, grid, depth_edges(rig.depth_range(grid), 16))
     ways = (frusta, grid_lattice(grid)) if back else (grid_lattice(grid), frusta)
     maps, shape = lattice_maps(*ways), ways[1].shape
     return lambda x: warp(x, maps.to(x.device), shape)
-
-
-def normalised(channels: int) -> Callable[[Tensor], Tensor]:
-    """Group normalisation and SiLU with channels last."""
-    layers = {}
-
-    def call(x: Tensor) -> Tensor:
-        layer = layers.setdefault(x.device, nn.GroupNorm(4, channels).to(x.device))
-        return normalised_silu(layer, x.to(memory_format=torch.channels_last_3d))
-
-    return call
 
 
 def attenuated(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Tensor]:
@@ -114,14 +100,12 @@ def check_fields(
         )
     world, frusta = warped(grid, rig, back=False), warped(grid, rig, back=True)
     lifted = world(x[:, None])[:, 0]
-    features = torch.cat([x * (k + 1) - k for k in range(16)], dim=1)
     calls = {
         "attenuated rays": (attenuated(grid, rig, back=False), x),
         "attenuated rays, back": (attenuated(grid, rig, back=True), views),
         "warp to frusta": (world, x[:, None]),
-        "warp to the world": (frusta, lifted),
+        "warp to the grid": (frusta, lifted),
         "back-projection": (lambda y: backproject(y, rig, grid, "distance"), views),
-        "normalisation and SiLU": (normalised(features.shape[1]), features),
     }
     for name, (call, values) in calls.items():
         results.attempt(f"agrees {name}", lambda c=call, v=values: agreement(c, v, device))

@@ -1,7 +1,7 @@
 """What Python costs in a call of a projection, its adjoint and its pose gradient: microseconds of
 processor time, over a driver that does nothing. Needs no GPU.
 
-    python scripts/gpu/host.py [--calls 200] [--rounds 40]
+    python -m mvrecon_bench.gpu.host [--calls 200] [--rounds 40]
 """
 
 import argparse

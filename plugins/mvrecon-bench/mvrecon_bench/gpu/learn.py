@@ -1,11 +1,10 @@
 """One method profiled, trained for a given time, and judged; results are on the disk all along.
 
-    python scripts/gpu/learn.py --train openkbp_train.h5 --test openkbp_val.h5 --out FOLDER
+    python -m mvrecon_bench.gpu.learn --train openkbp_train.h5 --test openkbp_val.h5 --out FOLDER
 
-Volumes and views are those of the experiment `open_kbp_cross_view`, for other models `open_kbp`,
-finer; the test patients are those of the second file, which training never sees. Without files the
-patients are random ellipsoids. The number of steps, for a cosine schedule, follows from the time of
-the first ones.
+Volumes and views are those of the experiment `open_kbp`, finer; the test patients are those of the
+second file, which training never sees. Without files the patients are random ellipsoids. The number
+of steps, for a cosine schedule, follows from the time of the first ones.
 """
 
 import argparse
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from measuring import Results, on_device, wait
 
 from mvrecon.config import compose
 from mvrecon.data.module import SceneData
@@ -24,6 +22,7 @@ from mvrecon.engine.fit import build_data, build_module
 from mvrecon.engine.module import ReconstructionModule, Settings
 from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.metrics import mean_and_spread
+from mvrecon_bench.gpu.measuring import Results, on_device, wait
 
 #: mm along (x, y, z), and of the detector along (v, u).
 FIELD, DETECTOR = (512, 320, 384), (864, 960)
@@ -37,7 +36,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--train", default="", help="of scripts/prepare_openkbp.py")
     parser.add_argument("--test", default="")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--model", default="cross_view")
+    parser.add_argument("--method", default="cross_view")
     parser.add_argument("--n", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=420.0, help="of training alone")
     parser.add_argument("--steps", type=int, default=0, help="instead of seconds")
@@ -48,7 +47,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--precision", default="bf16", choices=["bf16", "fp32"])
     parser.add_argument("--compile", action="store_true")
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("options", nargs="*", help="more settings, as model.support=hull")
+    parser.add_argument("options", nargs="*", help="more settings, as method.support=hull")
     return parser.parse_args()
 
 
@@ -57,10 +56,9 @@ def settings_of(options: argparse.Namespace, name: str) -> Settings:
     n, pixels = options.n, 3 * options.n // 2
     steps, pitch = [mm / n for mm in FIELD], [mm / pixels for mm in DETECTOR]
     sizes = f"{{train: {options.cases}, val: {options.val}, test: {options.tests}}}"
-    own = options.model == "cross_view"
     return compose(
-        "experiment=open_kbp_cross_view" if own else "experiment=open_kbp",
-        *([] if own else [f"model={options.model}"]),
+        "experiment=open_kbp",
+        f"method={options.method}",
         f"name={name}",
         *scenes_of(options.train, options.test),
         f"grid.size=[{n},{n},{n}]",
@@ -194,10 +192,10 @@ def judged(
 ) -> dict[str, Any]:
     """Figures of merit on the test patients, in the precision of the training."""
     data.setup("test")
-    model, half = module.model, options.precision == "bf16"
-    model.forward = torch.autocast(options.device, torch.bfloat16, enabled=half)(model.forward)
+    method, half = module.method, options.precision == "bf16"
+    method.forward = torch.autocast(options.device, torch.bfloat16, enabled=half)(method.forward)
     judge = module.projector, data.data_range, options.device
-    scores = evaluate({"one": model}, data.test_dataloader(), *judge)["one"]
+    scores = evaluate({"one": method}, data.test_dataloader(), *judge)["one"]
     numbers = [key for key, value in scores[0].items() if isinstance(value, int | float)]
     figures = {key: mean_and_spread([score[key] for score in scores]) for key in numbers}
     return {"scenes": len(scores)} | {
@@ -209,7 +207,7 @@ def main() -> None:
     """Entry point."""
     options = arguments()
     options.device = on_device(options.device)
-    name = f"{options.model}_{options.n}_{options.precision}" + "_compiled" * options.compile
+    name = f"{options.method}_{options.n}_{options.precision}" + "_compiled" * options.compile
     results = Results(options.out, f"learn_{name}")
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
     torch.backends.cudnn.benchmark = True
@@ -217,10 +215,10 @@ def main() -> None:
     data = build_data(settings)
     data.setup("fit")
     torch.manual_seed(0)
-    module = build_module(settings, settings["model"], data.data_range).to(options.device)
+    module = build_module(settings, settings["method"], data.data_range).to(options.device)
     results.add("parameters", sum(p.numel() for p in module.parameters()))
     if options.compile:
-        module.model.compile()
+        module.method.compile()
     trainer = Trainer(module, data, options)
     if trainer.weights:
         if options.profile:

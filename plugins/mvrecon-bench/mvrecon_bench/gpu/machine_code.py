@@ -2,7 +2,7 @@
 ones among them, and those of the innermost loops. Needs no GPU.
 
     pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm       # extra `dev` has both on Linux
-    python scripts/gpu/machine_code.py [--capability 90]
+    python -m mvrecon_bench.gpu.machine_code [--capability 90]
 """
 
 import argparse

@@ -27,7 +27,7 @@ def on_device(device: str) -> str:
         SystemExit: "cuda" where torch sees no GPU.
     """
     if device == "dry":
-        from dry import stand_in
+        from mvrecon_bench.gpu.dry import stand_in
 
         stand_in()
         device = "cuda"

@@ -1,6 +1,6 @@
-"""Do the models run on a GPU, in which precision, and where do they wait. About a minute.
+"""Do the methods run on a GPU, in which precision, and where do they wait. About a minute.
 
-python scripts/gpu/models.py --out FOLDER [--device cuda] [--n 24]
+python -m mvrecon_bench.gpu.models --out FOLDER [--device cuda] [--n 24]
 """
 
 import argparse
@@ -10,22 +10,26 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from check import waits
-from measuring import Results, latency, on_device, wait
 
 from mvrecon.config import compose
 from mvrecon.engine.fit import build_module
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.parts import MODELS
+from mvrecon_bench.gpu.check import waits
+from mvrecon_bench.gpu.measuring import Results, latency, on_device, wait
 
-VARIANTS = ("model.support=hull", "model.support=box", "model.refine_where=disagreement")
+METHODS = (
+    *("cross_view", "mean_fusion", "world_unet", "geometry_free", "uncertain"),
+    *("sirt", "backprojection"),
+)
+#: Of the cross-view model.
+VARIANTS = ("method.support=hull", "method.support=box method.crop=true")
 
 
-def built(model: str, n: int, device: str, extra: Sequence[str] = ()) -> ReconstructionModule:
-    """A model with fresh weights for 5 cameras of a small detector, all around."""
+def built(method: str, n: int, device: str, extra: Sequence[str] = ()) -> ReconstructionModule:
+    """A method with fresh weights, and 5 cameras of a small detector, all around."""
     pixels = 3 * n // 2
     settings = compose(
-        f"model={model}",
+        f"method={method}",
         f"grid.size=[{n},{n},{n}]",
         "camera.n_views=5",
         "camera.arc_degrees=360",
@@ -33,7 +37,7 @@ def built(model: str, n: int, device: str, extra: Sequence[str] = ()) -> Reconst
         "camera.detector.pixel_mm=6.0",
         *extra,
     )
-    return build_module(settings, settings["model"], 1.0).to(device)
+    return build_module(settings, settings["method"], 1.0).to(device)
 
 
 def box(n: int, device: str) -> torch.Tensor:
@@ -43,9 +47,9 @@ def box(n: int, device: str) -> torch.Tensor:
     return volume
 
 
-def learns(model: str, n: int, device: str) -> dict[str, Any]:
+def learns(method: str, n: int, device: str) -> dict[str, Any]:
     """Loss and gradient in both precisions, waits and milliseconds of a reconstruction."""
-    module, volume = built(model, n, device), box(n, device)
+    module, volume = built(method, n, device), box(n, device)
     views = module.projector(volume)
     batch = {"views": views, "volume": volume, "inside": volume > 0.5}
     result: dict[str, Any] = {}
@@ -60,35 +64,35 @@ def learns(model: str, n: int, device: str) -> dict[str, Any]:
             module.zero_grad()
     with torch.no_grad():
         if device == "cuda":
-            result |= waits(lambda: module.model(views))
-        result["ms"] = latency(lambda: module.model(views), device, 3)
+            result |= waits(lambda: module(views))
+        result["ms"] = latency(lambda: module(views), device, 3)
     return result
 
 
 def skips(extra: str, n: int, device: str) -> dict[str, Any]:
     """Milliseconds and waits of the cross-view model that leaves something out."""
-    module = built("single_pass", n, device, [extra]).eval()
+    module = built("cross_view", n, device, extra.split()).eval()
     with torch.no_grad():
         views = module.projector(box(n, device))
-        result: dict[str, Any] = {"ms": latency(lambda: module.model(views), device, 3)}
+        result: dict[str, Any] = {"ms": latency(lambda: module(views), device, 3)}
         if device == "cuda":
-            result["waits"] = waits(lambda: module.model(views))["waits"]
+            result["waits"] = waits(lambda: module(views))["waits"]
     return result
 
 
 def compiled(n: int, device: str) -> dict[str, Any]:
-    """`torch.compile` of a model: seconds of the first call, its difference, its milliseconds."""
-    module = built("backprojection_unet", n, device)
+    """`torch.compile` of a network: seconds of the first call, its difference, its milliseconds."""
+    module = built("world_unet", n, device)
     views = torch.rand(1, 1, *module.projector.range_shape, device=device)
     with torch.no_grad():
-        expected = module.model(views).volume
+        expected = module(views).volume
         start = time.perf_counter()
-        module.model.compile()
-        result = module.model(views).volume
+        module.method.compile()
+        result = module(views).volume
         wait(device)
         seconds = time.perf_counter() - start
         difference = (result - expected).abs().max() / expected.abs().max()
-        ms = latency(lambda: module.model(views), device, 3)
+        ms = latency(lambda: module(views), device, 3)
     return {"first_s": seconds, "difference": float(difference), "ms": ms}
 
 
@@ -98,17 +102,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--n", type=int, default=24)
-    parser.add_argument("--models", nargs="*", default=MODELS.names())
-    parser.add_argument("--variants", nargs="*", default=VARIANTS, help="of single_pass")
+    parser.add_argument("--methods", nargs="*", default=METHODS)
+    parser.add_argument("--variants", nargs="*", default=VARIANTS, help="of cross_view")
     options = parser.parse_args()
     device, n = on_device(options.device), options.n
     results = Results(options.out, "models")
-    for model in options.models:
-        results.attempt(model, lambda m=model: learns(m, n, device))
+    for method in options.methods:
+        results.attempt(method, lambda m=method: learns(m, n, device))
     for extra in options.variants:
-        results.attempt(f"single_pass {extra}", lambda e=extra: skips(e, n, device))
+        results.attempt(f"cross_view {extra}", lambda e=extra: skips(e, n, device))
     if device == "cuda":
-        results.attempt("torch.compile of backprojection_unet", lambda: compiled(n, device))
+        results.attempt("torch.compile of world_unet", lambda: compiled(n, device))
 
 
 if __name__ == "__main__":

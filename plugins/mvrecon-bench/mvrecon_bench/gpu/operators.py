@@ -1,7 +1,7 @@
 """Operators beside other programs' on one device: times on the device, of the host, of one call,
 and peak memory.
 
-    python scripts/gpu/operators.py --out FOLDER [--device cuda] [--cases 64:8:64 128:32:128]
+    python -m mvrecon_bench.gpu.operators --out FOLDER [--device cuda] [--cases 64:8:64 128:32:128]
 
 A case is voxels:views:pixels along an edge. A row is written as soon as it is measured; what a
 program lacks is a note. All get the same volume and the same rays; `difference` is from our forward
@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from measuring import Results, latency, on_device, peak_mb, reason, throughput
-from programs import MOST_PIXELS, ONE_VOLUME, PROGRAMS, Program
 from torch import Tensor
 
 import mvrecon as mv
+from mvrecon_bench.gpu.measuring import Results, latency, on_device, peak_mb, reason, throughput
+from mvrecon_bench.gpu.programs import MOST_PIXELS, ONE_VOLUME, PROGRAMS, Program
 
 CASES = ("64:8:96", "128:1:200", "128:32:128", "256:180:256", "512:720:512")
 REFERENCE, LEAST_S = "mvrecon joseph", 5.0

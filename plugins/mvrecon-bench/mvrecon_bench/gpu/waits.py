@@ -1,7 +1,7 @@
 """Where mvrecon would wait for a GPU, how many kernels it would start, and which devices would not
 meet. Needs no GPU.
 
-    python scripts/gpu/waits.py [--places] [--operators]
+    python -m mvrecon_bench.gpu.waits [--places] [--operators]
 """
 
 import argparse
@@ -12,9 +12,6 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from check import VECTORS
-from measuring import reason
-from mvrecon.testing.as_gpu import AsGpu, OnGpu
 
 import mvrecon as mv
 from mvrecon.config import compose
@@ -26,22 +23,21 @@ from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.reconstructors.iterative import sirt_weights
 from mvrecon.reconstructors.poisson import PoissonLikelihood
 from mvrecon.visual_hull.support import support_from_views
+from mvrecon_bench.gpu.as_gpu import AsGpu, OnGpu
+from mvrecon_bench.gpu.check import VECTORS
+from mvrecon_bench.gpu.measuring import reason
 
 N, PIXELS = 24, 36
 DETECTOR = {"pixels": [PIXELS, PIXELS], "pixel_mm": 6.0}
 ATTENUATED = "attenuated rays, there and back"
-MODELS = (
+METHODS = (
     "cross_view",
-    "cross_view model.support=hull",
-    "cross_view model.uncertainty=true",
-    "single_pass",
-    "single_pass model.support=hull",
-    "single_pass model.support=auto model.masked=false",
-    "single_pass model.refine_where=disagreement",
-    "single_pass model.sigma=0.1",
+    "cross_view method.support=hull",
+    "cross_view method.support=auto method.crop=true",
+    "uncertain",
     "mean_fusion",
-    "backprojection_unet",
-    "backprojection_unet model.support=hull",
+    "world_unet",
+    "world_unet method.support=hull",
     "geometry_free",
     "sirt",
     "backprojection",
@@ -75,14 +71,14 @@ def body() -> torch.Tensor:
     return x
 
 
-def show_models(places: bool) -> None:
-    """A step of every model: its loss and its gradients, or a forward pass without weights."""
+def show_methods(places: bool) -> None:
+    """A training step of every method, or a forward pass of one without weights."""
     x, rig = body(), ["camera.n_views=4", f"camera.detector.pixels=[{PIXELS},{PIXELS}]"]
     rig += ["camera.detector.pixel_mm=6.0", f"grid.size=[{N},{N},{N}]"]
-    for text in MODELS:
-        model, *extra = text.split()
-        settings = compose(f"model={model}", *rig, *extra)
-        module = build_module(settings, settings["model"], 1.0)
+    for text in METHODS:
+        method, *extra = text.split()
+        settings = compose(f"method={method}", *rig, *extra)
+        module = build_module(settings, settings["method"], 1.0)
         with torch.no_grad():
             batch = {"volume": x, "inside": x > 0.5, "views": module.projector(x)}
 
@@ -156,7 +152,7 @@ def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--places", action="store_true", help="each wait, by file and line")
-    parser.add_argument("--operators", action="store_true", help="no models")
+    parser.add_argument("--operators", action="store_true", help="no methods")
     places = parser.parse_args().places
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
@@ -164,7 +160,7 @@ def main() -> None:
         A = operator(what)
         show(what, lambda gpu, call=call, A=A: call(gpu.put(A)), places)
     if not parser.parse_args().operators:
-        show_models(places)
+        show_methods(places)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import pytest
 import torch
 
-ROOT = Path(__file__).parents[1]
-SCRIPTS = sorted((ROOT / "scripts" / "gpu").glob("*.py"))
+from mvrecon_bench import gpu
+
+SCRIPTS = sorted(Path(gpu.__file__).parent.glob("[!_]*.py"))
 RUN = {
     "check": ["--out", "OUT"],
     "models": ["--out", "OUT"],
@@ -21,7 +22,7 @@ RUN = {
 #: The same on a stand-in for a GPU, as small as can be: every line of the scripts that needs one.
 SMALL = {
     "check": ["--n", "8", "--modes"],
-    "models": ["--n", "12", "--models", "cross_view", "--variants", "model.support=hull"],
+    "models": ["--n", "12", "--methods", "cross_view", "--variants", "method.support=hull"],
     "operators": ["--cases", "12:2:12", "--volumes", "1"],
     "learn": "--n 16 --views 3 --cases 3 --val 1 --tests 1 --steps 2 --profile 1 --batch 1".split(),
 }
@@ -29,21 +30,20 @@ SMALL = {
 COMMANDS = {} if torch.cuda.is_available() else RUN
 #: Imports every script, then runs each command as a shell would; what each of them ended with.
 CODE = """
-import contextlib, importlib, io, json, runpy, sys
+import contextlib, importlib, io, json, sys
 names, commands, dry, ends = *map(json.loads, sys.argv[1:]), {}
-sys.path.insert(0, "scripts/gpu")
 for name in names:
-    importlib.import_module(name)
+    importlib.import_module(f"mvrecon_bench.gpu.{name}")
 for name, words in commands.items():
-    sys.argv = [f"scripts/gpu/{name}.py", *words]
+    sys.argv = [f"{name}.py", *words]
     try:
-        runpy.run_path(sys.argv[0], run_name="__main__")
+        importlib.import_module(f"mvrecon_bench.gpu.{name}").main()
     except SystemExit as end:
         ends[name] = end.code
 for name, words in dry.items():
-    sys.argv = [f"scripts/gpu/{name}.py", *words]
+    sys.argv = [f"{name}.py", *words]
     with contextlib.redirect_stdout(io.StringIO()):
-        runpy.run_path(sys.argv[0], run_name="__main__")
+        importlib.import_module(f"mvrecon_bench.gpu.{name}").main()
 sys.exit(json.dumps(ends))
 """
 
@@ -72,7 +72,6 @@ def ends(tmp_path_factory: pytest.TempPathFactory) -> Ends:
     texts = [json.dumps(argument) for argument in (names, commands, dry)]
     done = subprocess.run(
         [sys.executable, "-c", CODE, *texts],
-        cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=900,
