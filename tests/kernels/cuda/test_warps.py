@@ -9,8 +9,6 @@ from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.kernels.warps import cuda, reference
-from mvrecon.kernels.warps.warp import warp
-from mvrecon.testing.as_gpu import AsGpu, on_gpu
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
 from tests.kernels.warps.scenes import OTHER, RIGS, SMALL, generic, lattices
@@ -81,19 +79,6 @@ def test_a_warp_launches_one_kernel_and_waits_for_none(host):
     assert waits.names == []
     assert host.launches == ["warp", "invert", "warp_back", "warp_vary"]
     assert set(host.streams) == {7} and host.modules == 1
-
-
-def test_a_half_volume_on_a_gpu_is_read_as_it_is():
-    """No copy in float32 comes before the kernel; one in the volume's type behind it."""
-    maps = lifted_maps(generic())
-    x = torch.randn(2, 2, 3, *SMALL, dtype=torch.bfloat16)
-    with AsGpu() as gpu:
-        leaf = on_gpu(x).requires_grad_()
-        values = warp(leaf, on_gpu(maps), OTHER)
-        assert gpu.launches == {"warp": 1, "_to_copy": 1} and not gpu.waits
-        values.float().square().sum().backward()
-    assert values.dtype == leaf.grad.dtype == torch.bfloat16
-    assert torch.equal(values.values, warp(x, maps, OTHER))
 
 
 def test_what_is_beyond_a_volume_is_not_read_and_nothing_launches_nothing(host):
