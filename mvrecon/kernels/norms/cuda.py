@@ -6,19 +6,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.cuda.launching import start
-from mvrecon.kernels.cuda.layer import Layer
-from mvrecon.kernels.cuda.sources import Part
+from mvrecon.kernels.cuda.driver import BLOCK
+from mvrecon.kernels.cuda.launch import Layer, Variant, start
 from mvrecon.kernels.precision import arithmetic
-from mvrecon.kernels.rays.cuda.sources import BLOCK
 
 #: Threads at most, as many as fill a device, and values of one at least, of which it leaves two.
 THREADS, RUN = 2**17, 16
 
 
-def part_of(stored: Tensor) -> Part:
+def part_of(stored: Tensor) -> Variant:
     """The kernels that read features as they are stored; they write in the type of arithmetic."""
-    return Part("norm", arithmetic(stored.dtype), stored.dtype)
+    return Variant("norm", arithmetic(stored.dtype), stored.dtype)
 
 
 def normalised(
@@ -81,7 +79,7 @@ def all_blocks(layer: Layer, x: Tensor) -> int:
 
 
 def summed(
-    part: Part, name: str, layer: Layer, features: Float[Tensor, "n *d c"]
+    part: Variant, name: str, layer: Layer, features: Float[Tensor, "n *d c"]
 ) -> Float[Tensor, "n 2 c"]:
     """The two sums of each item's channels, first of each thread's values, in float64."""
     size = len(features), layer.rows, 2, layer.channels

@@ -6,8 +6,8 @@ Derivatives of the derivative are those of torch's own operations.
 import torch
 from torch import Tensor
 
-from mvrecon.kernels.derivatives import pull_of
 from mvrecon.kernels.norms import reference
+from mvrecon.kernels.operator import vjp_of
 from mvrecon.kernels.precision import arithmetic
 
 
@@ -73,7 +73,7 @@ def _backwards(ctx, answer, _):
         def act(x, scale, shift):
             return reference.plain(x, scale, shift, ctx.groups, ctx.eps)
 
-        return *pull_of(act, x, scale, shift)(answer), None, None
+        return *vjp_of(act, x, scale, shift)(answer), None, None
     by_x, back = _change(x, answer, scale, shift, sums, ctx.groups, ctx.eps)
     by_shift, by_scale = back.sum(dim=0).to(scale.dtype)
     return by_x.to(x.dtype), by_scale, by_shift, None, None

@@ -4,10 +4,10 @@ import torch
 
 from mvrecon.kernels.norms import cuda, reference
 from mvrecon.kernels.precision import wide
-from mvrecon.kernels.rays.cuda.selfcheck import Tried, error_of
+from mvrecon.kernels.self_test import Errors, error_of
 
 
-def differences(device: str, dtype: torch.dtype) -> Tried:
+def differences(device: str, dtype: torch.dtype, purpose: str) -> Errors:
     """Normalisation of features about a great mean, with its derivatives; features are stored as
     `dtype`.
     """

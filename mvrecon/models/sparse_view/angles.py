@@ -9,7 +9,7 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
-from mvrecon.kernels.known import known
+from mvrecon.kernels.device_cache import device_cached
 from mvrecon.reconstructors.filtered.orbit import Orbit, orbit_of
 
 #: A scan is a whole turn if its largest gap is at most so many median steps.
@@ -58,7 +58,7 @@ class AngularUpsampling:
         """Views of all angles, linear between measured neighbours; measured ones stay as they
         are.
         """
-        order = known(self.cameras, "order", views, lambda: self.order.to(views.device))
+        order = device_cached(self.cameras, "order", views, lambda: self.order.to(views.device))
         views = views.index_select(2, order)
         if self.factor == 1:
             return views

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mvrecon.kernels.backends import kernels_for
+from mvrecon.kernels import self_test
 from mvrecon.kernels.norms import cuda, ops, reference, trial
-from mvrecon.kernels.rays.cuda import selfcheck
+from mvrecon.kernels.operator import choose_backend
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
 
@@ -134,11 +134,11 @@ def test_the_operator_has_two_derivatives_and_is_opaque_to_the_compiler():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.float16])
 def test_it_checks_itself(dtype, host, monkeypatch):
     """A wrong derivative is not used, and the reason tells which."""
-    assert selfcheck.reason("cpu", "norm", dtype, tried=trial.differences) is None
-    selfcheck.forget()
+    assert self_test.failure("cpu", "norm", dtype, trial.differences) is None
+    self_test.forget()
     right = cuda.change
     monkeypatch.setattr(cuda, "change", lambda *all: [1.001 * one for one in right(*all)])
-    why = selfcheck.reason("cpu", "norm", dtype, tried=trial.differences)
+    why = self_test.failure("cpu", "norm", dtype, trial.differences)
     assert "its derivative differs from the reference by 1.0e-03" in str(why)
 
 
@@ -146,4 +146,4 @@ def test_without_kernels_torch_normalises(host):
     """Where the kernels cannot be started, `auto` takes torch's normalisation."""
     x = SimpleNamespace(device=torch.device("cuda:0"), shape=(1, 8, 4, 4), dtype=torch.float32)
     host.failure["cuLaunchKernel"] = 222
-    assert kernels_for(x, "auto", "norm", trial.differences)[0] == "reference"
+    assert choose_backend(x, "auto", "norm", trial.differences) == "reference"
