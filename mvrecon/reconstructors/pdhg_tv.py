@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.differences.choice import differences_for
-from mvrecon.kernels.differences.shrinkage import Shrinkage
+from mvrecon.kernels.differences import differences_for
+from mvrecon.kernels.differences.reference import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstructors.cgls import check_not_negative

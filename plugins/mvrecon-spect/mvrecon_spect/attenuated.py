@@ -14,10 +14,9 @@ from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.cameras.symmetry import Mirror
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import backends
+from mvrecon.kernels.operator import choose_backend
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays import attenuated_ops, attenuated_reference, ops
-from mvrecon.kernels.rays.cuda.attenuated_trial import differences
 from mvrecon.kernels.rays.occupancy import DENSE
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
@@ -170,14 +169,14 @@ class AttenuatedTransform(RayTransform):
 
 def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str, ModuleType]:
     """The back end's name and its operators along attenuated rays, for a tensor; raises as
-    `kernels_for`.
+    `choose_backend`.
 
     Args:
         tensor: volumes or views.
-        backend: as of `kernels_for`.
+        backend: as of `choose_backend`.
         moving: whether a gradient by the rays is asked for, which the reference alone has.
     """
-    name, _ = backends.kernels_for(tensor[:, None], backend, "attenuated", differences)
+    name = choose_backend(tensor, backend, "attenuated", attenuated_ops.self_test)
     if moving or name == "reference":
         return "reference", attenuated_reference
     return name, attenuated_ops

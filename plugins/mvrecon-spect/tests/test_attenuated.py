@@ -10,7 +10,7 @@ from mvrecon.cameras.rigs import parallel
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.kernels.rays.cpu import attenuated as cpu
-from mvrecon.kernels.rays.cpu.nonzero import box_of
+from mvrecon.kernels.rays.cpu.skip_policy import box_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.ray_transform import RayTransform

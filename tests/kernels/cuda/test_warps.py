@@ -30,7 +30,7 @@ def compared(maps: torch.Tensor, of, to, dtype: torch.dtype, channels: int) -> d
     volumes, change = torch.autograd.grad((values * y.double()).sum(), (wide, moving))
     return {
         "warp": difference(cuda.warp(x, maps, list(to)), values),
-        "back": difference(cuda.warp_back(y, maps, list(of)), volumes),
+        "back": difference(cuda.warp_transpose(y, maps, list(of)), volumes),
         "vjp": difference(cuda.warp_vjp(x, y, maps), change),
     }
 
@@ -74,7 +74,7 @@ def test_a_warp_launches_one_kernel_and_waits_for_none(host):
     x, y = torch.randn(2, 2, 3, *SMALL), torch.randn(2, 2, 2, 3, *OTHER)
     with Waits() as waits:
         cuda.warp(x, maps, OTHER)
-        cuda.warp_back(y, maps, SMALL)
+        cuda.warp_transpose(y, maps, SMALL)
         cuda.warp_vjp(x, y, maps)
     assert waits.names == []
     assert host.launches == ["warp", "invert", "warp_back", "warp_vary"]
@@ -90,4 +90,4 @@ def test_what_is_beyond_a_volume_is_not_read_and_nothing_launches_nothing(host):
     assert seen[1, :, :, 1].isfinite().all() and seen[0].isnan().any()
     host.launches.clear()
     assert cuda.warp(x[:0], maps, OTHER).shape == (0, 2, 2, 2, *OTHER) and not host.launches
-    assert not cuda.warp_back(x[:, :, None][:, :, :0], maps[:, :0], OTHER).any()
+    assert not cuda.warp_transpose(x[:, :, None][:, :, :0], maps[:, :0], OTHER).any()

@@ -21,7 +21,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from mvrecon.kernels.rays.cuda import selfcheck
+from mvrecon.kernels import self_test
 
 GPU = torch.device("cuda", 0)
 #: Operators that take tensors of both memories.
@@ -97,9 +97,9 @@ class AsGpu:
         self.launches: Counter[str] = Counter()
 
     def __enter__(self) -> "AsGpu":
-        self._before = torch.cuda._lazy_init, selfcheck.reason
+        self._before = torch.cuda._lazy_init, self_test.failure
         torch.cuda._lazy_init = lambda: None
-        selfcheck.reason = lambda *_: None  # pyright: ignore[reportAttributeAccessIssue]
+        self_test.failure = lambda *_: None  # pyright: ignore[reportAttributeAccessIssue]
         self._modes = _Operators(self), _Calls(self)
         for mode in self._modes:
             mode.__enter__()
@@ -108,7 +108,7 @@ class AsGpu:
     def __exit__(self, *error: Any) -> None:
         for mode in reversed(self._modes):
             mode.__exit__(*error)
-        torch.cuda._lazy_init, selfcheck.reason = self._before
+        torch.cuda._lazy_init, self_test.failure = self._before
 
     def put(self, module: nn.Module) -> nn.Module:
         """A module as if moved to the GPU; the counts begin anew."""

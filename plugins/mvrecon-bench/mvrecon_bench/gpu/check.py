@@ -78,17 +78,19 @@ def machine() -> dict[str, Any]:
 
 def self_checks(results: Results) -> None:
     """What the back end says of itself."""
-    from mvrecon.kernels.rays.cuda import selfcheck
+    from mvrecon.kernels import self_test
+    from mvrecon.kernels.rays import ops
 
     for method in METHODS:
         for dtype in (torch.float32, torch.float64, torch.bfloat16):
             for volumes in (1, 5):
-                what = f"self-check {method} {dtype} {volumes}"
+                what = f"self-test {method} {dtype} {volumes}"
+                purpose = method + (ops.SEVERAL if volumes > 1 else "")
                 start = time.perf_counter()
                 results.attempt(
                     what,
-                    lambda m=method, d=dtype, v=volumes: (
-                        selfcheck.reason("cuda", m, d, v) or "right"
+                    lambda p=purpose, d=dtype: (
+                        self_test.failure("cuda", p, d, ops.self_test) or "right"
                     ),
                 )
                 results.add(f"{what} seconds", round(time.perf_counter() - start, 2))

@@ -12,10 +12,10 @@ import mvrecon as mv
 from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps
-from mvrecon.kernels.rays.cuda import attenuated_trial as rays
-from mvrecon.kernels.rays.cuda import selfcheck
-from mvrecon.kernels.voxels import trial as voxels
-from mvrecon.kernels.warps import trial as warps
+from mvrecon.kernels import self_test
+from mvrecon.kernels.rays import attenuated_ops
+from mvrecon.kernels.voxels import ops as voxels
+from mvrecon.kernels.warps import warp as warps
 from mvrecon.kernels.warps.warp import warp
 from mvrecon.projectors.voxel_driven import backproject
 from mvrecon.visual_hull.hull import visual_hull
@@ -23,10 +23,10 @@ from mvrecon_bench.gpu.measuring import Results, throughput
 from mvrecon_spect.attenuated import AttenuatedTransform
 
 #: What the kernels for a purpose are tried on before their first use.
-TRIED = {
-    "attenuated": rays.differences,
-    "warp": warps.differences,
-    "look": voxels.differences,
+TESTS = {
+    "attenuated": attenuated_ops.self_test,
+    "warp": warps.self_test,
+    "look": voxels.self_test,
 }
 #: Linear attenuation in 1/mm of attenuated rays.
 MU = 0.015
@@ -93,10 +93,10 @@ def check_fields(
         views: of that rig, [b 1 m v u], with zeros beside the object.
         device: where they run.
     """
-    for purpose, tried in TRIED.items() if device.startswith("cuda") else ():
+    for purpose, tests in TESTS.items() if device.startswith("cuda") else ():
         results.attempt(
             f"self-check {purpose}",
-            lambda p=purpose, t=tried: selfcheck.reason(device, p, torch.float32, 1, t) or "right",
+            lambda p=purpose, t=tests: self_test.failure(device, p, torch.float32, t) or "right",
         )
     world, frusta = warped(grid, rig, back=False), warped(grid, rig, back=True)
     lifted = world(x[:, None])[:, 0]

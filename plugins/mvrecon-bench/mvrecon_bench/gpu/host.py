@@ -15,15 +15,15 @@ from typing import Any
 import torch
 
 import mvrecon as mv
-from mvrecon.kernels.rays.cuda import driver, operators
-from mvrecon.kernels.rays.cuda.sources import KERNELS
+from mvrecon.kernels.cuda import driver
+from mvrecon.kernels.cuda.launch import KERNELS
+from mvrecon.kernels.rays.cuda import operators
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.kernels.rays.occupancy import Occupancy
 
 
 def without_a_device() -> None:
     """Kernels that are none, by a driver whose launch is a foreign call that does nothing."""
-    none = {name: c_void_p() for name in KERNELS}
+    none = {name: c_void_p() for name in KERNELS["rays"]}
     stub = SimpleNamespace(cuLaunchKernel=ctypes.CDLL(None).abs)
     driver.library = lambda: stub
     driver.stream_of = lambda device: 0
@@ -35,12 +35,12 @@ def calls() -> dict[str, Callable[[], Any]]:
     """The operators of a small cone beam, of one volume."""
     grid = mv.Grid.centred(8, spacing=1.0)
     rig = mv.circular(6, 50.0, 75.0, {"pixels": [8, 8], "pixel_mm": 2.0})
-    lines, whole = lines_of(rig, grid), Occupancy.whole(grid.shape)
+    lines, shape = lines_of(rig, grid), list(grid.shape)
     x, y = torch.rand(1, *grid.shape), torch.rand(1, len(rig), *rig.shape)
-    scene = lines, list(rig.ray_extent), whole
+    scene = lines, list(rig.ray_extent)
     return {
         "projection": lambda: operators.project(x, *scene, list(rig.shape), "joseph"),
-        "adjoint": lambda: operators.backproject(y, *scene, "joseph"),
+        "adjoint": lambda: operators.backproject(y, *scene, shape, "joseph"),
         "pose gradient": lambda: operators.lines_vjp(x, y, *scene, "joseph"),
     }
 

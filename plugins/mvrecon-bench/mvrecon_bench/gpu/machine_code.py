@@ -15,15 +15,15 @@ from typing import NamedTuple
 
 import torch
 
-from mvrecon.kernels.cuda import sources as fields
-from mvrecon.kernels.rays.cuda import nvrtc
-from mvrecon.kernels.rays.cuda import sources as rays
+from mvrecon.kernels.cuda import nvrtc
+from mvrecon.kernels.cuda.launch import Variant, text_of
 from mvrecon.kernels.rays.trace import METHODS
 
-KERNELS = ("store", "project", "record", "gather", "scatter", "vary")
+#: Kernels along rays that are shown.
+SHOWN = ("store", "project", "record", "gather", "scatter", "vary")
 STORED = ((torch.float32, 1), (torch.float32, 4), (torch.bfloat16, 4))
 #: What reads numbers stored in half precision, beside the kernels along rays.
-HALF = ("warp", "norm")
+HALF = ("warp",)
 #: Patterns of instructions.
 DOUBLE, LOAD = r"\bD(?:FMA|MUL|ADD|SETP)\b|F64|64H", r"\bLDG\b"
 LOCAL, CALL, ATOMIC = r"\b(?:LDL|STL)\b", r"\bCALL\b", r"\b(?:ATOM|ATOMG|REDG?)\b"
@@ -110,18 +110,18 @@ def row(name: str, kernel: Kernel) -> str:
 def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """What is compiled at once: its title, its text, and the kernels that are shown."""
     single, half = torch.float32, torch.bfloat16
-    for method, number in METHODS.items():
+    for method in METHODS:
         for stored, together in STORED:
-            variant = rays.Variant(single, stored, together, number)
-            yield f"{method}, {stored}, {together} a ray", rays.text_of({"": variant}), KERNELS
+            variant = Variant("rays", single, stored, together, method)
+            yield f"{method}, {stored}, {together} a ray", text_of({"": variant}), SHOWN
     for method in ("joseph", "siddon"):
-        variant = rays.Variant(single, single, 1, METHODS[method], attenuated=True)
+        variant = Variant("attenuated", single, single, 1, method)
         title = f"{method}, attenuated, {single}"
-        yield title, rays.text_of({"": variant}), ("weaken", "receive", "bend")
-    for purpose, names in fields.KERNELS.items():
+        yield title, text_of({"": variant}), ("weaken", "receive", "bend")
+    for purpose in ("warp", "look", "hull"):
         for stored in (single, half) if purpose in HALF else (single,):
-            part = fields.Part(purpose, single, stored)
-            yield f"{purpose}, {stored}", fields.text_of({"": part}), names
+            variant = Variant(purpose, single, stored)
+            yield f"{purpose}, {stored}", text_of({"": variant}), variant.names
 
 
 def main() -> None:

@@ -50,10 +50,10 @@ def ours(grid: mv.Grid, rig: mv.Cameras, device: str, **options: Any) -> Program
 def scattered(grid: mv.Grid, rig: mv.Cameras, device: str) -> Program:
     """Our adjoint ray by ray, with atomic additions."""
     from mvrecon.kernels.rays.cuda import operators as cuda
-    from mvrecon.kernels.rays.occupancy import Occupancy
 
-    A, whole = mv.Drr(grid, rig).to(device), Occupancy.whole(grid.shape)
-    return Program(None, lambda y: cuda.scatter(y, A.fixed_lines, A.ray_extent, whole, "joseph"))
+    A = mv.Drr(grid, rig).to(device)
+    rays = A.fixed_lines, A.ray_extent, grid.shape, "joseph"
+    return Program(None, lambda y: cuda.scatter(y, *rays))
 
 
 def diffdrr(grid: mv.Grid, rig: mv.Cameras, device: str, method: str) -> Program:

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
-from mvrecon.models.weighting import fuse
 from torch import Tensor
 
 from mvrecon.models.frusta import Frusta

@@ -13,8 +13,3 @@
 #define HULL_OF(suffix, R, S)                                                                                            \
   ENTRY(judge##suffix, judge_bricks)                                                                                   \
   ENTRY(count##suffix, count_bricks)
-#define NORM_OF(suffix, R, S)                                                                                            \
-  ENTRY_OF(Layer, sum_features##suffix, (sum_features<R, S>))                                                          \
-  ENTRY_OF(Layer, normalise##suffix, (normalise<R, S>))                                                                \
-  ENTRY_OF(Layer, sum_changes##suffix, (sum_changes<R, S>))                                                            \
-  ENTRY_OF(Layer, change_features##suffix, (change_features<R, S>))

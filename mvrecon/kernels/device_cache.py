@@ -17,7 +17,7 @@ KEPT = 256
 _results: WeakKeyDictionary[Cameras, OrderedDict[Hashable, Any]] = WeakKeyDictionary()
 
 
-def known(cameras: Cameras, key: Hashable, like: Tensor, make: Callable[[], Any]) -> Any:
+def device_cached(cameras: Cameras, key: Hashable, like: Tensor, make: Callable[[], Any]) -> Any:
     """What `make` gives, made once as long as the rig lives and is not written to; in every call
     where its cameras want a gradient, or are traced.
 
@@ -43,6 +43,6 @@ def known(cameras: Cameras, key: Hashable, like: Tensor, make: Callable[[], Any]
     return result
 
 
-def key_of(grid: Grid) -> Hashable:
-    """What tells a grid from others, for `known`."""
+def grid_key(grid: Grid) -> Hashable:
+    """What tells a grid from others, for `device_cached`."""
     return grid.shape, tuple(grid.affine.flatten().tolist())

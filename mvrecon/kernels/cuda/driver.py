@@ -6,19 +6,35 @@ import ctypes
 from collections.abc import Sequence
 from ctypes import byref, c_char_p, c_int, c_void_p
 from functools import cache
-from typing import Any
+from typing import Any, Self
 
 import torch
+from torch import Tensor
 
-from mvrecon.kernels.rays.cuda import nvrtc
-from mvrecon.kernels.rays.cuda.scene import Packed
-from mvrecon.kernels.rays.cuda.sources import BLOCK
+from mvrecon.kernels.cuda import nvrtc
 
+#: Threads of a block and of a warp, as in `rays/cuda/source/1_scene.cu`.
+BLOCK, WARP = 128, 32
 #: What the driver says where the calling thread has no context: none, or that of another device.
 NO_CONTEXT = (201, 400)
 OUT_OF_MEMORY = 2
 #: A kernel's arguments: the address of its structure.
 Arguments = c_void_p * 1
+
+
+class Packed(ctypes.Structure):
+    """Addresses and numbers of one call of a kernel; its source says what each one is."""
+
+    def put(self, **values: Any) -> Self:
+        """Write some fields: tensors as their addresses, sequences as arrays."""
+        for name, value in values.items():
+            if isinstance(value, Tensor):
+                setattr(self, name, value.data_ptr())
+            elif isinstance(value, tuple):
+                getattr(self, name)[:] = value
+            else:
+                setattr(self, name, value)
+        return self
 
 
 @cache

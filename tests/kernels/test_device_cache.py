@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import known as module
-from mvrecon.kernels.known import key_of, known
+from mvrecon.kernels import device_cache as module
+from mvrecon.kernels.device_cache import device_cached, grid_key
 from tests.projectors.rigs import CONE
 
 
@@ -22,7 +22,7 @@ def counted(rig, key=(), like=None):
     """How often something is made in three calls."""
     made = []
     for _ in range(3):
-        known(rig, key, torch.zeros(1) if like is None else like, lambda: made.append(1))
+        device_cached(rig, key, torch.zeros(1) if like is None else like, lambda: made.append(1))
     return len(made)
 
 
@@ -42,15 +42,15 @@ def test_cameras_that_were_written_to_or_may_move_have_nothing_known(rig):
 
 def test_what_evaluation_made_has_derivatives_in_training(rig):
     with torch.inference_mode():
-        known(rig, "ones", torch.zeros(1), lambda: torch.ones(3))
-    kept = known(rig, "ones", torch.zeros(1), lambda: None)
+        device_cached(rig, "ones", torch.zeros(1), lambda: torch.ones(3))
+    kept = device_cached(rig, "ones", torch.zeros(1), lambda: None)
     x = torch.ones(3, requires_grad=True)
     assert (x * kept).sum().backward() is None and x.grad is not None
 
 
 def test_it_goes_with_its_rig(rig):
     other, result = rig[[0]], torch.ones(1)
-    known(other, (), torch.zeros(1), lambda: result)
+    device_cached(other, (), torch.zeros(1), lambda: result)
     gone, count = weakref.ref(other), len(module._results)
     del other
     gc.collect()
@@ -59,5 +59,5 @@ def test_it_goes_with_its_rig(rig):
 
 def test_grids_are_told_apart_by_where_their_voxels_lie():
     grids = [Grid.centred(4, spacing=s, centre=(c, 0, 0)) for s in (1.0, 2.0) for c in (0.0, 1.0)]
-    assert len({key_of(grid) for grid in grids}) == 4
-    assert key_of(Grid.centred(4, spacing=1.0)) == key_of(grids[0])
+    assert len({grid_key(grid) for grid in grids}) == 4
+    assert grid_key(Grid.centred(4, spacing=1.0)) == grid_key(grids[0])

@@ -21,7 +21,7 @@ def folder() -> Path:
     return Path(base) / "mvrecon" / "kernels"
 
 
-def kept(name: str, build: Callable[[], bytes]) -> bytes:
+def cached(name: str, build: Callable[[], bytes]) -> bytes:
     """The machine code of a name, from disk, or built and written there; files that do not fit are
     built anew. Nobody but the user may be able to write them.
     """
