@@ -20,7 +20,7 @@ from mvrecon.parts import PROJECTORS
 
 MISTAKES = {
     "camera.view=4": r"There is no setting 'camera.view'; did you mean 'n_views'\?",
-    "model=crossview": r"model has no choice 'crossview'; did you mean 'cross_view'\?",
+    "method=crossview": r"model has no choice 'crossview'; did you mean 'cross_view'\?",
     "camera.n_views=abc": r"camera.n_views: expected int > 0, got 'abc' \(number of cameras",
     "grid.spacing=x": r"grid.spacing: expected float > 0 or \[float > 0, .*\], got 'x' \(.*mm",
     "grid.size=[32,32]": r"grid.size: expected \[int > 0, int > 0, int > 0\] .*got \[32, 32\]",
@@ -74,7 +74,7 @@ def test_an_experiment_of_another_app_is_told_as_one(answer):
     """Hydra alone would propose to override a part of the experiment."""
     text = answer("experiment=smoke", app="simulate")
     assert "experiment/smoke is for another app: it chooses 'model', which is not here" in text
-    text = answer("model=sirt", app="simulate")
+    text = answer("method=sirt", app="simulate")
     assert "This app chooses no 'model'; --help shows what it chooses" in text
 
 
@@ -88,7 +88,7 @@ def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it(
 
 def test_the_traceback_is_there_where_it_is_asked_for(answer, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    monkeypatch.setattr(sys, "argv", ["mvrecon-train", "model=crossview"])
+    monkeypatch.setattr(sys, "argv", ["mvrecon-train", "method=crossview"])
     with pytest.raises(Exception, match="Could not find 'model/crossview'"):
         launch(reached, "train")
 

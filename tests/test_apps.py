@@ -102,10 +102,10 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     assert "hp_metric" not in tags["scalars"]
     data = test.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     session = HParamsPluginData.FromString(data).session_start_info.hparams
-    names = {key: session[key].string_value for key in ("method", "model.name", "scene.name")}
+    names = {key: session[key].string_value for key in ("method", "method.name", "scene.name")}
     assert names == {
         "method": "cross_view_small",
-        "model.name": "cross_view",
+        "method.name": "cross_view",
         "scene.name": "ellipsoids",
     }
 
@@ -178,7 +178,7 @@ def test_resume_goes_on_in_the_same_folder(run, tmp_path):
     [
         (mvrecon.eval, ["checkpoint=nowhere.ckpt"], "No checkpoint or run folder is at"),
         (mvrecon.train, ["experiment=smoke", "optimizer.lr=1e30"], "is not finite at step"),
-        (mvrecon.train, ["experiment=smoke", "model.name=cros_view"], "did you mean 'cross_view'"),
+        (mvrecon.train, ["experiment=smoke", "method.name=cros_view"], "did you mean 'cross_view'"),
         (
             mvrecon.train,
             ["experiment=smoke", "test_scene=ellipsoids"],

@@ -52,7 +52,7 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("option", ["seed=5", "model=sirt", "loss.volume=2.0", "projector=drr"])
+@pytest.mark.parametrize("option", ["seed=5", "method=sirt", "loss.volume=2.0", "projector=drr"])
 def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
     """The seed, the model, the loss and the projector of an evaluation are those of the run, and
     cannot be typed.
