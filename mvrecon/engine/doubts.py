@@ -16,7 +16,7 @@ from mvrecon.data.projections.region import Region
 from mvrecon.engine.coarse import coarse
 from mvrecon.engine.scan import Scan
 from mvrecon.metrics import nrmse
-from mvrecon.parts import PROJECTORS
+from mvrecon.parts import METHODS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.pixel_integral import sees_integrals
 from mvrecon.reconstructors.iterative import sirt
