@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from mvrecon.reconstructors.tikhonov import tikhonov as tikhonov
     from mvrecon.reconstructors.tv_map import tv_map as tv_map
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _DOOR = {
     "Cameras": "mvrecon.cameras.camera:Cameras",

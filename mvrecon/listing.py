@@ -1,4 +1,5 @@
-"""`mvrecon-list`: every part by name, what it is, its options, and where it comes from.
+"""`mvrecon-list`: every part by name in a line each; of one kind also its options, and where it
+comes from.
 
 Sources are read, not imported, so the answer comes at once and a broken plugin disturbs nobody;
 `--check` imports.
@@ -8,7 +9,6 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvrecon.config.values import in_words
 from mvrecon.new_plugin import new_plugin
 from mvrecon.parts import LISTED
 from mvrecon.signatures import SECTIONS, Option, Part, describe, describe_section
@@ -26,6 +26,22 @@ def listed(kind: str | None = None, check: bool = False) -> list[Part]:
     if not check:
         parts += [describe_section(s) for s in SECTIONS if kind in (None, SETTING, s)]
     return parts
+
+
+def overview(parts: Sequence[Part]) -> None:
+    """Write one line for each part to the console, as wide as that is, under their kinds."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console, width, kind = Console(highlight=False), max(len(part.name) for part in parts), ""
+    for part in parts:
+        if part.kind != kind:
+            kind = part.kind
+            console.print(Text(kind, style="bold"))
+        what = (f"broken: {part.error}", "red") if part.error else part.summary
+        line = Text.assemble((f"  {part.name:<{width}}  ", "cyan"), what)
+        console.print(line, no_wrap=True, overflow="ellipsis")
+    console.print("mvrecon-list KIND shows the options of one kind, and where its parts come from.")
 
 
 def show(parts: Sequence[Part]) -> None:
@@ -65,6 +81,8 @@ def report(parts: Sequence[Part]) -> int:
 
 def _line(name: str, option: Option) -> str:
     """An option with its default, its type where it has none, and its text, with the unit."""
+    from mvrecon.config.values import in_words  # Hydra's import takes longer than all the rest
+
     value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
     return f"  {name}{value}  {option.text}".rstrip()
 
@@ -89,7 +107,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="mvrecon-list", description="Lists the parts that a configuration can name."
     )
     parser.add_argument(
-        "kind", nargs="?", choices=sorted({*LISTED, SETTING}), help="only this kind of part"
+        "kind",
+        nargs="?",
+        choices=sorted({*LISTED, SETTING}),
+        help="only this kind of part, with options",
     )
     parser.add_argument(
         "--check", action="store_true", help="import every part, and say which are broken and why"
@@ -107,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return report(parts)
     if not parts:
         parser.exit(message=f"No {options.kind} has a name here; a plugin may bring one.\n")
-    show(parts)
+    (show if options.kind else overview)(parts)
     return 0
 
 

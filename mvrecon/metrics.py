@@ -9,6 +9,7 @@ data, so that numbers of different volumes compare.
 
 import math
 import statistics
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -136,6 +137,27 @@ def view_metrics(
     return {"view_nrmse": nrmse(views.detach().double(), measured.double())}
 
 
+def case_metrics(
+    volume: Float[Tensor, "1 d h w"],
+    views: Float[Tensor, "1 m v u"],
+    case: Mapping[str, Any],
+    data_range: float,
+) -> dict[str, float]:
+    """Every figure of merit of one case: `volume_metrics` and `view_metrics`; all are nan where the
+    volume has failed, that is, holds NaN or infinity.
+
+    Args:
+        volume: reconstructed.
+        views: of that volume.
+        case: a batch of one, with the true "volume", "inside" and the measured "views".
+        data_range: for PSNR and SSIM.
+    """
+    if not volume.isfinite().all():
+        return dict.fromkeys((*METRICS.names(), *UNITS), math.nan)
+    figures = volume_metrics(volume, case["volume"][0], case["inside"][0], data_range)
+    return figures | view_metrics(views, case["views"][0])
+
+
 def camera_metrics(
     by: Alignment,
     shift_px: Float[Tensor, "b m 2"],
@@ -193,12 +215,13 @@ def per_view_spread(
     return deviation.norm().item() / size if size else 0.0
 
 
-def mean_and_spread(values: list[float]) -> dict[str, Any]:
+def mean_and_spread(values: list[float], failed: bool = False) -> dict[str, Any]:
     """Mean, sample standard deviation (nan where there is none), and the values.
 
-    A nan among them, from a scene without an object, counts in neither.
+    A nan among them, from a scene without an object, counts in neither. A method that has failed
+    in a scene has neither, so that no mean over the other scenes can pass for its own.
     """
-    numbers = [value for value in values if not math.isnan(value)]
+    numbers = [value for value in values if not (failed or math.isnan(value))]
     mean = sum(numbers) / len(numbers) if numbers else math.nan
     spread = statistics.stdev(numbers) if len(numbers) > 1 and math.isfinite(mean) else math.nan
     return {"mean": mean, "std": spread, "values": values}

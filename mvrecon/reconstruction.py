@@ -8,7 +8,8 @@ from omegaconf import DictConfig
 
 from mvrecon.config import launch, to_plain
 from mvrecon.config.plugins import import_plugins
-from mvrecon.files.runs import RESULTS, SETTINGS, VERSIONS
+from mvrecon.files.atomic import check_writable
+from mvrecon.files.runs import RESULTS, SETTINGS, VERSIONS, leaves
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,7 +43,9 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     Raises:
         RuntimeError: another process is at work in the folder.
-        ValueError: the folder's run has other settings; views, rig, grid or method do not fit.
+        OSError: the volume cannot be written.
+        ValueError: the folder's run has other settings; an input would be written to; views, rig,
+            grid or method do not fit.
     """
     import_plugins(settings["plugins"])
     from mvrecon.cameras import files
@@ -56,6 +59,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         raise ValueError(f"Expected the unit 1/mm or HU, got {settings['unit']!r}")
     out = Path(settings["out"] or folder / "volume.nii.gz").expanduser()
     check_ending(out)
+    _check_places(settings, out, folder)
     case = scan.open_scan(settings)
     if settings["unit"] == "HU" and case.unit != scan.ATTENUATION:
         raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
@@ -131,10 +135,30 @@ def _values(volume: "Tensor", unit: str) -> dict[str, list[float]]:
 
 
 def beside(volume: Path, ending: str = ".cameras.json") -> Path:
-    """The file beside a volume with its name and another ending, that of a calibrated rig; a rig
-    that is there by another name stays.
+    """The file beside a volume with its name and another ending, that of a calibrated rig."""
+    from mvrecon.data.volume_files import name_of
+
+    return volume.with_name(name_of(volume) + ending)
+
+
+def _check_places(settings: dict[str, Any], out: Path, folder: Path) -> None:
+    """Check that the volume can be written, and that no input is written to.
+
+    Raises:
+        ValueError: a file that the run writes is one that the settings name as an input.
+        OSError: a place that cannot be written.
     """
-    return volume.with_name(volume.name.partition(".")[0] + ending)
+    check_writable(out)
+    written = [out, beside(out, ".sigma.nii.gz"), *(folder / name for name in WRITTEN)]
+    if settings["calibrate"]:
+        written.append(beside(out))
+    places = {path.resolve() for path in written}
+    for keys, value in leaves({**settings, "out": None}):
+        if isinstance(value, str) and Path(value).expanduser().resolve() in places:
+            raise ValueError(
+                f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "
+                f"choose another out or hydra.run.dir"
+            )
 
 
 def task(config: DictConfig) -> None:

@@ -29,6 +29,10 @@ SECTIONS = {
 }
 
 Definition = ast.ClassDef | ast.FunctionDef
+#: The lines of a class or a function in a module, its decorators included.
+LINES = re.compile(
+    r"^(?:@.*\n(?:[ )\]}].*\n)*)*(?:class|def) (\w+)\b.*\n(?:(?:[ \t)\]}].*)?\n)*", re.M
+)
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,10 @@ def definition(module: str, name: str) -> tuple[str, Definition]:
     Raises:
         ImportError: there is no such module, or no such name in it.
     """
-    for node in _tree(module).body:
+    with suppress(SyntaxError):  # a string whose lines begin at the margin; the module then tells
+        if node := ast.parse(_lines(module).get(name, "")).body:
+            return module, node[0]
+    for node in _tree(module).body:  # ten times as slow as its lines alone
         if isinstance(node, Definition) and node.name == name:
             return module, node
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -131,10 +138,21 @@ def parts_in(
 
 @cache
 def _tree(module: str) -> ast.Module:
+    return ast.parse(_source(module))
+
+
+@cache
+def _lines(module: str) -> dict[str, str]:
+    """The lines of each class and function of a module, the first of a name."""
+    return {m[1]: m[0] for m in reversed([*LINES.finditer(_source(module))])}
+
+
+@cache
+def _source(module: str) -> str:
     spec = locate(module)
     if spec is None or not spec.origin or not spec.origin.endswith(".py"):
         raise ImportError(f"No source found for module {module!r}")
-    return ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    return Path(spec.origin).read_text(encoding="utf-8")
 
 
 def _options(module: str, node: Definition) -> tuple[dict[str, Option], bool]:

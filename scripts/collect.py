@@ -20,6 +20,7 @@ def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
             "method": method,
             "parameters": figures["parameters"],
             "seed": results["seed"],
+            "failed": len(figures.get("failed", ())),
         }
         for name in FIGURES:
             row |= {name: figures[name]["mean"], f"{name}_std": figures[name]["std"]}

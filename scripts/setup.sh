@@ -8,7 +8,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 extras=${1:-io}
 state=$(cat <(pwd) pyproject.toml constraints.txt scripts/setup.sh plugins/*/pyproject.toml | cksum)
 stamps=(".venv/installed-$extras")
-if [ "$extras" = io ]; then stamps+=(.venv/installed-dev); fi # dev has io, but not docs
+if [ "$extras" = io ]; then stamps+=(.venv/installed-dev .venv/installed-docs); fi # both have io
 for stamp in "${stamps[@]}"; do
     if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$state" ]; then exit 0; fi
 done

@@ -2,8 +2,8 @@
 scripts/trust.py`.
 
 About half an hour, and the soak's time on top. What a step found stays in `docs/trust`, which is
-committed; a run that was broken off goes on with the next step, and one step is done again when its
-file there is removed: `doors.json` for a new test of a door.
+committed; an interrupted run resumes with the next step, and a step is repeated when its file there
+is removed.
 """
 
 import argparse
@@ -59,14 +59,6 @@ def stress(_: argparse.Namespace) -> Any:
     }
 
 
-def doors(given: argparse.Namespace) -> Any:
-    """What guards files, folders, settings and runs: the verdicts, fact by fact."""
-    file = FOUND / "doors.json"
-    kept = json.loads(file.read_text()) if given.doors and file.exists() else {}
-    said = done(sys.executable, "-m", "tests.doors", *given.doors)
-    return kept | json.loads(said.splitlines()[-1])
-
-
 def fuzz(given: argparse.Namespace) -> Any:
     """What became of damaged files, reader by reader."""
     with tempfile.TemporaryDirectory() as folder:
@@ -106,7 +98,6 @@ def soak(given: argparse.Namespace) -> Any:
 STEPS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "stress": stress,
     "properties": properties,
-    "doors": doors,
     "fuzz": fuzz,
     "kills": kills,
     "soak": soak,
@@ -149,16 +140,8 @@ def page(found: dict[str, Any], seed: int) -> str:
         "are not installed.\n\n"
     )
     text += markdown(("part", *VERDICTS), parts)
-    broken = [fact for fact, counts in found["doors"].items() if counts[FAIL]]
-    failed = *found["stress"]["failed"], *found["kills"]["runs that differ"], *broken
+    failed = *found["stress"]["failed"], *found["kills"]["runs that differ"]
     text += "".join(f"\nFailed: {line.removesuffix('.')}.\n" for line in failed)
-    text += "\n## Doors: files, folders, settings, runs\n\n"
-    text += "A row is a test: the fact that it asserts, and how many of its cases say so.\n\n"
-    counted = [
-        (fact, *(str(counts[verdict]) for verdict in VERDICTS))
-        for fact, counts in found["doors"].items()
-    ]
-    text += markdown(("what holds", *VERDICTS), counted)
     text += (
         "\n## Damaged files, reader by reader\n\nWhat has checksums (volume files written by "
         "mvrecon, packed NIfTI, checkpoints) is refused or has the values that were written. "
@@ -180,7 +163,7 @@ def total(rows: dict[str, dict[str, int]]) -> str:
 
 
 def figures(
-    stress: Any, properties: Any, doors: Any, fuzz: Any, kills: Any, soak: Any
+    stress: Any, properties: Any, fuzz: Any, kills: Any, soak: Any
 ) -> list[tuple[str, str, str]]:
     """What was done, how often, and the command that does it."""
     inputs, hurt = (
@@ -199,12 +182,6 @@ def figures(
         ("properties", str(properties["properties"]), "`pytest tests/properties`"),
         ("random geometries that they were tried on", str(properties["examples"]), ""),
         ("of these, failures", str(properties["failing"]), ""),
-        (
-            "facts about doors: files, folders, settings, runs",
-            str(len(doors)),
-            "`python -m tests.doors`",
-        ),
-        ("verdicts on their cases", total(doors), ""),
         ("damaged files given to readers", str(inputs), "`python -m tests.faults.fuzzing`"),
         ("of these, failures", str(hurt), ""),
         ("the slowest; the most memory", f"{slowest:.2f} s; {largest / 2**20:.0f} MB", ""),
@@ -248,14 +225,11 @@ def main() -> None:
         default=3600.0,
         help="seconds of training in a loop (default: an hour)",
     )
-    parser.add_argument(
-        "--doors", nargs="*", default=[], help="files of tests whose rows are renewed (none: all)"
-    )
     given, found = parser.parse_args(), {}
     FOUND.mkdir(parents=True, exist_ok=True)
     for name, step in STEPS.items():
         file = FOUND / f"{name}.json"
-        if not file.exists() or (name == "doors" and given.doors):
+        if not file.exists():
             print(f"{name}: {step.__doc__}", flush=True)
             answer = json.dumps(step(given), indent=1)
             with written_whole(file) as part:

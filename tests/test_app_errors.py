@@ -57,7 +57,6 @@ def answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Captu
     return run
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("override", MISTAKES)
 def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
     override: str, answer, tmp_path: Path
@@ -148,7 +147,6 @@ WRONG = {
 }
 
 
-@pytest.mark.door
 def test_a_number_out_of_its_range_and_a_list_of_wrong_length_are_refused():
     """A setting that must be positive, and is not, and a list of a wrong length are refused
     before anything is computed; the message names the setting.

@@ -12,7 +12,6 @@ CLAIM = (
 )
 
 
-@pytest.mark.door
 @pytest.mark.skipif(os.name != "posix", reason="folders are locked on POSIX systems alone")
 def test_a_second_process_is_refused_in_a_run_folder_until_the_first_leaves_it(
     run_python, tmp_path

@@ -132,7 +132,6 @@ def test_a_reconstructor_is_chosen_on_the_command_line_with_its_own_options_alon
         assert node == {name: "x" if v == "???" else v for name, v in options.items()}
 
 
-@pytest.mark.door
 def test_a_path_is_one_value_whatever_signs_are_in_it(tmp_path: Path):
     """The folder of a sweep's run, with = and commas in its name, and a folder with spaces or
     quotes, is one value on the command line; what is no path is left as it is.
@@ -172,7 +171,6 @@ def test_a_mistyped_choice_in_an_experiment_lists_what_there_is(user_conf):
         compose(*user_conf("defaults:\n  - override /projector: dr\nname: mine"))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -190,7 +188,6 @@ def test_a_mistyped_override_is_an_error_that_names_it(override: str, message: s
     assert re.search(message, f"{error.value}{error.value.__cause__}")
 
 
-@pytest.mark.door
 def test_a_model_takes_no_options_that_an_experiment_has_for_another_one(user_conf):
     """A model that the command line chooses in place of an experiment's own is refused the own
     one's options, under whose file's name a table would show what it is not.

@@ -11,14 +11,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
 from mvrecon import compare, view
+from mvrecon.cameras.rigs import circular
 from mvrecon.config import compose
 from mvrecon.config.typed import check_parts
+from mvrecon.geometry.grid import Grid
 from mvrecon.listing import SETTING
-from mvrecon.parts import LISTED
+from mvrecon.parts import LISTED, PROJECTORS
+from mvrecon.reconstructors.iterative import sirt
 from scripts import site_pages
 
 ROOT = Path(__file__).parents[1]
@@ -64,6 +68,19 @@ def test_the_python_of_a_page_runs(file: Path, registries: None):
             pytest.skip(str(error))
     for test in [value for name, value in space.items() if name.startswith("test_")]:
         test()
+
+
+def test_the_projector_that_the_plugins_page_prints_reconstructs(registries: None):
+    detector = {"pixels": [6, 6], "pixel_mm": 1.0}
+    page = "\n".join(blocks(ROOT / "plugins" / "README.md", "python"))
+    exec(page, {"__name__": "page"})  # noqa: S102
+    grid, rig = Grid.centred(6, spacing=1.0), circular(1, 40.0, 70.0, detector)
+    A = PROJECTORS.build("sum_along_y", grid=grid, cameras=rig).to("cpu")
+    x = torch.rand(2, 1, *grid.shape, dtype=torch.float64)
+    y = torch.rand_like(A(x))
+    torch.testing.assert_close((A(x) * y).sum(), (x * A.T(y)).sum())
+    torch.testing.assert_close(A(x)[0, 0, 0], x[0, 0].sum(dim=1))
+    torch.testing.assert_close((2 * A)(sirt(A, y, iterations=2)), 2 * y)
 
 
 def commands() -> Iterator[tuple[str, str]]:

@@ -3,6 +3,8 @@ give.
 """
 
 import inspect
+import subprocess
+import sys
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -35,13 +37,51 @@ def test_what_is_read_is_what_an_import_gives(kind: str, name: str):
 def test_every_part_and_origin_is_printed_and_options_with_their_units(
     capsys: pytest.CaptureFixture[str],
 ):
-    assert main([]) == 0
-    text = capsys.readouterr().out
-    assert "arc_degrees=180.0  the range of angles" in text
-    assert "sid (float > 0)  mm from the source to the axis." in text
+    texts = {}
+    for kind in REGISTRIES:
+        assert main([kind]) == 0
+        texts[kind] = capsys.readouterr().out
+    assert "arc_degrees=180.0  the range of angles" in texts["camera"]
+    assert "sid (float > 0)  mm from the source to the axis." in texts["camera"]
     for kind, name in PARTS:
-        assert name in text
-        assert REGISTRIES[kind].origin(name) in text
+        assert name in texts[kind]
+        assert REGISTRIES[kind].origin(name) in texts[kind]
+
+
+def test_without_a_kind_each_part_has_one_line(capsys: pytest.CaptureFixture[str]):
+    assert main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    for kind, registry_of_kind in LISTED.items():
+        if names := registry_of_kind.names():
+            first = lines.index(kind) + 1
+            assert [line.split()[0] for line in lines[first : first + len(names)]] == names
+
+
+def test_the_list_imports_no_heavy_library(root):
+    code = (
+        "import sys; from mvrecon.listing import main; main([]);"
+        "sys.exit(str(sorted({'torch', 'numpy', 'hydra', 'omegaconf'} & set(sys.modules)) or ''))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
+    assert ended.stderr.strip() == ""
+
+
+def test_a_definition_is_found_whatever_its_lines_look_like(tmp_path, monkeypatch):
+    (tmp_path / "odd_plugin.py").write_text(
+        '@print\n@dict(\n    a=1,\n)\ndef first(\n    a=1,\n) -> int:\n    """One."""\n\n'
+        '    return a\n\n\nclass Second:\n    """Two.\n\nAt the margin.\n"""\n\n'
+        "    def __init__(self, b=2):\n        self.b = b\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    points = {"first": "odd_plugin:first", "second": "odd_plugin:Second"}
+    found = tuple(
+        EntryPoint(f"head.{name}", value, registry.GROUP) for name, value in points.items()
+    )
+    monkeypatch.setattr(registry, "installed", lambda: found)
+    described = [describe("head", name) for name in points]
+    assert [part.summary for part in described] == ["One.", "Two."]
+    assert [list(part.options) for part in described] == [["a"], ["b"]]
 
 
 def test_one_kind_is_printed_alone(capsys: pytest.CaptureFixture[str]):

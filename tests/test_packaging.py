@@ -118,6 +118,21 @@ def test_every_dependency_is_pinned(root: Path):
             )
 
 
+def test_the_environment_of_the_site_can_read_and_write_the_volumes_of_its_tutorials(root: Path):
+    import tomllib
+
+    from packaging.requirements import Requirement
+
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+
+    def brought(extra: str) -> set[str]:
+        direct = list(map(Requirement, project["optional-dependencies"][extra]))
+        nested = (brought(e) for r in direct if r.name == "mvrecon" for e in r.extras)
+        return {r.name for r in direct}.union(*nested)
+
+    assert brought("io") <= brought("docs")
+
+
 def test_the_citation_and_the_hooks_have_the_versions_of_the_project(root: Path):
     import yaml
 

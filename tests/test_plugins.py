@@ -33,7 +33,6 @@ def test_a_name_that_is_taken_keeps_its_part_and_both_are_named(tmp_path):
         registry.register("twin")(first)
 
 
-@pytest.mark.door
 def test_two_plugins_with_one_name_are_refused_when_it_is_used_and_others_work(tmp_path):
     """Two installed plugins with a part of one name are refused when it is used, both named; other
     parts work.
@@ -60,7 +59,6 @@ HALF = (
 )
 
 
-@pytest.mark.door
 def test_broken_plugins_disturb_only_who_asks_for_them_each_time_with_the_same_cause(tmp_path):
     """A plugin that does not import is listed, says why each time it is used, and disturbs no other
     part.

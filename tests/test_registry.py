@@ -57,7 +57,6 @@ def test_an_unknown_name_gives_the_nearest_and_all(cameras: Registry):
         cameras.origin("xyzzy")
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("kind", REGISTRIES)
 def test_a_misspelt_part_gives_the_nearest(kind: str):
     """The misspelt name of a part is refused with the nearest one."""
@@ -66,7 +65,6 @@ def test_a_misspelt_part_gives_the_nearest(kind: str):
         REGISTRIES[kind].build(name[:-2] + name[:-3:-1])  # the last two letters swapped
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("kind", "name", "option", "nearest"),
     [("projector", "drr", "methd", "method"), ("scene", "ellipsoids", "valeu", "value")],

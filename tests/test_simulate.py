@@ -189,7 +189,6 @@ def test_what_goes_wrong_is_said_and_the_exit_is_not_zero(options, message, tmp_
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.door
 def test_the_app_works_in_foreign_places(root, tmp_path):
     """mvrecon-simulate works in the locale C, in folders with spaces and foreign letters, without a
     home.

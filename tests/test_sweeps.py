@@ -31,7 +31,6 @@ def test_a_sweep_names_its_runs_by_what_it_varies_and_compares_them(sweep):
     assert all(f"| {name} | geometry_free |" in page for name in runs)
 
 
-@pytest.mark.door
 def test_a_sweep_that_is_begun_again_runs_only_what_is_missing(sweep, monkeypatch):
     """A sweep that is begun again in its folder runs no finished run a second time."""
     folder, options = sweep
@@ -51,7 +50,6 @@ def test_sweepers_choose_by_validation_never_by_the_test(sweep):
     assert table["validation_psnr"] not in table["methods"]["geometry_free"]["psnr"]["values"]
 
 
-@pytest.mark.door
 def test_a_sweep_in_other_processes_takes_no_config_from_elsewhere(tmp_path):
     """A sweep whose jobs run in processes of their own, where configs are not checked, takes none
     from elsewhere.

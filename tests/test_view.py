@@ -53,7 +53,6 @@ def test_a_marker_is_where_nifti_says_in_every_picture(marked):
     assert {"view 0", "cameras", "rays", "grid"} <= {o.name for o in plot.objects}
 
 
-@pytest.mark.door
 def test_a_page_loads_nothing_from_elsewhere(marked):
     """A page that mvrecon-view writes loads nothing: it has no address of a program, style or
     picture, and its policy forbids any.
@@ -80,6 +79,15 @@ def test_blocks_of_a_large_volume_stay_where_they_are():
         z, y, x = (values == values.max()).nonzero()[0].tolist()
         index = (np.array([x, y, z]) + 0.5) / values.shape[::-1] - 0.5
         np.testing.assert_allclose((box_matrix(coarse) @ [*index, 1])[:3], whole)
+
+
+@pytest.mark.parametrize("shape", [(1, 300, 200), (2, 90, 700), (70, 1, 900), (5000, 3, 1)])
+def test_thin_volumes_keep_to_the_limit_too(shape):
+    grid = mv.Grid.centred(size=shape[::-1], spacing=1.0)
+    for limit in (1, 50, 1000):
+        values, coarse = reduced(torch.full(shape, 3.0), grid, limit)
+        assert values.numel() <= limit and tuple(values.shape) == coarse.shape
+        assert values.unique().tolist() == [3.0]
 
 
 def test_without_its_library_the_app_says_what_to_install(marked, monkeypatch):

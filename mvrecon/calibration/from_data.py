@@ -7,8 +7,14 @@ Gaussian blobs, G: with voxels alone a volume has so many freedoms that it expla
 too (of a sharp object wrongly by 0.4 degrees). In each step the rig's unknowns are eliminated
 exactly and the volume's change comes from conjugate gradients (separable least squares: Golub &
 Pereyra, SIAM J. Numer. Anal. 10, 1973; blobs: Lewitt, J. Opt. Soc. Am. A 7, 1990).
+
+No grid holds an object exactly, and that error pulls at every number that is free. A turn of all
+detectors about u, say, is on a circle nearly a stretched object, which voxels may resolve better:
+such a fit runs away, and even views that it left out fit better. A number is therefore fitted only
+where the volume explains its effect on the views far worse than the views themselves.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -32,13 +38,18 @@ OperatorOf = Callable[[Cameras], Projector]
 BLOB, VIEW_BLUR = 1.0, 2.0
 #: The fit ends where no number changes by so much of its longest change.
 CLOSE = 2e-3
+#: The views determine a number where, of its effect, the ratio of what the volume leaves to what it
+#: explains is so many times that of the views.
+DETERMINED = 10.0
+#: Parts of the views, each predicted from the others.
+PARTS = 2
 
 
 class Round(NamedTuple):
     """A round of the fit, as a monitor sees it.
 
     Args:
-        number: from 1.
+        number: from 1, and again from 1 without the numbers that the views do not determine.
         residual: |S y - A x| / |S y| of the blurred views at its end.
     """
 
@@ -56,12 +67,28 @@ class Estimate(NamedTuple):
         gains: factor of each view's integrals, their geometric mean 1; to be divided by.
         residual: |S y - A x| / |S y| of the blurred views, of the rig that was given and after
             each round.
+        kept: names out of `free` whose nominal values were kept.
+        left_out: |S y - A x| / |S y| with x from other views than those that are compared, of the
+            rig that was given and of the fitted one.
+        settled: whether the fit ended by itself before the last round.
     """
 
     cameras: Cameras
     misalignment: Misalignment
     gains: Float[Tensor, " m"]
     residual: list[float]
+    kept: list[str]
+    left_out: tuple[float, float]
+    settled: bool
+
+
+class _Fit(NamedTuple):
+    """The rig's numbers and the volume, the residuals of all rounds, and whether it settled."""
+
+    values: Float[Tensor, "m k"]
+    x: Float[Tensor, "1 1 d h w"]
+    residual: list[float]
+    settled: bool
 
 
 class _Problem(NamedTuple):
@@ -89,6 +116,18 @@ class _Problem(NamedTuple):
     def relative(self, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"]) -> float:
         return (self.residual(values, x).norm() / self.views.norm()).item()
 
+    def left_out(self, values: Float[Tensor, "m k"], iterations: int) -> float:
+        """The relative error of views as the volume of the other views predicts them."""
+        rig = self.rig(values)
+        views = self.views / self.unknowns.gains(values)[:, None, None].to(self.views)
+        part, squares = torch.arange(len(rig)) % PARTS, 0.0
+        for judge in range(PARTS):
+            out, others = part == judge, part != judge
+            x = cgls(self.operator_of(rig[others]) @ self.blobs, views[:, :, others], iterations)
+            rest = views[:, :, out] - (self.operator_of(rig[out]) @ self.blobs)(x)
+            squares += rest.square().sum().item()
+        return squares**0.5 / views.norm().item()
+
 
 @torch.no_grad()
 def calibrated(
@@ -100,7 +139,8 @@ def calibrated(
     rounds: int = 12,
     monitor: Callable[[Round], object] | None = None,
 ) -> Estimate:
-    """Rig fitted to the measured views alone, in pixels and degrees.
+    """Rig fitted to the measured views alone, in pixels and degrees; numbers that the views do not
+    determine keep their nominal values, and so does a rig that predicts left-out views best.
 
     Blobs and blur go with the grid's voxel. Voxels may be coarse, which is fast and robust: edges
     need not be resolved, but there should be about as many views as voxels across. The object must
@@ -112,22 +152,61 @@ def calibrated(
         views: measured integrals.
         free: what is fitted. One number for all views: "offset_u", "offset_v" (pixels), "tilt"
             (about the beam, which is the tilt of the axis), "slant" (about u), "swivel" (about v;
-            degrees). A number for each view: "shifts" (u and v, pixels), "gains" (factors). Along
-            the axis of a circle an offset_v is nearly a shift of the object.
+            degrees). A number for each view: "shifts" (u and v, pixels), "gains" (factors). On a
+            circle an offset_v is nearly a shift of the object, a slant nearly a stretch of it.
         iterations: of conjugate gradients in each round.
         rounds: of Gauss-Newton at most; it ends before where nothing changes any more.
         monitor: called after each round.
+
+    Warns:
+        UserWarning: nominal values are kept; the rig still changed in the last round.
 
     Raises:
         ValueError: names that `unknowns` refuses; views that are zero, not finite, or of another
             shape than the operator's; parallel beams, which `misaligned` refuses.
     """
     numbers = unknowns(cameras, free)
-    values = numbers.basis.new_zeros(numbers.basis.shape[:2])
-    A = operator_of(misaligned(cameras, numbers.misalignment(values)))
+    nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
+    A = operator_of(misaligned(cameras, numbers.misalignment(nominal)))
     _check(views, A)
     blobs = Blur(A.domain_shape, [BLOB] * 3, A.device)
     problem = _Problem(operator_of, cameras, numbers, blobs, blurred(views, _view_blur(A)))
+    kept: list[str] = []
+    while True:
+        fit = _fitted(problem, iterations, rounds, monitor)
+        lost = _undetermined(problem, fit, [name for name in free if name not in kept], iterations)
+        if not lost:
+            break
+        kept += lost
+        problem = problem._replace(unknowns=problem.unknowns.without(lost))
+    if kept:
+        warnings.warn(
+            f"The views do not determine {', '.join(kept)}: kept at the nominal value",
+            stacklevel=3,
+        )
+    if not fit.settled:
+        warnings.warn(f"The rig still changed in the last of {rounds} rounds", stacklevel=3)
+    values = fit.values
+    left_out = (problem.left_out(nominal, iterations), problem.left_out(values, iterations))
+    if left_out[1] > left_out[0]:
+        warnings.warn(
+            f"The nominal rig predicts left-out views with an error of {left_out[0]:.5g}, the "
+            f"fitted one with {left_out[1]:.5g}: the nominal rig is kept",
+            stacklevel=3,
+        )
+        values, kept = nominal, list(free)
+    by, gains = numbers.misalignment(values), numbers.gains(values)
+    return Estimate(problem.rig(values), by, gains, fit.residual, kept, left_out, fit.settled)
+
+
+def _fitted(
+    problem: _Problem,
+    iterations: int,
+    rounds: int,
+    monitor: Callable[[Round], object] | None,
+) -> _Fit:
+    """The fit of rig and volume, from the nominal rig."""
+    values = problem.unknowns.basis.new_zeros(problem.unknowns.basis.shape[:2])
     x = cgls(problem.operator(values), problem.views, iterations)
     history = [problem.relative(values, x)]
     for number in range(1, rounds + 1):
@@ -136,10 +215,30 @@ def calibrated(
         history.append(problem.relative(values, x))
         if monitor is not None:
             monitor(Round(number, history[-1]))
-        if ((values - last).abs() < CLOSE * numbers.longest).all():
-            break
-    by = numbers.misalignment(values)
-    return Estimate(problem.rig(values), by, numbers.gains(values), history)
+        if ((values - last).abs() < CLOSE * problem.unknowns.longest).all():
+            return _Fit(values, x, history, True)
+    return _Fit(values, x, history, False)
+
+
+def _undetermined(problem: _Problem, fit: _Fit, names: Sequence[str], iterations: int) -> list[str]:
+    """The names of numbers for all views whose effect the volume explains about as well as it
+    explains the views.
+    """
+    A, r = problem.operator(fit.values), problem.residual(fit.values, fit.x)
+    columns = derivatives(lambda moved: problem.operator(moved)(fit.x), fit.values)
+    effects = dict(zip(problem.unknowns.kinds, columns[:, None, None], strict=True))
+    least, lost = DETERMINED * _unexplained(r, problem.views), []
+    for name in names:
+        if name in effects:
+            rest = effects[name] - A(cgls(A, effects[name], iterations))
+            if not _unexplained(rest, effects[name]) >= least:
+                lost.append(name)
+    return lost
+
+
+def _unexplained(rest: Tensor, whole: Tensor) -> float:
+    """What a volume leaves of views, relative to what it explains."""
+    return (rest.norm() / (whole - rest).norm()).item()
 
 
 def _improved(

@@ -58,6 +58,11 @@ class Unknowns(NamedTuple):
         """The longest change in a round, of each kind."""
         return self.basis.new_tensor([KINDS[kind].longest for kind in self.kinds])
 
+    def without(self, kinds: Sequence[str]) -> "Unknowns":
+        """The same numbers, those of some kinds zero in all views."""
+        free = self.basis.new_tensor([kind not in kinds for kind in self.kinds])
+        return self._replace(basis=self.basis * free[:, None])
+
     def misalignment(self, values: Float[Tensor, "m k"]) -> Misalignment:
         """What is wrong with each view, in pixels and degrees; differentiable."""
         still = Misalignment.none(len(values))

@@ -47,6 +47,8 @@ VECTORS = ("source", "origin", "u", "v")
 class Cameras:
     """M cameras with detectors of one size.
 
+    The vectors are copied, but for tensors that require a gradient.
+
     Args:
         source: source or pinhole S in world mm; for a parallel beam, the start of the ray of pixel
             (0, 0).
@@ -73,6 +75,8 @@ class Cameras:
     def __post_init__(self) -> None:
         for name in VECTORS:
             vector = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            # a copy, but of what is optimised: its steps are the rig's
+            vector = vector if vector.requires_grad else vector.clone()
             object.__setattr__(self, name, vector)
             expected = (len(self.source) if self.source.ndim == 2 else "m", 3)
             if vector.ndim != 2 or vector.shape != expected or not len(vector):

@@ -48,7 +48,7 @@ class Detector:
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> "Detector":
-        """The detector that a mapping describes.
+        """The detector that a mapping describes; an option that is None counts as absent.
 
         Raises:
             TypeError: not a mapping, an unknown option, or a missing one; the message names it.
@@ -57,6 +57,7 @@ class Detector:
         if not isinstance(options, Mapping):
             raise TypeError(f"A detector must be a mapping of {', '.join(known)}, got {options!r}")
         check_options("A detector", options, known)
+        options = {name: value for name, value in options.items() if value is not None}
         if absent := {"pixels", "pixel_mm"} - set(options):
             raise TypeError(
                 f"A detector needs {' and '.join(sorted(absent))}, got only {sorted(options)}"

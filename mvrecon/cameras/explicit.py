@@ -14,7 +14,8 @@ class ExplicitRays:
     """The segments from source to target of every pixel of M detectors; a projector takes them
     instead of cameras.
 
-    A ray takes 96 bytes more than its two points. For a flat detector `Cameras` is smaller and
+    The points are copied, but for tensors that require a gradient. A ray takes 96 bytes more than
+    its two points. For a flat detector `Cameras` is smaller and
     faster.
 
     Args:
@@ -35,6 +36,7 @@ class ExplicitRays:
     def __post_init__(self) -> None:
         for name in ("source", "target"):
             points = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            points = points if points.requires_grad else points.clone()
             object.__setattr__(self, name, points)
             if points.ndim != 4 or points.shape[3] != 3 or not points.numel():
                 raise ValueError(

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 
 class Interval(NamedTuple):
-    """A mean with the bounds of its confidence interval; bounds are nan for fewer than two
-    values.
+    """A mean with the bounds of its confidence interval; bounds are nan for fewer than two values,
+    and where the mean is not finite.
     """
 
     mean: float
@@ -20,13 +20,13 @@ def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
     """The mean of independent values and the interval that holds their expectation with a
     probability of `level`, for values of a normal distribution (Student 1908).
 
-    Values that are not finite are left out.
+    No value is left out: the mean is nan where one is, and for none.
     """
-    numbers = [value for value in values if math.isfinite(value)]
-    if len(numbers) < 2:
-        return Interval(numbers[0] if numbers else math.nan, math.nan, math.nan)
-    mean, error = statistics.fmean(numbers), statistics.stdev(numbers) / math.sqrt(len(numbers))
-    half = t_quantile(level, len(numbers) - 1) * error
+    mean = sum(values) / len(values) if values else math.nan
+    if len(values) < 2 or not math.isfinite(mean):
+        return Interval(mean, math.nan, math.nan)
+    error = statistics.stdev(values) / math.sqrt(len(values))
+    half = t_quantile(level, len(values) - 1) * error
     return Interval(mean, mean - half, mean + half)
 
 

@@ -11,7 +11,9 @@ WIDTH, HEIGHT, LEFT, BOTTOM, RIGHT, TOP = 760, 440, 70, 50, 200, 20
 
 
 def front(rows: Sequence[Row], figure: str) -> list[Row]:
-    """The methods that no other one beats in both time and error, the fastest first."""
+    """The methods that no other one beats in both time and error, the fastest first; never one that
+    has failed in a scene.
+    """
     best, chosen = math.inf, []
     for row in sorted(rows, key=lambda row: (row.ms, _loss(row, figure))):
         if _loss(row, figure) < best:
@@ -21,19 +23,21 @@ def front(rows: Sequence[Row], figure: str) -> list[Row]:
 
 
 def picture(rows: Sequence[Row], figure: str = "psnr") -> str:
-    """Every method at its milliseconds (logarithmic) and its figure of merit, with a line along
-    those that none other beats in both; SVG.
+    """Every method at its milliseconds (logarithmic) and its figure of merit where that is finite,
+    with a line along those that none other beats in both; SVG.
 
     Raises:
         ValueError: no method with a time and a figure.
     """
-    shown = [row for row in rows if row.ms > 0 and math.isfinite(row.mean(figure))]
+    timed = [row for row in rows if row.ms > 0]
+    shown = [row for row in timed if math.isfinite(row.mean(figure))]
     if not shown:
         raise ValueError(f"Expected methods with a time and a {figure}, got none")
     x = _scale([math.log10(row.ms) for row in shown], LEFT, WIDTH - RIGHT)
     y = _scale([row.mean(figure) for row in shown], HEIGHT - BOTTOM, TOP)
     places = {id(row): (x(math.log10(row.ms)), y(row.mean(figure))) for row in shown}
-    line = " ".join("{:.1f},{:.1f}".format(*places[id(row)]) for row in front(shown, figure))
+    best = [places[id(row)] for row in front(timed, figure) if id(row) in places]
+    line = " ".join("{:.1f},{:.1f}".format(*place) for place in best)
     parts = [f'<polyline points="{line}" fill="none" stroke="#c44" stroke-dasharray="4 3"/>']
     for row in shown:
         across, down = places[id(row)]
@@ -57,7 +61,10 @@ def picture(rows: Sequence[Row], figure: str = "psnr") -> str:
 
 
 def _loss(row: Row, figure: str) -> float:
-    return -row.mean(figure) if figure in RISING else row.mean(figure)
+    mean = row.mean(figure)
+    if math.isnan(mean):
+        return math.inf
+    return -mean if figure in RISING else mean
 
 
 def _scale(values: Sequence[float], start: float, end: float):

@@ -25,7 +25,8 @@ class Row:
         run: what differs from the other runs.
         method: its label in the run.
         scenes: names of the test scenes, a patient each.
-        figures: of merit by name, a value for each scene.
+        figures: of merit by name, a value for each scene; nan where the volume has failed.
+        failed: number of scenes whose volume holds NaN or infinity.
         ms: milliseconds of one reconstruction.
         train_seconds: of training.
         parameters: number of weights.
@@ -37,6 +38,7 @@ class Row:
     method: str
     scenes: tuple[str, ...]
     figures: Mapping[str, tuple[float, ...]]
+    failed: int
     ms: float
     train_seconds: float
     parameters: int
@@ -44,8 +46,8 @@ class Row:
     folder: Path
 
     def mean(self, figure: str) -> float:
-        """Mean of a figure over the scenes where it is a number."""
-        values = [value for value in self.figures[figure] if math.isfinite(value)]
+        """Mean of a figure over all scenes; nan where the method has failed in one."""
+        values = self.figures[figure]
         return sum(values) / len(values) if values else math.nan
 
 
@@ -77,11 +79,13 @@ def _rows(folder: Path, name: str) -> Iterator[Row]:
 def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
     """The methods of a table of results, under a run's name."""
     for label, row in table["methods"].items():
+        figures = {key: tuple(map(_number, row[key]["values"])) for key in FIGURES}
         yield Row(
             run=run,
             method=str(label),
             scenes=tuple(map(str, table["scenes"])),
-            figures={key: tuple(map(_number, row[key]["values"])) for key in FIGURES},
+            figures=figures,
+            failed=sum(map(math.isnan, figures["ssim"])),  # a finite volume always has an SSIM
             ms=_number(row["ms_per_volume"]),
             train_seconds=_number(row["train_seconds"]),
             parameters=int(row["parameters"]),
@@ -90,8 +94,8 @@ def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
         )
 
 
-def _number(value: float | None) -> float:
-    """A number of a table, in which those that are not finite are null."""
+def _number(value: float | str | None) -> float:
+    """A number of a table, in which nan is null, and infinity a text."""
     return math.nan if value is None else float(value)
 
 

@@ -26,16 +26,19 @@ class Cells(NamedTuple):
 
 def difference(row: Row, reference: Row, figure: str) -> Interval:
     """Mean difference of a figure to the reference on the scenes that both were judged on, paired
-    scene by scene, with its 95 % confidence interval over the scenes.
+    scene by scene, with its 95 % confidence interval over the scenes; nan where one of the two has
+    failed in such a scene.
     """
     of_reference = dict(zip(reference.scenes, reference.figures[figure], strict=True))
     pairs = zip(row.scenes, row.figures[figure], strict=True)
-    return mean_interval([v - of_reference[scene] for scene, v in pairs if scene in of_reference])
+    both = [(v, of_reference[scene]) for scene, v in pairs if scene in of_reference]
+    return mean_interval([0.0 if v == other else v - other for v, other in both])  # inf, too
 
 
 def cells(rows: Sequence[Row], reference: Row, figure: str = "psnr") -> Cells:
-    """The table as texts: means over the scenes, the differences of one figure to the reference,
-    milliseconds of a reconstruction, its memory, weights and seconds of training.
+    """The table as texts: means over the scenes, or how many of a method's volumes have failed; the
+    differences of one figure to the reference, milliseconds of a reconstruction, its memory,
+    weights and seconds of training.
     """
     names = ["PSNR dB", "SSIM", "NRMSE", "view NRMSE"]
     change = f"{figure} - reference (95 %)"
@@ -43,6 +46,8 @@ def cells(rows: Sequence[Row], reference: Row, figure: str = "psnr") -> Cells:
     body = []
     for row in rows:
         means = [_text(row.mean(name), digits) for name, digits in DIGITS.items()]
+        if row.failed:
+            means = [f"{row.failed} of {len(row.scenes)} failed"] * len(means)
         same = row is reference
         apart = "reference" if same else _interval(difference(row, reference, figure), figure)
         costs = [_text(row.ms, 1), _text(row.peak_mb, 0), str(row.parameters)]
@@ -74,13 +79,13 @@ def comma_separated(rows: Sequence[Row], reference: Row) -> str:
     heads = [f"{figure} {part}" for figure in DIGITS for part in parts]
     costs = ["ms", "peak_mb", "parameters", "train_seconds", "folder"]
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["run", "method", "scenes", *heads, *costs])
+    writer.writerow(["run", "method", "scenes", "failed", *heads, *costs])
     for row in rows:
         numbers = [
             v for name in DIGITS for v in (row.mean(name), *difference(row, reference, name))
         ]
         ends = [row.ms, row.peak_mb, row.parameters, row.train_seconds, row.folder]
-        writer.writerow([row.run, row.method, len(row.scenes), *numbers, *ends])
+        writer.writerow([row.run, row.method, len(row.scenes), row.failed, *numbers, *ends])
     return file.getvalue()
 
 

@@ -35,13 +35,10 @@ from mvrecon.files.checks import shown, yaml_of
 from mvrecon.registry import installed, locate
 
 VERSION_BASE = "1.3"
-#: Settings of an app whose options need not be in its file: a method's are those of its signature,
-#: an evaluation's those of the run.
-OF_RUN = {
-    "train": ("method", "compare"),
-    "reconstruct": ("method",),
-    "eval": ("acquisition", "camera", "compare", "data", "grid", "test_scene"),
-}
+#: Settings whose options need not be in a file: those of parts are in their signatures.
+OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
+#: Further such settings of an app: an evaluation has those of its run.
+OF_RUN = {"eval": ("acquisition", "data", "grid")}
 
 
 class PluginConf(SearchPathPlugin):
@@ -104,7 +101,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         SystemExit: an error, or Ctrl-C.
     """
     sys.argv[1:] = arguments = with_options_added(
-        with_paths_quoted(with_flag_first(sys.argv[1:])), OF_RUN.get(config_name, ())
+        with_paths_quoted(with_flag_first(sys.argv[1:])), (*OF_PARTS, *OF_RUN.get(config_name, ()))
     )
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
@@ -190,7 +187,7 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
     prepare_hydra()
     guard = guarded(conf_dir(), plugin_conf_dirs())
     with guard, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
-        added = with_options_added(overrides, OF_RUN.get(config_name, ()))
+        added = with_options_added(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
         config = hydra.compose(config_name, added, return_hydra_config=True)
     choices = dict(config.hydra.runtime.choices)
     with open_dict(config):

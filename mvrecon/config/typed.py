@@ -16,8 +16,8 @@ LENGTH = "PositiveInt | Literal[-1]"
 WRITTEN = {
     "camera.detector": {
         "pixels": "PositiveInt | Pair[PositiveInt] | None",
-        "pixel_mm": "PositiveFloat | Pair[PositiveFloat]",
-        "offset_mm": "float | Pair[float]",
+        "pixel_mm": "PositiveFloat | Pair[PositiveFloat] | None",
+        "offset_mm": "float | Pair[float] | None",
     },
     "grid": {"like": "str"},
     "data": {"overlap": "bool", "sizes": ""},

@@ -1,6 +1,6 @@
 """Training samples from the cases of a scene, and their random order in each epoch."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -178,3 +178,9 @@ class EpochOrder(Sampler[int]):
         """
         self.resumed = (epoch, n_done)
         self.set_epoch(epoch)
+
+
+def single_cases(batch: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The cases of a batch, each as a batch of one."""
+    count = len(batch["views"])
+    return [{key: value[i : i + 1] for key, value in batch.items()} for i in range(count)]

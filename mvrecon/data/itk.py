@@ -6,7 +6,8 @@ and y change their signs.
 
 import math
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +36,9 @@ HEADER = 2**16
 #: Characters of a line of an NRRD header at most, comments and key/value pairs aside: ITK writes
 #: lines of 1000 beyond a buffer, which ends the process (SimpleITK 2.5.7; 500 do no harm).
 LINE = 500
+#: Millimetres in the units of length that an NRRD header may name, which ITK leaves out; "" is
+#: NRRD's word for an unknown one.
+MILLIMETRES = {"": 1.0, "nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
 #: From ITK's world (LPS) to ours (RAS).
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: SimpleITK's names of pixel types, and numpy's.
@@ -70,11 +74,11 @@ def itk_image(path: Path) -> ItkImage:
     Raises:
         ImportError: SimpleITK is not installed.
         FileNotFoundError: nothing is there.
-        Refused: damaged, cut short, not three axes, several values a pixel, or data in a file that
-            does not lie beside it.
+        Refused: damaged, cut short, not three axes, several values a pixel, data in a file that
+            does not lie beside it, or an unknown unit of length.
     """
     check_file(path, ", ".join(IO))
-    data, packed = _data_file(path)
+    data, packed, mm = _data_file(path)
     reader = _reader(path)
     with blaming(path, "cannot be read"):
         reader.ReadImageInformation()
@@ -94,6 +98,7 @@ def itk_image(path: Path) -> ItkImage:
         affine = np.eye(4)
         direction = np.array(reader.GetDirection()).reshape(3, 3)
         affine[:3, :3], affine[:3, 3] = direction * reader.GetSpacing(), reader.GetOrigin()
+        affine[:3] *= mm
     return ItkImage(path, size, dtype, affine)
 
 
@@ -165,9 +170,9 @@ def _reader(path: Path) -> Any:
     return reader
 
 
-def _data_file(path: Path) -> tuple[Path, bool]:
-    """The file that the values are in, which must lie beside the header, and whether it is
-    packed.
+def _data_file(path: Path) -> tuple[Path, bool, float]:
+    """The file that the values are in, which must lie beside the header, whether it is packed, and
+    the header's unit of length in mm.
     """
     with path.open("rb") as file:
         text = file.read(HEADER).decode("latin-1")
@@ -175,7 +180,7 @@ def _data_file(path: Path) -> tuple[Path, bool]:
         entries = _entries(_nrrd_lines(path, text), ":")
         if {"data file", "datafile"} & set(entries):
             raise Refused(f"{path}: expected NRRD with its values in the same file")
-        return path, entries.get("encoding") not in ("raw",)
+        return path, entries.get("encoding") not in ("raw",), _millimetres(path, entries)
     entries = _entries(text.splitlines(), "=")
     name = entries.get("elementdatafile")
     if name is None:
@@ -183,7 +188,19 @@ def _data_file(path: Path) -> tuple[Path, bool]:
     data = path if name == "LOCAL" else path.with_name(plain_name(name, path))
     if not data.is_file():
         raise FileNotFoundError(f"{path}: its values should be in {shown(name)}, which is missing")
-    return data, entries.get("compresseddata", "").lower() == "true"
+    return data, entries.get("compresseddata", "").lower() == "true", 1.0
+
+
+def _millimetres(path: Path, entries: Mapping[str, str]) -> float:
+    """Unit of length of an NRRD header in mm."""
+    texts = (entries.get(field, "") for field in ("units", "space units"))
+    named = {unit for text in texts for unit in re.findall(r'"([^"]*)"', text)} or {""}
+    if len(named) > 1 or not named <= MILLIMETRES.keys():
+        raise Refused(
+            f"{path}: expected one unit of length for all axes, of "
+            f"{', '.join(filter(None, MILLIMETRES))}, got {shown(sorted(named))}"
+        )
+    return MILLIMETRES[named.pop()]
 
 
 def _nrrd_lines(path: Path, text: str) -> list[str]:

@@ -71,11 +71,18 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
     more bytes than declared.
 
     Raises:
-        Refused: a chunk that is missing, or that unfolds to more than its size.
+        Refused: a chunk that is missing, or that unfolds to more than its size; a dataset without
+            chunks that was never written.
     """
+    item = dataset.id.get_type().get_size()
     if dataset.chunks is None:
+        if (got := dataset.id.get_storage_size()) < dataset.size * item:
+            raise Refused(
+                f"{path}: {dataset.name!r} has {got} of its {dataset.size * item} bytes; was it "
+                f"written to its end?"
+            )
         return
-    size = math.prod(dataset.chunks) * dataset.id.get_type().get_size()
+    size = math.prod(dataset.chunks) * item
     slack = (
         2 * size + 64
     )  # a reference to text takes 16 bytes and not 8; checksums and what does not shrink add some

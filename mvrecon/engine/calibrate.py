@@ -81,7 +81,9 @@ def in_words(estimate: Estimate, free: Sequence[str]) -> str:
     """What was wrong with a rig, in pixels and degrees, and the residual before and after."""
     parts, by = [], estimate.misalignment
     for name in free:
-        if name == "shifts":
+        if name in estimate.kept:
+            parts.append(f"{name} kept at the nominal value")
+        elif name == "shifts":
             length = by.offset_px.norm(dim=1)
             parts.append(
                 f"shifts of {length.square().mean().sqrt():.2f} pixels (rms), at most "
@@ -99,9 +101,10 @@ def in_words(estimate: Estimate, free: Sequence[str]) -> str:
             unit = "pixels" if kind.field == "offset_px" else "degrees"
             parts.append(f"{name} {value:+.3f} {unit}")
     before, after = estimate.residual[0], estimate.residual[-1]
+    rounds = f"{len(estimate.residual) - 1} rounds"
     return (
         f"{', '.join(parts)}; residual of the blurred views {before:.3g} before, {after:.3g} after "
-        f"{len(estimate.residual) - 1} rounds"
+        f"{rounds if estimate.settled else rounds + ', in the last of which the rig still changed'}"
     )
 
 
@@ -115,6 +118,9 @@ def table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]:
         "tilt_degrees": by.tilt_degrees.tolist(),
         "gains": estimate.gains.tolist(),
         "residual": estimate.residual,
+        "kept": estimate.kept,
+        "left_out": list(estimate.left_out),
+        "settled": estimate.settled,
     }
 
 

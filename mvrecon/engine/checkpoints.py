@@ -12,6 +12,7 @@ from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoint_check import check_archive, check_known, check_settings
 from mvrecon.engine.module import ReconstructionModule
 from mvrecon.engine.storage import read
+from mvrecon.engine.unfamiliar import warn_of_geometry, warn_of_values
 from mvrecon.files.checks import blaming, plain_name
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import PROJECTORS
@@ -53,18 +54,25 @@ class Trained:
             cameras: another rig; None: that of the training.
             grid: another grid of the volume; None: that of the training.
 
+        Warns:
+            UserWarning: another grid or range of values than in training, or another rig where it
+                was trained on one.
+
         Raises:
             ValueError: views that do not fit the rig, or weights that fit the rig and the grid of
                 the training alone.
         """
-        A = self.module.projector
+        A, name = self.module.projector, f"The trained {self.module.hparams['method']['name']}"
         if cameras is not None or grid is not None:
             A = PROJECTORS.from_config(
                 self.module.hparams["geometry"]["projector"],
                 grid=A.grid if grid is None else grid,
                 cameras=A.cameras if cameras is None else cameras,
             ).to(A.device)
-        return self.module(views, A).volume
+            warn_of_geometry(A, self.module, name)
+        volume = self.module(views, A).volume
+        warn_of_values(volume, self.module.hparams["data_range"], name)
+        return volume
 
 
 def finished(folder: Path, method: str) -> Path:

@@ -2,10 +2,12 @@
 scenes were used in training.
 """
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from mvrecon.data import digests
+from mvrecon.data.dataset import single_cases
 from mvrecon.data.module import SceneData
 from mvrecon.engine.checkpoints import Trained, finished, load
 from mvrecon.engine.fit import build_module, trainable
@@ -22,7 +25,7 @@ from mvrecon.engine.module import Settings, build_projector
 from mvrecon.engine.quality import quality_of, quality_row
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of
 from mvrecon.files.memory import peak_since, restarted_peak
-from mvrecon.metrics import UNITS, mean_and_spread, view_metrics, volume_metrics
+from mvrecon.metrics import UNITS, case_metrics, mean_and_spread
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import METRICS
 from mvrecon.projectors.operator import Projector
@@ -46,7 +49,8 @@ def evaluate(
 ) -> Scores:
     """Figures of merit, milliseconds and memory of one reconstruction ("ms"; "bytes", None where it
     is not known), what a method reports of its own error ("quality") and of the cameras
-    ("cameras", where it does), of each method on each scene.
+    ("cameras", where it does), of each method on each scene. Figures of merit are nan where a
+    volume has failed: `case_metrics`.
 
     Args:
         methods: by label.
@@ -60,7 +64,8 @@ def evaluate(
     A, others = A.to(device), {k: B.to(device) for k, B in (assumed or {}).items()}
     ready = {label: method.to(device).eval() for label, method in methods.items()}
     scores: Scores = {label: [] for label in methods}
-    for scene in (case for batch in batches for case in _singly(batch, device)):
+    for case in chain.from_iterable(map(single_cases, batches)):
+        scene = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
         volumes, of_case = {}, A.for_case(scene)
         for label, method in ready.items():
             B = others[label].for_case(scene) if label in others else of_case
@@ -68,8 +73,7 @@ def evaluate(
                 method(scene["views"], B)  # the first call compiles and fills caches
             milliseconds, needed, out = _measured(method, scene["views"], B)
             volume = out.volume
-            figures = volume_metrics(volume[0], scene["volume"][0], scene["inside"][0], data_range)
-            figures |= view_metrics(of_case(volume), scene["views"])
+            figures = case_metrics(volume[0], of_case(volume)[0], scene, data_range)
             costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
             scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
             volumes[label] = volume
@@ -152,15 +156,15 @@ def results(
         "threads": torch.get_num_threads(),
         "brought": METRICS.names(),
         "units": {**UNITS, **COSTS, "data_range": data.unit},
-        "methods": {label: _row(method, scores[label]) for label, method in trained.items()},
+        "methods": {label: _row(method, scores[label], names) for label, method in trained.items()},
     }
 
 
 def validation_psnr(
     settings: Settings, folder: Path, data: SceneData, device: str = "cpu"
 ) -> float:
-    """Mean PSNR of a run's main method on the validation scenes in dB, nan without any: what
-    settings may be chosen by.
+    """Mean PSNR of a run's main method on the validation scenes in dB, nan without any, and minus
+    infinity where a volume has failed: what settings may be chosen by.
     """
     data.setup("validate")
     label, model = next(iter(methods_of(settings).items()))
@@ -169,10 +173,12 @@ def validation_psnr(
     batches = DataLoader(data.sets["val"])
     methods = {label: module.method}
     scores = evaluate(methods, batches, module.projector, data.data_range, device)
-    return mean_and_spread([score["psnr"] for score in scores[label]])["mean"]
+    values = [score["psnr"] for score in scores[label]]
+    return -math.inf if any(map(math.isnan, values)) else mean_and_spread(values)["mean"]
 
 
-def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
+def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) -> dict[str, Any]:
+    failed = [n for n, score in zip(names, scores, strict=True) if math.isnan(score["nrmse"])]
     needed = [score["bytes"] for score in scores if score["bytes"] is not None]
     return {
         "parameters": sum(p.numel() for p in method.module.method.parameters() if p.requires_grad),
@@ -180,8 +186,9 @@ def _row(method: Trained, scores: list[dict[str, Any]]) -> dict[str, Any]:
         "train_seconds": method.seconds,
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
         "peak_mb": max(needed) / 2**20 if needed else None,
+        "failed": failed,
         **{
-            name: mean_and_spread([score[name] for score in scores])
+            name: mean_and_spread([score[name] for score in scores], bool(failed))
             for name in (*METRICS.names(), *UNITS)
         },
         **quality_row(scores),
@@ -208,15 +215,6 @@ def seen_in_training(
     known = truths or [""] * len(names)
     pairs = zip(names, known, strict=True)
     return [name for name, truth in pairs if name in cases or truth in volumes]
-
-
-def _singly(batch: dict[str, Any], device: str) -> Iterable[dict[str, Any]]:
-    for i in range(len(batch["views"])):
-        alone = {key: value[i : i + 1] for key, value in batch.items()}
-        yield {
-            key: value.to(device) if isinstance(value, Tensor) else value
-            for key, value in alone.items()
-        }
 
 
 def _measured(

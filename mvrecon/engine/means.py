@@ -9,23 +9,19 @@ from torchmetrics import MeanMetric
 
 class Means:
     """Means by name, over all cases and all processes of a run (torchmetrics' MeanMetric, which
-    sums over them).
-
-    Args:
-        ignore_nan: cases whose figure is nan count in no mean; otherwise they make it nan.
+    sums over them); a case whose figure is nan makes the mean nan.
     """
 
-    def __init__(self, ignore_nan: bool):
-        self._strategy = "ignore" if ignore_nan else "disable"
+    def __init__(self) -> None:
         self._means: dict[str, MeanMetric] = {}
 
     def update(self, values: Mapping[str, Float[Tensor, " n"]]) -> None:
-        """Add the figures of n cases, each by itself: torchmetrics 1.9 leaves a weight out where
-        nan counts.
+        """Add the figures of n cases, which may be none, each by itself: torchmetrics 1.9 leaves a
+        weight out where nan counts.
         """
         for name, value in values.items():
             if name not in self._means:
-                self._means[name] = MeanMetric(nan_strategy=self._strategy).to(value.device)  # pyright: ignore[reportArgumentType]
+                self._means[name] = MeanMetric(nan_strategy="disable").to(value.device)
             self._means[name].update(value.detach())
 
     def compute(self) -> dict[str, Tensor]:

@@ -1,5 +1,6 @@
 """One method in training, as a LightningModule: its loss, figures of merit and optimiser."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -7,6 +8,7 @@ import lightning.pytorch as L
 from torch import Tensor
 
 from mvrecon.cameras.field import common_field
+from mvrecon.data.dataset import single_cases
 from mvrecon.data.rigs import camera_of
 from mvrecon.engine.finite import FiniteLoss
 from mvrecon.engine.graph import GraphedLoss
@@ -16,7 +18,7 @@ from mvrecon.engine.schedule import build_optimizer, build_schedule
 from mvrecon.engine.wrong_cameras import TRUTH
 from mvrecon.geometry.grid import Grid
 from mvrecon.losses import ReconstructionLoss
-from mvrecon.metrics import camera_metrics, view_metrics, volume_metrics
+from mvrecon.metrics import camera_metrics, case_metrics
 from mvrecon.models.geometry import kept
 from mvrecon.models.method import build_method
 from mvrecon.models.output import Reconstruction
@@ -66,7 +68,7 @@ class ReconstructionModule(L.LightningModule):
         self._finite = FiniteLoss(method["name"])
         #: What computes the loss and its gradients in training instead of `terms`; none for those.
         self.graph: GraphedLoss | None = None
-        self._losses, self._figures = Means(ignore_nan=False), Means(ignore_nan=True)
+        self._means = Means()
 
     def forward(self, views: Tensor, A: Projector | None = None) -> Reconstruction:
         """The reconstruction of views [b 1 m v u] by the method; see there.
@@ -148,36 +150,38 @@ class ReconstructionModule(L.LightningModule):
         return self.loss(out, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
-        """Judge a batch by the loss and the figures of merit; hand the reconstruction on to the
-        board.
+        """Judge a batch by the loss and each of its cases by the figures of merit; hand the
+        reconstruction on to the board.
         """
         A = self.operator(batch)
         out = self.method(batch["views"], A)
         terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
         predicted = A(out.volume)
-        figures = [
-            volume_metrics(volume, truth, inside, self.hparams["data_range"])
-            | view_metrics(view, measured)
-            for volume, truth, inside, view, measured in zip(
-                out.volume, batch["volume"], batch["inside"], predicted, batch["views"], strict=True
-            )
-        ]
-        means = {name: predicted.new_tensor([f[name] for f in figures]) for name in figures[0]}
-        values = {name: predicted.new_tensor(q) for name, q in quality_of(out, batch).items()}
-        means |= {f"quality_{name}": value.expand(len(predicted)) for name, value in values.items()}
-        if out.alignment is not None and "gain" in batch:
-            known = camera_metrics(out.alignment, *(batch[key] for key in TRUTH))
-            values = {name: predicted.new_tensor(value) for name, value in known.items()}
-            means |= {f"cameras_{name}": v.expand(len(predicted)) for name, v in values.items()}
-        if out.support is not None:
-            means["support_fraction"] = out.support.flatten(1).float().mean(dim=1)
-        self._losses.update({name: value.expand(len(predicted)) for name, value in terms.items()})
-        self._figures.update(means)
+        self._means.update({name: value.expand(len(predicted)) for name, value in terms.items()})
+        for one, view, case in zip(out.split(), predicted, single_cases(batch), strict=True):
+            figures = self._figures(one, view, case)
+            failed = math.isnan(figures["nrmse"])
+            # without an object in the scene, nan is no figure; of a volume that has failed, it is
+            told = {k: [v] if failed or not math.isnan(v) else [] for k, v in figures.items()}
+            self._means.update({name: view.new_tensor(value) for name, value in told.items()})
         return {"out": out}
+
+    def _figures(
+        self, out: Reconstruction, views: Tensor, case: dict[str, Any]
+    ) -> dict[str, float]:
+        """Everything that judges the reconstruction of one case and its views."""
+        figures = case_metrics(out.volume[0], views, case, self.hparams["data_range"])
+        figures |= {f"quality_{name}": value for name, value in quality_of(out, case).items()}
+        if out.alignment is not None and "gain" in case:
+            known = camera_metrics(out.alignment, *(case[key] for key in TRUTH))
+            figures |= {f"cameras_{name}": value for name, value in known.items()}
+        if out.support is not None:
+            figures["support_fraction"] = out.support.float().mean().item()
+        return figures
 
     def on_validation_epoch_end(self) -> None:
         """Log the means over the cases of all processes."""
-        for name, value in (self._losses.compute() | self._figures.compute()).items():
+        for name, value in self._means.compute().items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr", sync_dist=True)  # equal already
 
     def configure_optimizers(self) -> Any:

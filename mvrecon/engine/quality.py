@@ -49,9 +49,10 @@ def quality_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     figures = [{**score.get("quality", {}), "view_nrmse": score["view_nrmse"]} for score in scores]
     errors, row = [score["nrmse"] for score in scores], {}
+    failed = any(map(math.isnan, errors))
     for name in figures[0]:
         values = [figure[name] for figure in figures]
-        row[name] = {} if name == "view_nrmse" else mean_and_spread(values)
+        row[name] = {} if name == "view_nrmse" else mean_and_spread(values, failed)
         if name in WITHOUT_TRUTH:
             row[name]["rank"] = rank_correlation(values, errors)
     return {"quality": row}

@@ -26,7 +26,7 @@ COLUMNS = {
 
 def table(results: Mapping[str, Any]) -> Table:
     """The result table for a terminal: mean over the scenes, and the standard deviation below
-    it.
+    it; in their place, how many volumes of a method have failed.
     """
     title = f"{results['name']}: {_scenes(len(results['scenes']), results['seen_in_training'])}"
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
@@ -39,7 +39,10 @@ def table(results: Mapping[str, Any]) -> Table:
     shown.add_column("ms per\nvolume", justify="right")
     shown.add_column("training\ns", justify="right")
     for label, row in results["methods"].items():
-        cells = [_cell(row[name], form) for name, (_, form) in columns.items()]
+        if failed := row.get("failed"):
+            cells = [f"{len(failed)} of {len(results['scenes'])}\nfailed"] * len(columns)
+        else:
+            cells = [_cell(row[name], form) for name, (_, form) in columns.items()]
         seconds = f"{row['train_seconds']:.0f}" if row["train_steps"] else "-"
         shown.add_row(
             label, f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds
@@ -57,8 +60,8 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
 
 
 def remarks(results: Mapping[str, Any]) -> list[str]:
-    """What a reader of the table must know of the measurement: a detector that is not perfect, and
-    cases that are in two sets.
+    """What a reader of the table must know of the measurement: a detector that is not perfect,
+    volumes that have failed, and cases that are in two sets.
     """
     lines, got = [], results.get("acquisition")
     if got and (spoilt := _spoilt(got)):
@@ -68,7 +71,9 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
     if got and Acquisition.of(run) != Acquisition.of(got):
         lines.append(f"The run's detector was another: {_spoilt(run) or 'perfect'}")
     for label, row in results.get("methods", {}).items():
-        if words := sentence(row.get("quality", {})):
+        if failed := row.get("failed"):
+            lines.append(f"{label} failed, with NaN or infinity in the volume: {', '.join(failed)}")
+        elif words := sentence(row.get("quality", {})):
             lines.append(f"{label}: {words}")
         if "auc" in (cameras := row.get("cameras", {})):
             lines.append(f"{label} tells which cameras are disturbed: {_accuracy(cameras)}")

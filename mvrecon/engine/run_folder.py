@@ -179,8 +179,8 @@ def anchored(value: Any) -> Any:
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:
-    """Write `results.json` with the command and the versions; figures that are not finite become
-    null.
+    """Write `results.json` with the command and the versions; nan becomes null, and infinity the
+    text "inf" or "-inf", which `float` reads.
     """
     whole = {**results, "command": sys.argv, "versions": versions()}
     write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
@@ -217,4 +217,6 @@ def _finite(value: Any) -> Any:
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value

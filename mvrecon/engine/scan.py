@@ -5,12 +5,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.detector import Detector
 from mvrecon.cameras.field import auto_grid, check_rig_sees
+from mvrecon.cameras.formats.rtk_xml import detector_of_image
 from mvrecon.cameras.formats.text import flips_rows
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import Corrected, MeasuredViews
@@ -21,9 +24,12 @@ from mvrecon.files.memory import check_memory
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS, PROJECTORS
 from mvrecon.projectors.operator import LinearOperator, Projector, Scaled
+from mvrecon.projectors.pixel_integral import sees_integrals
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
 VOLUMES = 3
+#: Pixels by which a detector's offset may differ from the one by the views' file, for rounding.
+OFFSET = 0.01
 #: Of the grid's diagonal: as much a line integral of ones reaches in any view, and counts behind a
 #: pinhole, or a grey value, never.
 LINE = 0.02
@@ -89,18 +95,22 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
 
     Args:
         settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
-            counts them from the other end (`flip_rows`); a camera's detector without pixels has
-            those of the views on disk; `grid` has size, spacing and centre, or like; without
-            any of them it is that of a trained network's training, or `auto_grid`'s.
+            counts them from the other end (`flip_rows`); what a camera's detector leaves open
+            (None) is that of the views on disk, see `_detector`; `grid` has size, spacing and
+            centre, or like; without any of them it is that of a trained network's training, or
+            `auto_grid`'s.
 
     Raises:
-        ValueError: another number of cameras than of views, a rig that does not see the grid, a
-            grid that does not fit into memory; what the parts raise.
+        ValueError: another number of cameras than of views, a detector that contradicts spacing or
+            origin of the views' file, a rig that does not see the grid, a grid that does not fit
+            into memory; what the parts raise.
     """
     flipped = settings["views"]["flip_rows"] or flips_rows(settings["camera"])
     views = {**settings["views"], "flip_rows": flipped}
     measured = MeasuredViews.of(Measured(**views))
-    rig = CAMERAS.from_config(_with_pixels(settings["camera"], measured.stack.shape))
+    known = _detector(measured)
+    _check_offset(settings["camera"], known, measured)
+    rig = CAMERAS.from_config(_completed(settings["camera"], known))
     cameras = measured.cameras(rig)
     grid = _grid(settings["grid"], settings["method"], cameras)
     seeing = int(check_rig_sees(cameras, grid).nonzero()[0, 0])
@@ -112,7 +122,7 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
         check_unit(unit, scan, seeing)
         return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
     A, largest = _coarse(scan, seeing)
-    emits = A.pixel_integral() is None and 0 < largest < LINE
+    emits = not sees_integrals(A) and 0 < largest < LINE
     return replace(scan, unit=EMISSION) if emits else scan
 
 
@@ -154,14 +164,52 @@ def _coarse(scan: Scan, view: int) -> tuple[Projector, float]:
     return A, most / (affine[:3, :3].sum(dim=1) * 2).norm().item()
 
 
-def _with_pixels(camera: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Any]:
-    """A camera's settings with the number of pixels of the views, where `pixels` is null."""
+def _detector(measured: MeasuredViews) -> dict[str, Any]:
+    """Options of `Detector` that the views on disk state: `pixels`, and `pixel_mm` and `offset_mm`
+    where their file gives a spacing and an origin.
+    """
+    affine, (rows, columns) = measured.stack.affine, measured.stack.shape
+    if affine is None:
+        return {"pixels": (rows, columns)}
+    spacing = np.linalg.norm(affine[:3, :2], axis=0)
+    if not np.allclose(affine[:3, :2], np.eye(3, 2) * spacing, atol=1e-6 * spacing.min()):
+        raise Refused(
+            f"{measured.options.path}: expected views with columns along x and rows along y, got "
+            f"the direction {(affine[:3, :2] / spacing).T.round(6).tolist()}"
+        )
+    known = detector_of_image((columns, rows), spacing.tolist(), affine[:2, 3].tolist())
+    (v, u), options = known["offset_mm"], measured.options
+    offset = (v if options.flip_rows else -v, -u if options.flip_columns else u)
+    return {**known, "offset_mm": offset}
+
+
+def _check_offset(
+    camera: Mapping[str, Any], known: Mapping[str, Any], views: MeasuredViews
+) -> None:
+    """Refuse a detector's offset that contradicts the origin of the views' file."""
+    detector, affine = camera.get("detector"), views.stack.affine
+    given = detector.get("offset_mm") if isinstance(detector, Mapping) else None
+    if given is None or affine is None or not affine[:2, 3].any():  # 0: where none was set
+        return
+    expected = Detector.of(known)
+    got = Detector.of({**known, "offset_mm": given}).offset_mm
+    if any(
+        abs(a - b) > OFFSET * pixel
+        for a, b, pixel in zip(got, expected.offset_mm, expected.pixel_mm, strict=True)
+    ):
+        down, right = expected.offset_mm
+        raise Refused(
+            f"{views.options.path}: expected the detector's offset_mm [{down:g}, {right:g}] (v, u) "
+            f"by the file's origin, got [{got[0]:g}, {got[1]:g}]"
+        )
+
+
+def _completed(camera: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
+    """A camera's settings with what is known of the detector in the place of None."""
     filled = {**camera}
     if isinstance(detector := camera.get("detector"), Mapping):
-        filled["detector"] = _with_pixels(detector, shape)
-    if camera.get("pixels", shape) is None:
-        filled["pixels"] = list(shape)
-    return filled
+        filled["detector"] = _completed(detector, known)
+    return filled | {name: known[name] for name in known if camera.get(name, known) is None}
 
 
 def _grid(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Cameras) -> Grid:

@@ -1,18 +1,13 @@
 """A trained method by its checkpoint; Lightning is imported at its first use."""
 
-import warnings
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.data import digests
+from mvrecon.engine.unfamiliar import warn_of_geometry, warn_of_values
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.output import Reconstruction
 from mvrecon.projectors.operator import Projector
-
-#: Of the training's value range: a volume whose greatest value is not between these is told.
-USUAL = (0.05, 2.0)
 
 
 class TrainedMethod(nn.Module):
@@ -42,11 +37,9 @@ class TrainedMethod(nn.Module):
         from mvrecon.engine.trained import load  # Lightning's import takes seconds
 
         module = load(self.checkpoint, self.label).module.to(A.device)
-        many = module.hparams["geometry"].get("rigs", 0) > 0
-        for difference in _differences(A, module.projector, many):
-            warnings.warn(f"{self.checkpoint} was trained with another {difference}", stacklevel=2)
+        warn_of_geometry(A, module, self.checkpoint)
         out = module.method.eval()(views, A)
-        _warn_of_values(out.volume, module.hparams["data_range"], self.checkpoint)
+        warn_of_values(out.volume, module.hparams["data_range"], self.checkpoint)
         return out
 
 
@@ -58,29 +51,3 @@ def grid_of_training(checkpoint: str, method: str | None = None) -> Grid:
     from mvrecon.engine.trained import load  # Lightning's import takes seconds
 
     return load(checkpoint, method).module.projector.grid
-
-
-def _differences(A: Projector, other: Projector, many: bool) -> list[str]:
-    """What differs from the operator of the training, in words; no rig where it was trained on
-    many.
-    """
-    grid, trained_grid, lines = A.grid, other.grid, []
-    if not many and digests.of_rig(A.cameras) != digests.of_rig(other.cameras):
-        counts = f"{len(other.cameras)} cameras of {other.cameras.shape} pixels"
-        lines.append(f"rig ({counts}); got {len(A.cameras)} of {A.cameras.shape}")
-    if grid.shape != trained_grid.shape or not torch.allclose(grid.affine, trained_grid.affine):
-        got = f"{grid.shape} voxels of {grid.spacing} mm"
-        lines.append(f"grid ({trained_grid.shape} of {trained_grid.spacing} mm); got {got}")
-    if type(A) is not type(other):
-        lines.append(f"projector ({type(other).__name__}); got {type(A).__name__}")
-    return lines
-
-
-def _warn_of_values(volume: Tensor, data_range: float, checkpoint: str) -> None:
-    top = volume.amax().item() / data_range
-    if not USUAL[0] <= top <= USUAL[1]:
-        warnings.warn(
-            f"{checkpoint} was trained on values up to {data_range:g}; the reconstruction reaches "
-            f"{top * data_range:.3g}: do the views have another unit?",
-            stacklevel=3,
-        )

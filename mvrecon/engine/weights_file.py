@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from mvrecon import __version__
@@ -21,6 +20,8 @@ from mvrecon.files.checks import TEXT, Refused, blaming, shown
 
 #: Ending of such files; the key of their text.
 ENDING, KEY = ".safetensors", "mvrecon"
+#: In place of a file's SHA-256, where it is computed.
+UNSEALED = "0" * 64
 
 
 def write(path: str | Path, trained: Trained) -> Path:
@@ -28,7 +29,7 @@ def write(path: str | Path, trained: Trained) -> Path:
 
     The file's metadata are JSON under the key `mvrecon`: `settings` (grid and rig in mm, projector,
     model, loss, optimiser, value range), `training` (version, steps, seconds, number of cases) and
-    the SHA-256 of the weights.
+    `sha256`, that of the whole file with zeros in its place.
 
     Raises:
         ValueError: another ending than .safetensors.
@@ -46,13 +47,10 @@ def write(path: str | Path, trained: Trained) -> Path:
         "seconds": round(trained.seconds, 1),
         "cases": None if trained.cases is None else len(trained.cases),
     }
-    record = {
-        "settings": dict(module.hparams),
-        "training": training,
-        "sha256": _digest(weights),
-    }
+    record = {"sha256": UNSEALED, "settings": dict(module.hparams), "training": training}
+    raw = save(weights, {KEY: json.dumps(record, allow_nan=False)})
     with written_whole(path) as part:
-        part.write_bytes(save(weights, {KEY: json.dumps(record, allow_nan=False)}))
+        part.write_bytes(raw.replace(UNSEALED.encode(), _digest(raw).encode(), 1))
     return path
 
 
@@ -76,8 +74,12 @@ def read(path: Path) -> Trained:
     with blaming(path, "is not described by JSON"):
         record = json.loads(text)
         digest, settings, training = (record[key] for key in ("sha256", "settings", "training"))
-    if digest != _digest(weights):
-        raise Refused(f"{path}: is damaged: its weights do not fit their SHA-256 {shown(digest)}")
+        found = _digest(path.read_bytes(), digest)
+    if digest != found:
+        raise Refused(
+            f"{path}: is damaged, or of an earlier version: expected the SHA-256 {shown(digest)}, "
+            f"got {found}"
+        )
     if bad := not_finite({"state_dict": weights}):
         raise Refused(f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them")
     return _trained(path, settings, weights, training)
@@ -93,10 +95,6 @@ def _trained(
     return Trained(module.eval(), seconds, steps, cases=None)
 
 
-def _digest(weights: Mapping[str, Tensor]) -> str:
-    """SHA-256 of names, types, shapes and values."""
-    sha = hashlib.sha256()
-    for name, value in sorted(weights.items()):
-        sha.update(json.dumps([name, str(value.dtype), list(value.shape)]).encode())
-        sha.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
-    return sha.hexdigest()
+def _digest(raw: bytes, digest: str = UNSEALED) -> str:
+    """SHA-256 of a file's bytes with zeros in place of the digest in its description."""
+    return hashlib.sha256(raw.replace(digest.encode(), UNSEALED.encode(), 1)).hexdigest()

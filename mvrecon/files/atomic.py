@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryFile
 
 try:
     import fcntl
@@ -50,6 +51,25 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
         raise
     finally:
         part.unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Check that a file can be written at a path, whose folder need not exist yet, without leaving
+    anything there.
+
+    Raises:
+        OSError: a folder is there, no permission, no space; the message names the path.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: expected a file, got a folder")
+    nearest = next(folder for folder in path.absolute().parents if os.path.exists(folder))
+    try:
+        with TemporaryFile(dir=nearest):
+            pass
+    except OSError as error:
+        raise type(error)(
+            f"{path}: expected a place that can be written, got {nearest}: {error.strerror}"
+        ) from error
 
 
 @contextmanager

@@ -17,6 +17,8 @@ NAME, NODES = 200, 100_000
 DEFLATE = 1032
 #: mm that a voxel may measure.
 SPACING = (1e-6, 1e6)
+#: What makes the files that the experiments read, by the beginning of their names.
+MAKERS = {"openkbp_": "scripts/prepare_openkbp.py", "cxr.": "scripts/fetch_chest_ct.py"}
 
 
 class Refused(ValueError):
@@ -124,7 +126,8 @@ def check_file(path: Path, expected: str) -> None:
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected {expected}")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {expected}")
+        makers = (f"; {maker} makes it" for k, maker in MAKERS.items() if path.name.startswith(k))
+        raise FileNotFoundError(f"{path}: no such file; expected {expected}{next(makers, '')}")
 
 
 def shown(value: Any) -> str:

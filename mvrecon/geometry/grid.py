@@ -25,7 +25,8 @@ class Grid:
 
     Args:
         shape: voxels along (z, y, x).
-        affine: maps a voxel index (x, y, z, 1) to world mm, as in NIfTI; float64, on the CPU.
+        affine: maps a voxel index (x, y, z, 1) to world mm, as in NIfTI; copied, float64, on the
+            CPU.
 
     Raises:
         ValueError: an empty shape, or an affine that is not finite, not 4x4, left-handed or
@@ -37,7 +38,7 @@ class Grid:
 
     def __post_init__(self) -> None:
         _check_shape(self.shape)
-        affine = torch.as_tensor(self.affine, dtype=torch.float64).cpu()
+        affine = torch.as_tensor(self.affine, dtype=torch.float64).cpu().clone()
         if affine.shape != (4, 4) or not affine.isfinite().all():
             raise ValueError(f"A grid's affine must be a finite 4x4 matrix, got {self.affine}")
         volume = torch.linalg.det(affine[:3, :3] / affine[:3, :3].norm(dim=0)).item()

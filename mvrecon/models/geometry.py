@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mvrecon.cameras.views import check_finite
 from mvrecon.kernels.rays.lines import writes
-from mvrecon.projectors.checks import check, check_floating
+from mvrecon.projectors.checks import check_floating, check_measured
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.reconstructors.iterative import SirtWeights, inverse_sums, sirt_weights
 from mvrecon.visual_hull.support import support_masks
@@ -138,12 +138,9 @@ def validated(views: Tensor, A: Projector, weights: Tensor) -> Float[Tensor, "b 
             f"Expected a network of float32 or float64, got {weights.dtype}; for half precision "
             f"use torch.autocast"
         )
-    check(views, "views [b 1 m v u]", (len(A.cameras), *A.cameras.shape), weights.device)
-    if views.shape[1] != 1 or not len(views):
-        raise ValueError(
-            f"Expected views [b 1 m v u] of at least one sample and one channel, got "
-            f"{tuple(views.shape)}"
-        )
+    check_measured(views, "views [b 1 m v u]", (len(A.cameras), *A.cameras.shape), weights.device)
+    if views.shape[1] != 1:
+        raise ValueError(f"Expected views [b 1 m v u] of one channel, got {tuple(views.shape)}")
     check_floating(views, "views")
     check_finite(views, on_gpu=False)  # there `start.nonzero` makes the volume NaN
     return views.to(weights.dtype)

@@ -1,6 +1,7 @@
 """What a method returns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -41,6 +42,21 @@ class Reconstruction:
     start: Float[Tensor, "b 1 d h w"] | None = None
     entry: Float[Tensor, "b 1 d h w"] | None = None
     alignment: Alignment | None = None
+
+    def split(self) -> list[Self]:
+        """The reconstruction of each case of the batch."""
+        count = len(self.volume)
+
+        def case(value: Any, i: int) -> Any:
+            if isinstance(value, Alignment):
+                return value.split()[i]
+            return value[i : i + 1] if value is not None and len(value) == count else value
+
+        own = [field.name for field in fields(self) if field.name != "visible"]  # of all cases
+        return [
+            replace(self, **{name: case(getattr(self, name), i) for name in own})
+            for i in range(count)
+        ]
 
     @property
     def camera_weights(self) -> Float[Tensor, "b m"] | None:

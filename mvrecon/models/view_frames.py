@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
+from mvrecon.kernels.known import key_of, known
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.geometry import Geometry, kept
 from mvrecon.models.unet import from_cells, halved, padded, to_cells, trimmed
@@ -46,7 +47,7 @@ class ViewFrames:
 
     @classmethod
     def of(cls, g: Geometry, scale: int, binning: int, depths: int) -> "ViewFrames":
-        """The frames of an operator; its frusta are computed once for each operator.
+        """The frames of an operator; its frusta are computed once for each rig and grid.
 
         Args:
             g: the operator, SIRT's weights and the support.
@@ -62,18 +63,22 @@ class ViewFrames:
             raise ValueError(f"Expected a rig of cameras, got {type(A.cameras).__name__}")
         edge = min(binning, *A.cameras.shape)
 
-        def make() -> tuple[Frusta, Tensor | None]:
+        def frusta_of_rig() -> Frusta:
             rows, columns = (n + -n % edge for n in A.cameras.shape)
             cameras = replace(A.cameras, shape=(rows, columns)).binned(edge)
-            frusta = Frusta.of(A.grid.coarsened(2**scale), cameras, depths).to(like)
+            return Frusta.of(A.grid.coarsened(2**scale), cameras, depths).to(like)
+
+        def transmission_of(frusta: Frusta) -> Tensor | None:
             mu = A.attenuation()
             if mu is None:
-                return frusta, None
+                return None
             mu = mu.detach().to(like)
-            mu = coarsened(mu[None, None] if mu.ndim == 3 else mu[:, None], scale)
-            return frusta, transmission(frusta, mu)
+            mu = mu[None, None] if mu.ndim == 3 else mu[:, None]
+            return transmission(frusta, coarsened(mu, scale))
 
-        frusta, share = kept(A, ("frames", scale, edge, depths, like.dtype), make)
+        cut = "frames", scale, edge, depths, like.dtype
+        frusta = known(A.cameras, (cut, key_of(A.grid)), like, frusta_of_rig)
+        share = kept(A, cut, lambda: transmission_of(frusta))
         frames = cls(frusta, scale, edge, share)
         if g.support is not None:
             support = g.support.to(like)

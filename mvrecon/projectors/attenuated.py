@@ -48,7 +48,7 @@ class AttenuatedTransform(RayTransform):
 
     Args:
         grid, cameras, options: as in `RayTransform`; without the method "trilinear".
-        mu: linear attenuation on the grid, in 1/mm.
+        mu: linear attenuation on the grid, in 1/mm; values written into it later count.
 
     Raises:
         ValueError: mu of another shape, negative, not finite, or in another unit; or as
@@ -71,7 +71,22 @@ class AttenuatedTransform(RayTransform):
             )
         check_mu(mu, grid)
         self.register_buffer("mu", mu.to(self.device), persistent=False)
-        self.clear = not mu.requires_grad and not bool((mu != 0).any())
+        self._seen: tuple[Tensor | None, int, bool] = None, 0, False
+        _ = self.clear
+
+    @property
+    def clear(self) -> bool:
+        """Whether mu is zero everywhere and no gradient by it is asked for; looked up again after a
+        write to it, which graphs of `torch.compile` and tensors of inference mode do not notice.
+        """
+        mu, (seen, version, clear) = self.mu, self._seen
+        if torch.compiler.is_compiling():
+            return clear
+        now = 0 if mu.is_inference() else mu._version
+        if seen is not mu or version != now:
+            clear = not mu.requires_grad and not bool((mu != 0).any())
+            self._seen = mu, now, clear
+        return clear
 
     @property
     def skipped(self) -> Skipped:

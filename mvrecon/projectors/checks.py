@@ -28,6 +28,19 @@ def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device)
         )
 
 
+def check_measured(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device) -> None:
+    """Check views or counts that a method reconstructs from: as `check`, and that there are some.
+
+    Raises:
+        ValueError: a wrong rank, size or device, or an empty batch.
+    """
+    check(tensor, what, sizes, device)
+    if not tensor.numel():
+        raise ValueError(
+            f"Expected {what} of at least one sample and one channel, got {tuple(tensor.shape)}"
+        )
+
+
 def _cure(tensor: Tensor, sizes: Sequence[int]) -> str:
     """What makes a tensor without batch or channel one of five axes; nothing for any other."""
     if tuple(tensor.shape[-3:]) != tuple(sizes) or tensor.ndim not in (3, 4):
@@ -53,7 +66,7 @@ def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
     """Check the shape of measured views, and in main memory that all values are finite.
 
     Raises:
-        ValueError: a wrong rank or size, or values that are not finite.
+        ValueError: a wrong rank or size, an empty batch, or values that are not finite.
     """
-    check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
+    check_measured(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     check_finite(views, on_gpu=False)

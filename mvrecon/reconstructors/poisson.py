@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from mvrecon.kernels.precision import wide
-from mvrecon.projectors.checks import check
+from mvrecon.projectors.checks import check_measured
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import RaySelection, ViewSelection
 
@@ -40,8 +40,8 @@ class PoissonLikelihood:
         skip_zero_bins: False takes all bins of those views.
 
     Raises:
-        ValueError: a wrong rank, size or device; counts or background that are negative or not
-            finite.
+        ValueError: a wrong rank, size or device; an empty batch; counts or background that are
+            negative or not finite.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class PoissonLikelihood:
         views: Sequence[int] | None = None,
         skip_zero_bins: bool = True,
     ):
-        check(counts, "counts [b c m v u]", A.range_shape, A.device)
+        check_measured(counts, "counts [b c m v u]", A.range_shape, A.device)
         self.A, self.views = (
             A,
             ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views),

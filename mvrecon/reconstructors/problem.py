@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mvrecon.cameras.views import check_finite
 from mvrecon.kernels.precision import wide
-from mvrecon.projectors.checks import check
+from mvrecon.projectors.checks import check, check_measured
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.registry import hint
 
@@ -136,10 +136,11 @@ def posed(
     Raises:
         TypeError: an option that the method does not have; the message gives the nearest and all.
         ValueError: views or a start of another shape than the operator's, on another device, or
-            with values that are not finite; a support that is no mask of the volume's shape.
+            with values that are not finite; an empty batch; a support that is no mask of the
+            volume's shape.
     """
     within = supported(method, A, options)
-    check(views, "views", A.range_shape, A.device)
+    check_measured(views, "views", A.range_shape, A.device)
     check_finite(views, on_gpu=False)
     views, support, start = wide(views), options.get("support"), options.get("start")
     started = start is not None

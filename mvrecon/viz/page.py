@@ -8,6 +8,7 @@ NIfTI).
 import math
 import re
 from html import escape
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d, max_pool3d
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz.planes import LETTERS
 from mvrecon.viz.rig_mesh import COLOURS, Segments, box, segments
@@ -102,11 +103,11 @@ def reduced(
 
     Voxels at the far ends that make no whole block are left out.
     """
-    factor = math.ceil((volume.numel() / voxels) ** (1 / 3))
+    factor = next(k for k in count(1) if math.prod(n // min(k, n) for n in volume.shape) <= voxels)
     if factor == 1:
         return volume, grid
     blocks = [min(factor, n) for n in volume.shape]
-    whole = tuple(n - n % block for n, block in zip(volume.shape, blocks, strict=True))
+    whole = three(n - n % block for n, block in zip(volume.shape, blocks, strict=True))
     pooled = (max_pool3d if most else avg_pool3d)(volume[None, None].float(), blocks)[0, 0]
     return pooled, grid.cropped(Box((0, 0, 0), whole)).coarsened(factor)
 

@@ -9,6 +9,7 @@ the first ones.
 """
 
 import argparse
+import math
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -199,7 +200,8 @@ def judged(
     judge = module.projector, data.data_range, options.device
     scores = evaluate({"one": model}, data.test_dataloader(), *judge)["one"]
     numbers = [key for key, value in scores[0].items() if isinstance(value, int | float)]
-    figures = {key: mean_and_spread([score[key] for score in scores]) for key in numbers}
+    failed = any(math.isnan(score["nrmse"]) for score in scores)
+    figures = {key: mean_and_spread([score[key] for score in scores], failed) for key in numbers}
     return {"scenes": len(scores)} | {
         key: {k: figure[k] for k in ("mean", "std")} for key, figure in figures.items()
     }

@@ -81,7 +81,6 @@ def test_an_empty_emission_stays_empty():
     assert not made(torch.zeros_like(FLAT), counts=1e3).any()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
@@ -101,7 +100,6 @@ def test_settings_of_an_acquisition_that_make_no_sense_are_refused(options, erro
         Acquisition.of(options)
 
 
-@pytest.mark.door
 def test_negative_views_are_no_counts():
     """Counts of views below zero are refused, not drawn from a clamped mean."""
     with pytest.raises(ValueError, match=re.escape("Counts need views of at least 0, got -2")):

@@ -139,7 +139,6 @@ def test_a_table_says_that_views_were_disturbed():
     assert line.endswith("disturbed.views 3, disturbed.shift_px 1, disturbed.gain 0.05")
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [

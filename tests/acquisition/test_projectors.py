@@ -135,7 +135,6 @@ def test_a_projector_that_takes_no_finer_grid_alone_gets_finer_pixels(parts):
     assert (measured("slices")[1].views - exact).norm() < 0.12 * exact.norm()
 
 
-@pytest.mark.door
 def test_a_projector_that_takes_no_finer_grid_at_all_is_refused(parts):
     """A projector that cannot make views on a finer grid is refused, with its own reason, once."""
     with pytest.raises(ValueError, match="'stubborn' cannot .* 2 times finer .*: this grid alone$"):

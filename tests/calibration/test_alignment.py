@@ -115,7 +115,6 @@ def test_the_deviation_tells_wrong_cameras():
     assert (deviation[0, :2] > 1).all() and deviation[0, 2] == 0
 
 
-@pytest.mark.door
 def test_views_of_another_shape_are_refused():
     """Alignment refuses expected views of another shape, and no step."""
     views = blobs()

@@ -5,11 +5,12 @@ from functools import cache, partial
 import pytest
 import torch
 
+from mvrecon.calibration import from_data
 from mvrecon.calibration.from_data import Round, calibrated
 from mvrecon.calibration.linearised import Complement, derivatives
 from mvrecon.calibration.unknowns import unknowns, without_motion
 from mvrecon.cameras.misalignment import Misalignment, misaligned
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.projectors.drr import Drr
 from mvrecon.scenes.shepp_logan import shepp_logan
@@ -85,6 +86,40 @@ def test_a_right_rig_stays_as_it_is():
     assert torch.equal(estimate.gains, torch.ones(20).double())
 
 
+def test_what_a_circle_does_not_determine_is_kept_and_what_it_determines_is_found():
+    """On a circle a slant nearly stretches the object and an offset_v moves it."""
+    views = measured(shared(1.3, 0.0))
+    with pytest.warns(UserWarning, match="do not determine .*slant"):
+        estimate = calibrated(OPERATOR, RIG, views, ["offset_u", "offset_v", "slant"])
+    by = estimate.misalignment
+    assert set(estimate.kept) == {"offset_v", "slant"}
+    assert not by.tilt_degrees.any() and not by.offset_px[:, 1].any()
+    assert (by.offset_px[:, 0] - 1.3).abs().max() < 0.02
+    assert estimate.settled and estimate.left_out[1] < 0.2 * estimate.left_out[0]
+
+
+def test_cameras_from_many_sides_determine_an_offset_along_v():
+    above = dome(24, 400.0, 600.0, 160.0, {"pixels": [24, 32], "pixel_mm": 6.4}, extent="segment")
+    truth = Misalignment.none(24)
+    truth.offset_px[:, 1] = 0.8
+    x = torch.exp(-((voxel_centres(GRID) - 10.0) ** 2).sum(-1) / 300)[None, None].float()
+    views = OPERATOR(misaligned(above, truth))(x)
+    estimate = calibrated(OPERATOR, above, views, ["offset_v"])
+    assert estimate.kept == []
+    assert (estimate.misalignment.offset_px[:, 1] - 0.8).abs().max() < 0.05
+
+
+def test_a_rig_that_predicts_left_out_views_worse_is_not_returned(monkeypatch):
+    monkeypatch.setattr(from_data, "_improved", lambda problem, values, x, _: (values + 1.0, x))
+    with pytest.warns(UserWarning) as warned:
+        estimate = calibrated(OPERATOR, RIG, measured(Misalignment.none(20)), rounds=1)
+    assert estimate.left_out[1] > estimate.left_out[0]
+    assert estimate.kept == ["offset_u", "tilt"] and not estimate.misalignment.offset_px.any()
+    assert torch.allclose(estimate.cameras.origin, RIG.origin)
+    words = " ".join(str(one.message) for one in warned)
+    assert "still changed" in words and "nominal rig is kept" in words and not estimate.settled
+
+
 def test_derivatives_are_those_that_autograd_has():
     """<w, dy/dt> by difference quotients and by the gradient through the operator."""
     x = torch.exp(-((voxel_centres(GRID) - 5.0) ** 2).sum(-1) / 300)[None, None].float()
@@ -129,7 +164,6 @@ def test_nothing_is_misaligned_by_nothing():
     assert torch.allclose(rig.origin, RIG.origin) and torch.allclose(rig.u, RIG.u)
 
 
-@pytest.mark.door
 def test_what_views_cannot_tell_is_not_fitted():
     """Unknown or doubled freedoms, a single view, parallel beams and views that are not finite or
     of another rig are refused by a calibration.

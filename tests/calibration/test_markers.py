@@ -48,7 +48,6 @@ def test_images_a_tenth_of_a_pixel_off_give_rays_a_tenth_of_a_pixel_off(rig):
     assert (fit.rms_px < expected_rms).all()  # a least-squares fit is nearer than the truth
 
 
-@pytest.mark.door
 def test_markers_that_do_not_fix_a_rig_are_refused(rig):
     """A rig is not calibrated from fewer than six markers, from markers in a plane, or from views
     upside down.

@@ -86,7 +86,6 @@ def test_what_modes_cannot_change_is_left():
     torch.testing.assert_close(least_deviations(values, 0 * modes, 1e-3), values)
 
 
-@pytest.mark.door
 def test_views_that_are_not_finite_are_refused(measurement):
     """Alignment of views by themselves refuses values that are not finite, and no alternation."""
     A, views = measurement

@@ -63,6 +63,21 @@ def test_numbers_keep_their_digits_whatever_holds_them():
     assert lists.source.dtype == torch.float64 and lists.source[0, 2].item() == -third
 
 
+@pytest.mark.parametrize("convert", [lambda x: x, torch.Tensor.numpy])
+def test_a_rig_keeps_its_own_numbers_but_moves_with_what_is_optimised(convert):
+    vectors = [getattr(record(), name).clone() for name in VECTORS]
+    cameras = Cameras(*map(convert, vectors), (4, 5))
+    before = [getattr(cameras, name).clone() for name in VECTORS]
+    for vector in vectors:
+        vector *= 2
+    assert all(torch.equal(getattr(cameras, n), x) for n, x in zip(VECTORS, before, strict=True))
+    source = before[0].requires_grad_()
+    cameras = Cameras(source, *before[1:], (4, 5))
+    with torch.no_grad():
+        source += 1
+    assert torch.equal(cameras.source, source)
+
+
 def test_the_textbook_camera():
     """At depth 150 of 200, the centre of pixel (u, v) = (4, 0) of a 4 x 5 detector: (4, -3) mm
     times 150/200.

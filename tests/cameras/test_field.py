@@ -80,7 +80,6 @@ def test_the_common_field_of_a_turned_grid_is_what_every_camera_sees():
     assert seen.any() and not seen.all() and torch.equal(common_field(rig, grid), seen)
 
 
-@pytest.mark.door
 def test_a_common_field_of_no_voxel_is_refused():
     """A loss over the voxels that all cameras see is refused where there is none."""
     rig = circular(8, 400.0, 800.0, PLATE)
@@ -88,7 +87,6 @@ def test_a_common_field_of_no_voxel_is_refused():
         common_field(rig, Grid.centred(4, spacing=1.0, centre=(0, 0, 70)))
 
 
-@pytest.mark.door
 def test_a_rig_that_misses_its_grid_is_refused():
     """A rig of which no view meets the grid is refused, with where both are in mm."""
     rig = circular(**OPTIONS["circular"])
@@ -97,7 +95,6 @@ def test_a_rig_that_misses_its_grid_is_refused():
         check_rig_sees(rig, Grid.centred(8, spacing=1.0, centre=(0, 0, 500)))
 
 
-@pytest.mark.door
 def test_no_grid_is_guessed_where_there_is_no_field():
     """A grid is not guessed from one view, nor where views see nothing in common."""
     with pytest.raises(ValueError, match="at least two directions"):

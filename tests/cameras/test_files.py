@@ -31,7 +31,6 @@ def test_the_file_is_plain_json_with_a_line_for_each_camera(rig):
     assert sum('"source"' in line for line in rig.read_text().splitlines()) == 5
 
 
-@pytest.mark.door
 def test_writing_is_all_or_nothing(rig, monkeypatch):
     """A camera file whose writing fails keeps what it held before, and nothing lies beside it."""
     before = rig.read_text()
@@ -41,14 +40,12 @@ def test_writing_is_all_or_nothing(rig, monkeypatch):
     assert rig.read_text() == before and list(rig.parent.iterdir()) == [rig]
 
 
-@pytest.mark.door
 def test_a_missing_file_is_named(tmp_path):
     """A camera file that is not there is an error with its name and what was expected."""
     with pytest.raises(FileNotFoundError, match="none.json: no such file; expected JSON"):
         from_file(tmp_path / "none.json")
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("text", ["", "{", "not json", b"\xff\xfe\x00binary"])
 def test_files_that_are_not_json_are_refused(text, tmp_path):
     """A camera file that is empty or not JSON is refused by name."""
@@ -58,7 +55,6 @@ def test_files_that_are_not_json_are_refused(text, tmp_path):
         from_file(path)
 
 
-@pytest.mark.door
 def test_a_truncated_file_is_refused_wherever_it_ends(rig):
     """A camera file that is cut short is refused, wherever it ends."""
     text = rig.read_text().rstrip()
@@ -77,7 +73,6 @@ def with_camera(record, **changes):
     return {**record, "cameras": [{**first, **changes}, *rest]}
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -21,7 +21,6 @@ VIEW = "<Projection><GantryAngle>{}</GantryAngle></Projection>\n"
 RADIANS = [k * math.pi / 8 for k in range(16)]
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -55,7 +54,6 @@ def test_xml_that_is_no_rig_is_refused(text, message, tmp_path):
         rtk_xml.read(path, DETECTOR)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -84,7 +82,6 @@ def test_a_small_arc_in_degrees_can_be_insisted_on(tmp_path):
     assert len(angles.read(path, DETECTOR, 400.0, 800.0, small_arc=True)) == len(RADIANS)
 
 
-@pytest.mark.door
 def test_vectors_and_json_that_are_no_rig_are_refused(tmp_path):
     """ASTRA's vectors and TIGRE's JSON that are cut short, not finite, in degrees, or pickled are
     refused with the reason.

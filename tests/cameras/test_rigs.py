@@ -143,7 +143,6 @@ def test_a_dome_puts_its_detector_on_the_side_that_the_extent_says(extent, side)
     torch.testing.assert_close(middle, cameras.source * (1 + side * 50 / 200), rtol=0, atol=1e-10)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "message"),
     [

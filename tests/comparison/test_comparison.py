@@ -106,7 +106,34 @@ def test_the_front_leaves_out_what_another_method_beats_in_both(sweep):
     assert [row.method for row in front] == ["unet", "ours"]
 
 
-@pytest.mark.door
+def test_a_method_that_failed_in_a_scene_is_never_ranked(tmp_path):
+    """Its figures over the other, easy scenes would be best."""
+    spoilt = [None, None, 35.0, 40.0]
+    folder = run(tmp_path / "a", {}, sirt=(EASY, 2.0), ours=(BETTER, 3.0), net=(spoilt, 1.0))
+    net = read([folder])[2]
+    assert net.failed == 2 and math.isnan(net.mean("psnr"))
+    head, body = compare.compare([folder], out=tmp_path / "out")
+    rows = [dict(zip(head, line, strict=True)) for line in body]
+    assert [row["PSNR dB"] for row in rows] == ["27.50", "28.50", "2 of 4 failed"]
+    assert rows[2]["psnr - reference (95 %)"] == "-"
+    lines = list(csv.DictReader(io.StringIO((tmp_path / "out" / "compare.csv").read_text())))
+    assert [line["failed"] for line in lines] == ["0", "0", "2"]
+    assert lines[2]["psnr mean"] == lines[2]["psnr difference"] == "nan"
+    assert [row.method for row in pareto.front(read([folder]), "psnr")] == ["sirt", "ours"]
+    assert "net" not in (tmp_path / "out" / "pareto.svg").read_text()
+
+
+def test_equal_volumes_are_infinitely_good_not_missing(tmp_path):
+    exact = ["inf", 26.1, 31.0, 36.0]
+    folder = run(tmp_path / "a", {}, sirt=(EASY, 2.0), exact=(exact, 1.0), twin=(exact, 3.0))
+    sirt, one, two = read([folder])
+    assert one.mean("psnr") == math.inf and one.failed == 0
+    assert tables.difference(one, sirt, "psnr").mean == math.inf
+    assert tables.difference(sirt, one, "psnr").mean == -math.inf
+    assert tables.difference(two, one, "psnr") == (0.0, 0.0, 0.0)
+    assert [row.method for row in pareto.front([sirt, one, two], "psnr")] == ["exact"]
+
+
 def test_a_table_from_elsewhere_is_refused_or_only_shown(tmp_path, capsys):
     """A file of results that is damaged is refused by name, and one with markup in a label shows it
     as text.

@@ -78,7 +78,6 @@ def test_the_slope_of_the_texture_is_that_of_differences():
     assert torch.allclose(torch.hypot(by_y, by_x), slope, rtol=1e-6)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     "options",
     [{"field": 0.6}, {"detail": 0}, {"fine": 0}, {"edge_mm": -1.0}, {"specks": (5, 2)}],

@@ -76,7 +76,6 @@ def test_another_scene_case_series_grid_or_rig_has_another_file(tmp_path, camera
     assert len(paths) == 6
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("how", ["cut short", "one bit", "other sizes", "text"])
 def test_a_kept_case_that_is_damaged_is_made_anew(tmp_path, cameras, how):
     """A case kept from an earlier run that is damaged or of another size is made anew."""

@@ -150,7 +150,6 @@ def test_slices_of_a_tilted_gantry_are_shifted_to_their_places(tmp_path):
     assert COUNT * (ROWS - 1) * (COLUMNS - 1) <= int(inside.sum()) <= COUNT * ROWS * COLUMNS
 
 
-@pytest.mark.door
 def test_frames_that_do_not_say_where_they_are_are_refused(tmp_path):
     """An image of several frames whose functional groups are missing or too few is refused."""
     file = enhanced(tmp_path / "frames", written(tmp_path / "plain")) / "all.dcm"
@@ -227,7 +226,6 @@ BROKEN = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_series_that_is_no_volume_is_refused(name, tmp_path):
     """A DICOM series with gaps, doubled or tilted slices, of several series, sizes or another
@@ -238,7 +236,6 @@ def test_a_series_that_is_no_volume_is_refused(name, tmp_path):
         open_series(written(tmp_path / "ct", change=change))
 
 
-@pytest.mark.door
 def test_a_missing_or_cut_slice_is_told(tmp_path):
     """A folder without DICOM, a single slice, a missing one and one cut short are told as such."""
     with pytest.raises(FileNotFoundError, match="no such folder; expected one with a DICOM CT"):

@@ -56,7 +56,6 @@ def test_the_new_file_takes_the_place_of_the_old_at_the_end_only(tmp_path):
     assert path.read_text() == "new" and not part.exists()
 
 
-@pytest.mark.door
 def test_while_a_file_is_written_anew_readers_see_the_old_one_whole(tmp_path):
     """Readers of a volume file see its old edition whole until the new one is written whole."""
     path = tmp_path / "a.h5"
@@ -106,7 +105,6 @@ SPOILT = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", SPOILT)
 def test_a_volume_file_that_is_cut_short_or_none_is_refused(volume_file, name):
     """A volume file that is cut short, empty, or no HDF5 file is refused with its name."""
@@ -118,7 +116,6 @@ def test_a_volume_file_that_is_cut_short_or_none_is_refused(volume_file, name):
         VolumeFile(volume_file).read(0)
 
 
-@pytest.mark.door
 def test_a_flipped_bit_never_changes_a_volume_silently(tmp_path):
     """A flipped bit in a volume's numbers is an error, or the volume is read as it was written."""
     rng, path = Random(0), tmp_path / "a.h5"
@@ -204,7 +201,6 @@ def test_an_open_file_goes_to_other_processes(volume_file):
     assert pickle.loads(pickle.dumps(file))._open is None
 
 
-@pytest.mark.door
 def test_names_are_unique(volume_file):
     """A volume file in which two volumes have one name is refused, and none is written."""
     rewritten(volume_file, lambda file: file["id"].__setitem__(5, "pt_2"))
@@ -218,7 +214,6 @@ def test_names_are_unique(volume_file):
     assert not volume_file.with_name("new.h5").exists()
 
 
-@pytest.mark.door
 def test_volumes_are_those_that_were_written_or_none(volume_file):
     """A volume file of mvrecon's in which one bit has flipped, anywhere, is refused or has the
     values written.
@@ -255,7 +250,6 @@ def test_slabs_are_the_volume_whatever_the_chunks(tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.door
 def test_a_chunk_of_gigabytes_is_refused_at_once(tmp_path):
     """A volume in one chunk of over 256 MiB, which cannot be read in slabs, is refused before it is
     unpacked.

@@ -21,7 +21,6 @@ READERS = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", READERS)
 def test_a_circle_in_the_heap_of_names_is_refused(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

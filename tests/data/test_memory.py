@@ -68,7 +68,6 @@ def source(request, tmp_path_factory) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.door
 @pytest.mark.parametrize("case", [0, 1])
 def test_a_large_volume_takes_the_memory_of_slabs(source, case, run_python):
     """A packed volume of 768 MiB in float32 on a small grid takes less than a third of that,

@@ -131,7 +131,6 @@ def test_without_nibabel_the_extra_is_named(tmp_path, monkeypatch):
         read_nifti(tmp_path / "a.nii")
 
 
-@pytest.mark.door
 def test_packed_values_are_those_that_were_written_or_none(tmp_path):
     """A `.nii.gz` in which one bit has flipped, anywhere, is refused or has the values that were
     written.
@@ -152,7 +151,6 @@ def test_packed_values_are_those_that_were_written_or_none(tmp_path):
     assert refused > 190
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", ["a.NII", "a.nii.GZ", "a.Nii.gz", "a.b.nii"])
 def test_endings_are_read_in_any_case(tmp_path, name):
     """`.NII`, `.NII.GZ` and the like are read as `.nii` and `.nii.gz` are."""
@@ -163,7 +161,6 @@ def test_endings_are_read_in_any_case(tmp_path, name):
     assert NiftiVolume(path=str(tmp_path / name)).case(0)[0] == name[: name.lower().index(".nii")]
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("more", [(1,), (1, 1)])
 def test_axes_of_one_voxel_behind_the_third_are_left_out(tmp_path, more):
     """A NIfTI of four or five axes with one volume is read as that volume."""

@@ -27,7 +27,6 @@ def test_a_file_to_predict_from_has_no_label(tmp_path):
     assert read_example(tmp_path / "a.h5").label is None
 
 
-@pytest.mark.door
 def test_what_is_no_such_file_is_refused(tmp_path):
     """A file of pytorch-3dunet with other axes, sizes or types is refused, and none is written."""
     path = tmp_path / "a.h5"

@@ -45,7 +45,6 @@ def test_the_views_of_a_case_are_those_of_its_rig():
     assert item["name"] == sample.name and torch.equal(item["views"], sample.views)
 
 
-@pytest.mark.door
 def test_rigs_that_nothing_draws_and_cases_that_do_not_fill_a_batch_are_refused():
     """Training on many rigs is refused for a fixed rig, and for rigs without a batch of cases."""
     circular = {"name": "circular", **OPTIONS["circular"]}

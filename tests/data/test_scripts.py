@@ -7,8 +7,10 @@ import zipfile
 import numpy as np
 import pytest
 
+from mvrecon.config import compose
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.volumes import Hdf5Volumes
+from mvrecon.parts import SCENES
 
 
 def load(root, name):
@@ -21,6 +23,24 @@ def load(root, name):
 @pytest.fixture
 def openkbp(root):
     return load(root, "prepare_openkbp")
+
+
+@pytest.mark.parametrize(
+    ("script", "choice"),
+    [
+        ("prepare_openkbp.py", "experiment=open_kbp"),
+        ("prepare_openkbp.py", "experiment=open_kbp_cross_view"),
+        ("fetch_chest_ct.py", "scene@test_scene=chest_ct"),
+    ],
+)
+def test_a_scene_without_its_data_names_the_script_that_makes_them(
+    script, choice, root, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    scene = SCENES.from_config(compose(choice)["test_scene"])
+    with pytest.raises(FileNotFoundError, match=rf"; scripts/{script} makes it$"):
+        scene.case(0)
+    assert (root / "scripts" / script).is_file()
 
 
 def flat(y, x, z):
@@ -77,7 +97,6 @@ def test_a_folder_that_is_no_clone_is_refused(openkbp, tmp_path):
         openkbp.prepare(tmp_path, tmp_path / "data")
 
 
-@pytest.mark.door
 def test_patients_without_a_ct_are_named_and_nothing_is_written(root, tmp_path, run_python):
     """A patient without `ct.csv` is named, the exit status is not zero, and no file is written
     unless told to skip.

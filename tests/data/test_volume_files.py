@@ -101,7 +101,6 @@ def test_hounsfield_units_come_back_from_attenuation():
     assert hounsfield(torch.tensor([0.0, WATER])).tolist() == [-1000, 0]
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("ending", ["mha", "nrrd"])
 def test_a_cut_itk_image_is_refused(ending, tmp_path):
     """An MHA or NRRD volume that is cut short is refused with its name, wherever it is cut."""
@@ -114,7 +113,6 @@ def test_a_cut_itk_image_is_refused(ending, tmp_path):
             read_volume(path)
 
 
-@pytest.mark.door
 def test_an_nrrd_header_that_would_end_the_process_or_hides_its_end_is_refused(tmp_path):
     """An NRRD header with a line that ITK would write beyond its buffer, with an end that only some
     programs see, or without one is refused; long comments and key/value pairs are read.
@@ -136,7 +134,6 @@ def test_an_nrrd_header_that_would_end_the_process_or_hides_its_end_is_refused(t
     assert torch.equal(read_volume(path)[0], values)
 
 
-@pytest.mark.door
 def test_itk_images_that_are_no_volume_are_refused(tmp_path):
     """An ITK image of two axes, of colours, or that declares more than it holds is refused."""
     path = tmp_path / "a.mha"
@@ -157,3 +154,20 @@ def test_a_scene_of_one_file_has_one_case(tmp_path):
     save_volume(tmp_path / "liver.mha", torch.full(grid.shape, 40.0), grid)
     scene = Volumes(path=str(tmp_path / "liver.mha"))
     assert scene.length == 1 and scene.case(0)[0] == "liver"
+
+
+PLACED = b"space: left-posterior-superior\nspace directions: (2,0,0) (0,3,0) (0,0,4)\nspace units"
+
+
+@pytest.mark.parametrize("field", [PLACED, b"spacings: 2 3 4\nunits"])
+def test_lengths_of_an_nrrd_are_in_the_unit_of_its_header(field, tmp_path):
+    head = b"NRRD0004\ntype: float\ndimension: 3\nsizes: 2 3 4\nendian: little\nencoding: raw\n"
+    path, values = tmp_path / "a.nrrd", np.arange(24, dtype="<f4").tobytes()
+    for unit, mm in (("mm", 1), ("um", 1e-3), ("cm", 10), ("m", 1e3), ("", 1)):
+        units = b": " + b" ".join([f'"{unit}"'.encode()] * 3)
+        path.write_bytes(head + field + units + b"\n\n" + values)
+        assert read_volume(path)[1].spacing == pytest.approx((2 * mm, 3 * mm, 4 * mm))
+    for units in (b'"parsec" "parsec" "parsec"', b'"mm" "mm" "um"'):
+        path.write_bytes(head + field + b": " + units + b"\n\n" + values)
+        with pytest.raises(Refused, match="expected one unit of length for all axes"):
+            read_volume(path)

@@ -44,7 +44,6 @@ def test_a_folder_of_volumes_has_a_case_for_each_file(folder, grid, cameras):
         assert torch.allclose(sample.views, expected.views, atol=1e-4)
 
 
-@pytest.mark.door
 def test_attenuation_that_is_taken_for_hu_is_refused(tmp_path, grid, cameras):
     """Attenuation in 1/mm, all of which would be water as HU, is refused, with what to say."""
     mu = attenuation(torch.from_numpy(head().astype("f4")))
@@ -55,7 +54,6 @@ def test_attenuation_that_is_taken_for_hu_is_refused(tmp_path, grid, cameras):
     assert Volumes(path=path, stored_unit="1/mm").sample(0, 0, grid, cameras).volume.max() > 0
 
 
-@pytest.mark.door
 def test_a_patient_of_a_few_voxels_is_warned_of(tmp_path, grid, cameras):
     """A patient who is a tenth as large, as with a spacing in cm, is warned of."""
     hu = torch.from_numpy(head().astype("f4"))
@@ -113,7 +111,6 @@ def test_activity_in_a_file_is_projected_and_kept(tmp_path, cameras):
     assert sample.views.max() == pytest.approx(70.0 * 6 * 2**0.5 * 2, rel=0.6)
 
 
-@pytest.mark.door
 def test_units_that_do_not_fit_are_refused(tmp_path, volume_file, grid, cameras):
     """A volume of other units than the scene's, or of HU as 1/mm, is refused with both named."""
     with pytest.raises(ValueError, match="to be the file's, 'HU', got '1/mm'"):
@@ -128,7 +125,6 @@ def test_units_that_do_not_fit_are_refused(tmp_path, volume_file, grid, cameras)
         Volumes(path=str(tmp_path / "a.nii"), stored_unit="1/mm").sample(0, 0, grid, cameras)
 
 
-@pytest.mark.door
 def test_a_folder_that_is_no_scene_is_refused(tmp_path):
     """A folder without volumes, or with DICOM slices beside others, is refused as a scene."""
     with pytest.raises(FileNotFoundError, match="no such file or folder; expected a volume or"):

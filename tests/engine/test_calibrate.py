@@ -50,6 +50,9 @@ def test_offset_gains_and_dead_pixels_of_a_scan(monkeypatch):
     views = mended.measured.whole().views
     assert ((views - exact / gains[:, None, None])[mask].norm() / exact[mask].norm()) < 0.01
     assert "offset_u +2." in calibrate.in_words(fit, ["offset_u", "gains"])
+    kept = fit._replace(kept=["offset_u"], settled=False)
+    words = calibrate.table(kept, ["offset_u", "gains"])["words"]
+    assert "offset_u kept at the nominal value" in words and "still changed" in words
 
 
 def test_the_coarse_grid_fills_the_same_box():

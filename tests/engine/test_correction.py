@@ -156,7 +156,6 @@ def test_the_app_writes_the_standard_deviation_beside_the_volume(runs, tmp_path)
     assert expected.min() > 0 and torch.allclose(saved[light], expected, rtol=1e-3, atol=0.1)
 
 
-@pytest.mark.door
 def test_a_correction_that_does_not_fit_is_refused(case, runs, tmp_path, capsys):
     """A model that corrects no view, a calibration without an alignment and an unknown option are
     refused.

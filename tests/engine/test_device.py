@@ -6,7 +6,6 @@ import torch
 from mvrecon.engine.device import device_of
 
 
-@pytest.mark.door
 def test_a_device_that_there_is_not_is_refused(monkeypatch):
     """An evaluation on a misspelt device, or on a GPU that torch does not see, is refused with the
     known names.

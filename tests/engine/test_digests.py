@@ -18,8 +18,6 @@ from mvrecon.parts import CAMERAS
 from tests.engine.lives import METHOD
 from tests.engine.runs import RIG, call, rig_file
 
-pytestmark = pytest.mark.door
-
 
 def test_a_run_keeps_its_rig_and_the_digests_of_rig_and_data(run):
     """The run folder keeps the rig, number for number, and the checkpoint has its digest and the

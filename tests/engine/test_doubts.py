@@ -54,7 +54,6 @@ def test_a_right_scan_raises_no_doubt(views):
     assert doubts(scan_of(views), "fdk", 0.05) == []
 
 
-@pytest.mark.door
 def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):
     """A mirrored detector, or a rig that turns the other way, is told with what mends it."""
     figures = oriented_nrmse(scan_of(views.flip(-1)))
@@ -65,7 +64,6 @@ def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):
         assert "columns reversed" in words and "views.flip_columns" in words
 
 
-@pytest.mark.door
 def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
     """Counts taken for line integrals, and a volume that does not explain its views, are told."""
     counts = scan_of((4e4 * torch.exp(-views)).round())
@@ -74,7 +72,6 @@ def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
     assert "osem" not in "".join(doubts(counts, "osem", 0.1))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("shape", [(24, 26), (12, 30)])
 def test_views_whose_axes_were_exchanged_are_told(shape):
     """Views stored as [u, v], whose detector has the file's number of pixels, are told."""

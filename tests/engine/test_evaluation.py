@@ -109,7 +109,6 @@ def test_the_table_tells_every_method_and_both_moments():
     )
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("scenes", "seen", "title"),
     [
@@ -124,7 +123,6 @@ def test_a_table_calls_no_scene_unseen_that_a_training_may_have_seen(scenes, see
     assert title in text and "unseen" not in text
 
 
-@pytest.mark.door
 def test_a_reader_of_the_table_learns_of_shared_cases_and_of_the_detector():
     """Below the table stand cases that training and test share, and a detector that is not
     perfect or not the run's.

@@ -155,7 +155,6 @@ def test_the_main_method_goes_by_its_file_of_settings_whatever_its_class(setting
     assert list(fit.methods({**unet, "label": None})) == ["cross_view", "sirt"], "of a run of then"
 
 
-@pytest.mark.door
 def test_no_method_is_labelled_as_the_truth(settings):
     """A method labelled "truth", whose volume would overwrite the true one, is refused."""
     for label in ("truth", "Truth"):

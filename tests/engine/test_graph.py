@@ -83,7 +83,6 @@ REFUSED = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_no_graph_can_hold_is_refused(what, monkeypatch):
     """trainer.graph=true is refused in one sentence where no CUDA graph can hold a training

@@ -40,7 +40,6 @@ def same(a, b):
     return all((x == y).all() for x, y in zip(a.values(), b.values(), strict=True))
 
 
-@pytest.mark.door
 def test_a_finished_run_goes_on_to_more_steps_as_if_it_had_never_ended(short, tmp_path, capsys):
     """A finished run that goes on to more steps ends, at a constant rate, with the same bits as one
     of so many steps from the start; its table is a new one.
@@ -57,7 +56,6 @@ def test_a_finished_run_goes_on_to_more_steps_as_if_it_had_never_ended(short, tm
     assert rows[0][METHOD]["psnr"]["values"] == rows[1][METHOD]["psnr"]["values"]
 
 
-@pytest.mark.door
 def test_a_run_is_never_shortened_and_takes_nothing_else(short, capsys):
     """A run that would go on to fewer steps, or with any other setting, is refused, and its table
     stays.

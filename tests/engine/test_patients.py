@@ -16,8 +16,6 @@ from mvrecon.engine.evaluation import seen_in_training
 from tests.engine.lives import OPTIONS
 from tests.engine.runs import call
 
-pytestmark = pytest.mark.door
-
 
 @pytest.fixture(scope="module")
 def patients(tmp_path_factory):

@@ -68,7 +68,6 @@ def test_two_processes_train_as_one_does_with_their_batches_together(pair):
 
 
 @pytest.mark.long
-@pytest.mark.door
 @pytest.mark.parametrize("rank", [0, 1])
 def test_a_run_of_two_processes_one_of_which_is_killed_goes_on(pair, rank, tmp_path):
     """A run of several processes, whichever of them is killed, ends all of them and resumes with
@@ -84,7 +83,6 @@ def test_a_run_of_two_processes_one_of_which_is_killed_goes_on(pair, rank, tmp_p
     assert different(state(folder), state(pair[0])) == []
 
 
-@pytest.mark.door
 def test_the_error_of_a_lost_connection_names_the_process_that_ended():
     """The first process of a training says which other one was killed, and keeps the words on how
     to go on; an error of its own stays as it is.
@@ -110,7 +108,6 @@ def test_processes_share_an_epoch_and_none_runs_out_of_cases_first():
     assert [list(share) for share in shares] == [[whole[6]], [whole[0]], [whole[1]]]
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "message"),
     [

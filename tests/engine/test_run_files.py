@@ -47,11 +47,11 @@ def test_results_are_strict_json_with_versions(tmp_path):
         tmp_path, {"psnr": math.inf, "values": [math.nan, 1.5], "deep": {"x": -math.inf}}
     )
     found = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
-    assert found["psnr"] is None and found["values"] == [None, 1.5] and found["deep"] == {"x": None}
+    assert found["values"] == [None, 1.5], "nan is missing"
+    assert float(found["psnr"]) == math.inf == -float(found["deep"]["x"]), "infinity is not"
     assert found["versions"]["mvrecon"] and found["command"]
 
 
-@pytest.mark.door
 def test_the_version_of_torch_tells_its_build(monkeypatch):
     """A run's versions tell the build of torch, which the metadata of an installed wheel leaves
     out.

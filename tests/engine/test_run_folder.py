@@ -14,8 +14,6 @@ from mvrecon.files.atomic import new_folder
 from tests.engine.lives import METHOD, OPTIONS
 from tests.engine.runs import NOON, call, contents, crowd
 
-pytestmark = pytest.mark.door
-
 
 def test_settings_that_differ_are_named_and_nothing_is_written(run, capsys):
     """A training into the folder of a run with other settings is refused, and not a byte of the

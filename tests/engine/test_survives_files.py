@@ -54,7 +54,6 @@ def test_other_programs_read_the_file_as_any_checkpoint_of_torch(last):
     assert step(plain) == 9, "nor does a checkpoint need a checksum"
 
 
-@pytest.mark.door
 def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
     """One flipped bit in a checkpoint leads to the checkpoint before it, and both are named."""
     whole, rng = last.read_bytes(), random.Random(SEED)
@@ -72,7 +71,6 @@ def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
             assert step(last) == 3, f"seed {SEED}, byte {place}"
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.99, 1.0])
 def test_a_file_cut_short_leads_to_the_one_before(last, kept):
     """A checkpoint that is cut short leads to the one before it."""
@@ -84,7 +82,6 @@ def test_a_file_cut_short_leads_to_the_one_before(last, kept):
         assert step(last) == 3
 
 
-@pytest.mark.door
 def test_a_kill_between_the_two_renames_leaves_the_one_before(last):
     """A kill between the two renames of a checkpoint leaves the one before it."""
     last.unlink()
@@ -95,7 +92,6 @@ def test_a_kill_between_the_two_renames_leaves_the_one_before(last):
         step(last)
 
 
-@pytest.mark.door
 def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
     """Two damaged checkpoints are an error, not a fresh start."""
     for path in (last, storage.previous(last)):
@@ -110,7 +106,6 @@ def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
         step(last)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("owner", "name"), [("os", "fsync"), ("pathlib.Path", "write_bytes"), ("torch", "save")]
 )
@@ -133,7 +128,6 @@ def test_what_goes_wrong_in_writing_is_told_and_leaves_both(last, monkeypatch, o
     assert len(list(last.parent.iterdir())) == 2
 
 
-@pytest.mark.door
 def test_weights_that_are_not_finite_take_no_good_ones_place(last):
     """Weights that are not finite never replace good ones on the disk."""
     bad = checkpoint(9)
@@ -146,7 +140,6 @@ def test_weights_that_are_not_finite_take_no_good_ones_place(last):
     assert step(last) == 6
 
 
-@pytest.mark.door
 def test_a_file_is_written_whole_or_not_at_all(tmp_path):
     """A file is written whole or not at all."""
     path = tmp_path / "results.json"
@@ -157,7 +150,6 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path):
     assert path.read_text() == "before" and [p.name for p in tmp_path.iterdir()] == ["results.json"]
 
 
-@pytest.mark.door
 def test_a_claim_clears_away_what_a_killed_writer_left(tmp_path):
     """What a killed writer left half done is cleared away by the next one."""
     left = tmp_path / "checkpoints" / ".last.ckpt.123.part"
@@ -180,7 +172,6 @@ def test_global_random_numbers_go_on_where_they_were():
     assert drawn() == first
 
 
-@pytest.mark.door
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a process is forked and killed as on POSIX")
 @pytest.mark.parametrize(
     ("name", "n"), [("fsync", 1), ("fsync", 2), ("replace", 1), ("replace", 2)]
@@ -202,7 +193,6 @@ def test_a_kill_at_any_flush_or_rename_leaves_a_whole_checkpoint(last, name, n):
     assert step(last) == 12
 
 
-@pytest.mark.door
 def test_a_file_that_may_not_grow_leaves_the_last_checkpoint(last):
     """A checkpoint that the kernel does not let grow is an error; the last one stays and nothing is
     left half done.
@@ -218,7 +208,6 @@ def test_a_file_that_may_not_grow_leaves_the_last_checkpoint(last):
     assert step(last) == 6 and len(list(last.parent.iterdir())) == 2
 
 
-@pytest.mark.door
 def test_a_folder_that_is_a_file_is_an_error(last):
     """A checkpoint in a folder that is a file is an error; that file stays as it was."""
     with pytest.raises(OSError, match=r"last\.ckpt"):

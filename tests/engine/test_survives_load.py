@@ -35,7 +35,6 @@ def crowded(root, tmp_path):
     return run
 
 
-@pytest.mark.door
 def test_readers_of_a_file_that_is_replaced_see_one_edition_whole(crowded):
     """Readers of a volume file that is replaced meanwhile see one edition of it, whole."""
     answers = crowded("readers")
@@ -43,7 +42,6 @@ def test_readers_of_a_file_that_is_replaced_see_one_edition_whole(crowded):
     assert all(int(times) >= 1 for _, times in answers[1:])
 
 
-@pytest.mark.door
 def test_runs_of_one_sweep_at_once_each_leave_their_own_results(crowded, tmp_path):
     """Runs of a sweep at once leave their own results in their own folders."""
     answers = crowded("sweep")
@@ -58,7 +56,6 @@ def test_runs_of_one_sweep_at_once_each_leave_their_own_results(crowded, tmp_pat
         assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == k
 
 
-@pytest.mark.door
 def test_of_several_runs_in_one_folder_one_goes_on_and_the_others_say_why_not(crowded, tmp_path):
     """Of several runs at once in one folder one goes on, and the others are refused."""
     answers = crowded("folder")

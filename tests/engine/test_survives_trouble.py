@@ -50,7 +50,6 @@ def troubled(request, tmp_path_factory):
     return folder, cases, lives.play(folder, runs, f"data.workers={request.param}")
 
 
-@pytest.mark.door
 def test_each_trouble_says_what_happened_and_does_not_end_well(troubled):
     """Whatever breaks a training off, it ends with an error and the path of the last good
     checkpoint.
@@ -67,7 +66,6 @@ def test_each_trouble_says_what_happened_and_does_not_end_well(troubled):
         assert any(note in line and "resume=" in line for line in lines), (name, life["said"])
 
 
-@pytest.mark.door
 def test_each_leaves_the_last_good_checkpoint_and_nothing_half_written(troubled):
     """A training that breaks off leaves its last good checkpoint and nothing half written."""
     _, cases, ended = troubled
@@ -77,7 +75,6 @@ def test_each_leaves_the_last_good_checkpoint_and_nothing_half_written(troubled)
         assert step is None or found["said"].strip() == f"step {step}", name
 
 
-@pytest.mark.door
 def test_each_goes_on_to_the_bits_of_a_run_without_trouble(troubled):
     """A training that broke off goes on to the bits of one without trouble."""
     folder, cases, ended = troubled
@@ -93,7 +90,6 @@ def test_each_goes_on_to_the_bits_of_a_run_without_trouble(troubled):
         assert lives.different(whole, found) == [], name
 
 
-@pytest.mark.door
 def test_a_folder_that_cannot_be_written_to_is_named():
     """A folder that cannot be written to is named."""
     folder = Path(tempfile.mkdtemp())  # where another user comes, too: nothing holds root

@@ -89,7 +89,25 @@ def test_views_in_another_unit_are_told_by_the_range_of_values(run, A, views):
         trained(A, 1000 * views, str(run))
 
 
-@pytest.mark.door
+def test_the_loaded_method_and_the_reconstructor_warn_in_the_same_words(run, A, views):
+    def told(source: str, reconstruct) -> list[str]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            reconstruct()
+        return [str(w.message).removeprefix(source) for w in caught if source in str(w.message)]
+
+    rig = replace(A.cameras, source=A.cameras.source + torch.tensor([5.0, 0.0, 0.0]))
+    fine, loaded = Grid.centred(size=(20, 20, 20), spacing=6.4), mv.load(run)
+    other, bright = PROJECTORS.build("drr", grid=fine, cameras=rig), 1000 * views
+    by_name = told(str(run), lambda: trained(other, bright, str(run)))
+    assert len(by_name) == 3  # rig, grid, values
+    assert told("The trained cross_view", lambda: loaded(bright, rig, fine)) == by_name
+    assert told("The trained cross_view", lambda: loaded(bright)) == [
+        told(str(run), lambda: trained(A, bright, str(run)))[-1]
+    ]
+    assert told("The trained cross_view", lambda: loaded(views, A.cameras, A.grid)) == []
+
+
 def test_a_network_made_for_its_own_cameras_refuses_another_number_of_views(run, A, views):
     """A network whose weights belong to one rig is not applied to another number of views."""
     other = PROJECTORS.build("drr", grid=A.grid, cameras=A.cameras[:3])

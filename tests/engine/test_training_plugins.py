@@ -123,7 +123,6 @@ def test_a_training_takes_the_optimiser_callback_logger_and_loss_of_a_plugin(
         load(tmp_path / "run")
 
 
-@pytest.mark.door
 def test_callbacks_loggers_and_losses_by_name_are_those_of_installed_plugins(installed, tmp_path):
     """A callback, a logger or a term of the loss by name is an installed plugin's or is refused,
     and its files stay in the run folder.

@@ -126,7 +126,6 @@ def test_conjugate_gradients_that_nobody_stops_stay_where_they_are_done(scanned)
     assert not waits
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", [name for name, waits in BEFORE.items() if waits < 3])
 def test_a_view_that_is_not_finite_shows_in_the_volume_of_a_gpu(name, scanned):
     """Iterative methods of a GPU, which do not wait to look at their views, give NaN where a view
@@ -229,7 +228,6 @@ def test_the_stand_in_refuses_tensors_of_two_memories():
         assert not gpu.waits
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", ["cross_view", "dif_net", "fbp_unet", "primal_dual"])
 def test_views_that_are_not_finite_make_no_number_on_a_gpu(name):
     """Views on a GPU that are not finite, for which nobody waits, give a volume of NaN, never a
@@ -243,7 +241,6 @@ def test_views_that_are_not_finite_make_no_number_on_a_gpu(name):
     assert volume.values.isnan().all()
 
 
-@pytest.mark.door
 def test_a_bad_loss_on_a_gpu_is_refused_with_its_step():
     """A loss on a GPU that is not finite ends the training by the next logged step, and before a
     checkpoint is written.

@@ -45,7 +45,6 @@ class Outcome(NamedTuple):
 
 
 pytestmark = [
-    pytest.mark.door,
     pytest.mark.slow,
     pytest.mark.skipif(sys.platform == "win32", reason="needs a limit of bytes a file"),
 ]

@@ -52,7 +52,6 @@ def test_a_model_that_starts_from_total_variation_keeps_the_contract(support):
     check_model("single_pass", small_projector(), **options)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("reconstructor", "message"),
     [

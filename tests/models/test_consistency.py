@@ -181,7 +181,6 @@ def test_a_length_past_one_learns_to_come_back_alone(counted, length, sign, move
     assert bool(steps.lengths.grad.any()) == moves
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("steps", "message"),
     [

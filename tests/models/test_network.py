@@ -106,7 +106,6 @@ def test_mvrecon_s_own_network_by_name_is_the_same_as_without_one():
     assert torch.equal(nets[0](x), nets[1](x)) and not nets[0](x)[:, 0].any()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("model", "options", "error", "message"),
     [
@@ -136,7 +135,6 @@ def test_a_network_that_a_model_cannot_use_is_refused(model, options, error, mes
         MODELS.build(model, small_projector(), **OPTIONS.get(model, {}), **options)
 
 
-@pytest.mark.door
 def test_a_network_s_answer_of_another_size_is_refused():
     """A network that answers with another size is refused by a model, with both sizes."""
     network = network_by_name(

@@ -77,7 +77,6 @@ def test_a_derivative_is_the_slope(name):
     assert torch.isclose((gradient * step).sum(), slope, rtol=1e-5) and slope.abs() > 1e-3
 
 
-@pytest.mark.door
 def test_a_size_that_cannot_be_halved_is_refused_with_the_next_that_can():
     """A tile whose pooled sizes are odd, or smaller than the border, is refused with the next
     larger size that fits.
@@ -89,7 +88,6 @@ def test_a_size_that_cannot_be_halved_is_refused_with_the_next_that_can():
     assert valid_size(132, 4) == 44 and valid_size(116, 4) == 28
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "message"),
     [

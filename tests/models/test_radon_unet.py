@@ -96,7 +96,6 @@ def test_both_networks_learn_from_projections_alone_and_end_to_end(weights):
         assert loss(out, batch)["corrected_views"].item() < 1e-12
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("options", [{"angles": 7}, {"angles": 2}, {"features": 0}])
 def test_projections_that_there_are_not_are_refused(options):
     """A model of ideal projections refuses an odd number of angles, fewer than 4, and no

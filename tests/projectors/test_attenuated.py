@@ -253,7 +253,6 @@ def test_no_emission_is_no_counts_and_nan_is_never_skipped():
     assert A(one * torch.nan)[seen].isnan().all()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("value", "told"),
     [(0.15, "1/cm"), (-0.01, "zero or more"), (torch.nan, "finite")],
@@ -266,7 +265,6 @@ def test_impossible_attenuation_is_refused(value, told):
         AttenuatedTransform(grid, rig(), mu)
 
 
-@pytest.mark.door
 def test_attenuation_of_another_grid_and_sampled_rays_are_refused():
     """Attenuation of another grid, or along rays of samples, is refused."""
     grid, mu, _ = scene()
@@ -274,3 +272,15 @@ def test_attenuation_of_another_grid_and_sampled_rays_are_refused():
         AttenuatedTransform(grid, rig(), mu[1:])
     with pytest.raises(ValueError, match="joseph"):
         AttenuatedTransform(grid, rig(), mu, method="trilinear")
+
+
+def test_attenuation_that_is_filled_in_later_counts():
+    grid, mu, x = scene()
+    own = torch.zeros_like(mu)
+    A = AttenuatedTransform(grid, rig(), own)
+    assert torch.equal(A(x), Drr(grid, rig())(x))
+    own.copy_(mu)
+    assert torch.equal(A(x), AttenuatedTransform(grid, rig(), mu)(x))
+    assert torch.equal(A.cropped(Box.whole(grid.shape), [1])(x), A(x)[:, :, [1]])
+    A.mu.zero_()
+    assert torch.equal(A(x), Drr(grid, rig())(x)) and A.attenuation() is None

@@ -186,3 +186,12 @@ def test_a_ray_all_but_along_a_face_crosses_it_where_it_does(backend):
     )
     expected = (48 + 60 * height[0]) * (1 + 1 / 60**2) ** 0.5
     assert (A(volume)[0, 0].double() - expected).abs().max() <= 1e-6 * expected.max()
+
+
+def test_explicit_rays_keep_their_own_points():
+    start, end = torch.zeros(2, 1, 3, 2, 3, dtype=torch.float64)
+    end += 1
+    rays = ExplicitRays(start.numpy(), end)
+    start += 7
+    end += 7
+    assert not rays.source.any() and torch.equal(rays.target, torch.ones_like(rays.target))

@@ -86,7 +86,6 @@ def test_gradients_flow_through_it():
     torch.autograd.gradcheck(lambda y: sirt(A, y, 2, nonnegative=False), (y,))
 
 
-@pytest.mark.door
 def test_the_logarithm_of_no_intensity_is_refused(A):
     """Views with logarithms of no or negative intensity are refused with their number."""
     views = A(torch.rand(1, 1, *GRID.shape))

@@ -38,7 +38,6 @@ def test_it_is_the_error_of_a_view_that_the_method_has_not_seen():
     assert seen == [(1, 1, 2, *views.shape[-2:])] * 3
 
 
-@pytest.mark.door
 def test_one_view_alone_cannot_be_judged_by_others():
     """Leave-one-out residuals need two views, and finite values."""
     A = small_projector(n_views=2)

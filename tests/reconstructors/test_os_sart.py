@@ -55,7 +55,6 @@ def test_with_a_relaxation_that_falls_noisy_views_end_at_the_least_squares_of_si
     assert gap(limit, least) < 0.4 * gap(cycle, least)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     "options",
     [{"relaxation": 0.0}, {"relaxation": 2.0}, {"relaxation": math.nan}, {"reduction": 1.1}],

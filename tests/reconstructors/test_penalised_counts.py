@@ -139,7 +139,6 @@ def test_more_weight_means_less_noise_at_any_number_of_counts(method):
         assert spreads[0] > spreads[1] > spreads[2] and spreads[2] < 0.1
 
 
-@pytest.mark.door
 def test_options_of_penalised_counts_that_do_not_fit_are_refused():
     """A penalised likelihood refuses a negative weight, a balance of zero, and an option that the
     prior does not have.

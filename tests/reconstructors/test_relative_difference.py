@@ -77,7 +77,6 @@ def test_ct_takes_away_the_cost_of_an_edge_that_it_shows():
     assert guided(inner).item() == pytest.approx(plain(torch.where(edge > 1, 1, inner)).item())
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     "options",
     [

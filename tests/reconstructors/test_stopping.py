@@ -112,7 +112,6 @@ def test_every_sample_of_a_batch_has_the_choice_that_it_would_have_alone(noisy, 
     assert len(choices) == 2
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("act", "message"),
     [

@@ -80,7 +80,6 @@ def test_half_of_the_cases_have_a_defect():
     assert min(c for c in cases if c > 0) >= 0.3
 
 
-@pytest.mark.door
 def test_a_grid_without_room_for_the_torso_is_refused():
     """A grid that cuts a patient's torso off is refused, with one that does not."""
     with pytest.raises(ValueError, match=r"holds a torso of \[311, 240, 240\] mm.*spacing 5"):

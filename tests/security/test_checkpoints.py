@@ -55,7 +55,6 @@ def test_a_valid_checkpoint_loads(kept: dict, tmp_path: Path):
     assert all(torch.equal(weights[name], value) for name, value in kept["state_dict"].items())
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", sorted(pickles(Path("sentinel"))))
 def test_a_pickle_builds_tensors_and_plain_values_only(
     name: str, kept: dict, sentinel: Path, tmp_path: Path
@@ -96,7 +95,6 @@ def test_the_sample_would_work_if_it_were_unpickled(sentinel: Path, tmp_path: Pa
     assert sentinel.exists()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", SETTINGS)
 def test_settings_in_a_checkpoint_are_names_and_numbers(name: str, kept: dict, tmp_path: Path):
     """Settings in a checkpoint that are no names and numbers are refused."""
@@ -114,7 +112,6 @@ def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: P
         load(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
-@pytest.mark.door
 def test_an_archive_does_not_unfold(kept: dict, tmp_path: Path):
     """A checkpoint with packed members is refused before they unfold."""
     members = repacked(saved(kept), **{"archive/data/0": bytes(2**26)})
@@ -123,7 +120,6 @@ def test_an_archive_does_not_unfold(kept: dict, tmp_path: Path):
         load(written(tmp_path / "bomb.ckpt", raw))
 
 
-@pytest.mark.door
 def test_members_that_share_their_bytes_are_refused(kept: dict, tmp_path: Path):
     """A checkpoint whose members share their bytes is refused."""
     raw = saved({**kept, "x": torch.zeros(2**16)})
@@ -150,7 +146,6 @@ def test_members_that_share_their_bytes_are_refused(kept: dict, tmp_path: Path):
         check_archive(written(tmp_path / "bomb.ckpt", overlapping + end))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     "name", ["../evil", "/etc/evil", "archive/../../evil", "archive/code/evil.py", "evil"]
 )
@@ -161,7 +156,6 @@ def test_members_lead_nowhere(name: str, kept: dict, tmp_path: Path):
         load(written(tmp_path / "evil.ckpt", raw))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("method", ["../../evil", "/etc/evil", "..", "a/b"])
 def test_a_methods_name_leads_nowhere(method: str, tmp_path: Path):
     """A method's name never leads out of the run folder."""
@@ -170,7 +164,6 @@ def test_a_methods_name_leads_nowhere(method: str, tmp_path: Path):
             place(tmp_path, method)
 
 
-@pytest.mark.door
 def test_a_storage_is_no_longer_than_its_file(kept: dict, tmp_path: Path):
     """A checkpoint that declares more numbers than its file holds is refused."""
     archive = saved({**kept, "x": torch.zeros(300)})
@@ -179,7 +172,6 @@ def test_a_storage_is_no_longer_than_its_file(kept: dict, tmp_path: Path):
         load(written(tmp_path / "evil.ckpt", with_pickle(archive, longer)))
 
 
-@pytest.mark.door
 def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
     """Weights that do not fit the settings beside them are refused, with their names."""
     first = next(iter(kept["state_dict"]))
@@ -188,7 +180,6 @@ def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
         load(written(tmp_path / "a.ckpt", saved({**kept, "state_dict": weights})))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_weights_that_are_not_finite_are_refused(value: float, kept: dict, tmp_path: Path):
     """A checkpoint with a weight that is not a finite number is refused, to be evaluated and to be
@@ -238,7 +229,6 @@ AMISS = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", AMISS)
 def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss(
     name: str, kept: dict, tmp_path: Path
@@ -252,7 +242,6 @@ def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss
         load(written(tmp_path / "a.ckpt", saved(change(kept, first))))
 
 
-@pytest.mark.door
 def test_weights_are_those_that_were_saved_or_none(kept: dict, tmp_path: Path):
     """A checkpoint without mvrecon's own checksum, with a bit flipped in a weight is refused."""
     raw = bytearray(saved(kept))

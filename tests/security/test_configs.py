@@ -23,7 +23,6 @@ def sentinel(tmp_path: Path) -> Path:
     return tmp_path / "sentinel"
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", sorted(targets(Path("sentinel"))))
 def test_a_target_is_a_callback_or_a_logger_or_refused(name: str, sentinel: Path):
     """A target in a config is a callback or a logger of Lightning or mvrecon, or it is refused and
@@ -35,7 +34,6 @@ def test_a_target_is_a_callback_or_a_logger_or_refused(name: str, sentinel: Path
     assert not sentinel.exists()
 
 
-@pytest.mark.door
 def test_an_alias_or_a_reference_to_a_target_is_what_it_names(sentinel: Path, folder):
     """A target by an alias or a reference is judged by what it names."""
     text = f"""
@@ -60,7 +58,6 @@ def folder(tmp_path: Path):
     return partial(experiment, tmp_path)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", sorted(experiments(Path("sentinel"))))
 def test_a_fetched_experiment_tells_hydra_nothing(name: str, sentinel: Path, folder):
     """A fetched experiment that sets callbacks, launchers, log files or folders of Hydra is
@@ -70,7 +67,6 @@ def test_a_fetched_experiment_tells_hydra_nothing(name: str, sentinel: Path, fol
         compose(*folder(experiments(sentinel)[name]))
 
 
-@pytest.mark.door
 def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, root: Path, tmp_path: Path):
     """A fetched experiment is refused before Hydra makes a folder or runs a callback."""
     folder(experiments(sentinel)["a callback"])
@@ -97,7 +93,6 @@ def test_what_an_experiment_may_say_of_hydra_still_composes(folder):
     assert settings["name"] == "mine"
 
 
-@pytest.mark.door
 def test_configs_of_hydras_own_in_a_fetched_folder_are_refused(folder):
     """A fetched folder with configs of Hydra's own is refused."""
     chosen = folder("name: mine", **{"hydra/launcher/evil.yaml": "_target_: os.system"})
@@ -105,7 +100,6 @@ def test_configs_of_hydras_own_in_a_fetched_folder_are_refused(folder):
         compose(*chosen, "hydra/launcher=evil")
 
 
-@pytest.mark.door
 def test_environment_variables_are_not_read(folder, monkeypatch: pytest.MonkeyPatch):
     """A fetched experiment does not read environment variables."""
     monkeypatch.setenv("SECRET", "s3cret")
@@ -114,7 +108,6 @@ def test_environment_variables_are_not_read(folder, monkeypatch: pytest.MonkeyPa
     assert compose("name=${oc.env:SECRET}")["name"] == "s3cret"  # the user's own word
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", WAYS_OUT)
 def test_a_name_does_not_lead_out_of_the_outputs(name: str, folder):
     """The name of an experiment never leads out of the folder of outputs."""
@@ -122,7 +115,6 @@ def test_a_name_does_not_lead_out_of_the_outputs(name: str, folder):
         compose(*folder(f"name: {name!r}"))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("text", "error"), [("out: {}", PermissionError), ("bench: {{name: ../..{}}}", Refused)]
 )
@@ -136,7 +128,6 @@ def test_a_fetched_benchmark_does_not_choose_its_folder(text: str, error: type, 
         compose(place, "bench=evil", config_name="bench")
 
 
-@pytest.mark.door
 def test_a_yaml_file_that_unfolds_is_refused_at_once(folder, tmp_path: Path):
     """A YAML file whose aliases unfold to more than 100,000 values is refused."""
     with pytest.raises(Refused, match=r"evil\.yaml: unfolds to more than"):
@@ -152,7 +143,6 @@ def test_a_yaml_file_that_unfolds_is_refused_at_once(folder, tmp_path: Path):
             yaml_of(path)
 
 
-@pytest.mark.door
 def test_yaml_tags_build_nothing(sentinel: Path, folder):
     """A tag in a YAML file builds nothing."""
     for tag in (f'!!python/object/apply:os.system ["touch {sentinel}"]', "!!python/name:os.system"):
@@ -161,7 +151,6 @@ def test_yaml_tags_build_nothing(sentinel: Path, folder):
     assert not sentinel.exists()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     "module", ["os", "antigravity", "lightning.pytorch.cli", "evil", "a b", ".x"]
 )
@@ -178,7 +167,6 @@ def test_a_setting_imports_only_what_was_written_for_mvrecon(
     assert not sentinel.exists()
 
 
-@pytest.mark.door
 def test_a_pickled_config_is_not_run_again(run_python):
     """A pickled config is not run again."""
     done = run_python(
@@ -189,7 +177,6 @@ def test_a_pickled_config_is_not_run_again(run_python):
     assert done.returncode == 1 and "unpickles a file" in done.stderr
 
 
-@pytest.mark.door
 def test_a_settings_file_of_a_gigabyte_is_not_read(tmp_path: Path):
     """A settings file of a gigabyte is refused without reading it."""
     with (tmp_path / "evil.yaml").open("wb") as file:

@@ -43,7 +43,6 @@ def volume_file(path: Path, change: Callable[[h5py.File], object]) -> VolumeFile
     return VolumeFile(path)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", DECLARED)
 def test_a_volume_file_gets_no_more_than_it_holds(name: str, tmp_path: Path):
     """An HDF5 file that declares more than it holds, or leads to other files, is refused within 64
@@ -53,7 +52,6 @@ def test_a_volume_file_gets_no_more_than_it_holds(name: str, tmp_path: Path):
     refused(lambda: len(volume_file(tmp_path / "evil.h5", change)), rf"(?s)evil\.h5: .*{message}")
 
 
-@pytest.mark.door
 def test_a_volume_that_was_never_written_is_not_zeros(tmp_path: Path):
     """A volume that was never written is refused instead of read as zeros."""
     made = {
@@ -73,7 +71,6 @@ def bomb(file: h5py.File) -> None:
     file["ct"].id.write_direct_chunk((0, 0, 0, 0), raw)
 
 
-@pytest.mark.door
 def test_a_chunk_does_not_unfold_to_more_than_it_declares(tmp_path: Path):
     """A chunk of an HDF5 file that unfolds to more than it declares is refused, and the other
     volumes are read.
@@ -100,7 +97,6 @@ def test_a_chunk_of_allowed_size_does_not_unfold_to_more_either(tmp_path: Path):
     )
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     "name", ["../../evil", "/etc/evil", "..", "a\\b", "c:evil", "a\0b", "a\nb", "", "x" * 300]
 )
@@ -157,7 +153,6 @@ def gigantic(raw: bytearray) -> None:
         raw[place : place + 4] = b"\xf0\xff\xff\xff"
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("damage", [endless, gigantic])
 def test_texts_that_libhdf5_believes_do_not_harm(damage, tmp_path: Path):
     """Damaged texts of an HDF5 file end in an error, not in endless work or gigabytes."""
@@ -165,7 +160,6 @@ def test_texts_that_libhdf5_believes_do_not_harm(damage, tmp_path: Path):
     refused(lambda: len(file), r"evil\.h5: cannot be opened .*its texts cannot be read")
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
 @pytest.mark.parametrize("name", HEADERS)
 def test_a_nifti_header_is_not_believed(name: str, suffix: str, tmp_path: Path):
@@ -175,7 +169,6 @@ def test_a_nifti_header_is_not_believed(name: str, suffix: str, tmp_path: Path):
     refused(lambda: read_nifti(path), rf"(?s)evil\{suffix}.*{message}")
 
 
-@pytest.mark.door
 def test_a_few_bytes_of_gzip_do_not_unfold(tmp_path: Path):
     """A packed NIfTI file that declares gigabytes and holds little is refused within 64 MB."""
     path = nifti(
@@ -219,7 +212,6 @@ NUMBERS = [
 ]
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("number", NUMBERS)
 @pytest.mark.parametrize("vector", ["source", "origin", "u", "v"])
 def test_a_cameras_numbers_are_finite(number: str, vector: str, tmp_path: Path):
@@ -240,7 +232,6 @@ TEXTS = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", TEXTS)
 def test_a_camera_file_of_nonsense_is_refused_in_few_words(name: str, tmp_path: Path):
     """A camera file that is no camera file is refused in less than 1000 characters, with its
@@ -253,7 +244,6 @@ def test_a_camera_file_of_nonsense_is_refused_in_few_words(name: str, tmp_path: 
     assert "evil.json" in str(error.value) and len(str(error.value)) < 1000
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("shape", [[10**9, 10**9], [2**63, 1], [10**400, 1], [True, 7], [7.0, 9]])
 def test_a_detector_has_no_more_pixels_than_can_be(shape: list, tmp_path: Path):
     """A camera file with more pixels than can be is refused."""
@@ -262,7 +252,6 @@ def test_a_detector_has_no_more_pixels_than_can_be(shape: list, tmp_path: Path):
     refused(lambda: from_file(tmp_path / "evil.json"), "'shape' as")
 
 
-@pytest.mark.door
 def test_a_text_file_is_read_up_to_a_limit(tmp_path: Path):
     """A text file of a terabyte is refused without reading it."""
     path = tmp_path / "large.json"

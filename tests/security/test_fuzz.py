@@ -45,7 +45,6 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
     return found, said
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("reader", READERS)
 def test_a_reader_survives_damaged_files(reader: str, survey: tuple[dict, str]):
     """A damaged file is read or refused with its name, within 256 MB, and the interpreter lives."""
@@ -69,7 +68,6 @@ def test_the_same_seed_damages_alike_and_another_otherwise():
     assert sum(case != data for case in first) > 50
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("reader", CHECKED)
 def test_a_damaged_file_with_checksums_is_refused_or_has_the_values_that_were_written(
     reader: str, survey: tuple[dict, str]

@@ -60,7 +60,6 @@ def run_folder(path: Path, settings: dict) -> Path:
     return path
 
 
-@pytest.mark.door
 def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: Path):
     """`resume=` a folder whose checkpoints lead to the user's documents, with a method of that
     name: they stay.
@@ -77,7 +76,6 @@ def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: 
     assert contents(home) == before
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", [*NAMES, *PARTS])
 def test_a_run_folder_with_a_link_in_it_is_refused(name: str, home: Path, tmp_path: Path):
     """A run folder in which anything is a link is refused before anything is written, whatever it
@@ -100,7 +98,6 @@ def test_a_run_folder_with_a_link_in_it_is_refused(name: str, home: Path, tmp_pa
         ] == []
 
 
-@pytest.mark.door
 def test_a_pipe_in_a_run_folder_is_refused(tmp_path: Path):
     """A named pipe in a run folder, which would let a reader wait for ever, is refused."""
     os.mkfifo(tmp_path / ".lock")
@@ -108,7 +105,6 @@ def test_a_pipe_in_a_run_folder_is_refused(tmp_path: Path):
         pytest.fail("the folder must not be taken")
 
 
-@pytest.mark.door
 def test_a_run_folder_may_be_reached_by_a_link_of_the_users(tmp_path: Path):
     """A link that the user made to a run folder works: only those inside are not followed."""
     folder = run_folder(tmp_path / "run", {"name": "a"})
@@ -116,7 +112,6 @@ def test_a_run_folder_may_be_reached_by_a_link_of_the_users(tmp_path: Path):
     assert resumed(str(tmp_path / "latest"), []) == ({"name": "a"}, folder.resolve())
 
 
-@pytest.mark.door
 def test_only_named_files_are_removed(tmp_path: Path):
     """A finished training removes its two last checkpoints by name, and their folder only if
     nothing is left in it.
@@ -132,7 +127,6 @@ def test_only_named_files_are_removed(tmp_path: Path):
     assert not last.parent.exists()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("label", ["../Documents", "/etc", "a/b", "..", "a\\b", ""])
 def test_a_label_is_a_name(label: str):
     """The label of a compared method is a name and no path, or nothing is trained."""
@@ -176,7 +170,6 @@ def outside(home: Path) -> dict[str, dict]:
     }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", sorted(outside(Path("home"))))
 def test_callbacks_and_loggers_write_into_the_run_folder(name: str, home: Path, tmp_path: Path):
     """Whatever option of a callback or a logger leads out of the run folder is refused, and nothing
@@ -189,7 +182,6 @@ def test_callbacks_and_loggers_write_into_the_run_folder(name: str, home: Path, 
     assert contents(home) == before and not (tmp_path / "run").exists()
 
 
-@pytest.mark.door
 def test_a_place_that_a_default_leads_to_is_looked_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -202,7 +194,6 @@ def test_a_place_that_a_default_leads_to_is_looked_at(
         instantiate(node, tmp_path / "run", save_dir=str(tmp_path / "run"))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     "name", ["survival.KeepLast", "survival.RandomNumbers", "callbacks.Clock", "callbacks.Confined"]
 )
@@ -235,7 +226,6 @@ def test_a_place_inside_is_taken_from_the_run_folder(tmp_path: Path):
     )
 
 
-@pytest.mark.door
 def test_checkpoints_are_kept_and_removed_inside_the_run_folder(home: Path, tmp_path: Path):
     """No checkpoint is written or removed outside the run folder, whatever an older one says of its
     predecessors.
@@ -255,7 +245,6 @@ def test_checkpoints_are_kept_and_removed_inside_the_run_folder(home: Path, tmp_
     assert thesis.read_text() == "years of work"
 
 
-@pytest.mark.door
 def test_a_checkpoint_gives_a_callback_no_place_outside(home: Path, tmp_path: Path):
     """A checkpoint to go on from that tells a callback to write elsewhere lets no training
     begin.

@@ -39,7 +39,6 @@ UNUSED = [
 ]
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(("app", "option"), UNUSED)
 def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypatch, capsys):
     """A setting that an app does not use is an error that names it, and nothing is written."""
@@ -53,7 +52,6 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("option", ["seed=5", "model=sirt", "loss.volume=2.0", "projector=drr"])
 def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
     """The seed, the model, the loss and the projector of an evaluation are those of the run, and
@@ -63,7 +61,6 @@ def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
         compose("checkpoint=x", option, config_name="eval")
 
 
-@pytest.mark.door
 def test_an_evaluation_does_not_describe_a_trained_method_anew(tmp_path: Path):
     """Settings of a method that the run has trained are refused by its evaluation: its checkpoint
     decides.

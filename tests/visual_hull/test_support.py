@@ -174,7 +174,6 @@ def test_a_tenth_of_many_views_must_agree_so_that_thin_rods_stay():
     assert [thin_witnesses(n) for n in (1, 8, 19, 20, 80)] == [1, 1, 1, 2, 8]
 
 
-@pytest.mark.door
 def test_voxels_that_are_smaller_than_rays_are_apart_are_warned_of():
     """A hull says when things as small as a voxel can pass between rays, and how far apart the rays
     are.
@@ -190,7 +189,6 @@ def test_voxels_that_are_smaller_than_rays_are_apart_are_warned_of():
         of(replace(fine, cameras=rods(2.0).cameras), "none")
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("mixed", [False, True])
 def test_wells_that_are_thinner_than_rays_are_apart_are_warned_of(mixed: bool):
     """A data set says when rays can pass by the smallest wells of its phantoms."""

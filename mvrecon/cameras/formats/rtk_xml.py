@@ -58,7 +58,8 @@ def read(
     Args:
         path: of the XML, version 3.
         detector: options of `Detector`: pixels and pixel_mm, each (v, u); offset_mm is 0 where the
-            projections' image is centred about its origin; see `detector_of_image`.
+            projections' image is centred about its origin; see `detector_of_image`, which
+            `mvrecon-reconstruct` uses for views in MHA and NRRD.
         world: axes of the file, "LPS" (ITK's own, as RTK writes volumes), "IEC" (a linac's) or
             "RAS"; see `to_ras`.
         small_arc: the gantry's angles are degrees although they look like radians.
@@ -74,13 +75,13 @@ def read(
     """
     if not flip_rows:
         raise Refused(f"{path}: RTK's rows run upwards; expected flip_rows=true, got false")
-    text = DOCTYPE.sub("", text_of(path), count=1)
+    text, plate = DOCTYPE.sub("", text_of(path), count=1), Detector.of(detector)
     with blaming(path, "is not an RTK geometry"):
         if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
             raise ValueError("expected no document type but RTKGEOMETRY, and no entities")
         table = _table(ElementTree.fromstring(text))
         check_degrees(table[:, 2].tolist(), small_arc, "GantryAngle")
-        return from_world(_cameras(table, Detector.of(detector)), world)
+        return from_world(_cameras(table, plate), world)
 
 
 def detector_of_image(

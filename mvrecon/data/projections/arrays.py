@@ -58,6 +58,9 @@ class ItkViews(ProjectionStack):
         columns, rows, views = self._image.size
         names = [f"{path.stem} {k}" for k in range(views)]
         super().__init__(path, names, (rows, columns), self._image.dtype)
+        affine = self._image.affine
+        if not np.array_equal(affine[:2, [0, 1, 3]], np.eye(2, 3)):  # ITK's own where none was set
+            self.affine = affine
 
     def _block(self, first: int, last: int) -> np.ndarray:
         return self._image.read(first, last)

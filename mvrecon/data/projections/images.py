@@ -1,7 +1,10 @@
 """Projections as images: a folder of TIFF, PNG or DICOM files, or one file of several pages."""
 
 import re
+import struct
 import warnings
+import zlib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,9 +19,26 @@ from mvrecon.files.checks import EDGE, Refused, blaming, check_file
 
 #: Formats of Pillow by a file's ending.
 PILLOW = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
-#: Pixel types by Pillow's mode, and by the bits and the sign that a TIFF declares.
+#: Pixel types by Pillow's mode, and those that a TIFF declares by its SampleFormat and bits where
+#: the mode is that of another type.
 MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4", "F": "f4"}
-WHITE_IS_ZERO, PHOTOMETRIC = 0, 262
+TIFF = {(1, 32): "u4", (2, 8): "i1", (2, 16): "i2"}
+#: Tags of TIFF. Not every version of Pillow turns images by their Orientation.
+BITS, PHOTOMETRIC, ORIENTATION, SAMPLE_FORMAT = 258, 262, 274, 339
+WHITE_IS_ZERO, UPPER_LEFT = 0, 1
+#: Passes of a plain and of an interlaced PNG: first column and row, and their steps.
+PLAIN, INTERLACED = (
+    [(0, 0, 1, 1)],
+    [
+        (0, 0, 8, 8),
+        (4, 0, 8, 8),
+        (0, 4, 4, 8),
+        (2, 0, 4, 4),
+        (0, 2, 2, 4),
+        (1, 0, 2, 2),
+        (0, 1, 1, 2),
+    ],
+)
 #: How names of dark and flat fields begin that lie among the views.
 FIELD = re.compile(r"(dark|flat)", re.IGNORECASE)
 
@@ -64,7 +84,7 @@ class ImageFiles(ProjectionStack):
 
 def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -> ImageFiles:
     """The images of a folder in the order of their numbers, without dark and flat fields: the
-    InstanceNumber of DICOM images where each has its own, else the numbers in their names.
+    InstanceNumber of DICOM images, else the numbers in their names.
 
     Args:
         folder: whose images are views; those whose names begin with dark or flat are none, unless
@@ -72,13 +92,18 @@ def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -
         pattern: of the names of the views, such as "scan_*.tif"; none: all images.
         gaps: see `ordered`.
 
+    Warns:
+        UserWarning: DICOM images without InstanceNumbers, or all of the same; see `ordered`.
+
     Raises:
-        Refused: no image, too many, or of several formats.
+        Refused: no image, too many, or of several formats; DICOM images of several series, or only
+            some of which have an InstanceNumber of their own; see `ordered`.
     """
     images = _images(folder, pattern)
     views = [file for file in images if not FIELD.match(file.name)] or images
     _check_kind(folder, views, f" named {pattern}" if pattern else "")
-    return ImageFiles(by_number(_instances(views), gaps) or ordered(views, gaps))
+    by_instance = _by_instance(views, gaps) if _ending(views[0]) == "DICOM" else []
+    return ImageFiles(by_instance or ordered(views, gaps))
 
 
 def field_files(folder: Path, field: str) -> list[Path]:
@@ -113,17 +138,39 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
         raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
 
 
-def _instances(files: Sequence[Path]) -> dict[Path, int]:
-    """InstanceNumber of DICOM images that have one."""
-    if _ending(files[0]) != "DICOM":
-        return {}
-    numbers = {}
+def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
+    """DICOM images of one series in the order of their InstanceNumbers; none where these tell no
+    order: there are none, or all are the same.
+    """
+    numbers: dict[Path, int | None] = {}
+    series = set()
     for file in files:
         with blaming(file, "has an InstanceNumber that cannot be read"):
-            if (number := header_of(file).get("InstanceNumber")) is None:
-                return {}
-            numbers[file] = int(number)
-    return numbers
+            dataset = header_of(file)
+            number = dataset.get("InstanceNumber")
+            numbers[file] = None if number is None else int(number)
+            series.add(dataset.get("SeriesInstanceUID"))
+    folder = files[0].parent
+    if 1 < len(series) < len(files):  # some detectors make each exposure a series of its own
+        raise Refused(
+            f"{folder}: expected DICOM projections of one series, got {len(series)} series in "
+            f"{len(files)} files; choose by pattern=..."
+        )
+    counts = Counter(numbers.values())
+    if len(counts) == 1 and len(files) > 1:
+        warnings.warn(
+            f"{folder}: DICOM projections have no InstanceNumbers of their own; they are in the "
+            f"order of the numbers in their names",
+            stacklevel=2,
+        )
+        return []
+    if None in counts or max(counts.values()) > 1:
+        number, count = max(counts.items(), key=lambda item: (item[0] is None, item[1]))
+        raise Refused(
+            f"{folder}: expected an InstanceNumber of its own for each view, got {number} in "
+            f"{count} files"
+        )
+    return by_number(numbers, gaps)  # type: ignore[arg-type]
 
 
 def _ending(file: Path) -> str:
@@ -166,9 +213,14 @@ def header(file: Path) -> Header:
 
 
 def _head(file: Path, image: Any, pages: int) -> Header:
-    kind = MODES.get(image.mode)
+    kind = _type(image)
     columns, rows = image.size
     tags = getattr(image, "tag_v2", {})
+    if (turned := tags.get(ORIENTATION, UPPER_LEFT)) != UPPER_LEFT:
+        raise Refused(
+            f"{file}: expected the first pixel at the upper left (Orientation 1), got {turned}; "
+            f"store it without that tag, and say views.flip_rows or flip_columns"
+        )
     if kind is None or max(rows, columns) > EDGE:
         raise Refused(
             f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got {rows} x "
@@ -185,10 +237,38 @@ def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
             values = pixels_of(file)
             yield from values.reshape(-1, *values.shape[-2:])[first:last]
             return
+        if PILLOW[file.suffix.lower()] == "PNG":
+            _check_rows(file)
         with _opened(file) as image:
             for page in range(first, last):
                 image.seek(page)
-                yield np.asarray(image)
+                yield np.asarray(image).astype(_type(image), copy=False)
+
+
+def _type(image: Any) -> str | None:
+    """Type of the pixels as they are stored; none where they are no grey values."""
+    kind, tags = MODES.get(image.mode), getattr(image, "tag_v2", {})
+    stored = tags.get(SAMPLE_FORMAT, (1,))[0], tags.get(BITS, (1,))[0]
+    return kind and TIFF.get(stored, kind)
+
+
+def _check_rows(file: Path) -> None:
+    """Refuse a PNG of grey values that ends before its last row: Pillow leaves the rest zero."""
+    data = file.read_bytes()
+    columns, rows, bits, interlaced = struct.unpack_from(">IIB3xB", data, 16)
+    sizes = [
+        (len(range(y, rows, down)), len(range(x, columns, right)))
+        for x, y, right, down in (INTERLACED if interlaced else PLAIN)
+    ]
+    needed = sum(m * (1 + (n * bits + 7) // 8) for m, n in sizes if n)  # a byte before each row
+    stream, got, place = zlib.decompressobj(), 0, 8
+    while got < needed and place + 8 <= len(data):
+        size, name = struct.unpack_from(">I4s", data, place)
+        if name == b"IDAT":
+            got += len(stream.decompress(data[place + 8 : place + 8 + size], needed - got))
+        place += size + 12
+    if got < needed:
+        raise Refused(f"{file}: expected {needed} bytes of {rows} x {columns} pixels, got {got}")
 
 
 @contextmanager

@@ -36,6 +36,8 @@ class ProjectionStack(ABC):
     kind: Literal["integrals", "intensities"] | None = None
     #: Unit of the pixels where the file says it, as `mvrecon-simulate` does.
     unit: str | None = None
+    #: From a pixel's index (u, v, view) to the file's (x, y, z) in mm, where the file states it.
+    affine: np.ndarray | None = None
 
     def __init__(
         self,

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -22,6 +23,9 @@ from mvrecon.data.projections.region import Region
 from mvrecon.data.projections.stack import PIXELS, ProjectionStack
 from mvrecon.files.checks import Refused
 from mvrecon.files.memory import check_memory
+
+#: Part of their size by which pixels may differ between a file and the cameras, for rounding.
+PITCH = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +104,8 @@ class MeasuredViews:
         """The cameras of all views on disk as those of the views here: each n-th, cropped, binned.
 
         Raises:
-            ValueError: another number of cameras than of views on disk, or another detector.
+            ValueError: another number of cameras than of views on disk, or another detector: of
+                other pixels, or of other sizes than those the file states.
         """
         if len(cameras) != self.stack.n_views:
             raise ValueError(
@@ -108,6 +113,16 @@ class MeasuredViews:
                 f"of {self.stack.shape} pixels (rows, columns), got {len(cameras)} cameras; is a "
                 f"view missing, or another axis than the first that of the views?"
             )
+        if self.stack.affine is not None:
+            right, down = np.linalg.norm(self.stack.affine[:3, :2], axis=0).tolist()
+            sizes = torch.stack([cameras.v.norm(dim=-1), cameras.u.norm(dim=-1)], dim=-1)
+            off = (sizes / sizes.new_tensor([down, right]) - 1).abs().amax(dim=-1)
+            if off.max() > PITCH:
+                got = " x ".join(f"{size:g}" for size in sizes[off.argmax()].tolist())
+                raise Refused(
+                    f"{self.options.path}: expected cameras with the file's pixels of {down:g} x "
+                    f"{right:g} mm (v, u), got {got} mm"
+                )
         return self.region.seen_by(cameras[:: self.options.every])
 
     def divided_by(self, gains: Float[Tensor, " m"]) -> "MeasuredViews":

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.projectors.checks import check
+from mvrecon.projectors.checks import check_measured
 from mvrecon.projectors.operator import Projector, Scaled
 from mvrecon.reconstructors.filtered.filters import Filter
 from mvrecon.reconstructors.filtered.scan_weights import ScanKind
@@ -100,7 +100,7 @@ def _plain(A: Projector, name: str) -> Cameras:
 def _reconstruct(
     A: Projector, views: Float[Tensor, "b c m v u"], filtering: Filtering
 ) -> Float[Tensor, "b c d h w"]:
-    check(views, "views [b c m v u]", (len(A.cameras), *A.cameras.shape), views.device)
+    check_measured(views, "views [b c m v u]", (len(A.cameras), *A.cameras.shape), views.device)
 
     def read(first: int, last: int) -> Tensor:
         return views[:, :, first:last]

@@ -69,7 +69,6 @@ def test_options_reach_monai(monai: None):
     assert {24, 48, 384} <= widths("monai_swin_unetr")
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", PARTS)
 def test_a_missing_library_is_named_with_what_installs_it(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -83,7 +82,6 @@ def test_a_missing_library_is_named_with_what_installs_it(
         PARTS[name](1, 1)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("name", "options"),
     [

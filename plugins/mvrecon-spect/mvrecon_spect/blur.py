@@ -29,6 +29,7 @@ from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.selection import ViewSelection
 from mvrecon_spect.extent import Extent, blurred, blurred_whole, extents_of
 from mvrecon_spect.hole import Hole
+from mvrecon_spect.matter import Beyond
 
 #: Layers of magnification of a view; cameras whose layers are in memory at a time.
 LAYERS, TOGETHER = 8, 8
@@ -37,10 +38,18 @@ PARTS, FWHM = 16, 2 * math.sqrt(2 * math.log(2))
 
 
 class Optics(NamedTuple):
-    """The hole, and the detector's own resolution as a FWHM in mm, 0: none."""
+    """The hole, the detector's own resolution as a FWHM in mm, 0: none, and attenuation beyond the
+    grid.
+    """
 
     hole: Hole
     intrinsic_mm: float = 0.0
+    beyond: Beyond | None = None
+
+    def weight(self, cameras: Cameras) -> Float[Tensor, "m v u"]:
+        """Counts of each pixel per line integral in the grid, in mm^2."""
+        weight = self.hole.weight(cameras)
+        return weight if self.beyond is None else weight * self.beyond.transmission(cameras)
 
 
 class BlurredPinholes(Projector):
@@ -86,7 +95,7 @@ class BlurredPinholes(Projector):
         self.kernels = kernels_of(cameras, self.magnification(), optics)
         margin = [(n - 1) // 2 for n in self.kernels.shape[-2:]]
         self.wider = grown(cameras, margin)
-        self.weight = None if self.pose_gradient else optics.hole.weight(self.wider)
+        self.weight = None if self.pose_gradient else optics.weight(self.wider)
 
     @property
     def device(self) -> torch.device:
@@ -191,7 +200,7 @@ class BlurredPinholes(Projector):
     def _parts(self, like: Tensor) -> Iterator["Part"]:
         """A few cameras at a time."""
         lines = lines_of(self.wider, self.grid).to(like.device)
-        weight = self.optics.hole.weight(self.wider) if self.weight is None else self.weight
+        weight = self.optics.weight(self.wider) if self.weight is None else self.weight
         weight = weight.to(like)
         layers = -self.magnification().to(like.device)
         kernels = self.kernels.to(like)

@@ -1,30 +1,80 @@
-"""Linear attenuation on a grid, in 1/mm, from a tensor, a number or a file."""
+"""Linear attenuation in 1/mm, from a tensor, a number or a file, on a grid and beyond it, or of
+each case.
+"""
 
 import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.data.resample import resample
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.attenuated import check_mu
+from mvrecon.projectors.drr import Drr
+from mvrecon.registry import check_options
 
-#: What a map of each case's own needs.
-OF_CASES = (
-    "; each case's own map is known to mvrecon-train and mvrecon-eval alone, with a scene that "
-    "attenuates (cardiac, nema, spect_ct, spect_labels)"
-)
+#: Values of the option `mu` that name a map of each case, and its key in a batch.
+MAPS = {"case": "mu", "measured": "mu_measured"}
 
+#: Voxels by which a map's box that ends with the grid's may miss it.
+SAME = 1e-3
+#: Voxels by which the ends of a ray may differ along an axis, and it runs in a plane of voxels.
+FLAT = 1e-9
 #: 1/mm: a body's tissue is at most that of half its voxels (water at 140.5 keV 0.01536, at 70 keV
 #: 0.0192; lung in 1/cm, 0.04, is more), and at least that where it is densest.
 TISSUE, WATERY = 0.025, 0.006
 
 
-def attenuation_on(
-    grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path
-) -> Float[Tensor, "d h w"]:
-    """Linear attenuation in 1/mm on a grid.
+@dataclass(frozen=True, eq=False)
+class Beyond:
+    """A map of attenuation that reaches out of the grid of the activity.
+
+    Emission begins in the grid, so that on its way the rest of the map weakens a whole ray by one
+    factor.
+
+    Args:
+        mu: in 1/mm.
+        source: the map's own grid.
+        grid: of the activity.
+    """
+
+    mu: Float[Tensor, "e i j"]
+    source: Grid
+    grid: Grid
+
+    def transmission(self, cameras: Cameras) -> Float[Tensor, "m v u"]:
+        """The share of each pixel's counts that gets from the grid's surface to the pinhole."""
+        hole, pixel = cameras.rays()
+        place = self.grid.to_index(hole)
+        along = place - self.grid.to_index(pixel)  # from the pinhole outward
+        along = torch.where(along.abs() < FLAT, FLAT, along)
+        low, high = place.new_full((3,), -0.5), place.new_tensor(self.grid.size) - 0.5
+        faces = ((low - place) / along).minimum((high - place) / along)
+        surface = faces.amax(dim=-1, keepdim=True)  # where the ray meets the grid's box
+        start = torch.where(surface > 0, hole + surface * (hole - pixel), pixel)
+        parts = []
+        for one in zip(start.split(1), hole.split(1), strict=True):  # bounds the memory
+            A = Drr(self.source, ExplicitRays(*one), method="siddon")
+            parts.append(A(self.mu[None, None])[0, 0])
+        return torch.cat(parts).to(hole).neg().exp()
+
+
+class Matter(NamedTuple):
+    """Linear attenuation in 1/mm on a grid, and beyond it where a map reaches out of the grid."""
+
+    mu: Float[Tensor, "d h w"]
+    beyond: Beyond | None = None
+
+
+def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) -> Matter:
+    """Linear attenuation in 1/mm on a grid, and of a map beyond it.
 
     Args:
         grid: the voxels.
@@ -35,12 +85,11 @@ def attenuation_on(
         UserWarning: values that a patient has not, as of another unit.
 
     Raises:
-        TypeError: no tensor, number or path, such as the name of a map of each case.
+        TypeError: no tensor, number or path.
         ValueError: values that cannot be attenuation in 1/mm, a tensor of another shape, or a map
             whose matter all lies outside of the grid.
     """
-    if isinstance(mu, str | Path) and str(mu) not in ("case", "measured"):
-        from mvrecon.data.resample import resample
+    if isinstance(mu, str | Path):
         from mvrecon.data.volume_files import read_volume
         from mvrecon_spect.files.interfile_volume import read_mu
 
@@ -56,13 +105,15 @@ def attenuation_on(
                 f"it elsewhere, in a map about {_point(source.centre)}; look at mm, cm and the "
                 f"axes of the file"
             )
-        return on_grid
+        corners = (grid.to_index(source.corners()) - grid.centre_index).abs()
+        larger = (corners > corners.new_tensor(grid.size) / 2 + SAME).any()
+        return Matter(on_grid, Beyond(values, source, grid) if larger else None)
     if not isinstance(mu, Tensor | float | int):
-        raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}{OF_CASES}")
+        raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}")
     values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))
     check_mu(values, grid)
     _doubt(values, "mu")
-    return values
+    return Matter(values)
 
 
 def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:
@@ -86,3 +137,57 @@ def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:
 def _point(place: Float[Tensor, "3"]) -> str:
     """A place as words, (x, y, z) in mm."""
     return f"({', '.join(f'{x:g}' for x in place.tolist())}) mm"
+
+
+@dataclass(frozen=True)
+class CaseAttenuation:
+    """Linear attenuation in 1/mm that each case brings.
+
+    Args:
+        name: key of the map in a batch, "mu" or "mu_measured".
+        shift_mm: misplacement of the map against the case, along (x, y, z).
+    """
+
+    name: str
+    shift_mm: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, mu: Any) -> "CaseAttenuation | None":
+        """From the option `mu`: "case", "measured", or `{of: case, shift_mm: [x, y, z]}`; None for
+        any other value.
+
+        Raises:
+            TypeError: a mapping with other keys.
+            ValueError: an unknown map, or a shift that is not three finite numbers.
+        """
+        if not isinstance(mu, Mapping):
+            return cls(MAPS[mu]) if isinstance(mu, str) and mu in MAPS else None
+        check_options("projector.mu", mu, ("of", "shift_mm"))
+        name = mu.get("of", "case")
+        shift = tuple(float(step) for step in mu.get("shift_mm", cls.shift_mm))
+        if name not in MAPS or len(shift) != 3 or not torch.tensor(shift).isfinite().all():
+            raise ValueError(
+                f"Expected projector.mu of case or measured, and a shift_mm of three finite "
+                f"numbers, got {dict(mu)}"
+            )
+        return cls(MAPS[name], shift)
+
+    def maps_of(self, batch: Mapping[str, Any], grid: Grid) -> list[Float[Tensor, "d h w"]]:
+        """The shifted maps of the cases of a batch, in 1/mm.
+
+        Raises:
+            ValueError: cases without the map.
+        """
+        if self.name not in batch:
+            scenes = {"mu": "cardiac or nema", "mu_measured": "spect_ct"}[self.name]
+            raise ValueError(
+                f"Expected cases with {self.name!r} for this projector.mu, as of the scene "
+                f"{scenes}, got {sorted(batch)}"
+            )
+        maps = [mu[0].cpu() for mu in batch[self.name]]
+        if not any(self.shift_mm):
+            return maps
+        affine = grid.affine.clone()
+        affine[:3, 3] += torch.tensor(self.shift_mm, dtype=affine.dtype)
+        moved = Grid(grid.shape, affine)
+        return [resample(mu, moved, grid).clamp_min(0) for mu in maps]

@@ -26,10 +26,10 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.operator import Projector, Scaled
+from mvrecon.projectors.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
 from mvrecon_spect.blur import BlurredPinholes, Optics
 from mvrecon_spect.hole import Hole
-from mvrecon_spect.matter import attenuation_on
+from mvrecon_spect.matter import CaseAttenuation, attenuation_on
 
 
 class Spect(Scaled):
@@ -45,7 +45,10 @@ class Spect(Scaled):
         cameras: pinholes, each with its detector behind it and at a right angle to its axis.
         diameter_mm: the pinholes' diameter, or the sides (u, v) of rectangular ones.
         mu: linear attenuation in 1/mm: a tensor on the grid, a number for all of the grid, or the
-            path of a volume in 1/mm, which is resampled. None: none.
+            path of a volume in 1/mm, which is resampled, and attenuates beyond the grid, too; or
+            "case" or "measured", the map that each case of a training or an evaluation brings, or
+            `{of: case, shift_mm: [x, y, z]}`: then `for_case` gives the operator of a batch. None:
+            none.
         blur: whether the pinholes' images and `intrinsic_mm`, the detector's own FWHM in mm, blur.
         intrinsic_mm: see `blur`.
         options: of the edge, as in `Hole` (collimator_mu, opening_degrees, acceptance_degrees,
@@ -62,7 +65,7 @@ class Spect(Scaled):
         grid: Grid,
         cameras: Cameras,
         diameter_mm: float | Sequence[float] = 2.3,
-        mu: Float[Tensor, "d h w"] | float | str | Path | None = None,
+        mu: Float[Tensor, "d h w"] | float | str | Path | Mapping[str, Any] | None = None,
         blur: bool = False,
         intrinsic_mm: float = 0.0,
         **options: Any,
@@ -77,14 +80,44 @@ class Spect(Scaled):
         edge = {name: options.pop(name) for name in EDGE if name in options}
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
-        matter = None if mu is None else attenuation_on(grid, mu)
-        optics = Optics(hole, float(intrinsic_mm))
+        attenuation, build = CaseAttenuation.of(mu), partial(type(self), **edge, **options)
+        matter, beyond = (None, None) if mu is None or attenuation else attenuation_on(grid, mu)
+        optics = Optics(hole, float(intrinsic_mm), beyond)
         if blur and blurs(grid, cameras, optics):
-            super().__init__(BlurredPinholes(grid, cameras, matter, optics, **options))
+            A, weight = BlurredPinholes(grid, cameras, matter, optics, **options), None
         else:
-            A = _sharp(grid, cameras, matter, options)
-            super().__init__(A, partial(hole.weight, cameras))
+            A, weight = _sharp(grid, cameras, matter, options), partial(optics.weight, cameras)
+        super().__init__(OfCases(A) if attenuation else A, weight)
         self.hole, self.diameter_mm = hole, diameter_mm
+        self.case_attenuation, self.per_case = attenuation, attenuation is not None
+        self._with_map = partial(
+            build, grid, cameras, diameter_mm, blur=blur, intrinsic_mm=intrinsic_mm
+        )
+
+    def for_case(self, case: Mapping[str, Any]) -> LinearOperator:
+        """The operators of the cases of a batch with their own attenuation.
+
+        Raises:
+            ValueError: cases without the map.
+        """
+        if self.case_attenuation is None:
+            return self
+        maps = self.case_attenuation.maps_of(case, self.grid)
+        return PerSample([self._with_map(mu=mu).to(self.device) for mu in maps])
+
+
+class OfCases(Wrapped):
+    """An operator whose attenuation is each case's own; `Spect.for_case` gives that of a batch.
+
+    Args:
+        A: the same without attenuation, which gives the grid, the rig and the sizes.
+    """
+
+    def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
+        raise TypeError("Expected the operator of a case, A.for_case(batch): mu is each case's own")
+
+    def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
+        return self.forward(y)
 
 
 #: Options of a hole's edge, see `Hole`.

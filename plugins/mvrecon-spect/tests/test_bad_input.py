@@ -45,7 +45,6 @@ PROJECTORS = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("case", PROJECTORS)
 def test_a_camera_hole_or_attenuation_that_cannot_be_is_refused(case: str):
     """Pinholes in the object or before their detector, and lengths and attenuation in another
@@ -79,7 +78,6 @@ METHODS = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("method", ["osem", "bsrem"])
 @pytest.mark.parametrize("case", METHODS)
 def test_counts_background_and_subsets_that_cannot_be_are_refused(operator, method, case):
@@ -95,7 +93,6 @@ def test_subsets_need_not_divide_the_cameras(operator):
     assert (operator(x) - measured).norm() < 0.02 * measured.norm()
 
 
-@pytest.mark.door
 def test_a_map_of_another_place_is_refused(tmp_path: Path):
     """An attenuation map with all of its matter beside the grid is refused."""
     path = tmp_path / "mu.nii.gz"
@@ -104,7 +101,6 @@ def test_a_map_of_another_place_is_refused(tmp_path: Path):
         Spect(GRID, RIG, mu=path)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("value", "message"),
     [(0.04, "0.04 in half of what attenuates; is it in 1/cm"), (0.0015, "at most 0.0015")],
@@ -124,7 +120,6 @@ def test_water_bone_and_air_raise_no_doubt(recwarn: pytest.WarningsRecorder):
     assert not recwarn.list
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -142,7 +137,6 @@ def test_the_app_refuses_them_before_it_writes(tmp_path: Path, options: list, me
     assert not (tmp_path / "run").exists() and str(refusal.value).count("Expected") <= 1
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("damage", ["cut short", "negative", "not finite"])
 def test_interfile_counts_that_cannot_be_are_refused(tmp_path: Path, damage: str):
     """Interfile projections whose data are cut short, negative or not finite are refused."""
@@ -162,7 +156,6 @@ def test_interfile_counts_that_cannot_be_are_refused(tmp_path: Path, damage: str
         InterfileViews(tmp_path / "counts.hs").read(0, 1)
 
 
-@pytest.mark.door
 def test_attenuation_at_an_energy_without_a_table_is_refused():
     """Hounsfield units at an energy that no table has are refused, with those that have one."""
     with pytest.raises(ValueError, match=r"energies \[70.0, 140.5\] keV, got 511"):

@@ -85,7 +85,6 @@ def test_decay_in_the_operator_gives_the_activity_at_time_zero():
         torch.testing.assert_close(solved, x)
 
 
-@pytest.mark.door
 def test_counts_windows_and_shares_that_cannot_be_are_refused():
     """Scatter, thinning and decay refuse counts that are negative, NaN or not whole, shares of more
     than all, and widths or times that are not positive.

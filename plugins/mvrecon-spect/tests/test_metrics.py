@@ -161,7 +161,6 @@ def test_bias_and_deviation_are_those_of_the_draws():
     assert even.within(torch.ones_like(truth, dtype=torch.bool)).bias == 0.0
 
 
-@pytest.mark.door
 def test_figures_of_what_does_not_fit_are_refused():
     """Figures of merit refuse a volume of another grid, masks without voxels, a ratio of one, balls
     and phantoms outside the grid, and a single noise draw.

@@ -97,7 +97,6 @@ def test_angles_run_with_the_direction_from_each_detector_s_start(nm: NmStudy):
     assert nm.views[0].duration_s == 20.0 and nm.views[4][:3] == (2, 1, 2)
 
 
-@pytest.mark.door
 def test_pinholes_of_nm_come_from_a_camera_file(nm: NmStudy):
     """DICOM NM does not say where pinholes are: without a rig of the same views it is refused."""
     rig = dcspect80(pixels=[4, 5])[:6]
@@ -110,7 +109,6 @@ def test_pinholes_of_nm_come_from_a_camera_file(nm: NmStudy):
         paired(nm, rig[torch.arange(5)])
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -128,7 +126,6 @@ def test_an_nm_file_that_does_not_fit_is_refused(tmp_path: Path, changes: dict, 
         read_nm(study(tmp_path / "a.dcm", **changes))
 
 
-@pytest.mark.door
 def test_nm_frames_are_no_projections_in_the_order_of_the_file(tmp_path: Path):
     """Frames of DICOM NM, which may be in any order, are refused as projections in their order."""
     with pytest.raises(ValueError, match="to be sorted by its vectors"):

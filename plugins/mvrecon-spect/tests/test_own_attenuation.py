@@ -11,17 +11,17 @@ from mvrecon.config.typed import check_parts
 from mvrecon.engine.evaluation import evaluate
 from mvrecon.engine.fit import build_data, build_module, methods
 from mvrecon.engine.module import build_projector
-from mvrecon.engine.on_case import CaseAttenuation
+from mvrecon_spect.matter import CaseAttenuation
 from mvrecon_spect.projector import Spect
 from mvrecon_spect.spect_ct import SpectCt
 
 #: A patient in 10 x 8 x 8 voxels, and networks of a few weights.
 TINY = (
-    "model=cross_view_small",
+    "method=cross_view_small",
     "camera.pixels=8",
     "camera.columns=[3]",
-    "compare.world_unet.rounds=[{resolution: full, widths: [2], cameras: null}]",
-    "compare.bsrem.reconstructor.iterations=1",
+    "compare.world_unet.widths=[2]",
+    "compare.bsrem.iterations=1",
     "data.sizes={train: 2, val: 0, test: 2}",
 )
 GRIDS = {
@@ -63,10 +63,16 @@ def test_an_experiment_takes_a_step_and_judges_every_method(name: str):
     slopes = [p.grad for p in module.parameters() if p.grad is not None]
     assert any(slope.any() for slope in slopes) and all(s.isfinite().all() for s in slopes)
     check_parts(settings)  # as the app does before it starts
-    rows = {label: module_of(name, label).own for label in methods(settings)}
+    modules = {label: module_of(name, label) for label in methods(settings)}
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
-    scores = evaluate(rows, data.test_dataloader(), A, 1.0)
-    assert set(scores) == set(rows)
+    scores = evaluate(
+        {label: module.method for label, module in modules.items()},
+        data.test_dataloader(),
+        A,
+        1.0,
+        assumed={label: module.projector for label, module in modules.items()},
+    )
+    assert set(scores) == set(modules)
     assert all(
         0 < s["nrmse"] < 3 and 0 < s["view_nrmse"] < 2 for row in scores.values() for s in row
     )
@@ -74,23 +80,23 @@ def test_an_experiment_takes_a_step_and_judges_every_method(name: str):
 
 def test_each_case_of_a_batch_is_reconstructed_by_its_own_attenuation():
     batch, module = batch_of("dcspect_cardiac"), module_of("dcspect_cardiac", "osem")
-    made = module.on(batch).model(batch["views"]).volume
+    made = module(batch["views"], module.operator(batch)).volume
     grid, cameras = module.projector.grid, module.projector.cameras
     for case in range(2):
         A = Spect(grid, cameras, mu=batch["mu"][case, 0])
         views = batch["views"][case : case + 1]
         assert torch.equal(made[case : case + 1], mv.osem(A, views, 1))
     assert not torch.equal(batch["mu"][0], batch["mu"][1])
-    assert torch.equal(module(batch["views"], mu=batch["mu"]).volume, made)
 
 
 def test_a_method_may_take_the_attenuation_for_something_else():
     batch = batch_of("dcspect_ct")
     plain = module_of("dcspect_ct", "osem_none")
     A = Spect(plain.projector.grid, plain.projector.cameras)
-    assert torch.equal(plain.on(batch).model(batch["views"]).volume, mv.osem(A, batch["views"], 1))
+    made = plain(batch["views"], plain.operator(batch)).volume
+    assert torch.equal(made, mv.osem(A, batch["views"], 1))
     maps = [
-        CaseAttenuation.of({"mu": mu}).maps_of(batch, A.grid)[0]
+        CaseAttenuation.of(mu).maps_of(batch, A.grid)[0]
         for mu in ("measured", {"of": "measured", "shift_mm": [32, 0, 0]})
     ]
     assert torch.equal(maps[0], batch["mu_measured"][0, 0])
@@ -108,23 +114,20 @@ def test_a_scan_measures_the_attenuation_of_its_patient():
     assert torch.equal(again.mu_measured, known[0])
 
 
-@pytest.mark.door
 def test_attenuation_that_no_case_brings_is_refused():
     """A projector that wants each case's attenuation refuses cases without, and to act without."""
     batch, module = batch_of("dcspect_derenzo"), module_of("dcspect_cardiac", "osem")
     with pytest.raises(ValueError, match="as of the scene cardiac or nema"):
-        module.on(batch)
-    with pytest.raises(ValueError, match="as of the scene cardiac or nema"):
-        module(batch["views"])
-    with pytest.raises(TypeError, match="projector of a case"):
+        module.operator(batch)
+    with pytest.raises(TypeError, match="operator of a case"):
         module.projector(batch["volume"])
-    with pytest.raises(TypeError, match="known to mvrecon-train and mvrecon-eval alone"):
-        Spect(module.projector.grid, module.projector.cameras, mu="case")
+    with pytest.raises(TypeError, match="operator of a case"):
+        module(batch["views"])
     for wrong in ({"of": "guessed"}, {"shift_mm": [1, 2]}):
         with pytest.raises(ValueError, match=r"projector\.mu of case or measured"):
-            CaseAttenuation.of({"mu": wrong})
+            CaseAttenuation.of(wrong)
     for wrong, message in (({"muh": 0}, "no option 'muh'"), (0.1, "expected options of the")):
-        settings = {"projector": {"name": "drr"}, "model": {"name": "sirt", "assume": wrong}}
+        settings = {"projector": {"name": "drr"}, "method": {"name": "sirt", "assume": wrong}}
         with pytest.raises(TypeError, match=message):
             check_parts(settings)
     with pytest.raises(ValueError, match="a scene with matter"):

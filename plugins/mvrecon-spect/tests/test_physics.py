@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.data.volume_files import save_volume
+from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
 from mvrecon.projectors.selection import view_subset
 from mvrecon_spect.hole import Hole
@@ -162,7 +164,33 @@ def test_a_volume_in_a_file_is_resampled_to_the_grid(tmp_path):
     torch.testing.assert_close(A.A.mu, torch.full(grid.shape, 0.015))
 
 
-@pytest.mark.door
+@pytest.mark.parametrize("blur", [{}, {"blur": True, "intrinsic_mm": 9.0}])
+def test_matter_of_a_map_beyond_the_grid_attenuates_as_on_a_grid_that_holds_it(tmp_path, blur):
+    torch.manual_seed(1)
+    whole, inner = Grid.centred(size=(14, 13, 12), spacing=12.0), Box((3, 2, 4), (9, 10, 11))
+    cameras = dcspect80(pixels=[12, 10], columns=[0, 5, 11], rows=[0, 1])
+    mu = 0.01 + 0.01 * torch.rand(whole.shape)
+    save_volume(tmp_path / "mu.nii.gz", mu, whole)
+    x = torch.rand(1, 1, *inner.shape)
+    options = {"method": "siddon", **blur}  # exact
+    A = Spect(whole.cropped(inner), cameras, mu=tmp_path / "mu.nii.gz", **options)
+    expected = Spect(whole, cameras, mu=mu, **options)(placed(x, inner, whole.shape))
+    cut = Spect(whole.cropped(inner), cameras, mu=mu[inner.slices], **options)(x)
+    torch.testing.assert_close(A(x), expected, rtol=1e-4, atol=1e-6 * expected.max().item())
+    assert (cut - expected).norm() > 0.5 * expected.norm()
+    y = torch.rand_like(expected)
+    assert (A(x) * y).sum().item() == pytest.approx((x * A.T(y)).sum().item(), rel=1e-5)
+    torch.testing.assert_close(view_subset(A, [1, 4])(x), A(x)[:, :, [1, 4]])
+
+
+def test_a_map_that_ends_with_the_grid_or_before_it_has_nothing_beyond(tmp_path):
+    grid, cameras, _ = scene()
+    for map_grid in (grid, grid.refined(2), grid.cropped(Box((1, 1, 1), (6, 6, 6)))):
+        save_volume(tmp_path / "mu.nii.gz", torch.full(map_grid.shape, 0.015), map_grid)
+        weight = Spect(grid, cameras, mu=tmp_path / "mu.nii.gz").pixels
+        assert torch.equal(weight, Hole().weight(cameras))
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [
@@ -184,7 +212,6 @@ def test_impossible_options_are_refused(options, told):
         Spect(grid, cameras, **options)
 
 
-@pytest.mark.door
 def test_a_pinhole_in_the_object_is_refused():
     """A pinhole inside the grid of the activity is refused."""
     with pytest.raises(ValueError, match="pinhole 0 in it"):

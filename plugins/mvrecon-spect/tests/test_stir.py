@@ -15,6 +15,8 @@ from mvrecon.config import compose
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.volume_files import read_volume
+from mvrecon.engine.scan import open_scan
+from mvrecon.files.checks import Refused
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import CAMERAS
 from mvrecon.reconstruction import reconstruct
@@ -137,7 +139,7 @@ def test_volumes_keep_their_values_and_their_place(tmp_path: Path):
     write_mu(tmp_path / "mu.hv", values, grid)
     assert np.fromfile(tmp_path / "mu.v", "<f4").max() == pytest.approx(10 * values.max().item())
     centred = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0))
-    torch.testing.assert_close(attenuation_on(centred, tmp_path / "mu.hv"), values)
+    torch.testing.assert_close(attenuation_on(centred, tmp_path / "mu.hv").mu, values)
     with pytest.warns(UserWarning, match="is the file in 1/mm"):
         write_volume(tmp_path / "a.hv", values / 10, grid)
         read_mu(tmp_path / "a.hv")
@@ -224,6 +226,39 @@ def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
         reconstruct({**settings, "unit": "HU"}, tmp_path / "in_hu")
 
 
+@pytest.mark.parametrize("name", ["counts.hs", "counts.npy"])
+def test_counts_without_attenuation_are_of_activity_and_have_no_hounsfield_units(tmp_path, name):
+    settings = settings_of_counts(tmp_path, name, "projector=spect", "reconstructor=osem")
+    assert open_scan(settings).unit == "activity"
+    with pytest.raises(ValueError, match="for the unit HU, got activity"):
+        reconstruct({**settings, "unit": "HU"}, tmp_path / "in_hu")
+    assert not (tmp_path / "in_hu").exists()
+
+
+def test_interfile_counts_are_no_line_integrals(tmp_path: Path):
+    with pytest.raises(Refused, match="expected line integrals for the projector 'drr'"):
+        open_scan(settings_of_counts(tmp_path, "counts.hs"))
+
+
+def settings_of_counts(folder: Path, name: str, *options: str) -> dict:
+    """Of a scan of STIR's counts, in Interfile or as an array."""
+    write_stir(folder, scan())
+    np.save(folder / "counts.npy", scan().counts[0, 0])
+    path, detector, collimator = files(folder)
+    return compose(
+        f"views.path={folder / name}",
+        "views.kind=integrals",
+        "camera=stir_pinhole",
+        f"camera.path={path}",
+        f"camera.detector_file={detector}",
+        f"camera.collimator_file={collimator}",
+        "grid.size=[4,4,4]",
+        "grid.spacing=5.0",
+        *options,
+        config_name="reconstruct",
+    )
+
+
 def files(folder: Path) -> tuple[Path, Path, Path]:
     return folder / "counts.hs", folder / "detector.txt", folder / "collimator.txt"
 
@@ -253,7 +288,6 @@ BAD = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", BAD)
 def test_a_file_of_stir_that_does_not_fit_is_refused(tmp_path: Path, name: str):
     """A pinhole system of STIR whose files do not fit each other, their size or unit is refused."""
@@ -266,7 +300,6 @@ def test_a_file_of_stir_that_does_not_fit_is_refused(tmp_path: Path, name: str):
         read_stir(*files(tmp_path))
 
 
-@pytest.mark.door
 def test_counts_of_interfile_are_in_a_plain_file_beside_it(tmp_path: Path):
     """Interfile counts are read from a plain file beside the header, and refused where negative."""
     inside, outside = tmp_path / "scan", tmp_path / "elsewhere"

@@ -112,7 +112,6 @@ def test_a_sinogram_is_the_radon_transform_at_theta_with_s_along_it():
     assert torch.equal(odd, whole[::4])
 
 
-@pytest.mark.door
 def test_events_are_the_same_bytes_for_any_number_of_workers(folder, tmp_path):
     """A data set of events has the same bytes for any number of worker processes."""
     write(tmp_path, workers=2)
@@ -121,7 +120,6 @@ def test_events_are_the_same_bytes_for_any_number_of_workers(folder, tmp_path):
     assert {line.split("  ")[1]: line.split("  ")[0] for line in lines} == digests(folder)
 
 
-@pytest.mark.door
 def test_a_killed_run_of_events_goes_on_and_doubles_nothing(copy, folder, monkeypatch):
     """A killed run of events goes on with the missing files, and leaves the others as they are."""
     (copy / "events-00001.h5").unlink()
@@ -144,7 +142,6 @@ def test_a_killed_run_of_events_goes_on_and_doubles_nothing(copy, folder, monkey
     assert (copy / "events-00000.h5").stat().st_mtime_ns == before.st_mtime_ns
 
 
-@pytest.mark.door
 def test_files_of_other_settings_and_damaged_ones_are_refused(copy):
     """A file of events of other settings, cut short or with a wrong byte is refused by name."""
     with pytest.raises(Refused, match="events-00000.h5: is of other settings"):
@@ -167,7 +164,6 @@ def test_files_of_other_settings_and_damaged_ones_are_refused(copy):
         Events(copy)
 
 
-@pytest.mark.door
 def test_a_disk_without_room_for_events_is_refused(tmp_path, monkeypatch):
     """A disk with less room than the events need is refused before any is made."""
     usage = namedtuple("usage", "total used free")
@@ -177,7 +173,6 @@ def test_a_disk_without_room_for_events_is_refused(tmp_path, monkeypatch):
     assert digests(tmp_path) == {}
 
 
-@pytest.mark.door
 def test_counts_that_could_be_negative_are_refused(copy):
     """A file of events whose counts have a sign is refused."""
     with h5py.File(copy / "events-00002.h5", "r+") as file:

@@ -32,7 +32,6 @@ def cut(path, size):
     return path
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("dark", [0, 300])
 def test_a_flat_field_of_nothing_is_refused(dark, scan):
     """A flat field that is not above the dark one is refused, with both medians."""
@@ -42,7 +41,6 @@ def test_a_flat_field_of_nothing_is_refused(dark, scan):
         opened(scan)
 
 
-@pytest.mark.door
 def test_intensities_need_a_flat_field(tmp_path):
     """Grey values without a flat field are refused, with the option that gives one."""
     folder = images(tmp_path / "scan", grey())
@@ -53,7 +51,6 @@ def test_intensities_need_a_flat_field(tmp_path):
         opened(folder, flat=str(tmp_path / "flat.npy"))
 
 
-@pytest.mark.door
 def test_the_kind_of_floats_is_not_guessed(tmp_path):
     """Floats that may be grey values or line integrals are refused until the kind is said, and
     integers as line integrals.
@@ -68,7 +65,6 @@ def test_the_kind_of_floats_is_not_guessed(tmp_path):
         Measured(path="a.npy", kind="counts")  # type: ignore[arg-type]
 
 
-@pytest.mark.door
 def test_dark_pixels_count_as_the_floor_and_are_counted(scan):
     """The logarithm of nothing is not taken: such pixels count as the floor, with their number."""
     values = grey()[3]
@@ -80,7 +76,6 @@ def test_dark_pixels_count_as_the_floor_and_are_counted(scan):
     assert torch.allclose(back.views[3, 2, 1:4], torch.tensor(1e4).log())
 
 
-@pytest.mark.door
 def test_a_view_without_light_is_refused(scan):
     """A view that is dark everywhere is refused with its name."""
     field(scan, "view_7", np.full((6, 8), 90))
@@ -88,7 +83,6 @@ def test_a_view_without_light_is_refused(scan):
         opened(scan).read(6, 9)
 
 
-@pytest.mark.door
 def test_saturated_and_dead_pixels_are_told_and_masked(scan):
     """Saturated and dead pixels are told with their number and are out of the mask."""
     flat = np.full((6, 8), 60_100)
@@ -114,7 +108,6 @@ def test_saturated_and_dead_pixels_are_told_and_masked(scan):
         opened(scan)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_pixels_that_are_not_finite_are_refused(value, tmp_path):
     """A pixel that is NaN or infinite is refused with the number and the name of its view."""
@@ -127,7 +120,6 @@ def test_pixels_that_are_not_finite_are_refused(value, tmp_path):
             stack.read(3, 6)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("size", [60, 150, 200])
 def test_a_cut_image_is_refused(size, scan):
     """A TIFF that is cut short is refused with its name, wherever it is cut."""
@@ -136,7 +128,6 @@ def test_a_cut_image_is_refused(size, scan):
         open_projections(scan).read(0, VIEWS)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("form", ["a.npy", "a.mha", "a.mhd", "a.nrrd", "a.h5", "a.tiff", "a.dcm"])
 def test_a_cut_stack_is_refused(form, tmp_path):
     """A stack of views that is cut short is refused with its name, in every format."""
@@ -154,7 +145,6 @@ def test_a_cut_stack_is_refused(form, tmp_path):
             open_projections(path).read(0, VIEWS)
 
 
-@pytest.mark.door
 def test_images_of_several_sizes_are_refused(scan, tmp_path):
     """Images of several sizes, types or formats in one scan are refused, with the file."""
     values = grey()[0]
@@ -176,7 +166,6 @@ def test_images_of_several_sizes_are_refused(scan, tmp_path):
         open_projections(tmp_path / "a.tif")
 
 
-@pytest.mark.door
 def test_pixels_that_are_no_grey_values_are_refused(tmp_path):
     """Colours, complex numbers, truth values and Python objects are refused as views."""
     Pillow.fromarray(np.zeros((4, 4, 3), "u1")).save(tmp_path / "a.png")
@@ -191,7 +180,6 @@ def test_pixels_that_are_no_grey_values_are_refused(tmp_path):
         open_projections(tmp_path / "a.npy")
 
 
-@pytest.mark.door
 def test_a_missing_view_is_told(scan):
     """A view whose number is missing between others is told, unless gaps are allowed."""
     (scan / "view_6.tif").unlink()
@@ -204,7 +192,6 @@ def test_a_missing_view_is_told(scan):
         open_projections(scan)
 
 
-@pytest.mark.door
 def test_an_order_without_numbers_is_told(scan):
     """Names of views that differ in more than their numbers are told, with the order that came."""
     (scan / "view_3.tif").rename(scan / "front.tif")
@@ -212,7 +199,6 @@ def test_an_order_without_numbers_is_told(scan):
         assert open_projections(scan).names[0] == "front"
 
 
-@pytest.mark.door
 def test_nothing_to_read_is_told(tmp_path, monkeypatch):
     """An empty folder, a missing path, another ending or too many files are told as such."""
     (tmp_path / "notes.txt").write_text("no view")
@@ -232,7 +218,6 @@ def test_nothing_to_read_is_told(tmp_path, monkeypatch):
         open_projections(tmp_path / "scan")
 
 
-@pytest.mark.door
 def test_an_h5_of_another_layout_is_refused(tmp_path):
     """An HDF5 file without our views is refused, with what it holds and what is expected."""
     path = tmp_path / "a.h5"
@@ -249,7 +234,6 @@ def test_an_h5_of_another_layout_is_refused(tmp_path):
         open_projections(path)
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", ["../a.raw", "/etc/passwd", "gone.raw"])
 def test_a_headers_values_lie_beside_it(name, tmp_path):
     """An MHD header that leads to another folder, or to no file, is refused."""
@@ -260,7 +244,6 @@ def test_a_headers_values_lie_beside_it(name, tmp_path):
         open_projections(tmp_path / "a.mhd")
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "message"),
     [

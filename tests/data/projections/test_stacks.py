@@ -1,9 +1,16 @@
 """Whatever form a scan has on disk, its views are the same numbers in the same order."""
 
+import struct
+import zlib
+
+import h5py
 import numpy as np
 import pytest
+import SimpleITK as sitk
 import torch
+from PIL import Image as Pillow
 
+from mvrecon.data.projections.images import INTERLACED, PLAIN
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.order import ordered
 from mvrecon.files import memory
@@ -37,6 +44,66 @@ def test_pixels_of_other_types_keep_their_values(kind, tmp_path):
         assert np.array_equal(stack.read(0, VIEWS).numpy(), values.astype("f4"))
 
 
+@pytest.mark.parametrize("kind", ["i1", "u1", "i2", "u2", "i4", "u4", "f4"])
+def test_a_tiff_of_any_type_keeps_its_values_and_its_greatest_one(kind, tmp_path):
+    """SimpleITK writes the TIFF and reads it, as the second reader."""
+    ends = [-2.5, 7.25] if kind == "f4" else [np.iinfo(kind).min, np.iinfo(kind).max]
+    values = np.array([[0, 1, 2], [3, *ends]], kind)
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / "a.tif"))
+    assert np.array_equal(sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "a.tif"))), values)
+    stack = open_projections(tmp_path / "a.tif")
+    assert np.array_equal(stack.read(0, 1)[0].numpy(), values.astype("f4"))
+    assert stack.top == (None if kind == "f4" else ends[1])
+
+
+@pytest.mark.parametrize("interlaced", [False, True])
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+def test_a_png_without_its_last_rows_is_refused(kind, interlaced, tmp_path):
+    values = np.full((6, 5), 200, kind)
+    path, passes = tmp_path / "a.png", INTERLACED if interlaced else PLAIN
+    parts = [values[y::down, x::right] for x, y, right, down in passes]
+    rows = [b"\0" + row.astype(f">{kind}").tobytes() for part in parts for row in part if row.size]
+    for count in (len(rows), len(rows) - 1):
+        path.write_bytes(png(values, b"".join(rows[:count]), interlaced))
+        if count == len(rows):
+            assert np.array_equal(np.asarray(Pillow.open(path)), values)
+            assert np.array_equal(open_projections(path).read(0, 1)[0].numpy(), values)
+            continue
+        with pytest.raises(Refused, match="expected .* bytes of 6 x 5 pixels, got"):
+            open_projections(path).read(0, 1)
+
+
+def png(values, raw, interlaced):
+    """A PNG of the size of some values, of these bytes."""
+    rows, columns = values.shape
+    head = struct.pack(">IIBBBBB", columns, rows, 8 * values.itemsize, 0, 0, 0, interlaced)
+    parts = [(b"IHDR", head), (b"IDAT", zlib.compress(raw)), (b"IEND", b"")]
+    chunks = (
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+@pytest.mark.parametrize("turned", range(2, 9))
+def test_a_tiff_that_is_turned_by_its_orientation_is_refused(turned, tmp_path):
+    """A TIFF whose Orientation turns or mirrors it is refused."""
+    Pillow.fromarray(grey()[0]).save(tmp_path / "a.tif", tiffinfo={274: turned})
+    with pytest.raises(Refused, match=f"upper left .Orientation 1., got {turned}"):
+        open_projections(tmp_path / "a.tif")
+    Pillow.fromarray(grey()[0]).save(tmp_path / "a.tif", tiffinfo={274: 1})
+    assert np.array_equal(open_projections(tmp_path / "a.tif").read(0, 1)[0].numpy(), grey()[0])
+
+
+@pytest.mark.parametrize("layout", [{}, {"chunks": (1, 6, 8)}])
+def test_a_views_h5_that_was_not_written_is_refused(layout, tmp_path):
+    with h5py.File(tmp_path / "views.h5", "w") as file:
+        file.create_dataset("views", (3, 6, 8), "f4", **layout)
+        file["padding"] = np.zeros(10_000)
+    with pytest.raises(Refused, match="0 of its 576 bytes|for the chunk"):
+        open_projections(tmp_path / "views.h5").read(0, 3)
+
+
 @pytest.mark.parametrize("ending", ["mha", "npy"])
 def test_memory_is_that_of_the_views_asked_for(ending, tmp_path):
     """512 MiB of views on disk, of which one is read."""
@@ -57,12 +124,54 @@ def test_memory_is_that_of_the_views_asked_for(ending, tmp_path):
 
 
 def test_numbers_in_names_decide_the_order(tmp_path):
-    for names in (["p9", "p10", "p11"], ["a1_b2", "a1_b10", "a2_b1"], ["0007", "8", "09"]):
+    for names in (
+        ["p9", "p10", "p11"],
+        ["a1_b2", "a1_b10", "a2_b2", "a2_b10"],
+        ["0007", "8", "09"],
+    ):
         paths = [tmp_path / f"{name}.tif" for name in names]
         assert ordered(paths[::-1]) == paths
     steps = [tmp_path / f"{k}.tif" for k in (0, 4, 8, 12)]
     assert ordered(steps[::-1]) == steps
     assert ordered([*steps, tmp_path / "14.tif"], gaps=True)[-1].name == "14.tif"
+
+
+def test_decimals_in_names_decide_the_order(tmp_path):
+    for names in (
+        ["p_0.0", "p_0.25", "p_0.5", "p_0.75"],
+        ["p_0", "p_0.5", "p_1", "p_1.5"],
+        ["p0_0.0", "p1_0.333", "p2_0.667", "p3_1.0"],
+        [f"p_{360 / 7 * k:.2f}" for k in range(7)],
+        ["p1.9", "p1.10", "p1.11"],  # 1.10 is no decimal beside 1.9
+        ["1.2.9", "1.2.10", "1.2.11"],
+    ):
+        paths = [tmp_path / f"{name}.tif" for name in names]
+        assert ordered(paths[::-1]) == paths
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["p_0.0", "p_0.25", "p_0.75"],
+        ["p_0.1", "p_0.2", "p_0.4"],
+        ["p1.8", "p1.9", "p1.11"],
+        ["a1_1", "a1_2", "a1_3", "a2_1", "a2_3"],
+        ["a1_1", "a1_3", "a1_4", "a2_1", "a2_3", "a2_4"],
+        ["a1_1", "a1_2", "a3_1", "a3_2", "a4_1", "a4_2"],
+        ["a1_t3", "a2_t5", "a4_t6"],
+    ],
+)
+def test_a_view_missing_among_decimals_or_pairs_of_numbers_is_told(names, tmp_path):
+    """Names with decimals or several numbers, one of which is missing, are refused."""
+    paths = [tmp_path / f"{name}.tif" for name in names]
+    with pytest.raises(Refused, match="is a file missing"):
+        ordered(paths)
+    assert sorted(ordered(paths, gaps=True)) == sorted(paths)
+
+
+def test_an_index_beside_another_number_tells_that_no_view_is_missing(tmp_path):
+    paths = [tmp_path / f"a{k}_t{t}.tif" for k, t in enumerate((3, 8, 9, 17))]
+    assert ordered(paths[::-1]) == paths
 
 
 def test_the_instance_number_of_dicom_views_decides_their_order(tmp_path):
@@ -72,12 +181,40 @@ def test_the_instance_number_of_dicom_views_decides_their_order(tmp_path):
         dicom_image(tmp_path / name, view, InstanceNumber=k + 1)
     expected = torch.from_numpy(values.astype("f4"))
     assert torch.equal(open_projections(tmp_path).read(0, VIEWS), expected)
-    dicom_image(tmp_path / "view_0.dcm", values[0], InstanceNumber=2)  # one twice: names decide
-    stack = open_projections(tmp_path)
-    assert list(stack.names) == [f"view_{k}" for k in range(VIEWS)]
+    for k, view in enumerate(values):  # all the same: names decide
+        dicom_image(tmp_path / f"view_{k}.dcm", view, InstanceNumber=1)
+    with pytest.warns(UserWarning, match="have no InstanceNumbers of their own"):
+        assert torch.equal(open_projections(tmp_path).read(0, VIEWS), expected)
 
 
-@pytest.mark.door
+@pytest.mark.parametrize("number", [2, None])
+def test_dicom_views_of_which_one_has_no_number_of_its_own_are_refused(number, tmp_path):
+    """DICOM projections with an InstanceNumber twice, or without one in some files, are refused."""
+    for k, view in enumerate(grey()):
+        dicom_image(tmp_path / f"view_{k}.dcm", view, InstanceNumber=k + 1)
+    dicom_image(tmp_path / "view_0.dcm", grey()[0], InstanceNumber=number)
+    with pytest.raises(Refused, match=f"InstanceNumber of its own for each view, got {number} in"):
+        open_projections(tmp_path)
+
+
+def test_two_dicom_series_are_no_scan(tmp_path):
+    """DICOM projections of two series in one folder are refused until a pattern names one; series
+    of a single exposure each are one scan.
+    """
+    for k, view in enumerate(grey()):
+        name = f"{'ab'[k % 2]}_{k // 2}.dcm"
+        dicom_image(tmp_path / name, view, InstanceNumber=k, SeriesInstanceUID=f"1.2.{k % 2}")
+    with pytest.raises(Refused, match="of one series, got 2 series in 12 files; choose by pattern"):
+        open_projections(tmp_path)
+    one = open_projections(tmp_path, pattern="b_*")
+    assert torch.equal(one.read(0, 6), torch.from_numpy(grey()[1::2].astype("f4")))
+    for k, view in enumerate(grey()):
+        name = f"{'ab'[k % 2]}_{k // 2}.dcm"
+        dicom_image(tmp_path / name, view, InstanceNumber=k, SeriesInstanceUID=f"1.2.{k}")
+    whole = open_projections(tmp_path)
+    assert torch.equal(whole.read(0, VIEWS), torch.from_numpy(grey().astype("f4")))
+
+
 def test_a_dicom_view_that_is_missing_by_its_instance_number_is_refused(tmp_path):
     """DICOM projections among whose InstanceNumbers one is missing are refused, but with gaps."""
     for k, view in enumerate(grey()):

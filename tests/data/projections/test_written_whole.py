@@ -7,7 +7,6 @@ from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.files.checks import Refused
 
 
-@pytest.mark.door
 def test_a_scan_is_written_whole_or_not_at_all(tmp_path):
     """A scan that breaks off while it is written leaves nothing, and none is written over."""
 

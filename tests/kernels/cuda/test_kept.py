@@ -22,7 +22,6 @@ def test_code_is_built_once(folder):
     assert folder.stat().st_mode & 0o077 == 0
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty"])
 def test_damaged_code_is_built_anew(damage, folder):
     """A damaged file of compiled GPU kernels is built anew, never run."""
@@ -34,7 +33,6 @@ def test_damaged_code_is_built_anew(damage, folder):
     assert kept.kept("a", never) == b"again"
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("writable", ["file", "folder"])
 def test_code_that_others_may_write_is_not_run(writable, folder, caplog):
     """Compiled GPU kernels that another user could have written are not run."""

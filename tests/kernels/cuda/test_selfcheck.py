@@ -116,7 +116,6 @@ def refused(words):
     return words in line
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("what", REASONS)
 def test_what_is_missing_is_the_reason(what, host, monkeypatch):
     """Without a driver or a compiler, or with an old one, `auto` takes the reference and `cuda`
@@ -142,7 +141,6 @@ REFUSALS = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("call", REFUSALS)
 def test_what_the_driver_refuses_is_the_reason(call, host):
     """Kernels that an old driver does not take, or a device does not start, are not used, and the
@@ -152,7 +150,6 @@ def test_what_the_driver_refuses_is_the_reason(call, host):
     assert REFUSALS[call] in str(selfcheck.reason("cpu")) and refused(REFUSALS[call])
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("call", REFUSALS)
 def test_a_full_memory_is_not_remembered(call, host):
     """A full memory of a device is told, and forgotten, since another time there may be room."""

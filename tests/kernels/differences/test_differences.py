@@ -72,7 +72,6 @@ def test_every_bit_is_the_same_on_any_number_of_threads(dtype, threads, monkeypa
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
-@pytest.mark.door
 def test_a_dual_field_of_another_volume_is_refused():
     """A dual field of another shape or type of number than its volume's is refused."""
     volume, dual, _, shrinkage = problem((1, 1, 5, 6, 7), torch.float64)

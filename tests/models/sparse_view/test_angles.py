@@ -45,7 +45,6 @@ def test_measured_views_stay_and_a_disc_looks_the_same_from_between():
     assert (views - expected).abs().max() < 0.02 * expected.max()
 
 
-@pytest.mark.door
 def test_a_factor_below_one_is_refused():
     """A number of views below the measured one is refused."""
     A = fan()

@@ -164,7 +164,6 @@ def test_in_training_the_true_sinogram_is_of_the_rig_that_the_model_completes(A,
     assert plain._on_rig({}).corrected is plain.projector
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("name", ["fbp_unet", "sinogram_unet", "dual_domain", "itnet"])
 def test_a_rig_without_filtered_back_projection_is_refused_when_the_model_is_built(name):
     """A model of filtered back-projection is refused for a rig whose angles do not suffice."""
@@ -172,7 +171,6 @@ def test_a_rig_without_filtered_back_projection_is_refused_when_the_model_is_bui
         MODELS.build(name, fan(arc_degrees=90.0))
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("name", "options"),
     [

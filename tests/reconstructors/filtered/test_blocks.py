@@ -61,7 +61,6 @@ def test_views_come_once_in_blocks_of_the_stated_size(monkeypatch):
     assert torch.equal(fdk_streamed(read, rig, VOLUME), streamed)  # two views filtered at a time
 
 
-@pytest.mark.door
 def test_a_reader_that_gives_too_few_views_is_refused():
     """A block of streamed views that is too small, of integers, or not finite is refused."""
     rows, columns = RIG.shape

@@ -50,7 +50,6 @@ def test_a_period_has_room_for_twice_the_row_and_small_prime_factors():
         assert length >= 2 * columns and length % 2 == 0 and rest == 1
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("filter", "cutoff", "message"),
     [("ramlak", 1.0, "Known: ram-lak"), ("hann", 0.0, "got 0.0"), ("hann", 1.5, "in \\(0, 1\\]")],

@@ -72,7 +72,6 @@ REFUSED = {
 }
 
 
-@pytest.mark.door
 @pytest.mark.parametrize("kind", REFUSED)
 def test_a_rig_without_a_turn_about_an_axis_is_refused(kind: str):
     """A rig that FBP or FDK is not made for is refused with the reason, and with what will do."""
@@ -82,7 +81,6 @@ def test_a_rig_without_a_turn_about_an_axis_is_refused(kind: str):
         method(A, torch.zeros(1, 1, *A.range_shape))
 
 
-@pytest.mark.door
 def test_weighted_integrals_views_with_nan_and_unknown_scans_are_refused():
     """FDK refuses weighted operators, views that are not finite or too few, and unknown scans."""
     A = Drr(VOLUME, CONES["full"])

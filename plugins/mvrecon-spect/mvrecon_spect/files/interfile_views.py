@@ -23,6 +23,7 @@ class InterfileViews(ProjectionStack):
     """
 
     kind = "integrals"
+    unit = "spect of activity"
 
     def __init__(self, path: Path):
         header = read_header(path)

@@ -1,0 +1,79 @@
+"""Does a calibration leave a right rig right?
+
+`python experiments/08_calibration/right_rig.py --out experiments/08_calibration/right_rig.csv`
+"""
+
+import argparse
+import warnings
+from functools import partial
+
+from mvrecon.calibration.from_data import calibrated
+from mvrecon.cameras.rigs import circular
+from mvrecon.files.tables import write_rows
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import SCENES
+from mvrecon.projectors.drr import Drr
+from mvrecon.reconstructors.cgls import cgls
+
+EDGE = 96.0  # mm of the grid
+OBJECTS = ("shepp_logan", "ellipsoids", "derenzo")
+FREE = (
+    ("slant",),
+    ("offset_v",),
+    ("offset_u", "offset_v", "tilt", "slant", "swivel"),
+    ("offset_u", "tilt"),
+    ("shifts",),
+    ("gains",),
+)
+
+
+def scans(size, views):
+    """Rows of the table: exact views of a right rig, reconstructed with it and with the fitted
+    one.
+    """
+    grid = Grid.centred(size, spacing=EDGE / size)
+    pixels = [size * 5 // 4, size * 4 // 3]
+    rig = circular(views, 400.0, 600.0, {"pixels": pixels, "pixel_mm": 1.6 * EDGE / size})
+    for name in OBJECTS:
+        scene = SCENES.build(name).sample(0, 0, grid, rig)
+        y, truth = scene.views[None], scene.volume[None]
+
+        def error(cameras, y=y, truth=truth):
+            x = cgls(Drr(grid, cameras), y, 12)
+            return ((x - truth).norm() / truth.norm()).item()
+
+        nominal = error(rig)
+        for free in FREE:
+            fit = calibrated(partial(Drr, grid), rig, y, free)
+            by = fit.misalignment
+            corrected = y / fit.gains[:, None, None].float()
+            yield {
+                "object": name,
+                "free": " ".join(free),
+                "error, nominal rig": f"{nominal:.4f}",
+                "error, fitted rig": f"{error(fit.cameras, corrected):.4f}",
+                "offset, px (largest)": f"{by.offset_px.abs().max():.3f}",
+                "turn, degrees (largest)": f"{by.tilt_degrees.abs().max():.3f}",
+                "rounds": len(fit.residual) - 1,
+                "kept": " ".join(fit.kept),
+            }
+
+
+def main():
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", type=int, default=32)
+    parser.add_argument("--views", type=int, default=60)
+    parser.add_argument("--out", default="right_rig.csv")
+    options = parser.parse_args()
+    rows = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
+        for row in scans(options.size, options.views):
+            rows.append(row)
+            print(row, flush=True)
+    write_rows(options.out, rows)
+
+
+if __name__ == "__main__":
+    main()

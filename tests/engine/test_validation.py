@@ -1,0 +1,117 @@
+"""Figures of a validation: means over its cases, of which a failed one cannot be left out."""
+
+import math
+from dataclasses import fields, replace
+
+import lightning.pytorch as L
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from mvrecon.config import compose
+from mvrecon.engine import fit
+from mvrecon.engine.checkpoints import load
+from mvrecon.engine.module import ReconstructionModule
+from mvrecon.engine.on_case import joined
+
+CORRECTED = (
+    "experiment=smoke",
+    "model=corrected",
+    "model@model.model=cross_view_small",
+    "model.model.uncertainty=true",
+    "acquisition.disturbed={views: 1, shift_px: 1.0, gain: 0.05, probability: 0.7}",
+    "data.sizes.val=5",
+)
+
+
+def validated(module, cases, batch_size):
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    trainer = L.Trainer(accelerator="cpu", devices=1, **quiet)
+    (figures,) = trainer.validate(module, DataLoader(cases, batch_size), verbose=False)
+    return figures
+
+
+@pytest.fixture(scope="module")
+def validation():
+    """A model that tells its uncertainty and what is wrong with its cameras, and five cases."""
+    torch.manual_seed(0)
+    settings = compose(*CORRECTED)
+    data = fit.build_data(settings)
+    data.setup("validate")
+    return fit.build_module(settings, settings["model"], data.data_range), data.sets["val"]
+
+
+def test_no_figure_depends_on_the_batch_size(validation):
+    module, cases = validation
+    alone = validated(module, cases, 1)
+    kinds = ("quality_predicted", "quality_coverage", "quality_wrong", "cameras_auc")
+    assert all(any(f"val/{kind}" in name for name in alone) for kind in kinds), sorted(alone)
+    for size in (2, 3, 5):
+        assert validated(module, cases, size) == pytest.approx(alone, rel=1e-4, nan_ok=True)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_failed_volume_spoils_the_mean_but_a_scene_without_an_object_does_not(
+    validation, bad, monkeypatch
+):
+    module, cases = validation
+    some = [dict(cases[k]) for k in range(3)]
+    whole = validated(module, some, 2)
+    some[1]["inside"] = torch.zeros_like(some[1]["inside"])
+    empty = validated(module, some, 2)
+    assert empty["val/psnr"] == pytest.approx(whole["val/psnr"], rel=1e-5)
+    assert math.isfinite(empty["val/psnr_inside"])
+
+    make = module.model.forward
+
+    def spoilt(views):
+        out = make(views)
+        out.volume[0, 0, 0, 0, 0] = bad
+        return out
+
+    monkeypatch.setattr(module.model, "forward", spoilt)
+    failed = validated(module, some, 2)
+    names = ("psnr", "ssim", "nrmse", "psnr_inside", "view_nrmse")
+    assert all(math.isnan(failed[f"val/{name}"]) for name in names)
+
+
+def test_weights_that_fail_in_a_case_are_not_the_best_even_if_they_are_perfect_in_all_others(
+    tmp_path, monkeypatch
+):
+    judge = ReconstructionModule.validation_step
+
+    def spoilt_at_step_2(module, batch, index):
+        make = module.model.forward
+
+        def perfect_but_for_one(views):
+            volume = batch["volume"].clone()
+            volume[0, 0, 0, 0, 0] = math.nan
+            return replace(make(views), volume=volume)
+
+        with monkeypatch.context() as patch:
+            if module.global_step == 2:
+                patch.setattr(module.model, "forward", perfect_but_for_one)
+            return judge(module, batch, index)
+
+    monkeypatch.setattr(ReconstructionModule, "validation_step", spoilt_at_step_2)
+    settings = compose("experiment=smoke", "callbacks=best", "~callbacks.board")
+    settings["trainer"] |= {"val_check_interval": 1, "num_sanity_val_steps": 0}
+    fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
+    assert load(tmp_path / "best" / "best.ckpt").steps in (1, 3)
+
+
+def test_a_batch_split_into_its_cases_is_the_batch_joined_again(validation):
+    module, cases = validation
+    batch = next(iter(DataLoader(cases, 3)))
+    with torch.no_grad():
+        out = module.model(batch["views"])
+    parts = out.split()
+    assert len(parts) == 3 and all(len(part.volume) == 1 for part in parts)
+    again = joined(parts)
+    for field in fields(out):
+        one, other = getattr(out, field.name), getattr(again, field.name)
+        if field.name == "alignment":
+            one, other = one.tensors(), other.tensors()
+        elif field.name == "row":  # the same for all cases
+            one = one.expand_as(other)
+        torch.testing.assert_close(other, one, rtol=0, atol=0)
