@@ -404,7 +404,6 @@ def test_rays_that_miss_the_grid_have_no_effect():
     assert change < 1e-4 * method(views, A).volume.norm()
 
 
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [

@@ -88,7 +88,7 @@ def test_a_bin_has_the_transmission_that_its_depth_gives_it():
 
 def test_attenuation_is_undone_and_nothing_is_divided_by_next_to_nothing():
     cameras = RIGS["cone"]()
-    lead = AttenuatedTransform(GRID, cameras, torch.full(GRID.shape, 0.1))
+    lead = AttenuatedTransform(GRID, cameras, torch.full(GRID.shape, 0.099))
     frames = ViewFrames.of(Geometry.of(lead), 0, 1, 8)
     assert frames.transmission.min() == LEAST
     density = torch.rand(1, 3, 1, *frames.frusta.shape)
@@ -109,8 +109,8 @@ def test_a_start_that_is_too_faint_is_raised_by_its_lack_at_any_depth():
     truth = ball(25.0, (-40.0, 30.0, 0.0)).float()
     estimates = PerViewEstimates((4,), 0, 1, 32, 1, "softmax_depth")  # as before training
     expected, errors = avg_pool3d(truth, 2)[:, None], []
-    for mu in (None, WATER * ball(85.0)[0, 0].float()):
-        A = Drr(GRID, cameras) if mu is None else AttenuatedTransform(GRID, cameras, mu)
+    for density in (0.0, WATER):
+        A = 2.0 * AttenuatedTransform(GRID, cameras, density * ball(85.0)[0, 0].float())
         g, views, x = Geometry.of(A), A(truth), 0.7 * truth
         r = views - A(x)
         change, *_ = estimates(estimates.frames(g), g, views, r, x, g.direction(r))
