@@ -1,24 +1,20 @@
-"""Every model takes a network by name, a plugin's too; mask, size and the start at zero are the
-model's care.
-"""
+"""Methods take a network by name, a plugin's too; they see to sizes and to the start at zero."""
 
 import pytest
 import torch
 from torch import nn
 
-from mvrecon.models.network import SizedNetwork, network_by_name
-from mvrecon.models.networks import UNet3d
-from mvrecon.parts import MODELS, NETWORKS
-from mvrecon.testing import check_model, check_network
-from tests.models.rig import small_projector
-from tests.models.test_published import SMALL
-from tests.models.test_single_pass import OPTIONS
+from mvrecon.models.network import network_by_name
+from mvrecon.parts import NETWORKS
+from mvrecon.testing import check_method, check_network
+from tests.models.rig import SMALL, blob, small, small_projector
 
-BUILT_IN = {"unet": {"width": 4, "levels": 2}, **SMALL}
+TINY, UNET = {"name": "tiny"}, {"name": "unet", "widths": [4, 6]}
+WITH_NETWORK = ("world_unet", "geometry_free")
 
 
 class Tiny(nn.Module):
-    """A plugin's network: it knows no mask, and takes sizes that 4 divides."""
+    """A plugin's network, for sizes that 4 divides."""
 
     multiple = 4
 
@@ -32,113 +28,64 @@ class Tiny(nn.Module):
         return nn.functional.interpolate(coarse, scale_factor=4.0, mode="nearest")
 
 
+class Smaller(nn.Conv3d):
+    """A network whose answer is smaller than its input."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__(inputs, outputs, 5)
+
+
 @pytest.fixture(autouse=True)
-def tiny(monkeypatch):
-    """The plugin, for one test."""
+def registered(monkeypatch):
+    """The networks by name, for one test."""
     monkeypatch.setitem(NETWORKS._parts, "tiny", Tiny)
+    monkeypatch.setitem(NETWORKS._parts, "smaller", Smaller)
 
 
-@pytest.mark.parametrize("name", [*BUILT_IN, "tiny"])
-def test_networks_keep_the_contract(name):
-    check_network(name, **BUILT_IN.get(name, {}))
+@pytest.mark.parametrize("config", [TINY, UNET], ids=lambda config: config["name"])
+def test_networks_keep_the_contract(config):
+    check_network(**config)
 
 
-MODELS_WITH_NETWORKS = {
-    "single_pass": {"network": {"name": "tiny"}, "opinion": {"network": {"name": "tiny"}}},
-    "mean_fusion": {
-        "opinion": {"network": {"name": "residual_unet3d", **SMALL["residual_unet3d"]}}
-    },
-    "backprojection_unet": {"network": {"name": "unet3d", **SMALL["unet3d"]}, "support": "hull"},
-    "geometry_free": {"network": {"name": "tiny", "channels": 2}},
-}
+@pytest.mark.parametrize("name", WITH_NETWORK)
+def test_a_method_with_a_network_by_name_keeps_the_contract(name):
+    check_method(name, small_projector(), **SMALL[name] | {"network": TINY})
 
 
-@pytest.mark.parametrize("name", MODELS_WITH_NETWORKS)
-def test_a_model_with_a_network_by_name_keeps_the_contract(name):
-    check_model(name, small_projector(), **OPTIONS.get(name, {}), **MODELS_WITH_NETWORKS[name])
+def test_before_training_any_network_leaves_the_start():
+    """The change of it is zero, so the volume is the same with any network."""
+    A = small_projector()
+    views = A(blob(A))
+    volumes = [small("world_unet", network=network)(views, A).volume for network in (None, TINY)]
+    assert torch.equal(*volumes) and volumes[0].any()
 
 
-def test_every_model_that_learns_from_volumes_is_here():
-    learned = {
-        name
-        for name in MODELS.names()
-        if any(
-            isinstance(module, UNet3d | SizedNetwork)
-            for module in MODELS.build(name, small_projector(), **OPTIONS.get(name, {})).modules()
-        )
-    }
-    assert learned == set(MODELS_WITH_NETWORKS)
-
-
-@pytest.mark.parametrize("name", ["single_pass", "backprojection_unet"])
-def test_before_training_any_network_leaves_the_model_s_start(name):
-    """What corrects starts at zero, so the answer is the same with any network in the world."""
-    projector = small_projector()
-    views = projector(torch.rand(1, 1, *projector.grid.shape))
-    volumes = []
-    for network in (
-        None,
-        {"name": "tiny"},
-        {"name": "residual_unet3d", **SMALL["residual_unet3d"]},
-    ):
-        torch.manual_seed(0)
-        options = {**OPTIONS.get(name, {}), "network": network}
-        volumes.append(MODELS.build(name, projector, **options)(views).volume)
-    assert torch.equal(volumes[0], volumes[1]) and torch.equal(volumes[0], volumes[2])
-
-
-def test_outside_the_mask_of_a_support_no_network_adds_anything():
+@pytest.mark.parametrize("sizes", [(1, 1, 1), (6, 5, 7)])
+def test_volumes_of_any_size_are_padded_and_cropped(sizes):
     torch.manual_seed(0)
-    network = network_by_name({"name": "tiny"}, 2, 1, width=8)
-    x, mask = torch.randn(2, 2, 6, 5, 7), torch.rand(2, 1, 6, 5, 7) > 0.6
-    answer = network(x, mask)
-    assert torch.equal(answer, network(x) * mask) and answer.any()
-
-
-def test_mvrecon_s_own_network_by_name_is_the_same_as_without_one():
-    """To the last bit, weights and answers."""
-    nets = []
-    for config in (None, {"name": "unet", "width": 6}):
-        torch.manual_seed(0)
-        nets.append(network_by_name(config, 2, 3, width=6, zero=1))
-    x = torch.randn(1, 2, 6, 5, 7)
-    assert nets[0].state_dict().keys() == nets[1].state_dict().keys()
-    assert torch.equal(nets[0](x), nets[1](x)) and not nets[0](x)[:, 0].any()
+    network, x = network_by_name(TINY, 2, 3, zero=1), torch.randn(2, 2, *sizes)
+    answer = network(x)
+    assert answer.shape == (2, 3, *sizes)
+    assert not answer[:, 0].any() and answer[:, 1:].any()
 
 
 @pytest.mark.parametrize(
-    ("model", "options", "error", "message"),
+    ("network", "error", "message"),
     [
-        ("geometry_free", {"network": {"name": "unit"}}, LookupError, "did you mean 'unet'"),
-        ("geometry_free", {"network": {"width": 3}}, TypeError, "A network needs a 'name'"),
-        (
-            "geometry_free",
-            {"network": {"name": "unet", "widht": 3}},
-            TypeError,
-            "did you mean 'width'",
-        ),
-        ("single_pass", {"refine": 0, "network": {"name": "unet"}}, ValueError, "refine=0"),
-        ("mean_fusion", {"network": {"name": "unet"}}, ValueError, "refine=0"),
-        (
-            "single_pass",
-            {"opinion": {"prior": "uniform", "network": {"name": "unet"}}},
-            ValueError,
-            "prior='uniform' has no network",
-        ),
+        ({"name": "unit"}, LookupError, "did you mean 'unet'"),
+        ({"widths": [3]}, TypeError, "A network needs a 'name'"),
+        ({"name": "unet", "width": [3]}, TypeError, "did you mean 'widths'"),
     ],
 )
-def test_a_network_that_a_model_cannot_use_is_refused(model, options, error, message):
-    """A network that is unknown, nameless, misspelt in an option or without a use in the model is
-    refused.
-    """
+@pytest.mark.parametrize("name", WITH_NETWORK)
+def test_a_network_that_a_method_cannot_use_is_refused(name, network, error, message):
+    """A network that is unknown, without a name, or misspelt in an option."""
     with pytest.raises(error, match=message):
-        MODELS.build(model, small_projector(), **OPTIONS.get(model, {}), **options)
+        small(name, network=network)
 
 
-def test_a_network_s_answer_of_another_size_is_refused():
-    """A network that answers with another size is refused by a model, with both sizes."""
-    network = network_by_name(
-        {"name": "unet3d", "width": 1, "levels": 1, "norm": "none"}, 1, 1, width=8
-    )
-    with pytest.raises(ValueError, match=r"\(1, 1, 8, 8, 8\).* got \(1, 1, 4, 4, 4\).*'same'"):
+def test_an_answer_of_another_size_is_refused():
+    """With both sizes."""
+    network = network_by_name({"name": "smaller"}, 1, 1)
+    with pytest.raises(ValueError, match=r"\(1, 1, 8, 8, 8\).* got \(1, 1, 4, 4, 4\)"):
         network(torch.zeros(1, 1, 8, 8, 8))
