@@ -2,7 +2,6 @@
 config.
 """
 
-import inspect
 import re
 import sys
 from dataclasses import asdict
@@ -21,7 +20,6 @@ from mvrecon.config import compose, conf_dir, help_text
 from mvrecon.config.arguments import with_flag_first, with_paths_quoted
 from mvrecon.config.plugins import import_plugins
 from mvrecon.config.targets import instantiate
-from mvrecon.parts import NETWORKS
 from mvrecon.registry import GROUP
 
 EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))
@@ -109,15 +107,6 @@ def test_head_and_networks_are_chosen_on_the_command_line():
     assert model["opinion"] == {
         **unchanged["opinion"],
         "network": {"name": "unet", "width": 16, "levels": 3},
-    }
-
-
-@pytest.mark.parametrize("name", ["unet", "unet3d", "residual_unet3d"])
-def test_a_network_s_file_says_every_option(name: str):
-    options = inspect.signature(NETWORKS.get(name)).parameters.keys() - {"inputs", "outputs"}
-    assert set(yaml.safe_load((conf_dir() / "network" / f"{name}.yaml").read_text())) == {
-        "name",
-        *options,
     }
 
 

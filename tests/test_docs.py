@@ -149,6 +149,7 @@ def test_a_file_that_is_mentioned_is_there():
     missing = {
         f"{page}: {path}"
         for page, text in told().items()
+        if page != "CHANGELOG.md"
         for path in re.findall(r"(?<![\w.*<>/-])[\w./-]*\w\.(?:py|md)\b", text)
         if path not in ELSEWHERE
         and not any(p.endswith("/" + re.sub(r"^(\.\./|\./|/)*", "", path)) for p in paths)
@@ -251,15 +252,3 @@ def test_the_layers_that_contributors_read_are_those_that_are_checked():
     assert rule is not None
     rows = [set(re.findall(r"`(\w+)`", row)) for row in rule[0].split(";")]
     assert rows == [set(re.split(r" \| ", layer)) for layer in layers]
-
-
-def test_a_word_of_our_own_is_explained_once():
-    rows = [
-        line.split("|")[1:-1]
-        for line in (ROOT / "docs" / "glossary.md").read_text().splitlines()[6:]
-        if line.startswith("|")
-    ]
-    words = [word.strip() for row in rows for word in row[0].split(",")]
-    assert {"opinion", "lift", "rig"} <= set(words)
-    assert len(words) == len(set(words))
-    assert all(len(row) == 3 and row[2].strip().endswith(".") for row in rows)

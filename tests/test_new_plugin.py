@@ -1,7 +1,6 @@
-"""The project that `mvrecon-list --new-plugin` writes keeps what mvrecon asks of every part."""
+"""The project that `mvrecon-list --new-plugin` writes keeps the contract of every kind of part."""
 
 import importlib.util
-import inspect
 import shlex
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mvrecon.config import check_settings, compose
+from mvrecon.config.typed import check_parts
 from mvrecon.listing import main
 from mvrecon.new_plugin import new_plugin
 from mvrecon.parts import REGISTRIES
@@ -39,49 +39,40 @@ def project(tmp_path_factory: pytest.TempPathFactory):
         del sys.modules[module]
 
 
-KINDS = ["scene", "camera", "projector", "head", "network", "model", "reconstructor"]
+KINDS = ["scene", "camera", "projector", "head", "network", "method"]
+#: The settings that choose the project's parts.
+CHOICES = {
+    *(f"{kind}={NAME}" for kind in ("scene", "camera", "projector", "method")),
+    *(f"method.head={NAME}", f"method.network.name={NAME}", f"method={NAME}_solver"),
+}
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_part_of_the_project_passes_its_own_test(kind: str, project):
+@pytest.mark.parametrize("part", [*KINDS, "solver"])
+def test_a_part_of_the_project_passes_its_own_test(part: str, project):
     _, tests = project
-    getattr(tests, f"test_{kind}")()
+    getattr(tests, f"test_{part}")()
 
 
 def test_the_commands_of_the_project_compose(project):
     folder, _ = project
     lines = (folder / "README.md").read_text().splitlines()
     commands = [shlex.split(line) for line in lines if line.startswith("    mvrecon-train")]
-    assert {kind for kind in KINDS if any(f"{kind}={NAME}" in " ".join(c) for c in commands)} == {
-        *KINDS
-    }
+    assert CHOICES <= {word for command in commands for word in command}
     for _, *overrides in commands:
-        compose(*overrides)
+        settings = compose(*overrides)
+        check_settings(OmegaConf.create(settings))
+        check_parts(settings)
 
 
-def test_the_project_tests_every_part_and_option(project):
+def test_the_project_registers_every_part_with_its_file(project):
     folder, tests = project
-    own = {n.removeprefix("test_") for n, _ in inspect.getmembers(tests) if n.startswith("test_")}
-    assert own == {*KINDS, "a_file_of_options_has_every_option"}
     for kind in KINDS:
         assert NAME in REGISTRIES[kind].names()
-    assert [file.parent.name for file in tests.CONF] == sorted(KINDS)
+    assert f"{NAME}_solver" in REGISTRIES["method"].names()
+    files = {f"{file.parent.name}/{file.stem}" for file in tests.CONF}
+    assert files == {*(f"{kind}/{NAME}" for kind in KINDS), f"method/{NAME}_solver"}
     for file in tests.CONF:
-        tests.test_a_file_of_options_has_every_option(file)
-    chosen = compose(*(f"{kind}={NAME}" for kind in ("scene", "camera", "projector", "model")))
-    assert chosen["camera"]["rise_mm"] == 20.0 and chosen["model"] == {
-        "name": NAME,
-        "iterations": 5,
-    }
-
-
-def test_the_training_of_its_readme_has_settings_that_its_parts_take(project):
-    folder, _ = project
-    lines = (folder / "README.md").read_text().splitlines()
-    command = next(line.split() for line in lines if line.strip().startswith("mvrecon-train"))
-    settings = compose(*command[1:])
-    check_settings(OmegaConf.create(settings))
-    assert settings["camera"]["name"] == settings["model"]["name"] == NAME
+        tests.test_a_file_names_a_part_and_options_that_it_has(file)
 
 
 def test_the_project_is_written_as_mvrecon_is(project, root: Path):

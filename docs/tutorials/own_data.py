@@ -61,7 +61,7 @@ save_png("views.png", montage.gallery(views[:4]))
 # %% [markdown]
 # ## Reconstructing
 #
-# `fdk` is the usual first look, `fista_tv` for few views; `mvrecon-list reconstructor` shows all.
+# `fdk` is the usual first look, `fista_tv` for few views; `mvrecon-list method` shows all.
 
 # %%
 volume = mv.reconstruct(views[None, None], cameras, grid, method="fdk")

@@ -11,9 +11,10 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
+from mvrecon.models.cross_view import CrossView
 from mvrecon.models.frusta import Frusta
 from mvrecon.new_plugin import new_plugin
-from mvrecon.parts import HEADS, MODELS, PROJECTORS
+from mvrecon.parts import HEADS, PROJECTORS
 from mvrecon.projectors.operator import Wrapped
 from mvrecon.testing import check_head, check_projector
 
@@ -34,8 +35,8 @@ PROJECTORS.register("my_projector")(sensitive)
 # ## A projector
 #
 # Now one of our own: line integrals that the detector blurs along its rows. Only the blur is new, so it wraps `Drr`; `adjoint`
-# must be the exact transpose. The blur is symmetric, and is its own. `pixelwise = False` tells the stress plan that a pixel depends
-# on its neighbours.
+# must be the exact transpose. The blur is symmetric, and so is its own transpose. `pixelwise = False` declares for the stress plan that
+# a pixel depends on its neighbours.
 
 
 # %%
@@ -46,7 +47,7 @@ class Blurred(Wrapped):
     Args:
         grid: of the volume.
         cameras: the rig.
-        share: what either neighbour along u gets.
+        share: of a pixel's value that each neighbour along u gets.
     """
 
     pixelwise = False
@@ -68,7 +69,7 @@ class Blurred(Wrapped):
 
 
 # %% [markdown]
-# `check_projector` asks for what every projector must keep: shapes, the transpose, linearity, gradients, supports.
+# `check_projector` tests the contract of projectors: shapes, the transpose, linearity, gradients, supports.
 
 # %%
 small = mv.Grid.centred(size=(3, 4, 3), spacing=(1.0, 1.2, 0.9))
@@ -108,9 +109,9 @@ A = PROJECTORS.build(
     cameras=mv.circular(3, 200.0, 400.0, {"pixels": [15, 15], "pixel_mm": 8.0}),
 )
 check_head("my_head", Frusta.of(grid, A.cameras, depth=12))
-model = MODELS.build("single_pass", projector=A, head={"name": "my_head"})
+method = CrossView(head="my_head", widths=[4, 8], depth_widths=[4], scale=1)
 views = A(torch.rand(1, 1, *grid.shape))
-print(f"a model with both: {tuple(model(views).volume.shape)}")
+print(f"a method with both: {tuple(method(views, A).volume.shape)}")
 
 # %% [markdown]
 # In a project the names come from its `pyproject.toml`, options from its `conf`, and

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Your own training loop
 #
-# Operators and models are plain `torch.nn.Module`s. `mvrecon-train` adds Lightning, checkpoints and a board; a loop of one's own
-# needs neither.
+# Operators and learned methods are plain `torch.nn.Module`s. `mvrecon-train` adds Lightning, checkpoints and TensorBoard; your own loop
+# needs none of them.
 
 # %%
 import torch
@@ -10,7 +10,8 @@ import torch
 import mvrecon as mv
 from mvrecon.engine.export import save_png
 from mvrecon.metrics import volume_metrics
-from mvrecon.parts import MODELS, SCENES
+from mvrecon.models.cross_view import CrossView
+from mvrecon.parts import SCENES
 from mvrecon.viz import review
 
 torch.manual_seed(0)
@@ -27,25 +28,24 @@ def batch(seed, cases):
 
 
 # %% [markdown]
-# ## A model
+# ## A method
 #
-# `cross_view` with one round at full resolution and no cameras' networks is a U-Net in the world between a classical start and steps
-# of data consistency. Any of `mvrecon-list model` is built alike.
+# A method maps views and an operator to a reconstruction; its weights contain no geometry. Here the cross-view model, small enough
+# for a demonstration. Other learned methods of `mvrecon-list method` are used alike.
 
 # %%
-world = {"resolution": "full", "widths": [8, 16], "cameras": None, "opinions": None}
-model = MODELS.build("cross_view", projector=A, rounds=[world], start=4, consistency=1)
-print(f"{sum(p.numel() for p in model.parameters())} weights")
+method = CrossView(widths=[8, 16], depth_widths=[8], scale=1, depths=8, start=4, consistency=1)
+print(f"{sum(p.numel() for p in method.parameters())} weights")
 
 # %% [markdown]
 # ## The loop
 
 # %%
-optimiser = torch.optim.AdamW(model.parameters(), lr=3e-3)
+optimiser = torch.optim.AdamW(method.parameters(), lr=3e-3)
 losses = []
 for step in range(24):
     views, truth = batch(seed=1, cases=[2 * step, 2 * step + 1])
-    out = model(views)  # a Reconstruction: volume, and what led to it
+    out = method(views, A)  # a Reconstruction: the volume, per-view estimates, weights
     views_too = (A(out.volume) - views).square().mean() / views.square().mean()
     loss = (out.volume - truth).square().mean() / truth.square().mean() + 0.1 * views_too
     optimiser.zero_grad()
@@ -58,13 +58,13 @@ assert sum(losses[-6:]) < sum(losses[:6])
 # %% [markdown]
 # ## Unseen cases
 #
-# Another seed gives cases that training never sees. After so few steps this shows how to judge, not how good the model gets.
+# Another seed gives cases that training never sees. After so few steps this shows how to evaluate, not how good the method gets.
 
 # %%
-model.eval()
+method.eval()
 views, truth = batch(seed=2, cases=[0])
 with torch.no_grad():
-    volumes = {"network": model(views).volume, "SIRT": mv.sirt(A, views, iterations=50)}
+    volumes = {"network": method(views, A).volume, "SIRT": mv.sirt(A, views, iterations=50)}
 inside = torch.ones_like(truth[0], dtype=torch.bool)
 for name, volume in volumes.items():
     psnr = volume_metrics(volume[0], truth[0], inside, scene.data_range)["psnr"]
@@ -76,5 +76,5 @@ save_png("planes.png", review.planes(case, truth[0, 0], shown))
 # %% [markdown]
 # ## What to keep
 #
-# `torch.save(model.state_dict(), ...)` keeps the weights, `torch.compile(model)` takes operators as opaque steps, and
-# `mvrecon.engine.program.exported(model, views)` is a program of `torch.export`: [python.md](../python.md).
+# `torch.save(method.state_dict(), ...)` keeps the weights, `torch.compile(method)` treats operators as opaque steps, and
+# `mvrecon.engine.program.exported(method, A, views)` is a program of `torch.export`: [python.md](../python.md).

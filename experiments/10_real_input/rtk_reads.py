@@ -14,11 +14,11 @@ import itk
 import torch
 from itk import RTK
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor
 
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import read_volume
-from mvrecon.engine.export import save_png
 from mvrecon.geometry.grid import Grid
 from mvrecon.viz import review
 
@@ -96,7 +96,7 @@ def main(scan: Path, volumes: Path, folder: Path) -> None:
     shown.pop("fdk_floor", None)
     shown = {"fdk": shown.pop("fdk"), "RTK's fdk": peer, **shown}
     picture = review.planes(review.Case("", grid, WHITE), truth, shown)
-    save_png(folder / "planes.png", picture)
+    Image.fromarray(picture).save(folder / "planes.png")
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import torch
 from geometry import HOLE, ball, counts_of, geometry
+from PIL import Image
 
 import mvrecon as mv
-from mvrecon.engine.export import save_png
 from mvrecon.files.tables import read_rows, write_rows
 from mvrecon.scenes.derenzo import derenzo
 from mvrecon.scenes.voxelise import voxelise
@@ -100,7 +100,7 @@ def wells(out: Path) -> None:
     phantom = derenzo(DIAMETERS, radius=RADIUS, height=HEIGHT)
     ideal = Spect(fine, cameras, HOLE, blur=True)(voxelise(phantom, fine)[None, None])[0, 0]
     images = enlarged(radiographs(ideal), 64)
-    save_png(out / "views.png", tiled([images[r : r + 20] for r in range(0, 80, 20)]))
+    Image.fromarray(tiled([images[r : r + 20] for r in range(0, 80, 20)])).save(out / "views.png")
     counts, _ = drawn(ideal, 5e6, seed=1)
     rows = []
     for name, options in BLUR.items():

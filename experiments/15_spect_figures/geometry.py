@@ -10,10 +10,10 @@ import torch
 import mvrecon as mv
 from mvrecon.cameras.field import sees
 from mvrecon.files.tables import write_rows
-from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon.viz.rig import save_picture
+from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.projector import Spect
 

@@ -15,10 +15,10 @@ from mvrecon.data.resample import resample
 from mvrecon.files.tables import write_rows
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.ventricle import ventricle
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_spect.metrics.contrast import count_bias
 from mvrecon_spect.projector import Spect
+from mvrecon_spect.scenes.ventricle import ventricle
 
 GRID = mv.Grid.centred(48, spacing=5.0)
 CT_KEV, SPECT_KEV = 70.0, 140.5

@@ -13,10 +13,10 @@ import torch
 import mvrecon as mv
 from mvrecon.files.tables import write_rows
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.scenes.cardiac import RandomCardiac
 from mvrecon_spect.metrics.contrast import contrast_to_noise, count_bias, defect_contrast
 from mvrecon_spect.metrics.polar_map import LongAxis, polar_map
 from mvrecon_spect.projector import Spect
+from mvrecon_spect.scenes.cardiac import RandomCardiac
 
 GRID = mv.Grid.centred(size=(54, 42, 42), spacing=6.0, centre=(42, -42, 0))
 CAMERAS, CASE, SEED, LOST = mv.dcspect80(pixels=32), 2, 0, 0.6
@@ -55,7 +55,7 @@ def patient() -> Patient:
     ill = RandomCardiac(defects=1.0, contrast=(LOST, LOST))
     well = RandomCardiac(defects=1.0, contrast=(0.0, 0.0))
     fine = ill.finer(CASE, SEED, GRID, CAMERAS, 2)
-    A = Spect(GRID.refined(2), CAMERAS, mu=ill.attenuation(CASE, SEED, GRID, 2)[0])
+    A = Spect(GRID.refined(2), CAMERAS, mu=ill.maps(CASE, SEED, GRID, 2)["mu"][0])
     truth, healthy = (
         scene.pooled(CASE, SEED, GRID, scene.finer(CASE, SEED, GRID, CAMERAS, 2)).volume[0]
         for scene in (ill, well)
@@ -67,7 +67,7 @@ def patient() -> Patient:
     base = torch.tensor([numbers[f"{name}_mm"] for name in "xyz"], dtype=torch.float64)
     apex = base + numbers["length_mm"] * R[:, 2]
     axis = LongAxis(base.tolist(), apex.tolist(), R[:, 0].tolist())
-    mu = ill.attenuation(CASE, SEED, GRID)[0]
+    mu = ill.maps(CASE, SEED, GRID)["mu"][0]
     return Patient(truth, A(fine[None]), mu, wall & (lost < 0.1), wall & (lost > 0.7), axis)
 
 

@@ -19,7 +19,7 @@ from mvrecon.parts import PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.pixel_integral import PixelIntegral
 from mvrecon.scenes.analytic import case_numbers, generator, mixed
-from mvrecon.scenes.sample import Attenuating, Placing, Pooling, Sample, Scene, Thin, finer
+from mvrecon.scenes.sample import Mapped, Placing, Pooling, Sample, Scene, Thin, finer
 
 #: The series of the random numbers of the detector and of rig errors, apart from those that draw
 #: the objects.
@@ -72,9 +72,9 @@ class Acquired:
 
     A projector that says how its pixels are made of line integrals (`pixel_integral`) takes the
     scene's own; any other is built anew on a finer grid, and sees the object there. Case, truth and
-    name are the scene's. The noise is a function of (seed, index). A scene whose objects attenuate
-    does so in every projector that has an option `mu`, in place of the option's value, which is
-    what a reconstruction takes the attenuation for.
+    name are the scene's. The noise is a function of (seed, index). Where a scene has a map of a
+    case by the name of one of the projector's options, such as its attenuation, the map stands for
+    the option's value, which is the assumption of a reconstruction.
 
     Args:
         scene: the objects.
@@ -158,8 +158,8 @@ class Acquired:
         Raises:
             ValueError: as `sample`.
         """
-        matter = self._matter(index, seed, grid)
-        source = self._source_for(matter, grid, rig)
+        maps = self._maps(index, seed, grid)
+        source = self._source_for(maps, grid, rig)
         if isinstance(source, Lines):
             sample = self.scene.sample(index, seed, grid, source.rig)
             views = _pooled(sample.views, source.pixel.rays)
@@ -173,41 +173,45 @@ class Acquired:
                 sample = self.scene.sample(index, seed, grid, rig)
         with torch.no_grad():
             views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
-        pooled = None if matter is None else avg_pool3d(matter[None], self.acquisition.fine)[0]
-        mu = sample.mu if pooled is None else pooled
-        return Seen(replace(sample, views=views, mu=mu), volume)
+        pooled = {
+            name: avg_pool3d(values[None], self.acquisition.fine)[0]
+            for name, values in maps.items()
+        }
+        return Seen(replace(sample, views=views, maps={**sample.maps, **pooled}), volume)
 
-    def _matter(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "1 d h w"] | None:
-        """Attenuation of a case on the finer grid in 1/mm; none where it does not act."""
-        if not isinstance(self.scene, Attenuating) or self.projector is None:
-            return None
-        if not PROJECTORS.takes(self.projector["name"], "mu"):
-            return None
-        return self.scene.attenuation(index, seed, grid, self.acquisition.fine)
+    def _maps(self, index: int, seed: int, grid: Grid) -> dict[str, Float[Tensor, "1 d h w"]]:
+        """The maps of a case that the projector takes, on the finer grid."""
+        if self.projector is None or not isinstance(self.scene, Mapped):
+            return {}
+        maps = self.scene.maps(index, seed, grid, self.acquisition.fine)
+        name = self.projector["name"]
+        return {option: maps[option] for option in maps if PROJECTORS.takes(name, option)}
 
     def _source_for(
-        self, matter: Float[Tensor, "1 d h w"] | None, grid: Grid, rig: Any
+        self, maps: Mapping[str, Float[Tensor, "1 d h w"]], grid: Grid, rig: Any
     ) -> Lines | Projection:
-        if matter is not None and bool(matter.any()):  # an operator of this case alone
-            config = {**(self.projector or {}), "mu": matter[0]}
-            return projection_of(config, grid, rig, self.acquisition.fine)
-        if self.acquisition.disturbed is not None:  # a rig of this case alone
-            return self._made(grid, rig)
+        if maps or self.acquisition.disturbed is not None:  # of this case alone
+            acting = {name: values[0] if values.any() else None for name, values in maps.items()}
+            return self._made(acting, grid, rig)
         return self._source_of(grid, rig)
 
     def _source_of(self, grid: Grid, cameras: Cameras) -> Lines | Projection:
         if self._source is None or self._source[0] is not grid or self._source[1] is not cameras:
-            self._source = (grid, cameras, self._made(grid, cameras))
+            self._source = (grid, cameras, self._made({}, grid, cameras))
         return self._source[2]
 
-    def _made(self, grid: Grid, cameras: Cameras) -> Lines | Projection:
+    def _made(
+        self, maps: Mapping[str, Float[Tensor, "d h w"] | None], grid: Grid, cameras: Cameras
+    ) -> Lines | Projection:
         projector, acquisition = self.projector, self.acquisition
-        if projector is not None and isinstance(self.scene, Attenuating):
-            if PROJECTORS.takes(projector["name"], "mu"):
-                projector = {**projector, "mu": None}  # the scene's is zero
-        if projector is not None and not acquisition.closed_form:
-            return projection_of(projector, grid, cameras, acquisition.fine)
-        return source_of(projector, grid, cameras, acquisition.fine)
+        if projector is None:
+            return source_of(None, grid, cameras, acquisition.fine)
+        acts = any(values is not None for values in maps.values())
+        make = source_of if acquisition.closed_form and not acts else projection_of
+        source = make({**projector, **maps}, grid, cameras, acquisition.fine)
+        if isinstance(source, Projection) and not isinstance(self.scene, Mapped):
+            source.operator.for_case({})  # refuses cases without the maps that it needs
+        return source
 
 
 def source_of(

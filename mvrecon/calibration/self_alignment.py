@@ -15,7 +15,7 @@ from torch import Tensor
 from mvrecon.calibration.alignment import Alignment, CorrectedViews, aligned, alignment
 from mvrecon.calibration.unknowns import motions
 from mvrecon.cameras.views import check_finite
-from mvrecon.kernels.known import key_of, known
+from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.projectors.operator import Projector
 from mvrecon.reconstructors.iterative import sirt, sirt_weights
 
@@ -74,9 +74,9 @@ def self_alignment(
     check_finite(views, on_gpu=False)
     by, volume, weights = Alignment.none(views), None, sirt_weights(A, views.dtype)
     cameras, centre = A.cameras, A.grid.centre
-    moves = known(
+    moves = device_cached(
         cameras,
-        ("motions", key_of(A.grid)),
+        ("motions", grid_key(A.grid)),
         views,
         lambda: motions(cameras, centre).detach().to(views.device),
     )

@@ -37,8 +37,8 @@ from mvrecon.registry import installed, locate
 VERSION_BASE = "1.3"
 #: Settings whose options need not be in a file: those of parts are in their signatures.
 OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
-#: Further such settings of an app: an evaluation has those of its run.
-OF_RUN = {"eval": ("acquisition", "data", "grid")}
+#: Further such settings of an app: those of the run that it evaluates, or of `EventSettings`.
+OF_RUN = {"eval": ("acquisition", "data", "grid"), "simulate": ("events",)}
 
 
 class PluginConf(SearchPathPlugin):

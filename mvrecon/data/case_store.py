@@ -16,7 +16,7 @@ from mvrecon.data.storage import dataset_in
 from mvrecon.files.atomic import written_whole
 from mvrecon.files.checks import Refused, blaming
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.sample import MAPS, Sample, Scene
+from mvrecon.scenes.sample import Sample, Scene
 
 #: Raised where what a scene, a projector or a file of this store is has changed: older files are
 #: not read.
@@ -72,9 +72,8 @@ class CaseStore:
 
 def _write(path: Path, sample: Sample) -> None:
     with written_whole(path) as part, h5py.File(part, "w") as file:
-        for name in ("views", "volume", "inside", *MAPS):
-            if (tensor := getattr(sample, name)) is None:
-                continue
+        tensors = {"views": sample.views, "volume": sample.volume, "inside": sample.inside}
+        for name, tensor in {**tensors, **sample.maps}.items():
             values = tensor.cpu().numpy()
             file.create_dataset(name, data=values, fletcher32=True, chunks=(1, *values.shape[1:]))
         file.attrs["name"] = sample.name
@@ -94,12 +93,13 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
     }
     values = {}
     with blaming(path, "is not a case that can be read"), reading(path) as file:
-        expected |= {name: (volume, "float32") for name in MAPS if name in file}
-        for name, kind in expected.items():
+        maps = {name: (volume, "float32") for name in file if name not in expected}
+        for name, kind in {**expected, **maps}.items():
             dataset = dataset_in(path, file, name, "a case")
             if (dataset.shape, str(dataset.dtype)) != kind:
                 raise Refused(
                     f"{path}: expected {name} as {kind}, got {dataset.shape}, {dataset.dtype}"
                 )
             values[name] = torch.from_numpy(dataset[()])
-        return Sample(**values, name=str(file.attrs["name"]))
+        held = {name: values.pop(name) for name in maps}
+        return Sample(**values, name=str(file.attrs["name"]), maps=held)

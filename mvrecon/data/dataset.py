@@ -13,7 +13,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.files.rank import rank
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import case_numbers, generator, mixed
-from mvrecon.scenes.sample import MAPS, Sample, Scene, Thin
+from mvrecon.scenes.sample import Sample, Scene, Thin
 from mvrecon.visual_hull.support import warn_of_gaps
 
 TENSORS = ("views", "volume", "inside")
@@ -23,8 +23,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
     """Cases of one scene; each item is a pure function of its index, whichever process asks for it.
 
     An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; where the rig is
-    disturbed also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; where
-    the scene attenuates "mu" [1 d h w], 1/mm, and where it was scanned "mu_measured".
+    disturbed also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; and the
+    maps [1 d h w] of its sample by their names.
 
     Args:
         scene: where the cases come from.
@@ -88,13 +88,12 @@ class SceneDataset(Dataset[dict[str, Any]]):
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
         made = {key: getattr(sample, key) for key in TENSORS}
-        made |= {key: mu for key in MAPS if (mu := getattr(sample, key)) is not None}
         for key in ("views", "volume"):
             if bad := int((~made[key].isfinite()).sum()):
                 raise ValueError(
                     f"{sample.name}: expected finite {key}, got {bad} values that are not"
                 )
-        return {**made, **sample.errors, "name": sample.name}
+        return {**made, **sample.maps, **sample.errors, "name": sample.name}
 
 
 class _Making(Dataset[dict[str, Any]]):

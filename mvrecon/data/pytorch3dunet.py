@@ -79,7 +79,7 @@ def write_view(
         path: of the new file; it finds the other by its way from there.
         events: a file of `mvrecon.data.events`.
         item: the event's number in it.
-        raw: an array on the truth's voxels, "backprojection" or "mu".
+        raw: an array on the truth's voxels, "backprojection" or a map.
 
     Raises:
         Refused: not a file of events, no such event, or an array of other voxels.

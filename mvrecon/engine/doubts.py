@@ -20,7 +20,6 @@ from mvrecon.parts import METHODS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon.projectors.pixel_integral import sees_integrals
 from mvrecon.reconstructors.iterative import sirt
-from mvrecon.reconstructors.problem import kind_of_views
 
 #: Voxels along the grid's longest side, views, and iterations of SIRT that tell mirrored views.
 VOXELS, VIEWS, ITERATIONS = 32, 40, 8
@@ -50,7 +49,7 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
     """What speaks against a scan's reconstruction, in words, without a unit; empty for most.
 
     A projector whose `pixel_integral` says nothing, and one of weighted integrals, have doubts of
-    their volume's residual alone; a method says by `takes` what its views are.
+    their volume's residual alone; a method declares its views, `declares`.
 
     Args:
         scan: that was reconstructed.
@@ -60,7 +59,7 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
     """
     words: list[str] = []
     limit = POOR
-    orders, kind = _orders(scan), kind_of_views(METHODS.get(method))
+    orders, kind = _orders(scan), getattr(METHODS.get(method), "views", "integrals")
     if sees_integrals(orders[0].A):
         first, views = _read(scan, orders)
         if kind == "integrals":

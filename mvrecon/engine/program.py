@@ -48,6 +48,7 @@ def exported(method: nn.Module, A: Projector, views: Float[Tensor, "b 1 m v u"])
         with torch.no_grad(), warnings.catch_warnings():
             # an operator's last plan, which is no part of the program
             warnings.filterwarnings("ignore", "The tensor attribute .* was assigned during export")
+            method(views, A)  # its geometry, which is kept beside A, is a constant of the program
             return torch.export.export(Volume(method, A), (views,), strict=False)
     except RuntimeError as error:  # of many classes, all of them torch's
         why = str(error).strip().partition("\n")[0]

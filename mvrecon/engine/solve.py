@@ -223,8 +223,7 @@ def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
 
 def _iterates(name: str) -> bool:
     """Whether a method shows its iterates to a monitor."""
-    parameters = signature(METHODS.get(name)).parameters.values()
-    return any(p.name == "monitor" or p.kind is p.VAR_KEYWORD for p in parameters)
+    return getattr(METHODS.get(name), "iterates", False)
 
 
 @contextmanager

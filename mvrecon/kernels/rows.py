@@ -1,5 +1,5 @@
-"""One row of an output lattice in a source lattice: where it enters and leaves it, for every kernel
-driven by voxels.
+"""One row of an output lattice in a source lattice: where it enters and leaves it, and bilinear
+values on padded, flat planes, for every kernel driven by voxels.
 
 Numerators and denominators of a row's places are affine in the position i along it, so that the
 part of the row inside the source's box is an interval, cut out by linear inequalities, and no later
@@ -62,3 +62,31 @@ def cell(top, inverse, i, border, size):
     out.
     """
     return min(max((top[0] + i * top[1]) * inverse + border, 0.0), size + 1.0)
+
+
+@scalar
+def face(flat, across):
+    """A plane as seen from the four corners of its cells, so that one index serves all."""
+    return flat, flat[1:], flat[across:], flat[across + 1 :]
+
+
+@scalar
+def bilinear(face, k, x, y):
+    """The value in cell k."""
+    near, far = (
+        face[0][k] + x * (face[1][k] - face[0][k]),
+        face[2][k] + x * (face[3][k] - face[2][k]),
+    )
+    return near + y * (far - near)
+
+
+@scalar
+def lay(face, k, x, y, value):
+    """Add a value to the corners of cell k with the weights of `bilinear`."""
+    far = y * value
+    near = value - far
+    near_x, far_x = x * near, x * far
+    face[0][k] += near - near_x
+    face[1][k] += near_x
+    face[2][k] += far - far_x
+    face[3][k] += far_x

@@ -47,7 +47,9 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix=f"mvrecon-{process}")
 
 
-def share(work: Callable[[int, int], None], count: int, samples: int, per_thread: int = 1) -> None:
+def parallel_for(
+    work: Callable[[int, int], None], count: int, samples: int, per_thread: int = 1
+) -> None:
     """Do work(first, last) for ranges that cover `count` items, on the threads that torch has and
     `samples` deserve.
     """

@@ -38,7 +38,7 @@ def kept(A: LinearOperator, key: Hashable, make: Callable[[], Any]) -> Any:
         key: names the result among those of the operator.
         make: computes it.
     """
-    if A.pose_gradient or torch.compiler.is_compiling():
+    if A.pose_gradient or torch.compiler.is_dynamo_compiling():
         return make()
     results = _kept.setdefault(A, {})
     state = key, A.device, *_versions(A)

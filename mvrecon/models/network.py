@@ -94,6 +94,6 @@ class SizedNetwork(nn.Module):
         got = tuple(answer.shape) if isinstance(answer, Tensor) else type(answer).__name__
         if got != expected:
             raise ValueError(
-                f"Expected the network {type(self.network).__name__} to give a tensor {expected} "
-                f"for volumes {tuple(x.shape)}, got {got}; 'unet3d' needs padding 'same' in a model"
+                f"Expected the network {type(self.network).__name__} to keep the size of its "
+                f"volumes and give a tensor {expected}, got {got}"
             )

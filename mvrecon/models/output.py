@@ -50,7 +50,7 @@ class Reconstruction:
         def case(value: Any, i: int) -> Any:
             if isinstance(value, Alignment):
                 return value.split()[i]
-            return value[i : i + 1] if value is not None and len(value) == count else value
+            return value[i : i + 1] if isinstance(value, Tensor) and len(value) == count else value
 
         own = [field.name for field in fields(self) if field.name != "visible"]  # of all cases
         return [

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
-from mvrecon.kernels.known import key_of, known
+from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.geometry import Geometry, kept
 from mvrecon.models.unet import from_cells, halved, padded, to_cells, trimmed
@@ -77,7 +77,7 @@ class ViewFrames:
             return transmission(frusta, coarsened(mu, scale))
 
         cut = "frames", scale, edge, depths, like.dtype
-        frusta = known(A.cameras, (cut, key_of(A.grid)), like, frusta_of_rig)
+        frusta = device_cached(A.cameras, (cut, grid_key(A.grid)), like, frusta_of_rig)
         share = kept(A, cut, lambda: transmission_of(frusta))
         frames = cls(frusta, scale, edge, share)
         if g.support is not None:

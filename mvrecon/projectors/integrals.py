@@ -14,7 +14,7 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels import backends
+from mvrecon.kernels import operator as operators
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays, tensors_of, writes
@@ -43,7 +43,7 @@ class LineIntegrals(Projector):
     ):
         super().__init__()
         self.check_rig(cameras)
-        names = {"method": METHODS, "backend": backends.BACKENDS, "skip": SKIPS}
+        names = {"method": METHODS, "backend": operators.BACKENDS, "skip": SKIPS}
         for what, name in (
             ("method", method.partition(":")[0]),
             ("backend", backend),
@@ -206,7 +206,7 @@ class LineIntegrals(Projector):
     def _occupied_by_support(self) -> tuple[Tensor, Box]:
         """The occupancy code of the support, and the box around it."""
         occupancy = Occupancy.whole(self.grid.shape)
-        if self.support is not None and self.skip != "off" and backends.COMPILED:
+        if self.support is not None and self.skip != "off" and operators.COMPILED:
             mask, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
             how = self.skip if self.skip in ("box", "brick") else "once"
             code = ops.occupied(mask, rays, self.ray_extent, self.detector, self.kernel, how)
@@ -214,9 +214,8 @@ class LineIntegrals(Projector):
         return occupancy.encoded(), occupancy.box
 
     def _kernels(self, tensor: Tensor) -> ModuleType:
-        chosen, kernels = backends.kernels_for(tensor, self.backend, self.kernel)
-        self.last_backend = chosen
-        return kernels
+        self.last_backend = ops.backend_for(tensor, self.backend, self.kernel)
+        return reference if self.last_backend == "reference" else ops
 
 
 def _kernel(method: str, grid: Grid) -> str:

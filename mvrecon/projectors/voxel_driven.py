@@ -13,12 +13,11 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
-from mvrecon.kernels.backends import kernels_for
-from mvrecon.kernels.known import key_of, known
+from mvrecon.kernels.device_cache import device_cached, grid_key
+from mvrecon.kernels.operator import choose_backend
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.kernels.voxels import reference as voxel_reference
-from mvrecon.kernels.voxels.trial import differences
 from mvrecon.projectors.checks import check
 
 Weight = Literal["none", "distance"]
@@ -84,8 +83,8 @@ def images_of(cameras: Cameras, grid: Grid, like: Tensor) -> Images:
     def maps() -> Tensor:
         return image_maps(cameras, grid).to(like.device)
 
-    key = "image maps", key_of(grid)
-    return Images(known(cameras, key, like, maps), cameras.ray_extent, grid.shape)
+    key = "image maps", grid_key(grid)
+    return Images(device_cached(cameras, key, like, maps), cameras.ray_extent, grid.shape)
 
 
 def looked(
@@ -93,9 +92,9 @@ def looked(
 ) -> Float[Tensor, "b c d h w"]:
     """`backproject` by images that are known, which a GPU does not wait for."""
     values = wide(views)
-    chosen, _ = kernels_for(values, backend, "look", differences)
+    chosen = choose_backend(values, backend, "look", voxel_ops.self_test)
     kernels = voxel_reference if chosen == "reference" else voxel_ops
-    volumes = kernels.look(
+    volumes = kernels.backproject(
         values.flatten(0, 1),
         images.maps,
         list(images.ray_extent),

@@ -27,8 +27,8 @@ from mvrecon.reconstructors.problem import (
     Watch,
     check_iterations,
     check_start,
+    declares,
     supported,
-    takes,
     without_gradient,
 )
 from mvrecon.reconstructors.relative_difference import RelativeDifference
@@ -41,7 +41,7 @@ RELAXATION = 1 / 15
 FLOOR = 1e-6
 
 
-@takes("counts")
+@declares(views="counts", iterates=True)
 @without_gradient
 def bsrem(
     A: LinearOperator,

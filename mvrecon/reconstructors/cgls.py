@@ -9,12 +9,13 @@ from torch import Tensor
 
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.quantities import NonNegativeInt
-from mvrecon.reconstructors.problem import Common, Problem, Watch, posed, without_gradient
+from mvrecon.reconstructors.problem import Common, Problem, Watch, declares, posed, without_gradient
 
 #: N x of a penalty <x, N x>, for a volume x.
 Penalty = Callable[[Tensor], Tensor]
 
 
+@declares(iterates=True)
 @without_gradient
 def cgls(
     A: LinearOperator,

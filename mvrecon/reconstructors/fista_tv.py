@@ -11,7 +11,7 @@ from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstructors.cgls import check_not_negative
 from mvrecon.reconstructors.descent import descend
 from mvrecon.reconstructors.power import power_norm
-from mvrecon.reconstructors.problem import Common, posed, without_gradient
+from mvrecon.reconstructors.problem import Common, declares, posed, without_gradient
 from mvrecon.reconstructors.total_variation import (
     Shrinkage,
     dual_rate,
@@ -26,6 +26,7 @@ from mvrecon.reconstructors.weighted_fit import WeightedFit
 FLOOR = 0.5
 
 
+@declares(iterates=True)
 @without_gradient
 def fista_tv(
     A: LinearOperator,

@@ -10,7 +10,7 @@ from mvrecon.projectors.operator import LinearOperator
 from mvrecon.projectors.selection import ViewSelection
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstructors.descent import descend
-from mvrecon.reconstructors.problem import Common, posed
+from mvrecon.reconstructors.problem import Common, declares, posed
 
 
 class SirtWeights(NamedTuple):
@@ -74,6 +74,7 @@ def correction(
     return weights.column * A.T(weights.row * residual)
 
 
+@declares(iterates=True)
 def sirt(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],

@@ -24,8 +24,8 @@ from mvrecon.reconstructors.problem import (
     Watch,
     check_iterations,
     check_start,
+    declares,
     supported,
-    takes,
     without_gradient,
 )
 
@@ -34,7 +34,7 @@ from mvrecon.reconstructors.problem import (
 GONE = 1e-25
 
 
-@takes("counts")
+@declares(views="counts", iterates=True)
 @without_gradient
 def mlem(
     A: LinearOperator,
@@ -118,7 +118,7 @@ def _step(
     return torch.where(x < GONE * x.amax(dim=tuple(range(2, x.ndim)), keepdim=True), 0, x)
 
 
-@takes("counts")
+@declares(views="counts", iterates=True)
 @without_gradient
 def osem(
     A: LinearOperator,

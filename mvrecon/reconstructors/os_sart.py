@@ -22,7 +22,7 @@ from mvrecon.projectors.selection import (
 )
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstructors.iterative import inverse_sums
-from mvrecon.reconstructors.problem import Common, Problem, Watch, posed, without_gradient
+from mvrecon.reconstructors.problem import Common, Problem, Watch, declares, posed, without_gradient
 
 #: The longest step, in inverse greatest column sums: below 2, beyond which none is stable.
 STABLE = 1.9
@@ -36,6 +36,7 @@ class Subset(NamedTuple):
     views: Float[Tensor, "b c k v u"]
 
 
+@declares(iterates=True)
 @without_gradient
 def os_sart(
     A: LinearOperator,

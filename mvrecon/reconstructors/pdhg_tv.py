@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.differences.choice import differences_for
-from mvrecon.kernels.differences.shrinkage import Shrinkage
+from mvrecon.kernels.differences import differences_for
+from mvrecon.kernels.differences.reference import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstructors.cgls import check_not_negative
 from mvrecon.reconstructors.duality import Bound, PenalisedFit, closed
-from mvrecon.reconstructors.problem import Common, Problem, Watch, posed, without_gradient
+from mvrecon.reconstructors.problem import Common, Problem, Watch, declares, posed, without_gradient
 from mvrecon.reconstructors.stopping import combined
 from mvrecon.reconstructors.total_variation import voxel_steps
 from mvrecon.reconstructors.weighted_fit import WeightedFit
@@ -23,6 +23,7 @@ RELAXATION = 1.8
 EVERY = 10
 
 
+@declares(iterates=True)
 @without_gradient
 def pdhg_tv(
     A: LinearOperator,

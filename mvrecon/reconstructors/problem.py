@@ -64,21 +64,21 @@ class Common(TypedDict, total=False):
     monitor: Monitor | None
 
 
-def takes(kind: Kind) -> Callable[[Method], Method]:
-    """Decorator that says what a reconstructor's views are, in its attribute `views`; without it
-    they are line integrals.
+def declares(views: Kind = "integrals", iterates: bool = False) -> Callable[[Method], Method]:
+    """Decorator that declares properties of a classical method as its attributes.
+
+    Args:
+        views: line integrals, or counts.
+        iterates: whether it shows its iterates to a monitor, so that stopping rules, progress bars
+            and the choice of iterations apply.
     """
 
-    def said(method: Method) -> Method:
-        setattr(method, "views", kind)  # noqa: B010 - functions have no such attribute by type
+    def declared(method: Method) -> Method:
+        setattr(method, "views", views)  # noqa: B010 - functions have no such attribute by type
+        setattr(method, "iterates", iterates)  # noqa: B010
         return method
 
-    return said
-
-
-def kind_of_views(method: Callable[..., Any]) -> Kind:
-    """What a reconstructor's views are, by its attribute `views`."""
-    return getattr(method, "views", "integrals")
+    return declared
 
 
 def without_gradient(method: Callable[P, Tensor]) -> Callable[P, Tensor]:

@@ -11,11 +11,12 @@ from torch.autograd.function import once_differentiable
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstructors.cgls import check_not_negative, conjugate_gradients
-from mvrecon.reconstructors.problem import Common, Problem, posed
+from mvrecon.reconstructors.problem import Common, Problem, declares, posed
 from mvrecon.reconstructors.total_variation import gradient, gradient_adjoint, voxel_steps
 from mvrecon.reconstructors.weighted_fit import WeightedFit
 
 
+@declares(iterates=True)
 def tikhonov(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.differences.choice import differences_for
-from mvrecon.kernels.differences.reference import gradient, gradient_adjoint
-from mvrecon.kernels.differences.shrinkage import Shrinkage, Stride
+from mvrecon.kernels.differences import differences_for
+from mvrecon.kernels.differences.reference import Shrinkage, Stride, gradient, gradient_adjoint
 from mvrecon.projectors.operator import LinearOperator
 
 __all__ = [

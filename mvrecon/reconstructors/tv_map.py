@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.differences.choice import differences_for
-from mvrecon.kernels.differences.shrinkage import Shrinkage
+from mvrecon.kernels.differences import differences_for
+from mvrecon.kernels.differences.reference import Shrinkage
 from mvrecon.projectors.operator import LinearOperator
 from mvrecon.quantities import NonNegativeInt
 from mvrecon.reconstructors.cgls import check_not_negative
@@ -23,14 +23,14 @@ from mvrecon.reconstructors.problem import (
     Watch,
     check_iterations,
     check_start,
+    declares,
     supported,
-    takes,
     without_gradient,
 )
 from mvrecon.reconstructors.total_variation import total_variation, voxel_steps
 
 
-@takes("counts")
+@declares(views="counts", iterates=True)
 @without_gradient
 def tv_map(
     A: LinearOperator,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.parts import SCENES
-from mvrecon.scenes.sample import Rays, Sample, Scene, Thin, finer
+from mvrecon.scenes.sample import Mapped, Rays, Sample, Scene, Thin, finer
 
 
 class Mixture:
@@ -57,6 +57,13 @@ class Mixture:
         """The case's values on `grid.refined(factor)`."""
         scene, case = self._case(index)
         return finer(scene, case, seed, grid, cameras, factor)
+
+    def maps(
+        self, index: int, seed: int, grid: Grid, factor: int = 1
+    ) -> Mapping[str, Float[Tensor, "1 d h w"]]:
+        """The maps of the case on `grid.refined(factor)`; none where its scene has none."""
+        scene, case = self._case(index)
+        return scene.maps(case, seed, grid, factor) if isinstance(scene, Mapped) else {}
 
     def _case(self, index: int) -> tuple[Scene, int]:
         turn, which = divmod(index, len(self.scenes))

@@ -23,10 +23,6 @@ class Rays(Protocol):
         ...
 
 
-#: The maps of attenuation that a sample may have.
-MAPS = ("mu", "mu_measured")
-
-
 @dataclass(frozen=True, eq=False)
 class Sample:
     """One case.
@@ -38,8 +34,8 @@ class Sample:
         inside: the voxels that the object touches.
         name: of the case, the same for the same (seed, index).
         errors: what is wrong with each view and nobody knows, by name; empty where nothing is.
-        mu: linear attenuation on the grid in 1/mm; none where the scene has no matter.
-        mu_measured: what a transmission scan makes of it; none where there was none.
+        maps: further volumes of the case on the grid by name, such as its attenuation, which a
+            batch holds under their names.
     """
 
     views: Float[Tensor, "1 m v u"]
@@ -47,8 +43,7 @@ class Sample:
     inside: Bool[Tensor, "1 d h w"]
     name: str
     errors: Mapping[str, Shaped[Tensor, "m *n"]] = field(default_factory=dict)
-    mu: Float[Tensor, "1 d h w"] | None = None
-    mu_measured: Float[Tensor, "1 d h w"] | None = None
+    maps: Mapping[str, Float[Tensor, "1 d h w"]] = field(default_factory=dict)
 
 
 class Scene(Protocol):
@@ -106,14 +101,15 @@ class Parametrised(Protocol):
 
 
 @runtime_checkable
-class Attenuating(Protocol):
-    """A scene with matter that attenuates what its objects emit."""
+class Mapped(Protocol):
+    """A scene whose cases have further volumes, such as what attenuates the emission."""
 
-    def attenuation(
+    def maps(
         self, index: int, seed: int, grid: Grid, factor: int = 1
-    ) -> Float[Tensor, "1 d h w"]:
-        """Linear attenuation in 1/mm of the case `index` of the series `seed`, on
-        `grid.refined(factor)`.
+    ) -> Mapping[str, Float[Tensor, "1 d h w"]]:
+        """The true maps of the case `index` of the series `seed` by name, on
+        `grid.refined(factor)`. A projector with an option of a map's name measures the case with
+        the map.
         """
         ...
 

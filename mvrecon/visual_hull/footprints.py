@@ -18,8 +18,8 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.devices import beside
-from mvrecon.kernels.footprints import Prints
+from mvrecon.kernels.cuda.bricks import Prints
+from mvrecon.kernels.rays.lines import beside
 
 #: Part of a pixel by which rounding to float32 may shift a ray.
 ROUNDING = 1e-3

@@ -13,10 +13,10 @@ from mvrecon.cameras.rigs import circular
 from mvrecon.cameras.views import check_finite
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
-from mvrecon.kernels.footprints import Prints, Rule
-from mvrecon.kernels.known import key_of, known
-from mvrecon.kernels.rays.cuda import selfcheck
+from mvrecon.kernels.cuda.bricks import Prints, Rule
+from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.visual_hull.footprints import Bricks, footprints, prints_of, summed_area_tables
 from mvrecon.visual_hull.judging import AT_ONCE, judged, proofs
 
@@ -77,7 +77,7 @@ def visual_hull(
         )
     rule = Rule(brick, REACH, witnesses, keep_unseen)
     foreground = _foreground(views, threshold)
-    if views.is_cuda and not selfcheck.reason(views.device, "hull", torch.float64, 1, _tried):
+    if views.is_cuda and not self_test.failure(views.device, "hull", torch.float64, _self_test):
         return at_once(foreground, cameras, grid, rule)
     return refined(foreground, cameras.to(views.device), grid, rule)
 
@@ -95,7 +95,7 @@ def at_once(
         prints = prints_of(cameras, grid, GAPS)
         return prints._replace(numbers=prints.numbers.to(foreground.device))
 
-    prints = known(cameras, ("footprints", key_of(grid)), foreground, moved)
+    prints = device_cached(cameras, ("footprints", grid_key(grid)), foreground, moved)
     return judge(summed_area_tables(foreground), prints, rule, grid.shape)
 
 
@@ -163,7 +163,7 @@ def _foreground(
     return (~(views <= limits) | views.isinf())[:, 0]
 
 
-def _tried(device: str, dtype: torch.dtype) -> selfcheck.Tried:
+def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Errors:
     """A hull in one launch, of three views of a box of bright pixels."""
     detector = {"pixels": [40, 44], "pixel_mm": 1.0}
     cameras, grid = circular(3, 40.0, 70.0, detector), Grid.centred(size=(13, 12, 10), spacing=1.5)
@@ -172,7 +172,7 @@ def _tried(device: str, dtype: torch.dtype) -> selfcheck.Tried:
     rule = Rule(2, REACH, 1, True)
     expected = refined(bright, cameras.to(torch.device(device)), grid, rule)
     stays = at_once(bright, cameras, grid, rule, bricks.judge)
-    yield "hull", selfcheck.error_of(stays.float(), expected.float())
+    yield "hull", self_test.error_of(stays.float(), expected.float())
 
 
 def _edges(brick: int, shape: Sequence[int]) -> Iterator[int]:

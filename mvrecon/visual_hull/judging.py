@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from mvrecon.geometry.box import bricks_along
-from mvrecon.kernels.footprints import Prints, Rule
+from mvrecon.kernels.cuda.bricks import Prints, Rule
 from mvrecon.visual_hull.footprints import Bricks, Footprints, footprint_sums, footprints_of
 
 #: Footprints at a time, which bounds the memory (500 bytes a footprint).

@@ -20,9 +20,9 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.footprints import Prints
-from mvrecon.kernels.known import key_of, known
-from mvrecon.kernels.rays.cuda import selfcheck
+from mvrecon.kernels import self_test
+from mvrecon.kernels.cuda.bricks import Prints
+from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.visual_hull.footprints import prints_of, summed_area_tables
 from mvrecon.visual_hull.hull import REACH, check_measured
 from mvrecon.visual_hull.judging import AT_ONCE, counted, counted_at_once
@@ -138,8 +138,8 @@ def activity_bound(
     sets, prints = _known(cameras, grid, counts)
     n_bricks, at_once = math.prod(lattice), max(1, AT_ONCE // (len(cameras) * len(counts)))
     share, expected = delta / (n_bricks * len(sets)), sensitivity.to(sets).flatten(1)
-    there = counts.is_cuda and not selfcheck.reason(
-        counts.device, "counts", torch.float64, 1, _tried
+    there = counts.is_cuda and not self_test.failure(
+        counts.device, "counts", torch.float64, _self_test
     )
     counting = counted_at_once if there else counted
     bounds = []
@@ -159,7 +159,7 @@ def _known(cameras: Cameras, grid: Grid, like: Tensor) -> tuple[Float[Tensor, "t
         prints = prints._replace(numbers=prints.numbers.to(like.device))
         return view_sets(len(cameras)).to(like.device), prints
 
-    return known(cameras, ("footprints of counts", key_of(grid)), like, made)
+    return device_cached(cameras, ("footprints of counts", grid_key(grid)), like, made)
 
 
 def _bounds(counts: Float[Tensor, "b t n"], delta: float) -> Float[Tensor, "b t n"]:
@@ -170,14 +170,14 @@ def _bounds(counts: Float[Tensor, "b t n"], delta: float) -> Float[Tensor, "b t 
     return poisson_bound(numbers, delta)[back]
 
 
-def _tried(device: str, dtype: torch.dtype) -> selfcheck.Tried:
+def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Errors:
     """Counts in the bricks of a small grid, of three views of pixels of which no two are alike."""
     cameras, grid = circular(3, 40.0, 70.0, DETECTOR), Grid.centred(size=(13, 12, 10), spacing=1.5)
     views = torch.arange(3.0 * math.prod(cameras.shape), device=device)
     table = summed_area_tables(views.reshape(1, 3, *cameras.shape))
     _, prints = _known(cameras, grid, views)
     rest = table, prints, 4, REACH, grid.shape, range(5, 30)
-    yield "counts", selfcheck.error_of(counted_at_once(*rest).double(), counted(*rest).double())
+    yield "counts", self_test.error_of(counted_at_once(*rest).double(), counted(*rest).double())
 
 
 def view_sets(count: int) -> Float[Tensor, "t m"]:

@@ -21,7 +21,7 @@ from mvrecon.scenes.sample import finer
 from tests.data.conftest import stored
 
 GRID = Grid.centred((12, 12, 12), 10.0)
-NAMES = ["ellipsoids", "derenzo", "ventricle", "shepp_logan", "quickstart"]
+NAMES = ["ellipsoids", "derenzo", "shepp_logan", "quickstart"]
 
 
 @pytest.fixture(scope="module")

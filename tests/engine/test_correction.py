@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from mvrecon.engine.trained_correction import corrected_by
+from mvrecon.models.corrected import Corrected
 
 import mvrecon as mv
 import mvrecon.reconstruction
@@ -14,9 +16,7 @@ from mvrecon.cameras import files
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.volume_files import read_volume
 from mvrecon.engine.export import save_views
-from mvrecon.engine.trained_correction import corrected_by
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of, sentences
-from mvrecon.models.corrected import Corrected
 from mvrecon.parts import PROJECTORS, SCENES
 from mvrecon.reconstructors.iterative import sirt
 from tests.engine.runs import call, trained_for_a_step

@@ -9,9 +9,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from mvrecon.config import compose
 from mvrecon.engine import checkpoints, fit
-from mvrecon.kernels import backends
-from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.kernels.threads import in_one_order, share
+from mvrecon.kernels import operator
+from mvrecon.kernels.threads import in_one_order, parallel_for
 
 #: What torch.use_deterministic_algorithms refuses on CUDA (its documentation, torch 2.13), of what
 #: a network may hold.
@@ -72,7 +71,7 @@ def taken_for_a_gpu(strict, monkeypatch):
     """
     monkeypatch.setattr(torch.Tensor, "is_cpu", property(lambda _: False))
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda _: True))
-    monkeypatch.setattr(backends, "COMPILED", False)
+    monkeypatch.setattr(operator, "COMPILED", False)
 
 
 SMALL = (
@@ -125,7 +124,7 @@ def test_explicit_rays_of_a_gpu_add_up_in_no_fixed_order_and_say_so(strict):
 
     views, lines = torch.zeros(1, 2, 1, 1), torch.zeros(2, 4, 3, 1)
     with pytest.raises(RuntimeError, match="explicit rays adds up in no fixed order"):
-        backproject(views, lines, (0.0, 1.0), Occupancy.whole((2, 2, 2)), "joseph")
+        backproject(views, lines, (0.0, 1.0), (2, 2, 2), "joseph")
 
 
 @pytest.fixture
@@ -184,7 +183,7 @@ def test_the_compiled_loops_keep_their_threads_in_one_order(threads):
     threads(3)
     parts: list[tuple[int, int]] = []
     with in_one_order(), in_one_order():
-        share(lambda first, last: parts.append((first, last)), 30, 2**20)
+        parallel_for(lambda first, last: parts.append((first, last)), 30, 2**20)
         assert torch.get_num_threads() == 1
     assert sorted(parts) == [(0, 10), (10, 20), (20, 30)] and torch.get_num_threads() == 3
     with in_one_order(wanted=False):

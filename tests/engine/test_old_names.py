@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
+from mvrecon.engine.old_names import RIGS, current
 
 from mvrecon.cameras import rigs
 from mvrecon.config import compose
 from mvrecon.engine import run_folder
 from mvrecon.engine.checkpoint_check import check_settings
-from mvrecon.engine.old_names import RIGS, current
 
 OLD = {"seed": 3, "camera": {"name": "circular", "views": 8, "sid": 400.0}}
 NEW = {"seed": 3, "camera": {"name": "circular", "n_views": 8, "sid": 400.0}}

@@ -1,10 +1,10 @@
 """Activation checkpointing: the same gradients from less memory."""
 
 import torch
+from mvrecon.models.networks import UNet3d
 from torch.autograd.graph import saved_tensors_hooks
 
 from mvrecon.engine.recompute import Recompute
-from mvrecon.models.networks import UNet3d
 
 
 def gradients(model, x):

@@ -1,10 +1,10 @@
 """What a training's step keeps is told before the first, and refused where it cannot fit."""
 
 import pytest
+from mvrecon.engine.training_memory import check_training, step_bytes
 
 from mvrecon.config import compose
 from mvrecon.engine import fit, training_memory
-from mvrecon.engine.training_memory import check_training, step_bytes
 
 
 @pytest.fixture(scope="module")

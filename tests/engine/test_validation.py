@@ -6,13 +6,13 @@ from dataclasses import fields, replace
 import lightning.pytorch as L
 import pytest
 import torch
+from mvrecon.engine.on_case import joined
 from torch.utils.data import DataLoader
 
 from mvrecon.config import compose
 from mvrecon.engine import fit
 from mvrecon.engine.checkpoints import load
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.engine.on_case import joined
 
 CORRECTED = (
     "experiment=smoke",

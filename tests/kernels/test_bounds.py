@@ -10,8 +10,8 @@ import torch
 
 from mvrecon.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.rays.cpu import columns, plan
 from mvrecon.kernels.rays.cpu import operators as cpu
-from mvrecon.kernels.rays.cpu import plan, upright
 from mvrecon.projectors.radon import Radon
 
 N = 24
@@ -52,7 +52,7 @@ def test_rays_along_the_end_of_a_box_stay_inside_its_copy(by, turn, method, dtyp
     """
     if by == "rows":
         monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
-        monkeypatch.setattr(plan, "columnar", lambda rig: upright.columnar(rig) & False)
+        monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
     for slope in SLOPES:
         for low in (4, 5):
             x = torch.zeros(1, 1, N, N, N, dtype=dtype)

@@ -10,7 +10,7 @@ import torch
 from mvrecon.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import ops, reference
-from mvrecon.kernels.rays.cpu import columns, packed_volume, plan, upright
+from mvrecon.kernels.rays.cpu import columns, packed_volume, plan
 from mvrecon.kernels.rays.cpu import operators as cpu
 from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room_of
 from mvrecon.kernels.rays.cpu.rig import Reads, Slabs, Units, rig_of
@@ -59,7 +59,7 @@ def test_upright_columns_are_walked_once_for_all_of_their_rays(monkeypatch):
         assert walked == {"project_columns": 8 * 48, "backproject_columns": 2 * slabs}
         walked.clear()
         monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
-        monkeypatch.setattr(plan, "columnar", lambda rig: upright.columnar(rig) & False)
+        monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
         for one, other in zip((A(x), A.T(y)), results, strict=True):
             assert (one - other).norm() < 1e-12 * other.norm()
         assert walked.keys() == {"project_rows", "backproject_slabs"}

@@ -5,8 +5,8 @@ import pytest
 
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.rays.cpu.footprint import projection_matrix
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.kernels.rays.projection_matrix import projection_matrix
 from tests.projectors.rigs import CONE, GRID, PARALLEL
 
 BODY = Grid.centred(size=(10, 8, 9), spacing=22.0)

@@ -18,8 +18,7 @@ from mvrecon.models.pooling import leave_one_out
 from mvrecon.models.start import Beginning
 from mvrecon.models.view_frames import coarsened
 from mvrecon.parts import CAMERAS, PROJECTORS
-from mvrecon.projectors.attenuated import AttenuatedTransform
-from mvrecon.projectors.operator import PerSample, Scaled
+from mvrecon.projectors.operator import Scaled
 from mvrecon.reconstructors.iterative import SirtWeights, sirt, sirt_weights
 from mvrecon.testing import check_method
 from tests.models.rig import SMALL, ball, blob, small, small_projector, small_rig, stirred
@@ -366,29 +365,6 @@ def test_expectation_maximisation_at_the_end_keeps_the_counts():
         out = method(counts, A)
         assert A(out.volume).sum().item() == pytest.approx(counts.sum().item(), rel=1e-4)
         assert out.entry is not None
-
-
-@torch.no_grad()
-def test_attenuation_reaches_the_frusta_and_belongs_to_its_sample():
-    grid, cameras = small_rig()
-    maps = [0.02 * blob(small_projector())[0, 0], torch.zeros(grid.shape), None]
-    A, empty, plain = (
-        PROJECTORS.build("drr", grid=grid, cameras=cameras)
-        if mu is None
-        else AttenuatedTransform(grid, cameras, mu)
-        for mu in maps
-    )
-    other = AttenuatedTransform(grid, cameras, 2 * maps[0])
-    method, volume = stirred("cross_view"), blob(A)
-    both = PerSample([A, other])
-    views = both(volume)
-    out = method(views, both).volume
-    for i, B in enumerate((A, other)):
-        own = method(views[i : i + 1], B).volume
-        torch.testing.assert_close(out[i : i + 1], own, rtol=1e-4, atol=1e-5)
-    frames = [method.estimates.frames(Geometry.of(B)) for B in (A, empty, plain)]
-    assert frames[0].transmission is not None and frames[0].transmission.min() < 0.9
-    assert frames[1].transmission is None and frames[2].transmission is None
 
 
 @torch.no_grad()

@@ -2,36 +2,33 @@
 
 import math
 
-import pytest
 import torch
-from torch.nn.functional import avg_pool3d
 
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import circular, parallel
-from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.models.cross_view import PerViewEstimates
+from mvrecon.cameras.rigs import parallel
+from mvrecon.geometry.grid import Grid
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.geometry import Geometry
 from mvrecon.models.view_frames import LEAST, ViewFrames, means, transmission
 from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.attenuated import AttenuatedTransform
-from mvrecon.projectors.drr import Drr
-from tests.models.rig import small_projector, small_rig
-
-WATER = 0.01536
-GRID = Grid.centred(32, spacing=6.0)
-DETECTOR = {"pixels": [12, 12], "pixel_mm": [24.0, 24.0]}
-RIGS = {
-    "pinholes": lambda: dcspect80(pixels=[12, 12], columns=[0, 7, 13], rows=[0, 2]),
-    "cone": lambda: circular(3, sid=400.0, sdd=600.0, detector=DETECTOR),
-    "parallel": lambda: parallel(3, detector={"pixels": [12, 12], "pixel_mm": [14.0, 14.0]}),
-}
+from mvrecon.projectors.operator import PerSample, Wrapped
+from tests.models.rig import blob, small_projector, small_rig
 
 
-def ball(radius, at=(0.0, 0.0, 0.0)):
-    """A smooth ball of 1 on the grid, at a place (x, y, z) in mm."""
-    far = (voxel_centres(GRID).double() - torch.tensor(at)).norm(dim=-1)
-    return torch.sigmoid((radius - far) / 4.0)[None, None]
+class Attenuating(Wrapped):
+    """An operator with an attenuation map, in 1/mm; what it computes does not matter here."""
+
+    def __init__(self, A, mu):
+        super().__init__(A)
+        self.register_buffer("mu", mu)
+
+    def forward(self, x):
+        return self.A(x)
+
+    def adjoint(self, y):
+        return self.A.adjoint(y)
+
+    def attenuation(self):
+        return self.mu
 
 
 def test_a_cell_beyond_the_detector_is_where_its_pixels_would_be():
@@ -64,37 +61,31 @@ def test_the_mean_along_a_ray_lies_between_the_weights_and_is_that_of_dense_voxe
     assert thick.any() and means[thick].min() > 1.9
 
 
-@pytest.mark.parametrize("rig", RIGS)
-def test_the_transmitted_density_of_a_frustum_sums_to_the_attenuated_view(rig):
-    cameras, emission, mu = RIGS[rig](), ball(45.0, (20.0, -10.0, 5.0)), WATER * ball(80.0)
-    frusta = Frusta.of(GRID, cameras, 64)
-    frusta = frusta.to(torch.float64)
-    density = frusta.to_frusta(emission[:, None]) * frusta.occupied
-    views = AttenuatedTransform(GRID, cameras, mu[0, 0])(emission)
-    seen = frusta.integrate(density * transmission(frusta, mu))
-    assert (seen - views).norm() < 0.015 * views.norm()
-    assert (frusta.integrate(density) - views).norm() > 0.5 * views.norm()
-
-
 def test_a_bin_has_the_transmission_that_its_depth_gives_it():
-    """exp(-mu D) of the bins beyond it, and (1 - exp(-mu D)) / (mu D) of its own."""
-    frusta = Frusta.of(GRID, RIGS["parallel"](), 32)
-    share = transmission(frusta, WATER * torch.ones(1, 1, *GRID.shape))[0, 0, 0, :, 6, 6]
-    size = WATER * 6.0
+    """exp(-mu D) of the bins beyond it, and (1 - exp(-mu D)) / (mu D) of its own; of the last bins
+    at least `LEAST`.
+    """
+    grid = Grid.centred(32, spacing=6.0)
+    detector = {"pixels": [12, 12], "pixel_mm": [14.0, 14.0]}
+    frusta = Frusta.of(grid, parallel(3, detector=detector), 32)
+    mu = 0.01536
+    share = transmission(frusta, torch.full((1, 1, *grid.shape), mu))[0, 0, 0, :, 6, 6]
+    size = mu * 6.0
     expected = torch.exp(-size * torch.arange(31, -1, -1)) * -math.expm1(-size) / size
     torch.testing.assert_close(share[2:-2], expected[2:-2], rtol=0.06, atol=0)
     torch.testing.assert_close(share[3:-2] / share[2:-3], share.new_full((27,), math.exp(size)))
+    assert transmission(frusta, torch.full((1, 1, *grid.shape), 0.2)).min() == LEAST
 
 
 def test_attenuation_is_undone_and_nothing_is_divided_by_next_to_nothing():
-    cameras = RIGS["cone"]()
-    lead = AttenuatedTransform(GRID, cameras, torch.full(GRID.shape, 0.099))
+    A = small_projector()
+    lead = Attenuating(A, torch.full((12, 12, 12), 0.5))
     frames = ViewFrames.of(Geometry.of(lead), 0, 1, 8)
     assert frames.transmission.min() == LEAST
-    density = torch.rand(1, 3, 1, *frames.frusta.shape)
+    density = torch.rand(1, 4, 1, *frames.frusta.shape)
     torch.testing.assert_close(frames.emitted(density) * frames.transmission, density)
-    integrals = torch.rand(1, 1, 3, 12, 12) * (frames.frusta.chord[:, 0, 0] > 0)
-    plain = ViewFrames.of(Geometry.of(Drr(GRID, cameras)), 0, 1, 8)
+    integrals = torch.rand(1, 1, 4, 12, 12) * (frames.frusta.chord[:, 0, 0] > 0)
+    plain = ViewFrames.of(Geometry.of(A), 0, 1, 8)
     for each in (frames, plain):
         even = each.spread(integrals)
         share = 1 if each.transmission is None else each.transmission
@@ -102,27 +93,11 @@ def test_attenuation_is_undone_and_nothing_is_divided_by_next_to_nothing():
     assert plain.emitted(density) is density
 
 
-@torch.no_grad()
-def test_a_start_that_is_too_faint_is_raised_by_its_lack_at_any_depth():
-    """As well through attenuating matter as without it."""
-    cameras = dcspect80(pixels=[16, 16], columns=[0, 7, 13], rows=[0, 2])
-    truth = ball(25.0, (-40.0, 30.0, 0.0)).float()
-    estimates = PerViewEstimates((4,), 0, 1, 32, 1, "softmax_depth")  # as before training
-    expected, errors = avg_pool3d(truth, 2)[:, None], []
-    for density in (0.0, WATER):
-        A = 2.0 * AttenuatedTransform(GRID, cameras, density * ball(85.0)[0, 0].float())
-        g, views, x = Geometry.of(A), A(truth), 0.7 * truth
-        r = views - A(x)
-        change, *_ = estimates(estimates.frames(g), g, views, r, x, g.direction(r))
-        error = avg_pool3d(x, 2)[:, None] + change - expected
-        errors.append((error.norm() / expected.norm()).item() / 6**0.5)
-    assert errors[1] < 1.2 * errors[0]
-
-
-def test_only_matter_that_attenuates_has_a_transmission():
-    cameras = RIGS["pinholes"]()
-    nothing = AttenuatedTransform(GRID, cameras, torch.zeros(GRID.shape))
-    assert nothing.attenuation() is None and Drr(GRID, cameras).attenuation() is None
-    A = 2.0 * AttenuatedTransform(GRID, cameras, torch.full(GRID.shape, WATER))
-    assert torch.equal(A.attenuation(), A.A.mu)
-    assert ViewFrames.of(Geometry.of(A), 1, 3, 4).transmission is not None
+def test_the_transmission_is_that_of_an_operator_of_each_sample_s_own():
+    A, mu = small_projector(), 0.03 * blob(small_projector())[0, 0]
+    each = [Attenuating(A, factor * mu) for factor in (1.0, 2.0)]
+    both = ViewFrames.of(Geometry.of(PerSample(each)), 1, 3, 8).transmission
+    alone = [ViewFrames.of(Geometry.of(B), 1, 3, 8).transmission for B in each]
+    torch.testing.assert_close(both, torch.cat(alone))
+    assert both[1].min() < both[0].min() < 0.9
+    assert ViewFrames.of(Geometry.of(A), 1, 3, 8).transmission is None

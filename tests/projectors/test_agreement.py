@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays.cpu import plan, upright
+from mvrecon.kernels.rays.cpu import columns, plan
 from mvrecon.kernels.rays.cpu.rig import rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.projectors.cases import CASES, OPTIONS, UPRIGHT, Case, gap, noise
@@ -22,7 +22,7 @@ def oblique(monkeypatch):
 
     def send() -> None:
         monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
-        monkeypatch.setattr(plan, "columnar", lambda rig: upright.columnar(rig) & False)
+        monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
 
     return send
 
@@ -31,7 +31,7 @@ def test_the_cases_stand_upright_where_they_say_so():
     for kind, case in CASES.items():
         A = case.build()
         rig = rig_of(A.lines, A.ray_extent, Occupancy.whole(case.grid.shape), A.detector, "joseph")
-        assert upright.columnar(rig).tolist() == [case.upright] * len(A.lines), kind
+        assert columns.columnar(rig).tolist() == [case.upright] * len(A.lines), kind
 
 
 @pytest.mark.parametrize("option", OPTIONS)

@@ -10,8 +10,8 @@ from mvrecon.cameras.rigs import dome
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import reference
-from mvrecon.kernels.rays.cpu import nonzero, plan, skip_policy
-from mvrecon.kernels.rays.cpu.nonzero import bricks_of
+from mvrecon.kernels.rays.cpu import plan, skip_policy
+from mvrecon.kernels.rays.cpu.skip_policy import bricks_of, readable
 from mvrecon.kernels.rays.occupancy import EDGE
 from tests.projectors.cases import Case
 from tests.projectors.sparse import CASES, volumes
@@ -91,14 +91,12 @@ class Counted(np.ndarray):
 def test_of_a_full_volume_few_voxels_are_looked_at(monkeypatch):
     """A row of each face of its box, and one voxel of each of a few hundred bricks."""
     for name in ("inward", "look", "_face_holds", "_brick_holds", "_stride"):
-        monkeypatch.setattr(nonzero, name, getattr(nonzero, name).py_func)
+        monkeypatch.setattr(skip_policy, name, getattr(skip_policy, name).py_func)
     monkeypatch.setattr(
         skip_policy, "bricks_of", lambda *_: pytest.fail("all voxels are looked at")
     )
     Counted.reads = 0
-    monkeypatch.setattr(
-        skip_policy, "readable", lambda volumes: nonzero.readable(volumes).view(Counted)
-    )
+    monkeypatch.setattr(skip_policy, "readable", lambda volumes: readable(volumes).view(Counted))
     case = CASES["cone"]
     A = replace(case, grid=Grid.centred((64, 64, 64), 1.0)).build(skip="auto")
     full = torch.rand(1, 64, 64, 64) + 0.1

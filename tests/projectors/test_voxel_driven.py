@@ -8,7 +8,7 @@ import torch
 from mvrecon.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.kernels.voxels import ops as voxel_ops
-from mvrecon.kernels.voxels.columns import upright
+from mvrecon.kernels.voxels.cpu import upright
 from mvrecon.projectors.voxel_driven import backproject, image_maps
 from tests.projectors.cases import gap
 from tests.projectors.rigs import CENTRAL, CONE, GRID, PARALLEL, PINHOLES
@@ -28,9 +28,9 @@ def test_compiled_equals_the_reference_and_its_transpose_is_exact(kind, weight):
         exact = backproject(y, rig, GRID, weight, "reference")
         assert exact.norm() > 0.1 and (seen - exact).norm() < tolerance * exact.norm()
         x = torch.randn_like(seen)
-        back = voxel_ops.show(x.flatten(0, 1), maps, window, weighted, list(rig.shape)).unflatten(
-            0, (2, 2)
-        )
+        back = voxel_ops.project(
+            x.flatten(0, 1), maps, window, weighted, list(rig.shape)
+        ).unflatten(0, (2, 2))
         assert ((seen * x).sum() - (y * back).sum()).abs() < tolerance * seen.norm() * x.norm()
 
 
@@ -64,7 +64,7 @@ def test_upright_columns_equal_the_reference_and_their_transpose_is_exact(kind, 
             assert exact.norm() > 0.1 and (seen - exact).norm() < tolerance * exact.norm()
         x = torch.randn(2, *TALL.shape, dtype=torch.float64)
         arguments = list(rig.ray_extent), weight == "distance", list(rig.shape)
-        back = voxel_ops.show(x, image_maps(cameras, TALL), *arguments)
+        back = voxel_ops.project(x, image_maps(cameras, TALL), *arguments)
         seen = backproject(y.double(), cameras, TALL, weight, "cpu")[:, 0]
         total = (y.double()[:, 0] * back).sum()
         assert ((seen * x).sum() - total).abs() < 1e-12 * seen.norm() * x.norm()
@@ -172,17 +172,23 @@ def test_torch_accepts_the_operators_and_compiles_and_maps_them():
     x = torch.randn(2, *GRID.shape, dtype=torch.float64, requires_grad=True)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(
-        torch.ops.mvrecon.look.default, (y, maps, window, True, shape), test_utils=checks
+        torch.ops.mvrecon.voxel_backproject.default,
+        (y, maps, window, True, shape),
+        test_utils=checks,
     )
     torch.library.opcheck(
-        torch.ops.mvrecon.show.default, (x, maps, window, True, list(CONE.shape)), test_utils=checks
+        torch.ops.mvrecon.voxel_project.default,
+        (x, maps, window, True, list(CONE.shape)),
+        test_utils=checks,
     )
-    mapped = torch.func.vmap(lambda y: voxel_ops.look(y, maps, window, True, shape), in_dims=1)
+    mapped = torch.func.vmap(
+        lambda y: voxel_ops.backproject(y, maps, window, True, shape), in_dims=1
+    )
     several = torch.randn(2, 3, 4, *CONE.shape)
-    one = voxel_ops.look(several[:, 1], maps, window, True, shape)
+    one = voxel_ops.backproject(several[:, 1], maps, window, True, shape)
     assert torch.equal(mapped(several)[1], one)
     compiled = torch.compile(
-        lambda y: voxel_ops.look(2 * y, maps, window, True, shape),
+        lambda y: voxel_ops.backproject(2 * y, maps, window, True, shape),
         fullgraph=True,
         backend="aot_eager",
     )
@@ -199,7 +205,7 @@ def test_threads_change_no_bit(monkeypatch):
     maps, window, results = image_maps(CONE, GRID), list(CONE.ray_extent), []
     for count in (1, 2, 3, 7):
         torch.set_num_threads(count)
-        back = voxel_ops.show(x, maps, window, True, list(CONE.shape))
+        back = voxel_ops.project(x, maps, window, True, list(CONE.shape))
         results.append((backproject(y, CONE, GRID, "distance", "cpu"), back))
         tall = torch.linspace(0, 1, 4 * 11 * 12).sin().reshape(1, 1, 4, 11, 12)
         results[-1] += (backproject(tall, UPRIGHT["cone"][:4], TALL, "distance", "cpu"),)

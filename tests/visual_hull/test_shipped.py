@@ -23,10 +23,8 @@ def shipped(kind: str) -> dict[str, dict[str, Any]]:
 
 
 SCENE, RIG = shipped("scene"), shipped("camera")
-#: A slice goes on beyond every detector, and a torso or a phantom as wide as the grid fills it: no
-#: view bounds them in a volume.
-for unbounded in ("breast", "cardiac", "defrise", "nema"):
-    del SCENE[unbounded]
+#: A phantom as wide as the grid fills it: no view bounds it in a volume.
+del SCENE["defrise"]
 #: For a grid of 16^3: its rays are farther apart than the voxels below.
 del RIG["circular_small"]
 

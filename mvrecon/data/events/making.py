@@ -145,8 +145,7 @@ class EventMaker:
         }
         if self.volumes is not None:
             arrays["backprojection"] = self.volumes(number, dose).numpy()
-        if sample.mu is not None:
-            arrays["mu"] = sample.mu[0].numpy()
+        arrays |= {name: values[0].numpy() for name, values in sample.maps.items()}
         if self.sinograms is not None:
             fine = seen.fine if seen.fine is not None else self._finer(index)
             arrays["radon"] = self.sinograms(fine).numpy()

@@ -12,7 +12,7 @@ import h5py
 import torch
 from torch.utils.data import Dataset
 
-from mvrecon.data.events.shards import EXPECTED, NEEDED, OPTIONAL, checked, header_of
+from mvrecon.data.events.shards import EXPECTED, checked, header_of
 from mvrecon.data.hdf5_reading import reading
 from mvrecon.data.storage import check_chunks
 from mvrecon.files.checks import Refused, blaming
@@ -26,8 +26,8 @@ OPEN = 16
 class Events(Dataset[dict[str, Any]]):
     """Events in the files of a folder, read one at a time, in whichever process asks.
 
-    An item has, as float32 with a channel first, what `names` says of "truth", "mu",
-    "backprojection" [1 d h w], "ideal", "counts" [1 m v u] and "radon" [1 a z s]; also "dose" and
+    An item has, as float32 with a channel first, what `names` says of "truth", "backprojection",
+    the scene's maps [1 d h w], "ideal", "counts" [1 m v u] and "radon" [1 a z s]; also "dose" and
     "pose" [k] (float64), "index". Columns of "pose": `columns`.
 
     Args:
@@ -115,7 +115,7 @@ class Events(Dataset[dict[str, Any]]):
 
     def _kinds_of(self, shard: int) -> dict[str, tuple[int, ...]]:
         arrays = self._arrays(shard)
-        return {name: arrays[name].shape[1:] for name in NEEDED | OPTIONAL if name in arrays}
+        return {name: array.shape[1:] for name, array in arrays.items()}
 
 
 def _tensor(values: Any) -> torch.Tensor:

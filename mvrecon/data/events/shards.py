@@ -6,9 +6,9 @@
     dose     [n]         expected counts per unit of `ideal` as the detector sees it
     index    [n]         of the event in its series
     radon    [n a z s]   optional: sinograms of the slices, activity * mm
-    mu       [n d h w]   optional: attenuation in 1/mm
     pose     [n k]       optional: what was drawn, named by the header's `columns`
     backprojection [n d h w]  optional: A^T counts / (dose A^T 1), for networks in the volume
+    others   [n d h w]   optional: the maps of the scene by name, such as attenuation in 1/mm
 
 The attribute `header` is JSON: `format`, and the fields of `Header`.
 """
@@ -30,10 +30,12 @@ from mvrecon.files.checks import Refused, blaming, shown
 
 EXPECTED = "a file of events: HDF5 with truth [n d h w], ideal and counts [n m v u], dose, index"
 KIND = "mvrecon events 1"
-#: Arrays of every file, and those that it may have, with their number of axes and kind of number.
+#: Arrays of every file, and those that it may have, with their number of axes and kind of number;
+#: any other one is a map.
 NEEDED = {"truth": (4, "f"), "ideal": (4, "f"), "counts": (4, "u"), "dose": (1, "f")}
 NEEDED["index"] = (1, "i")
-OPTIONAL = {"radon": (4, "f"), "mu": (4, "f"), "pose": (2, "f"), "backprojection": (4, "f")}
+OPTIONAL = {"radon": (4, "f"), "pose": (2, "f"), "backprojection": (4, "f")}
+MAP = (4, "f")
 #: Level of gzip: higher ones save 2 % of a file and cost several times the time.
 LEVEL = 1
 #: Most bytes of a header.
@@ -118,10 +120,10 @@ def checked(path: Path, file: h5py.File) -> dict[str, h5py.Dataset]:
         Refused: arrays that are missing, of another type or of another number of
             events; signed counts, which could be negative.
     """
-    names = [*NEEDED, *(name for name in OPTIONAL if name in file)]
+    names = [*NEEDED, *(name for name in file if name not in NEEDED)]
     arrays = {name: dataset_in(path, file, name, EXPECTED) for name in names}
     for name, array in arrays.items():
-        axes, kind = (NEEDED | OPTIONAL)[name]
+        axes, kind = (NEEDED | OPTIONAL).get(name, MAP)
         if array.ndim != axes or array.dtype.kind != kind or len(array) != len(arrays["index"]):
             raise Refused(
                 f"{path}: has {name} as {array.dtype} {array.shape}; expected "

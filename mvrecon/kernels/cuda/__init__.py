@@ -1,1 +1,1 @@
-"""Kernels of CUDA devices that have a thread a voxel, a sample or a pixel."""
+"""CUDA: compiling, keeping and launching kernels, and those with a thread a voxel or a sample."""

@@ -2,18 +2,49 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mvrecon.geometry.box import bricks_along
-from mvrecon.kernels.cuda.field import Field
-from mvrecon.kernels.cuda.launching import blocks, numbers_of, start
-from mvrecon.kernels.cuda.sources import Part
-from mvrecon.kernels.footprints import Prints, Rule
+from mvrecon.kernels.cuda.launch import Field, Variant, blocks, numbers_of, start
 
-PART = Part("hull", torch.float64)
+HULL = Variant("hull", torch.float64)
+
+
+class Prints(NamedTuple):
+    """The views' footprints.
+
+    Args:
+        numbers: of each view the map [3 4] from voxels about the grid's centre to (u w, v w, w), of
+            parallel beams (u, v, w); by how many pixels (u, v) a footprint is wider than its
+            brick's image; the part of a ray that this takes; by how many pixels (u, v) more it is
+            grown. float64.
+        window: which part of a ray counts.
+        parallel: whether the beams are.
+    """
+
+    numbers: Float[Tensor, "m 17"]
+    window: Sequence[float]
+    parallel: bool
+
+
+class Rule(NamedTuple):
+    """When a brick is empty.
+
+    Args:
+        edge: of a brick in voxels.
+        reach: voxels by which interpolation carries a value beyond the faces of its voxel.
+        enough: views that must agree.
+        keep_unseen: whether bricks stay that no view sees whole and none shows.
+    """
+
+    edge: int
+    reach: float
+    enough: int
+    keep_unseen: bool
 
 
 def judge(
@@ -27,7 +58,7 @@ def judge(
     sums, numbers = tables.to(torch.int32).contiguous(), numbers_of(prints.numbers)
     field = _field(sums, numbers, prints, shape, rule.edge)
     field.put(result=kept, **rule._asdict())
-    start(PART, "judge", field, tables, blocks(math.prod(counts)), len(tables))
+    start(HULL, "judge", field, tables, blocks(math.prod(counts)), len(tables))
     return kept
 
 
@@ -47,7 +78,7 @@ def count(
     sums, numbers = tables.to(torch.int64).contiguous(), numbers_of(prints.numbers)
     field = _field(sums, numbers, prints, shape, edge)
     field.put(result=counts, sources=part.start, items=len(part), edge=edge, reach=reach)
-    start(PART, "count", field, tables, blocks(len(part)), items)
+    start(HULL, "count", field, tables, blocks(len(part)), items)
     return counts
 
 

@@ -1,25 +1,184 @@
-"""The compiled steps of the total variation on the CPU. Every result is the same to the last bit
-for any number of threads: a thread owns slices, and a voxel's terms are added in one order.
+"""The compiled steps of the total variation on the CPU: primal volumes and dual fields. Every
+result is the same to the last bit for any number of threads: a thread owns slices, and a voxel's
+terms are added in one order.
+
+A row's neighbour behind the last one of an axis is the row itself, so that the difference is zero.
+Loops have one array to write, or the compiler makes no vectors of them.
 """
 
 from collections.abc import Sequence
+from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.differences.loops import (
-    Dual,
-    Primal,
-    Room,
-    dual_slabs,
-    dual_slices,
-    first_slices,
-    primal_slices,
-)
-from mvrecon.kernels.differences.shrinkage import Shrinkage, Stride
-from mvrecon.kernels.threads import share
+from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon.kernels.differences.reference import Shrinkage, Stride
+from mvrecon.kernels.threads import parallel_for
+
+
+class Dual(NamedTuple):
+    """A dual field beyond its values, p + momentum (p - q), and where its step leads.
+
+    Args:
+        values: p [3 n d h w].
+        last: the values before them, q; p itself where the momentum is zero. A step is written
+            over them.
+        momentum: without unit.
+        rates: step length / voxel size along (z, y, x).
+        one: 1 as the fields' type of number.
+    """
+
+    values: np.ndarray
+    last: np.ndarray
+    momentum: np.floating
+    rates: tuple[np.floating, np.floating, np.floating]
+    one: np.floating
+
+
+class Primal(NamedTuple):
+    """What makes a volume of a dual field, z - strength D^T p, clipped.
+
+    Args:
+        volume: z [n d h w].
+        strength: [d h w].
+        slopes: 1 / voxel size along (z, y, x).
+        least: no value below it.
+    """
+
+    volume: np.ndarray
+    strength: np.ndarray
+    slopes: tuple[np.floating, np.floating, np.floating]
+    least: np.floating
+
+
+class Room(NamedTuple):
+    """Memory of a thread's own: rows of a field [3 w], of sizes [w], and two slices [2 h w]."""
+
+    field: np.ndarray
+    size: np.ndarray
+    slices: np.ndarray
+
+
+@scalar
+def _add(p, q, momentum, factor, out):
+    """Add the factor times a row of p + momentum (p - q)."""
+    for x in range(len(out)):
+        out[x] += factor * (p[x] + momentum * (p[x] - q[x]))
+
+
+@scalar
+def _primal_row(dual, primal, n, z, y, out):
+    """Write a row of the primal volume; D^T first."""
+    p, q, momentum, slopes = dual.values, dual.last, dual.momentum, primal.slopes
+    out[:] = 0
+    inner = len(out) - 1
+    _add(p[2, n, z, y, :inner], q[2, n, z, y, :inner], momentum, -slopes[2], out[:inner])
+    _add(p[2, n, z, y, :inner], q[2, n, z, y, :inner], momentum, slopes[2], out[1:])
+    if y + 1 < p.shape[3]:
+        _add(p[1, n, z, y], q[1, n, z, y], momentum, -slopes[1], out)
+    if y > 0:
+        _add(p[1, n, z, y - 1], q[1, n, z, y - 1], momentum, slopes[1], out)
+    if z + 1 < p.shape[2]:
+        _add(p[0, n, z, y], q[0, n, z, y], momentum, -slopes[0], out)
+    if z > 0:
+        _add(p[0, n, z - 1, y], q[0, n, z - 1, y], momentum, slopes[0], out)
+    volume, strength, least = primal.volume[n, z, y], primal.strength[z, y], primal.least
+    for x in range(len(out)):
+        value = volume[x] - strength[x] * out[x]
+        out[x] = least if value < least else value
+
+
+@scalar
+def _ahead(p, q, momentum, rate, after, before, out):
+    """Write a row of p + momentum (p - q) + rate (after - before)."""
+    for x in range(len(out)):
+        out[x] = p[x] + momentum * (p[x] - q[x]) + rate * (after[x] - before[x])
+
+
+@scalar
+def _dual_rows(dual, above, below, room, n, z):
+    """Write slice z of a field's step: along the gradient of the volume between the slices `above`
+    and `below` [h w], vectors longer than 1 shortened to 1.
+    """
+    p, q, momentum, rates, one = dual
+    field, size = room.field, room.size
+    height, width = above.shape
+    for y in range(height):
+        row, after = above[y], above[min(y + 1, height - 1)]
+        _ahead(p[0, n, z, y], q[0, n, z, y], momentum, rates[0], below[y], row, field[0])
+        _ahead(p[1, n, z, y], q[1, n, z, y], momentum, rates[1], after, row, field[1])
+        inner, px, qx = width - 1, p[2, n, z, y], q[2, n, z, y]
+        _ahead(px, qx, momentum, rates[2], row[1:], row, field[2, :inner])
+        field[2, inner] = px[inner] + momentum * (px[inner] - qx[inner])
+        for x in range(width):
+            square = field[0, x] ** 2 + field[1, x] ** 2 + field[2, x] ** 2
+            size[x] = one / sqrt(max(square, one))
+        for axis in range(3):
+            new, old = q[axis, n, z, y], field[axis]
+            for x in range(width):
+                new[x] = old[x] * size[x]
+
+
+@compiled
+def primal_slices(dual, primal, out, first, last):
+    """Write the slices first to last, counted through (n, d), of the primal volumes [n d h w]."""
+    depth = out.shape[1]
+    for number in range(first, last):
+        n, z = number // depth, number % depth
+        for y in range(out.shape[2]):
+            _primal_row(dual, primal, n, z, y, out[n, z, y])
+
+
+@compiled
+def dual_slices(dual, volumes, room, first, last):
+    """Step the slices first to last, counted through (n, d), of a field along the gradient of
+    volumes [n d h w].
+    """
+    depth = volumes.shape[1]
+    for number in range(first, last):
+        n, z = number // depth, number % depth
+        _dual_rows(dual, volumes[n, z], volumes[n, min(z + 1, depth - 1)], room, n, z)
+
+
+@compiled
+def first_slices(dual, primal, thickness, heads, first, last):
+    """Write the slices with which slabs begin, first to last, counted through (n, slab), of the
+    primal volumes to `heads` [n slab h w].
+    """
+    slabs = heads.shape[1]
+    for number in range(first, last):
+        n, slab = number // slabs, number % slabs
+        for y in range(heads.shape[2]):
+            _primal_row(dual, primal, n, slab * thickness, y, heads[n, slab, y])
+
+
+@compiled
+def dual_slabs(dual, primal, thickness, heads, room, first, last):
+    """Step the slabs first to last, counted through (n, slab), of a field along the gradient of its
+    own primal volume, which is never stored.
+
+    A slice of the primal volume is made before the step writes over the slice of `last` above it;
+    the slices with which slabs begin are in `heads` [n slab h w].
+    """
+    slabs, depth = heads.shape[1], dual.values.shape[2]
+    for number in range(first, last):
+        n, slab = number // slabs, number % slabs
+        begin, end = slab * thickness, min(depth, (slab + 1) * thickness)
+        above = heads[n, slab]
+        for z in range(begin, end):
+            if z + 1 < end:
+                below = room.slices[z % 2]
+                for y in range(below.shape[0]):
+                    _primal_row(dual, primal, n, z + 1, y, below[y])
+            else:
+                below = heads[n, slab + 1] if end < depth else above
+            _dual_rows(dual, above, below, room, n, z)
+            above = below
+
 
 #: Slices of a slab; one more is computed for it.
 THICKNESS = 16
@@ -75,7 +234,7 @@ def primal(
     def work(first: int, last: int) -> None:
         primal_slices(of, to, flat, first, last)
 
-    share(work, len(flat) * flat.shape[1], flat.size)
+    parallel_for(work, len(flat) * flat.shape[1], flat.size)
     return out
 
 
@@ -92,7 +251,7 @@ def dual_step(
     def work(first: int, last: int) -> None:
         dual_slices(of, flat, _room(flat), first, last)
 
-    share(work, len(flat) * flat.shape[1], flat.size)
+    parallel_for(work, len(flat) * flat.shape[1], flat.size)
     return dual
 
 
@@ -116,6 +275,6 @@ def proximal_step(
     def work(first: int, end: int) -> None:
         dual_slabs(of, to, THICKNESS, heads, _room(to.volume), first, end)
 
-    share(begin, batch * slabs, heads.size)
-    share(work, batch * slabs, to.volume.size)
+    parallel_for(begin, batch * slabs, heads.size)
+    parallel_for(work, batch * slabs, to.volume.size)
     return last

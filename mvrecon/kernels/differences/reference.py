@@ -5,12 +5,38 @@ none, so that a volume of one slice has the total variation of an image.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.differences.shrinkage import Shrinkage, Stride
+
+class Shrinkage(NamedTuple):
+    """How far the proximal map of the total variation may shrink each voxel.
+
+    Args:
+        strength: weight times the step's metric, in the unit of the volume times mm; it broadcasts
+            to volumes, and is zero where a voxel stays as it is.
+        steps: voxel size along (z, y, x), in mm.
+        nonnegative: clip at zero.
+    """
+
+    strength: Float[Tensor, "1 1 #d #h #w"]
+    steps: Sequence[float]
+    nonnegative: bool
+
+
+class Stride(NamedTuple):
+    """A step of the dual field.
+
+    Args:
+        rate: its length, in mm by the unit of the volume.
+        momentum: how far it begins beyond the field, as a share of the way from the field before.
+    """
+
+    rate: float
+    momentum: float = 0.0
 
 
 def gradient(

@@ -1,179 +1,57 @@
-"""Attenuated projections as torch operators: opaque to `torch.compile`, with derivatives in
-emission and attenuation.
+"""Attenuated projection, its transpose, and its derivative by the attenuation mu.
 
+Emission that is zero is left out, which changes no bit, but for a method with the suffix `DENSE`.
 CPU and CUDA devices have kernels for a single attenuation and rays without a gradient; all else is
 the reference's.
 """
 
-from collections.abc import Sequence
-from functools import partial
-
 import torch
-from torch import Tensor
 
-from mvrecon.kernels.derivatives import bent, curved, linear, transposed
+from mvrecon.kernels.operator import LinearKernel
+from mvrecon.kernels.precision import arithmetic
 from mvrecon.kernels.rays import attenuated_reference as reference
 from mvrecon.kernels.rays.occupancy import DENSE
-
-# numba is heavy, so the kernels are imported at their first call
-
-
-@torch.library.custom_op("mvrecon::project_attenuated", mutates_args=(), device_types="cpu")
-def _project(
-    volume: Tensor,
-    mu: Tensor,
-    lines: Tensor,
-    layers: Tensor,
-    window: Sequence[float],
-    detector: Sequence[int],
-    method: str,
-) -> Tensor:
-    """Attenuated integrals of volumes [n d h w] as views [n m v u k]."""
-    from mvrecon.kernels.rays.cpu import attenuated as cpu
-
-    return cpu.project(volume, mu, lines, layers, window, detector, method)
+from mvrecon.kernels.rays.ops import tiny_scene
+from mvrecon.kernels.self_test import Errors
 
 
-@torch.library.custom_op("mvrecon::backproject_attenuated", mutates_args=(), device_types="cpu")
-def _backproject(
-    views: Tensor, mu: Tensor, lines: Tensor, layers: Tensor, window: Sequence[float], method: str
-) -> Tensor:
-    """The exact transpose of `project` in the emission: views [n m v u k] to volumes [n d h w]."""
-    from mvrecon.kernels.rays.cpu import attenuated as cpu
-
-    return cpu.backproject(views, mu, lines, layers, window, method)
-
-
-@torch.library.custom_op("mvrecon::attenuation_vjp", mutates_args=(), device_types="cpu")
-def _mu_vjp(
-    volume: Tensor,
-    views: Tensor,
-    mu: Tensor,
-    lines: Tensor,
-    layers: Tensor,
-    window: Sequence[float],
-    method: str,
-) -> Tensor:
-    """The derivative of <views, project(volume, mu)> by the attenuation mu [d h w]."""
-    from mvrecon.kernels.rays.cpu import attenuated as cpu
-
-    return cpu.mu_vjp(volume, views, mu, lines, layers, window, method).to(mu.dtype)
-
-
-@_project.register_kernel("cuda")
-def _(volume, mu, lines, layers, window, detector, method):
-    from mvrecon.kernels.rays.cuda import attenuated as cuda
-
-    return cuda.project(volume, mu, lines, layers, window, detector, method.removesuffix(DENSE))
-
-
-@_backproject.register_kernel("cuda")
-def _(views, mu, lines, layers, window, method):
-    from mvrecon.kernels.rays.cuda import attenuated as cuda
-
-    return cuda.backproject(views, mu, lines, layers, window, method.removesuffix(DENSE))
-
-
-@_mu_vjp.register_kernel("cuda")
-def _(volume, views, mu, lines, layers, window, method):
-    from mvrecon.kernels.rays.cuda import attenuated as cuda
-
-    method = method.removesuffix(DENSE)
-    return cuda.mu_vjp(volume, views, mu, lines, layers, window, method).to(mu.dtype)
-
-
-@_project.register_fake
-def _(volume, mu, lines, layers, window, detector, method):
-    wide = torch.float64 if volume.dtype == torch.float64 else torch.float32
-    return volume.new_empty(volume.shape[0], lines.shape[0], *detector, layers.shape[1], dtype=wide)
-
-
-@_backproject.register_fake
-def _(views, mu, lines, layers, window, method):
-    return views.new_empty(views.shape[0], *mu.shape)
-
-
-@_mu_vjp.register_fake
-def _(volume, views, mu, lines, layers, window, method):
-    return mu.new_empty(mu.shape)
-
-
-def _keep(ctx, inputs, output):
-    *rest, ctx.method = inputs
-    _remember(ctx, *rest)
-
-
-def _keep_project(ctx, inputs, output):
-    *rest, _, ctx.method = inputs
-    _remember(ctx, *rest)
-
-
-def _remember(ctx, first, mu, lines, layers, window):
-    ctx.window, ctx.dtype, ctx.detector = window, first.dtype, list(first.shape[2:4])
-    ctx.save_for_backward(first if ctx.needs_input_grad[1] else None, mu, lines, layers)
-
-
-def _project_back(ctx, views):
-    volume, mu, lines, layers = ctx.saved_tensors
-    by_volume = by_mu = None
-    if ctx.needs_input_grad[0]:
-        by_volume = backproject(views, mu, lines, layers, ctx.window, ctx.method).to(ctx.dtype)
-    if ctx.needs_input_grad[1]:
-        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method)
-    return by_volume, by_mu, *[None] * 5
-
-
-def _backproject_back(ctx, volume):
-    views, mu, lines, layers = ctx.saved_tensors
-    by_views = by_mu = None
-    if ctx.needs_input_grad[0]:
-        by_views = project(volume, mu, lines, layers, ctx.window, ctx.detector, ctx.method)
-    if ctx.needs_input_grad[1]:
-        by_mu = mu_vjp(volume, views, mu, lines, layers, ctx.window, ctx.method)
-    return by_views, by_mu, None, None, None, None
-
-
-def _in_torch(volume, mu, lines, layers, window, detector, method):
-    rays = {
-        "lines": lines,
-        "layers": layers,
-        "window": window,
-        "detector": detector,
-        "method": method.removesuffix(DENSE),
-    }
-    return partial(_act, **rays)
-
-
-def _act(volume, mu, **rays):
+def _project_in_torch(volume, mu, lines, layers, window, detector, method):
     return reference.project(
-        volume.to(torch.promote_types(volume.dtype, torch.float32)), mu, **rays
+        volume, mu, lines, layers, window, detector, method.removesuffix(DENSE)
     )
 
 
-def _back_in_torch(views, mu, lines, layers, window, method):
-    act = _in_torch(None, mu, lines, layers, window, views.shape[2:4], method)
-    return transposed(act, (len(views), *mu.shape))
+ATTENUATED = LinearKernel(
+    "project(Tensor volume, Tensor mu, Tensor lines, Tensor layers, float[] window, "
+    "SymInt[] detector, str method) -> Tensor",
+    "backproject(Tensor views, Tensor mu, Tensor lines, Tensor layers, float[] window, "
+    "str method) -> Tensor",
+    "mu_vjp(Tensor volume, Tensor views, Tensor mu, Tensor lines, Tensor layers, float[] window, "
+    "str method) -> Tensor",
+    {
+        "cpu": "mvrecon.kernels.rays.cpu.attenuated",
+        "cuda": "mvrecon.kernels.rays.cuda.attenuated",
+    },
+    _project_in_torch,
+    shapes=(
+        lambda volume, mu, lines, layers, window, detector, method: (
+            *(volume.shape[0], lines.shape[0]),
+            *(*detector, layers.shape[1]),
+        ),
+        lambda views, mu, *_: (views.shape[0], *mu.shape),
+    ),
+    sizes=(slice(1, 4), slice(2, 4)),
+    prefix="attenuated_",
+)
+project, backproject, mu_vjp = ATTENUATED.forward, ATTENUATED.transpose, ATTENUATED.vjp
 
 
-def _vjp_in_torch(volume, views, mu, lines, layers, window, method):
-    return bent(_in_torch(volume, mu, lines, layers, window, views.shape[2:4], method))
-
-
-_projected = linear(_project, _in_torch, _keep_project, _project_back)
-backproject = linear(_backproject, _back_in_torch, _keep, _backproject_back)
-mu_vjp = curved(_mu_vjp, _vjp_in_torch)
-
-
-def project(
-    volume: Tensor,
-    mu: Tensor,
-    lines: Tensor,
-    layers: Tensor,
-    window: Sequence[float],
-    detector: Sequence[int],
-    method: str,
-) -> Tensor:
-    """Attenuated line integrals; see `attenuated_reference.project`. Emission that is zero is left
-    out, which changes no bit, but for a method with the suffix `DENSE`.
-    """
-    return _projected(volume, mu, lines, layers, window, detector, method)
+def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
+    """Views in two layers, by either method."""
+    lines, window, detector, shape = tiny_scene(device)
+    generator, real = torch.Generator().manual_seed(0), arithmetic(dtype)
+    x = torch.rand(2, *shape, generator=generator).to(device, real)
+    mu = (0.2 * torch.rand(shape, generator=generator)).to(device, real)
+    layers = torch.tensor([[1.2, 2.5]], dtype=torch.float64).expand(len(lines), -1).to(device)
+    for method in reference.CELLS:
+        yield from ATTENUATED.self_test(x, mu, lines, layers, window, detector, method)

@@ -20,13 +20,17 @@ from torch import Tensor
 from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.devices import beside
 
 #: The four linear maps of a view in `lines_of`.
 DIRECTION, MOMENT, START, WORLD = range(4)
 #: Axes whose components differ by less than this part tie; the first of them is the main axis, in
 #: every back end.
 TIE = 1e-12
+
+
+def beside(tensor: Tensor, like: Tensor) -> Tensor:
+    """A tensor in the type and the place of another; the host does not wait for a GPU's copy."""
+    return tensor.to(like, non_blocking=not like.is_cpu)
 
 
 def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:

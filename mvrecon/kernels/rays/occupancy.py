@@ -50,6 +50,15 @@ class Occupancy:
         box = Box.whole(shape)
         return cls(box.high, box)
 
+    @classmethod
+    def of(cls, shape: Sequence[int], code: "Tensor | Occupancy | None") -> "Occupancy":
+        """Where volumes of `shape` lie in the whole: an occupancy, or its code; None: they are all
+        of it.
+        """
+        if code is None:
+            return cls.whole(shape)
+        return code if isinstance(code, Occupancy) else cls.decoded(code)
+
     @property
     def read(self) -> Box:
         """The box that rays are clipped to: a voxel larger than the occupied one, as rounding may

@@ -1,21 +1,302 @@
-"""Voxel-driven back-projection on the CPU, and its transpose: the same to the last bit for any
-number of threads.
+"""Voxel-driven back-projection on the CPU, in which every voxel looks up its image in every view,
+and its transpose: the same to the last bit for any number of threads.
 
 A thread owns slabs of the volume, in the transpose rows of views, and meets what adds to them in
-one order.
+one order. Rows of voxels are cut to the part whose images touch the detector, see `rows.py`; no
+later loop tests a bound.
+
+Views that stand upright over the volume are read by columns: a column of voxels along z has its
+image in one detector column, at even steps. That is so for every circular orbit about z whose
+detector columns run along z, and every stack of slices. The two neighbouring detector columns are
+blended once, as contiguous vectors, and a voxel then takes a pair of neighbours out of the blend:
+no division and two values in place of four, with the same weights. These views are turned so that
+detector columns are contiguous.
 """
 
+from collections import namedtuple
 from collections.abc import Sequence
+from math import ceil, floor
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.padding import padded, room, steps
-from mvrecon.kernels.threads import share
-from mvrecon.kernels.voxels.columns import look_up_columns, room_of, turned, upright
-from mvrecon.kernels.voxels.loops import Sight, look_up, show_rows
+from mvrecon.kernels.rows import affine, between, bilinear, cell, face, lay, over, positive, whole
+from mvrecon.kernels.threads import parallel_for
+
+#: maps [m 4 2 3], detector (u, v) and flat steps (u, v) of a padded view, window, whether the
+#: distance weighs.
+Sight = namedtuple("Sight", ["maps", "detector", "steps", "window", "weighted"])
+#: The affine functions along a row of voxels: numerators u and v, denominator, fraction of the ray.
+Row = namedtuple("Row", ["u", "v", "under", "fraction", "half", "count"])
+
+
+@scalar
+def _row_of(lines, shape, k, j):
+    z, y = k - (shape[0] - 1) / 2, j - (shape[1] - 1) / 2
+    u, v, under, fraction = (
+        affine(lines[0], y, z),
+        affine(lines[1], y, z),
+        affine(lines[2], y, z),
+        affine(lines[3], y, z),
+    )
+    return Row(u, v, under, fraction, (shape[2] - 1) / 2, shape[2])
+
+
+@scalar
+def _seen(row, sight):
+    """The voxels first to last of a row whose images touch the detector, where their rays count."""
+    part = positive(row.under[0], row.under[1], -row.half, row.half)
+    part = positive(row.fraction[0] - sight.window[0], row.fraction[1], part[0], part[1])
+    part = positive(sight.window[1] - row.fraction[0], -row.fraction[1], part[0], part[1])
+    u, v = (sight.detector[0] + 1) / 2, (sight.detector[1] + 1) / 2
+    part = between(row.u, row.under, -u, u, part)
+    return whole(between(row.v, row.under, -v, v, part), row.half, row.count)
+
+
+@scalar
+def _near_rows(row, sight, low, high, part):
+    """The voxels that can touch the detector rows [low, high), with half a pixel to spare for
+    rounding.
+    """
+    centre = (sight.detector[1] - 1) / 2
+    interval = between(
+        row.v, row.under, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half)
+    )
+    first, last = whole(interval, row.half, row.count)
+    return max(part[0], first), min(part[1], last)
+
+
+@scalar
+def _cells(row, part, sight, at, weight):
+    """Per voxel: flat index of its bilinear cell, the weights towards u and v, and that of the
+    distance.
+    """
+    real, number = weight.dtype.type, at.dtype.type
+    u, v = (sight.detector[0] + 1) / 2, (sight.detector[1] + 1) / 2
+    start = part[0] - row.half
+    for n in range(np.uint32(max(0, part[1] - part[0]))):
+        i = np.float64(np.int32(n)) + start
+        inverse = over(row.under, i)
+        pu = cell(row.u, inverse, i, u, sight.detector[0])
+        pv = cell(row.v, inverse, i, v, sight.detector[1])
+        iu, iv = np.int32(pu), np.int32(pv)
+        weight[0, n], weight[1, n] = real(pu - iu), real(pv - iv)
+        weight[2, n] = real(inverse * inverse) if sight.weighted else real(1)
+        at[n] = number(number(iu) + number(number(iv) * sight.steps[1]))
+
+
+@scalar
+def _look(flat, across, count, at, weight, line):
+    image = face(flat, across)
+    for n in range(np.uint32(count)):
+        line[n] += weight[2, n] * bilinear(image, np.uint64(at[n]), weight[0, n], weight[1, n])
+
+
+@scalar
+def _show(flat, across, count, at, weight, line):
+    image, end = face(flat, across), np.uint64(len(flat) - across)
+    for n in range(np.uint32(count)):
+        k = np.uint64(at[n])
+        if (
+            k < end
+        ):  # voxels reach beyond these detector rows, and no unsigned index lies before them
+            lay(image, k, weight[0, n], weight[1, n], weight[2, n] * line[n])
+
+
+@compiled
+def look_up(flat, sight, room, volumes, first, last):
+    """Add to the slabs first to last of the volumes [n d h w] what their voxels see in the views [n
+    m p].
+    """
+    depth, height, width = volumes.shape[1:]
+    at, weight = room.at, room.weight
+    for z in range(first, last):
+        for m in range(len(sight.maps)):
+            for y in range(height):
+                row = _row_of(sight.maps[m], (depth, height, width), z, y)
+                part = _seen(row, sight)
+                count = part[1] - part[0]
+                if count <= 0:
+                    continue
+                _cells(row, part, sight, at, weight)
+                for n in range(len(volumes)):
+                    _look(
+                        flat[n, m], sight.steps[1], count, at, weight, volumes[n, z, y, part[0] :]
+                    )
+
+
+@compiled
+def show_rows(volumes, sight, room, views, m, low, high):
+    """Write the rows [low, high) of view m of [n m v u]: what the voxels of [n d h w] put there.
+
+    The room's own is [n p], those rows and one on either side.
+    """
+    depth, height, width = volumes.shape[1:]
+    across = sight.steps[1]
+    at, weight, own = room.at, room.weight, room.own
+    for number in range(depth * height):
+        z, y = number // height, number % height
+        row = _row_of(sight.maps[m], (depth, height, width), z, y)
+        part = _seen(row, sight)
+        if high - low < sight.detector[1]:
+            part = _near_rows(row, sight, low, high, part)
+        count = part[1] - part[0]
+        if count <= 0:
+            continue
+        _cells(row, part, sight, at, weight)
+        for i in range(count):
+            at[i] -= low * across
+        for n in range(len(volumes)):
+            _show(own[n], across, count, at, weight, volumes[n, z, y, part[0] :])
+    for n in range(len(volumes)):
+        for v in range(low, high):
+            begin = (v - low + 1) * across + 1
+            for u in range(sight.detector[0]):
+                views[n, m, v, u] = own[n, begin + u]
+
+
+#: Columns of voxels that are computed before they are written, so that whole cache lines are.
+TILE = 16
+#: From so many voxels along z on it pays.
+LEAST_DEPTH = 8
+COMPLEX = {np.dtype(np.float32): np.complex64, np.dtype(np.float64): np.complex128}
+
+#: What a thread works in: the blended column [n p] flat, each value and the next as one complex
+#: number on the same memory; per voxel its place and share of the upper neighbour, the pair taken
+#: and its parts; sums [n x z] of a tile.
+Column = namedtuple("Column", ["blend", "pairs", "places", "shares", "taken", "parts", "sums"])
+#: Where a column's images lie: padded place along u, of the first voxel along v and step, the
+#: distance weight, and the voxels first to last whose images touch the detector.
+Image = namedtuple("Image", ["u", "v", "step", "weight", "first", "last"])
+
+
+def upright(maps: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """Which views [m] of maps [m 4 2 3] are such, but for rounding."""
+    if shape[0] < LEAST_DEPTH:
+        return np.zeros(len(maps), bool)
+    level = maps[:, [0, 2, 3]]
+    rising = np.abs(level[:, :, 1]).sum(axis=2) * shape[0]
+    return (rising <= 1e-13 * np.abs(level[:, :, 0]).sum(axis=2)).all(axis=1)
+
+
+def turned(views: np.ndarray) -> np.ndarray:
+    """Views [n m v u] as padded columns [n m u+3 v+3]."""
+    n, m, v, u = views.shape
+    columns = np.zeros((n, m, u + 3, v + 3), views.dtype)
+    columns[:, :, 1:-2, 1:-2] = views.swapaxes(2, 3)
+    return columns
+
+
+def room_of(columns: np.ndarray, depth: int) -> Column:
+    """Room for a thread."""
+    count, _, _, width = columns.shape
+    real, pair = columns.dtype, COMPLEX[columns.dtype]
+    blend, taken = np.zeros(count * width, real), np.empty(depth, pair)
+    pairs = np.ndarray((len(blend) - 1,), pair, blend, strides=blend.strides)
+    sums = np.empty((count, TILE, depth), real)
+    places, shares = np.empty(depth, np.uint32), np.empty(depth, real)
+    return Column(blend, pairs, places, shares, taken, taken.view(real), sums)
+
+
+@scalar
+def _image(lines, sight, i, j, depth):
+    nowhere = Image(0.0, 0.0, 0.0, 0.0, 0, 0)
+    under = lines[2, 0, 0] * i + lines[2, 0, 1] * j + lines[2, 0, 2]
+    fraction = lines[3, 0, 0] * i + lines[3, 0, 1] * j + lines[3, 0, 2]
+    if under <= 0 or fraction <= sight.window[0] or fraction >= sight.window[1]:
+        return nowhere
+    inverse, border = 1.0 / under, sight.detector[1] + 1.0
+    u = (lines[0, 0, 0] * i + lines[0, 0, 1] * j + lines[0, 0, 2]) * inverse
+    u += (sight.detector[0] + 1) / 2
+    if u <= 0 or u >= sight.detector[0] + 1:
+        return nowhere
+    step = lines[1, 1, 2] * inverse
+    v = (lines[1, 0, 0] * i + lines[1, 0, 1] * j + lines[1, 0, 2]) * inverse + border / 2
+    v -= step * (depth - 1) / 2
+    low, high = 0.0, depth - 1.0
+    if step > 0:
+        low, high = max(low, -v / step), min(high, (border - v) / step)
+    elif step < 0:
+        low, high = max(low, (border - v) / step), min(high, -v / step)
+    elif v <= 0 or v >= border:
+        return nowhere
+    if low > high:
+        return nowhere
+    weight = inverse * inverse if sight.weighted else 1.0
+    return Image(u, v, step, weight, int(ceil(low)), int(floor(high)) + 1)
+
+
+@scalar
+def _places(image, room):
+    """Lower neighbours of a column's images, and the upper ones' shares."""
+    real, places, shares = room.shares.dtype.type, room.places, room.shares
+    v, step = real(image.v + image.first * image.step), real(image.step)
+    for k in range(np.uint32(image.last - image.first)):
+        place = v + real(np.int32(k)) * step
+        below = np.int32(place)
+        places[k], shares[k] = np.uint32(below), place - real(below)
+
+
+@scalar
+def _blend(image, columns, blend):
+    """The detector's column at u, times the weight, where images lie."""
+    real, left = blend.dtype.type, int(image.u)
+    share = image.u - left
+    low, high = real((1 - share) * image.weight), real(share * image.weight)
+    one = image.v + image.first * image.step
+    other = image.v + (image.last - 1) * image.step
+    first = max(0, int(min(one, other)) - 1)
+    last = min(columns.shape[1], int(max(one, other)) + 3)
+    near, far = columns[left], columns[left + 1]
+    for v in range(np.uint32(first), np.uint32(last)):
+        blend[v] = low * near[v] + high * far[v]
+
+
+@scalar
+def _take(room, start, line, count):
+    places, shares, taken, parts = room.places, room.shares, room.taken, room.parts
+    for k in range(count):
+        taken[k] = room.pairs[np.uint64(places[k]) + start]
+    for k in range(count):
+        lower = parts[2 * k]
+        line[k] += lower + shares[k] * (parts[2 * k + 1] - lower)
+
+
+@scalar
+def _add_tile(columns, sight, room, tile, volumes):
+    """The sums of all views over the voxels tile = (y, first x, one behind the last x)."""
+    depth, height, width = volumes.shape[1:]
+    y, start, end = tile
+    room.sums[:] = 0
+    for x in range(start, end):
+        for m in range(len(sight.maps)):
+            i, j = x - (width - 1) / 2, y - (height - 1) / 2
+            image = _image(sight.maps[m], sight, i, j, depth)
+            if image.first >= image.last:
+                continue
+            _places(image, room)
+            for n in range(len(volumes)):
+                begin = n * columns.shape[3]
+                _blend(image, columns[n, m], room.blend[begin:])
+                line = room.sums[n, x - start, image.first :]
+                _take(room, np.uint64(begin), line, np.uint32(image.last - image.first))
+
+
+@compiled
+def look_up_columns(columns, sight, room, volumes, first, last):
+    """Add to the rows first to last along y of volumes [n d h w] what their voxels see in views."""
+    depth, _, width = volumes.shape[1:]
+    for y in range(first, last):
+        for start in range(0, width, TILE):
+            end = min(start + TILE, width)
+            _add_tile(columns, sight, room, (y, start, end), volumes)
+            for n in range(len(volumes)):
+                for z in range(depth):
+                    for x in range(start, end):
+                        volumes[n, z, y, x] += room.sums[n, x - start, z]
 
 
 def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weighted: bool) -> Sight:
@@ -26,14 +307,8 @@ def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weigh
     )
 
 
-def look(
-    views: Float[Tensor, "n m v u"],
-    maps: Float[Tensor, "m 4 2 3"],
-    window: Sequence[float],
-    weighted: bool,
-    shape: Sequence[int],
-) -> Float[Tensor, "n d h w"]:
-    """What every voxel sees in all views; see `voxel_reference.look`."""
+def backproject(views, maps, window, weighted, shape):
+    """What every voxel sees in all views; see `reference.backproject`."""
     sight = _sight(maps, views.shape[2:], window, weighted)
     depth, height, width = map(int, shape)
     volumes = np.zeros([len(views), depth, height, width], dtype=views.numpy().dtype)
@@ -52,7 +327,7 @@ def _add_by_rows(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> None:
     def work(first: int, last: int) -> None:
         look_up(flat, sight, room(width, sight.steps, flat.dtype), volumes, first, last)
 
-    share(work, depth, volumes.size * len(sight.maps), 4)
+    parallel_for(work, depth, volumes.size * len(sight.maps), 4)
 
 
 def _add_by_columns(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> None:
@@ -61,17 +336,11 @@ def _add_by_columns(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> Non
     def work(first: int, last: int) -> None:
         look_up_columns(columns, sight, room_of(columns, depth), volumes, first, last)
 
-    share(work, height, volumes.size * len(sight.maps), 4)
+    parallel_for(work, height, volumes.size * len(sight.maps), 4)
 
 
-def show(
-    volumes: Float[Tensor, "n d h w"],
-    maps: Float[Tensor, "m 4 2 3"],
-    window: Sequence[float],
-    weighted: bool,
-    detector: Sequence[int],
-) -> Float[Tensor, "n m v u"]:
-    """The exact transpose of `look`."""
+def project(volumes, maps, window, weighted, detector):
+    """The exact transpose of `backproject`."""
     sight = _sight(maps, detector, window, weighted)
     values, rows = np.ascontiguousarray(volumes.numpy()), int(detector[0])
     views = volumes.new_empty(len(volumes), len(maps), *detector)
@@ -90,5 +359,5 @@ def show(
                 high,
             )
 
-    share(work, len(maps) * rows, values.size * len(maps))
+    parallel_for(work, len(maps) * rows, values.size * len(maps))
     return views

@@ -5,12 +5,12 @@ every run.
 import math
 from collections.abc import Sequence
 
-from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.cuda.field import Field
-from mvrecon.kernels.cuda.launching import blocks, check_count, numbers_of, start
-from mvrecon.kernels.cuda.sources import TILE, Part
+from mvrecon.kernels.cuda.launch import Field, Variant, blocks, check_count, numbers_of, start
+
+#: Voxels of a block along x, y and z, as in `4_look.cu`.
+TILE = (16, 8, 8)
 
 
 def _field(
@@ -26,35 +26,23 @@ def _field(
     )
 
 
-def look(
-    views: Float[Tensor, "n m v u"],
-    maps: Float[Tensor, "m 4 2 3"],
-    window: Sequence[float],
-    weighted: bool,
-    shape: Sequence[int],
-) -> Float[Tensor, "n d h w"]:
-    """What every voxel sees in all views; see `voxels.reference.look`."""
+def backproject(views, maps, window, weighted, shape):
+    """What every voxel sees in all views; see `reference.backproject`."""
     y = views.detach().contiguous()
     volumes = y.new_empty(len(y), *shape)
     numbers = numbers_of(maps)
     field = _field(numbers, y, volumes, window, weighted).put(origin=y, result=volumes)
     check_count(math.prod(map(int, shape)))
     tiles = math.prod(-(-int(n) // edge) for n, edge in zip(shape[::-1], TILE, strict=True))
-    start(Part("look", y.dtype), "look", field, y, tiles, len(y))
+    start(Variant("look", y.dtype), "look", field, y, tiles, len(y))
     return volumes
 
 
-def show(
-    volumes: Float[Tensor, "n d h w"],
-    maps: Float[Tensor, "m 4 2 3"],
-    window: Sequence[float],
-    weighted: bool,
-    detector: Sequence[int],
-) -> Float[Tensor, "n m v u"]:
-    """The exact transpose of `look`."""
+def project(volumes, maps, window, weighted, detector):
+    """The exact transpose of `backproject`."""
     x = volumes.detach().contiguous()
     views = x.new_empty(len(x), len(maps), *detector)
     numbers = numbers_of(maps)
     field = _field(numbers, views, x, window, weighted).put(origin=x, result=views)
-    start(Part("look", x.dtype), "show", field, x, blocks(math.prod(views.shape[1:])), len(x))
+    start(Variant("look", x.dtype), "show", field, x, blocks(math.prod(views.shape[1:])), len(x))
     return views

@@ -10,7 +10,7 @@ from mvrecon.geometry.lattice import spread_map
 from mvrecon.geometry.sample import filled, normalised, sample
 
 
-def look(
+def backproject(
     views: Float[Tensor, "n m v u"],
     maps: Float[Tensor, "m 4 2 3"],
     window: Sequence[float],

@@ -6,24 +6,23 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.cuda.field import Field
-from mvrecon.kernels.cuda.launching import blocks, check_count, numbers_of, start
-from mvrecon.kernels.cuda.sources import MAP, PLANES, Part
+from mvrecon.kernels.cuda.driver import BLOCK, WARP
+from mvrecon.kernels.cuda.launch import Field, Variant, blocks, check_count, numbers_of, start
 from mvrecon.kernels.precision import arithmetic
-from mvrecon.kernels.rays.cuda.sources import BLOCK, WARP
 
+#: Channels of a thread, as in `2_warp.cu`; numbers of a map.
+PLANES, MAP = 8, 30
 #: Threads of a derivative by the maps, so that a small warp is split over blocks.
 THREADS = 2**18
 
 
-def part_of(stored: Tensor) -> Part:
+def part_of(stored: Tensor) -> Variant:
     """The kernels that read a tensor as it is stored, half precision among it; they write in the
     type of arithmetic.
     """
-    return Part("warp", arithmetic(stored.dtype), stored.dtype)
+    return Variant("warp", arithmetic(stored.dtype), stored.dtype)
 
 
 def _field(
@@ -40,9 +39,7 @@ def _field(
     )
 
 
-def warp(
-    volumes: Float[Tensor, "n s c d h w"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int]
-) -> Float[Tensor, "n s k c d h w"]:
+def warp(volumes, maps, shape):
     """Volumes on other lattices; see `warps.reference.warp`."""
     x, numbers, part = volumes.detach().contiguous(), numbers_of(maps), part_of(volumes)
     items, sources, channels = x.shape[:3]
@@ -55,9 +52,7 @@ def warp(
     return values
 
 
-def warp_back(
-    values: Float[Tensor, "n s k c d h w"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int]
-) -> Float[Tensor, "n s c d h w"]:
+def warp_transpose(values, maps, shape):
     """The exact transpose of `warp`: every voxel finds its samples by the inverse maps."""
     y, numbers, part = values.detach().contiguous(), numbers_of(maps), part_of(values)
     items, sources, kinds, channels = y.shape[:4]
@@ -71,11 +66,7 @@ def warp_back(
     return volumes
 
 
-def warp_vjp(
-    volumes: Float[Tensor, "n s c d h w"],
-    values: Float[Tensor, "n s k c d h w"],
-    maps: Float[Tensor, "s k 5 2 3"],
-) -> Float[Tensor, "s k 5 2 3"]:
+def warp_vjp(volumes, values, maps):
     """The derivative of <values, warp(volumes, maps)> by the maps; float64."""
     x, numbers, part = volumes.detach().contiguous(), numbers_of(maps), part_of(volumes)
     y = values.detach().to(part.real).contiguous()

@@ -4,15 +4,28 @@ frustum.
 
 from collections.abc import Sequence
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.backends import kernels_for
+from mvrecon.geometry.lattice import lifted_maps
+from mvrecon.kernels.operator import LinearKernel, choose_backend
 from mvrecon.kernels.precision import wide
-from mvrecon.kernels.rays.cuda.selfcheck import STORED
-from mvrecon.kernels.warps import ops as warp_ops
-from mvrecon.kernels.warps import reference as warp_reference
-from mvrecon.kernels.warps.trial import differences
+from mvrecon.kernels.self_test import STORED, Errors
+from mvrecon.kernels.warps import reference
+
+WARP = LinearKernel(
+    "warp(Tensor volumes, Tensor maps, SymInt[] shape) -> Tensor",
+    "warp_transpose(Tensor values, Tensor maps, SymInt[] shape) -> Tensor",
+    "warp_vjp(Tensor volumes, Tensor values, Tensor maps) -> Tensor",
+    {"cpu": "mvrecon.kernels.warps.cpu", "cuda": "mvrecon.kernels.warps.cuda"},
+    reference.warp,
+    shapes=(
+        lambda x, maps, shape: (*x.shape[:2], maps.shape[1], x.shape[2], *shape),
+        lambda y, maps, shape: (*y.shape[:2], y.shape[3], *shape),
+    ),
+    sizes=(slice(3, 6), slice(4, 7)),
+)
 
 
 def warp(
@@ -50,8 +63,18 @@ def warp(
             "Expected volumes [b s c d h w] and maps [s k 5 2 3] of the same s, "
             f"got {tuple(volumes.shape)} and {tuple(maps.shape)}"
         )
-    chosen, _ = kernels_for(volumes, backend, "warp", differences)
-    kernels = warp_reference if chosen == "reference" else warp_ops
+    chosen = choose_backend(volumes, backend, "warp", self_test)
+    warp = reference.warp if chosen == "reference" else WARP.forward
     # a GPU reads half precision as it is
     x = volumes if chosen == "cuda" and volumes.dtype in STORED else wide(volumes)
-    return kernels.warp(x, maps, list(shape)).to(volumes.dtype)
+    return warp(x, maps, list(shape)).to(volumes.dtype)
+
+
+def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
+    """Warps between lattices that diverge."""
+    generator = torch.Generator().manual_seed(0)
+    H = torch.randn(2, 3, 4, 4, generator=generator, dtype=torch.float64)
+    lifts = torch.tensor([[1.0, 0.05], [0.9, 0.1], [1.0, 0.0]], dtype=torch.float64)
+    maps = lifted_maps(torch.eye(4).double() + 0.05 * H, lifts[:2, None], lifts).to(device)
+    x = torch.randn(2, 2, 3, 4, 5, 6, generator=generator).to(device, dtype)
+    yield from WARP.self_test(x, maps, [5, 4, 7])

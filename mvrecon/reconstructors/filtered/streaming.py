@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.known import key_of, known
+from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.precision import wide
 from mvrecon.projectors.checks import check_floating, check_views
 from mvrecon.projectors.voxel_driven import Images, image_maps, looked
@@ -94,7 +94,7 @@ def _known(
     if filtering.weights_from is not None:
         return make()
     options = filtering.filter, filtering.cutoff, filtering.scan
-    return known(cameras, ("filtering", key_of(grid), *options), like, make)
+    return device_cached(cameras, ("filtering", grid_key(grid), *options), like, make)
 
 
 def _slices(first: int, last: int, size: int) -> Iterator[slice]:

@@ -1,3 +1,3 @@
 """Benchmarks (run time against error) and the stress plan for projectors, cameras, scenes, heads
-and models.
+and methods.
 """

@@ -1,4 +1,4 @@
-"""`mvrecon-stress`: stress plan on an operator, camera, scene, head or model, a plugin's too."""
+"""`mvrecon-stress`: stress plan on an operator, camera, scene, head or method, a plugin's too."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""ASTRA's 2-D algorithms on the CPU as reconstructors: FBP, SIRT and CGLS of stacks of parallel
+"""ASTRA's 2-D algorithms on the CPU as methods: FBP, SIRT and CGLS of stacks of parallel
 slices, one slice after the other on one thread. ASTRA's 3-D algorithms need a GPU.
 """
 

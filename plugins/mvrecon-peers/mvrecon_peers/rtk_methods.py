@@ -1,4 +1,4 @@
-"""RTK's reconstruction filters on the CPU as reconstructors: FDK, SART, conjugate gradients, TV.
+"""RTK's reconstruction filters on the CPU as methods: FDK, SART, conjugate gradients, TV.
 
 The rig's axis of rotation is the grid's z axis, as in `circular`; RTK's is y, so grid and rig are
 turned by 90 degrees about x first. Values go in and come out in 1/mm.

@@ -1,4 +1,4 @@
-"""ASTRA's methods as reconstructors: an object off the centre comes back in place, in its unit."""
+"""ASTRA's methods: an object off the centre comes back in place, in its unit."""
 
 import pytest
 import torch

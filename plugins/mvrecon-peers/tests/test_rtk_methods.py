@@ -1,4 +1,4 @@
-"""RTK's methods as reconstructors: an asymmetric object comes back in place, in its unit."""
+"""RTK's methods: an asymmetric object comes back in place, in its unit."""
 
 import pytest
 import torch

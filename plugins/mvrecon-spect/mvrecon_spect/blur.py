@@ -23,10 +23,10 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.projectors.attenuated import attenuated_kernels, check_mu
 from mvrecon.projectors.checks import check, check_floating
 from mvrecon.projectors.operator import LinearOperator, Projector
 from mvrecon.projectors.selection import ViewSelection
+from mvrecon_spect.attenuated import attenuated_kernels, check_mu
 from mvrecon_spect.extent import Extent, blurred, blurred_whole, extents_of
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import Beyond

@@ -16,9 +16,9 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.explicit import ExplicitRays
 from mvrecon.data.resample import resample
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.attenuated import check_mu
 from mvrecon.projectors.drr import Drr
 from mvrecon.registry import check_options
+from mvrecon_spect.attenuated import check_mu
 
 #: Values of the option `mu` that name a map of each case, and its key in a batch.
 MAPS = {"case": "mu", "measured": "mu_measured"}

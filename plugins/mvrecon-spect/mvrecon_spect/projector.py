@@ -24,9 +24,9 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.attenuated import AttenuatedTransform
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
+from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.blur import BlurredPinholes, Optics
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import CaseAttenuation, attenuation_on

@@ -12,9 +12,10 @@ from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.events.making import EventMaker
 from mvrecon.geometry.grid import Grid
 from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.attenuated import attenuated_integrals
-from mvrecon.scenes.cardiac import RandomCardiac
+from mvrecon.scenes.mixture import Mixture
 from mvrecon_spect.hole import Hole
+from mvrecon_spect.scenes.attenuating import attenuated_integrals
+from mvrecon_spect.scenes.cardiac import RandomCardiac
 
 GRID = Grid.centred(32, spacing=10.0, centre=(40, -40, 0))
 RIG = dcspect80(pixels=8, columns=[2, 11], rows=[1])
@@ -37,14 +38,23 @@ def test_a_patient_s_own_matter_attenuates_his_views():
     assert sample.views.sum().item() == pytest.approx(exact.sum().item(), rel=5e-3)
     plain = seen(RandomCardiac(attenuates=False))
     assert (sample.views.sum() / plain.views.sum()).item() == pytest.approx(0.27, abs=0.02)
-    mean = scene.attenuation(5, 0, GRID).mean().item()
-    assert sample.mu.mean().item() == pytest.approx(mean, rel=5e-3)
-    assert not plain.mu.any()
+    mean = scene.maps(5, 0, GRID)["mu"].mean().item()
+    assert sample.maps["mu"].mean().item() == pytest.approx(mean, rel=5e-3)
+    assert not plain.maps["mu"].any()
 
 
 def test_the_scene_s_matter_makes_the_views_whatever_the_reconstruction_takes_it_for():
     wrong = Acquired(RandomCardiac(), {**SPECT, "mu": 0.05}).sample(5, 0, GRID, RIG)
     assert torch.equal(wrong.views, seen(RandomCardiac()).views)
+
+
+def test_a_patient_of_a_mixture_attenuates_the_views_as_alone():
+    mixture = Mixture([{"name": "cardiac"}, {"name": "derenzo", "unit": "activity"}])
+    patient = Acquired(mixture, SPECT).sample(4, 0, GRID, RIG)
+    alone = Acquired(RandomCardiac(), SPECT).sample(4, 0, GRID, RIG)
+    assert torch.equal(patient.views, alone.views)
+    assert torch.equal(patient.maps["mu"], alone.maps["mu"])
+    assert not Acquired(mixture, SPECT).sample(1, 0, GRID, RIG).maps
 
 
 def test_views_from_the_finer_grid_are_near_those_in_closed_form():
@@ -61,7 +71,7 @@ def test_a_data_set_and_a_store_keep_the_matter_of_their_cases(tmp_path):
     stored = Acquired(scene, SPECT, store=CaseStore(tmp_path, {"scene": "cardiac"}, scene))
     for _ in range(2):  # made, then read
         case = SceneDataset(stored, GRID, RIG, [5], 0, cache=False)[0]
-        assert torch.equal(case["mu"], seen(scene).mu)
+        assert torch.equal(case["mu"], seen(scene).maps["mu"])
 
 
 @pytest.mark.parametrize("name", ["events", "events_cardiac"])

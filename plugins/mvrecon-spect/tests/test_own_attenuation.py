@@ -13,7 +13,7 @@ from mvrecon.engine.fit import build_data, build_module, methods
 from mvrecon.engine.module import build_projector
 from mvrecon_spect.matter import CaseAttenuation
 from mvrecon_spect.projector import Spect
-from mvrecon_spect.spect_ct import SpectCt
+from mvrecon_spect.scenes.spect_ct import SpectCt
 
 #: A patient in 10 x 8 x 8 voxels, and networks of a few weights.
 TINY = (
@@ -111,7 +111,7 @@ def test_a_scan_measures_the_attenuation_of_its_patient():
     assert known.sum().item() == pytest.approx(true.sum().item(), rel=0.03)
     assert (known - true).norm() < 0.35 * true.norm()
     again = scene.sample(0, 0, data_of("dcspect_ct").grid, data_of("dcspect_ct").cameras)
-    assert torch.equal(again.mu_measured, known[0])
+    assert torch.equal(again.maps["mu_measured"], known[0])
 
 
 def test_attenuation_that_no_case_brings_is_refused():

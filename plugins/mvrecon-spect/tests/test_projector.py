@@ -92,13 +92,8 @@ def test_it_is_found_by_name_with_its_options():
 def test_its_configuration_composes():
     from mvrecon.config import compose
 
-    assert compose("projector=spect")["projector"] == {
-        "name": "spect",
-        "diameter_mm": 2.3,
-        "mu": None,
-        "blur": False,
-        "intrinsic_mm": 0.0,
-    }
+    settings = compose("projector=spect", "projector.blur=true")["projector"]
+    assert settings == {"name": "spect", "blur": True}
 
 
 def test_other_cameras_and_diameters_are_refused():

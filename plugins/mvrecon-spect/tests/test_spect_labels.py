@@ -10,8 +10,8 @@ from mvrecon.engine.evaluation import evaluate
 from mvrecon.engine.fit import build_data, build_module, methods
 from mvrecon.engine.module import build_projector
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon_spect.spect_ct import SpectCt
-from mvrecon_spect.spect_labels import SpectLabels
+from mvrecon_spect.scenes.spect_ct import SpectCt
+from mvrecon_spect.scenes.spect_labels import SpectLabels
 
 GRID = Grid.centred(size=(14, 12, 10), spacing=8.0)
 SPACING = (4.0, 4.0, 4.0)  # z, y, x
@@ -64,12 +64,12 @@ def test_activity_is_that_of_the_structures_of_the_body_and_none_in_air(path):
 
 
 def test_what_attenuates_is_water_and_bone_at_140_kev(path):
-    mu = scene(path, crop="none").attenuation(0, 0, GRID, 2)[0]
+    mu = scene(path, crop="none").maps(0, 0, GRID, 2)["mu"][0]
     hu = torch.from_numpy(patient().ct)
     assert torch.allclose(mu[hu == 0], torch.tensor(0.01536), rtol=1e-4)
     assert torch.allclose(mu[hu == 1000], torch.tensor(0.0295), rtol=1e-4)
     assert mu[hu == -1000].abs().max() < 1e-6
-    assert not scene(path, attenuates=False).attenuation(0, 0, GRID).any()
+    assert not scene(path, attenuates=False).maps(0, 0, GRID)["mu"].any()
 
 
 def test_a_copy_is_mirrored_with_its_structures_and_draws_other_uptakes(path):
@@ -78,7 +78,7 @@ def test_a_copy_is_mirrored_with_its_structures_and_draws_other_uptakes(path):
     assert 0 < sum(copies) < len(copies)
     for index in (2 + copies.index(True), 2 + copies.index(False)):
         fine = case.finer(index, 0, GRID, None, 2)[0]
-        mu = case.attenuation(index, 0, GRID, 2)[0]
+        mu = case.maps(index, 0, GRID, 2)["mu"][0]
         places = voxel_centres(GRID.refined(2), torch.float32)
         centre = (places * (mu > 0.004)[..., None]).sum(dim=(0, 1, 2)) / (mu > 0.004).sum()
         hot = fine > 1.5
@@ -111,7 +111,7 @@ def test_spect_ct_scans_labelled_patients(path):
     camera = {"name": "circular", "n_views": 8, "sid": 300.0, "sdd": 500.0}
     camera["detector"] = {"pixels": [24, 24], "pixel_mm": 8.0}
     scan = SpectCt({"name": "spect_labels", "path": path, "uptake": UPTAKE, "fine": 2}, camera)
-    measured, mu = scan.measured(0, 0, GRID), scan.attenuation(0, 0, GRID)
+    measured, mu = scan.measured(0, 0, GRID), scan.maps(0, 0, GRID)["mu"]
     assert (measured - mu).norm() < 0.4 * mu.norm()
 
 
@@ -151,11 +151,11 @@ def test_the_experiment_takes_a_step_and_judges_every_method(tmp_path):
     settings = compose(
         "experiment=dcspect_labels",
         *(f"{part}.path={file}" for part, file in files.items()),
-        "model=cross_view_small",
+        "method=cross_view_small",
         "camera.pixels=8",
         "camera.columns=[3]",
-        "compare.world_unet.rounds=[{resolution: full, widths: [2], cameras: null}]",
-        "compare.bsrem.reconstructor.iterations=1",
+        "compare.world_unet.widths=[2]",
+        "compare.bsrem.iterations=1",
         "data.sizes={train: 2, val: 1, test: 2}",
         "grid.size=[8,8,8]",
         "grid.spacing=32",
@@ -171,7 +171,7 @@ def test_the_experiment_takes_a_step_and_judges_every_method(tmp_path):
     loss.backward()
     assert loss.isfinite() and batch["mu"].max() < 0.03
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
-    judged = {label: row.own for label, row in rows.items()}
+    judged = {label: row.method for label, row in rows.items()}
     scores = evaluate(judged, data.test_dataloader(), A, 1.0)
     assert set(scores) == {"cross_view", "world_unet", "osem", "bsrem"}
     assert all(0 < s["nrmse"] < 3 for row in scores.values() for s in row)

@@ -210,8 +210,8 @@ def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
         "projector=spect",
         "projector.diameter_mm=1.0",
         f"projector.mu={tmp_path / 'mu.hv'}",
-        "reconstructor=osem",
-        "reconstructor.iterations=20",
+        "method=osem",
+        "method.iterations=20",
         "grid.size=[10,10,10]",
         "grid.spacing=2.0",
     )
@@ -228,7 +228,7 @@ def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["counts.hs", "counts.npy"])
 def test_counts_without_attenuation_are_of_activity_and_have_no_hounsfield_units(tmp_path, name):
-    settings = settings_of_counts(tmp_path, name, "projector=spect", "reconstructor=osem")
+    settings = settings_of_counts(tmp_path, name, "projector=spect", "method=osem")
     assert open_scan(settings).unit == "activity"
     with pytest.raises(ValueError, match="for the unit HU, got activity"):
         reconstruct({**settings, "unit": "HU"}, tmp_path / "in_hu")

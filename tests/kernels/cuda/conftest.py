@@ -2,9 +2,8 @@ import shutil
 
 import pytest
 
-from mvrecon.kernels.cuda import launching
-from mvrecon.kernels.rays.cuda import selfcheck
-from mvrecon.kernels.rays.cuda.kernels import kernels_of
+from mvrecon.kernels import self_test
+from mvrecon.kernels.cuda.launch import kernels_of
 from tests.kernels.cuda.host import compiled, stand_in
 
 
@@ -25,6 +24,5 @@ def host(libraries, monkeypatch, tmp_path):
 
 
 def forget() -> None:
-    for kernels in (kernels_of, launching.kernels_of):
-        kernels.cache_clear()
-    selfcheck.forget()
+    kernels_of.cache_clear()
+    self_test.forget()

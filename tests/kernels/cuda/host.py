@@ -9,46 +9,32 @@ from pathlib import Path
 
 import torch
 
-from mvrecon.kernels.cuda.field import Field
-from mvrecon.kernels.cuda.layer import Layer
-from mvrecon.kernels.cuda.sources import Part, source
+from mvrecon.kernels.cuda.driver import BLOCK, Packed
+from mvrecon.kernels.cuda.launch import NAMES, Field, Scene, Variant, source
 from mvrecon.kernels.precision import arithmetic
-from mvrecon.kernels.rays.cuda import sources as rays
-from mvrecon.kernels.rays.cuda.scene import Packed, Scene
-from mvrecon.kernels.rays.cuda.sources import BLOCK, NAMES, Variant
-from mvrecon.kernels.rays.trace import JOSEPH, SIDDON
 
 F, D, H, B = torch.float32, torch.float64, torch.float16, torch.bfloat16
 #: Types of arithmetic and of storage, and how many volumes share a ray.
 TYPES = [(F, F, 1), (F, F, 4), (D, D, 1), (D, D, 4), (F, H, 1), (F, B, 4)]
 VARIANTS = {
-    f"_{NAMES[stored]}_{together}_{method}": Variant(real, stored, together, method)
+    f"_{NAMES[stored]}_{together}_{method}": Variant("rays", real, stored, together, method)
     for real, stored, together in TYPES
-    for method in range(3)
+    for method in ("joseph", "siddon", "trilinear")
 }
 VARIANTS |= {
-    f"_{NAMES[real]}_attenuated_{method}": Variant(real, real, 1, method, attenuated=True)
+    f"_{NAMES[real]}_attenuated_{method}": Variant("attenuated", real, real, 1, method)
     for real in (F, D)
-    for method in (JOSEPH, SIDDON)
+    for method in ("joseph", "siddon")
 }
-PARTS = {
-    f"_{NAMES[stored]}_{purpose}": Part(purpose, arithmetic(stored), stored)
+VARIANTS |= {
+    f"_{NAMES[stored]}_{purpose}": Variant(purpose, arithmetic(stored), stored)
     for purpose, types in {
         "warp": (F, D, H, B),
         "look": (F, D),
         "hull": (D,),
-        "norm": (F, D, H, B),
     }.items()
     for stored in types
 }
-EVERY = {**VARIANTS, **PARTS}
-
-
-def packed_of(suffix: str) -> type[Packed]:
-    """The structure that kernels are launched with."""
-    if suffix in VARIANTS:
-        return Scene
-    return Layer if PARTS[suffix].purpose == "norm" else Field
 
 
 def running(packed: type[Packed]) -> str:
@@ -68,9 +54,9 @@ extern "C" const int layout_{name}[] = {{
 
 def compiled(folder: Path) -> dict[type[Packed], ctypes.CDLL]:
     """The kernels of all variants, by g++, one library for each structure."""
-    texts = {Scene: rays.text_of(VARIANTS), Field: source(), Layer: source()}
-    for suffix, part in PARTS.items():
-        texts[packed_of(suffix)] += part.line(suffix)
+    texts = {packed: source(packed) for packed in (Scene, Field)}
+    for suffix, variant in VARIANTS.items():
+        texts[variant.packed] += variant.line(suffix)
     compilers, libraries = [], {}
     for packed, text in texts.items():
         code, library = folder / f"{packed.__name__}.cpp", folder / f"{packed.__name__}.so"
@@ -97,14 +83,14 @@ class Driver:
         return lambda *_: self.failure.get(name, 0)
 
     def cuModuleLoadData(self, module, code: c_char_p) -> int:
-        lines = [variant.line("") for variant in EVERY.values()]
+        lines = [variant.line("") for variant in VARIANTS.values()]
         module._obj.value = 1 + lines.index(code.value.decode())
         self.modules += 1
         return self.failure.get("cuModuleLoadData", 0)
 
     def cuModuleGetFunction(self, function, module, name: bytes) -> int:
-        suffix = list(EVERY)[module.value - 1]
-        packed = packed_of(suffix)
+        suffix = list(VARIANTS)[module.value - 1]
+        packed = VARIANTS[suffix].packed
         code = getattr(self.libraries[packed], name.decode() + suffix)
         function._obj.value = ctypes.cast(code, c_void_p).value
         self.names[function._obj.value] = name.decode(), packed
@@ -134,7 +120,7 @@ class Driver:
 
 def stand_in(monkeypatch, libraries: dict[type[Packed], ctypes.CDLL], cache: Path) -> Driver:
     """Put the CPU in the place of a device, its driver and its compiler."""
-    from mvrecon.kernels.rays.cuda import driver, kept, nvrtc
+    from mvrecon.kernels.cuda import code_cache, driver, nvrtc
 
     stub = Driver(libraries)
     last = lambda text, architecture: text.splitlines(keepends=True)[-1].encode()  # noqa: E731
@@ -146,7 +132,7 @@ def stand_in(monkeypatch, libraries: dict[type[Packed], ctypes.CDLL], cache: Pat
         (nvrtc, "build", last),
         (nvrtc, "capabilities", lambda: [80, 90]),
         (nvrtc, "version", lambda: "0.0"),
-        (kept, "folder", lambda: cache),
+        (code_cache, "folder", lambda: cache),
     ):
         monkeypatch.setattr(module, name, value)
     return stub

@@ -36,7 +36,7 @@ def test_rays_along_the_end_of_a_box_stay_inside_its_store(method, dtype, host, 
         for slope in SLOPES:
             A = Radon(whole, rig(slope, turn))
             part = Occupancy(whole.shape, Box((6, 5, 5), (19, 16, 16)))
-            rays = A.fixed_lines, A.ray_extent, part, list(A.detector), method
+            rays = A.fixed_lines, A.ray_extent, list(A.detector), method, part
             expected = cuda.project(x, *rays)
             with monkeypatch.context() as context:
                 between_guards(context)

@@ -8,12 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.kernels.cuda.sources import KERNELS as FIELDS
-from mvrecon.kernels.cuda.sources import Part
-from mvrecon.kernels.cuda.sources import text_of as fields
-from mvrecon.kernels.rays.cuda import nvrtc
-from mvrecon.kernels.rays.cuda.sources import ATTENUATED, KERNELS, Variant, text_of
-from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR
+from mvrecon.kernels.cuda import nvrtc
+from mvrecon.kernels.cuda.launch import KERNELS, Variant, text_of
 
 SCRIPT = Path(__file__).parents[3] / "scripts" / "gpu" / "machine_code.py"
 #: Registers of a thread: 65 536 of a multiprocessor for at least 4 blocks of 128 threads.
@@ -23,10 +19,11 @@ ASIDE = 10
 F, D, B = torch.float32, torch.float64, torch.bfloat16
 #: Ampere and Hopper, one volume and four; a case takes two seconds.
 CASES = [
-    (80, Variant(F, B, 4, SIDDON)),
-    (80, Variant(F, F, 1, TRILINEAR)),
-    (90, Variant(F, F, 1, JOSEPH)),
+    (80, Variant("rays", F, B, 4, "siddon")),
+    (80, Variant("rays", F, F, 1, "trilinear")),
+    (90, Variant("rays", F, F, 1, "joseph")),
 ]
+PARTS = [Variant("warp", F, B), Variant("look", F), Variant("hull", D)]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +47,7 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
     bfloat16 volumes does, and set-up in float64.
     """
     kernels, count = machine_code.compiled(text_of({"": variant}), capability), machine_code.count
-    assert kernels.keys() == set(KERNELS)
+    assert kernels.keys() == set(KERNELS["rays"])
     for name, kernel in kernels.items():
         assert kernel.registers <= MOST, (name, kernel.registers)
         assert count(machine_code.LOCAL, kernel.instructions) <= ASIDE, name
@@ -65,12 +62,12 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
             assert name == "scatter" or not count(machine_code.CALL, step), name
 
 
-@pytest.mark.parametrize(("capability", "method"), [(80, SIDDON), (90, JOSEPH)])
+@pytest.mark.parametrize(("capability", "method"), [(80, "siddon"), (90, "joseph")])
 def test_attenuated_rays_are_in_registers_and_single_precision(capability, method, machine_code):
     """As plain rays, but that a quotient's rare case is a call; numbers are added up whole."""
-    variant, count = Variant(F, F, 1, method, attenuated=True), machine_code.count
+    variant, count = Variant("attenuated", F, F, 1, method), machine_code.count
     kernels = machine_code.compiled(text_of({"": variant}), capability)
-    assert kernels.keys() == set(ATTENUATED)
+    assert kernels.keys() == set(KERNELS["attenuated"])
     for name, kernel in kernels.items():
         assert kernel.registers <= MOST, (name, kernel.registers)
         assert count(machine_code.LOCAL, kernel.instructions) <= ASIDE, name
@@ -82,37 +79,21 @@ def test_attenuated_rays_are_in_registers_and_single_precision(capability, metho
 
 
 @pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize("part", [Part("warp", F, B), Part("look", F), Part("hull", D)], ids=str)
+@pytest.mark.parametrize(
+    "part", [Variant("warp", F, B), Variant("look", F), Variant("hull", D)], ids=str
+)
 def test_warps_back_projection_and_hull_keep_all_in_registers(part, capability, machine_code):
     """float64 in no loop that reads values, nor over a brick's corners."""
-    text, count = fields({"": part}), machine_code.count
+    text, count = text_of({"": part}), machine_code.count
     kernels = machine_code.compiled(text, capability)
-    assert kernels.keys() == set(FIELDS[part.purpose])
+    assert kernels.keys() == set(KERNELS[part.purpose])
     for name, kernel in kernels.items():
         assert kernel.registers <= MOST, (name, kernel.registers)
         assert not count(machine_code.LOCAL + "|" + machine_code.ATOMIC, kernel.instructions), name
         values = [loop for loop in kernel.loops if count(r"LDG\.E(?!\S*\.64)", loop)]
-        assert bool(values) == (name not in ("invert", *FIELDS["hull"])), name
-        inner = kernel.loops if name in FIELDS["hull"] else values
+        assert bool(values) == (name not in ("invert", *KERNELS["hull"])), name
+        inner = kernel.loops if name in KERNELS["hull"] else values
         assert not any(count(machine_code.DOUBLE, loop) for loop in inner), name
-
-
-@pytest.mark.parametrize("capability", [80, 90])
-def test_normalisation_keeps_its_values_in_registers_and_float32(capability, machine_code):
-    """float64 in the loops over a group's sums alone, which read nothing else; nothing in local
-    memory, no call in a loop.
-    """
-    text, count = fields({"": Part("norm", F, B)}), machine_code.count
-    kernels = machine_code.compiled(text, capability)
-    assert kernels.keys() == set(FIELDS["norm"])
-    for name, kernel in kernels.items():
-        assert kernel.registers <= MOST // 2, (name, kernel.registers)
-        assert not count(machine_code.LOCAL + "|" + machine_code.ATOMIC, kernel.instructions), name
-        values = [loop for loop in kernel.loops if count(r"LDG\.E\.U16", loop)]
-        assert values, name
-        for loop in kernel.loops:
-            assert not count(machine_code.CALL, loop), name
-            assert loop not in values or not count(machine_code.DOUBLE, loop), name
 
 
 def test_a_mistake_is_an_error_with_the_compiler_s_words(machine_code):

@@ -7,8 +7,10 @@ import re
 import pytest
 import torch
 
-from mvrecon.kernels.cuda.sources import KERNELS, Part, text_of
-from mvrecon.kernels.rays.cuda import nvrtc
+from mvrecon.kernels.cuda import nvrtc
+from mvrecon.kernels.cuda.launch import KERNELS, Variant, text_of
+
+PURPOSES = ("warp", "look", "hull")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -33,12 +35,12 @@ def loops(ptx: str) -> list[str]:
 
 
 @pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize("purpose", KERNELS)
+@pytest.mark.parametrize("purpose", PURPOSES)
 def test_inner_loops_are_in_registers_and_single_precision(purpose, capability):
     """Nothing in local memory, no atomic addition; no float64 and no call in the inner loops of
     warps.
     """
-    text = nvrtc.build(text_of({"": Part(purpose, torch.float32)}), f"compute_{capability}")
+    text = nvrtc.build(text_of({"": Variant(purpose, torch.float32)}), f"compute_{capability}")
     parts = re.split(r"\.entry (\w+)", text.decode())[1:]
     ptx = dict(zip(parts[::2], parts[1::2], strict=True))
     every = "".join(ptx.values())
@@ -49,7 +51,7 @@ def test_inner_loops_are_in_registers_and_single_precision(purpose, capability):
         assert inner and not [loop for loop in inner if ".f64" in loop or "call" in loop], name
 
 
-@pytest.mark.parametrize("purpose", KERNELS)
+@pytest.mark.parametrize("purpose", PURPOSES)
 def test_machine_code_for_hopper_in_float64(purpose):
-    source = text_of({"": Part(purpose, torch.float64)})
+    source = text_of({"": Variant(purpose, torch.float64)})
     assert nvrtc.build(source, "sm_90")[:4] == b"\x7fELF"

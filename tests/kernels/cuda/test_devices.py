@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mvrecon.kernels.rays.cuda import driver
-from mvrecon.kernels.rays.cuda.scene import Scene
+from mvrecon.kernels.cuda import driver
+from mvrecon.kernels.cuda.launch import Scene
 
 SECOND = torch.device("cuda", 1)
 

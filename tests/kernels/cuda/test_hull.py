@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from mvrecon.geometry.box import bricks_along
+from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
-from mvrecon.kernels.footprints import Rule
-from mvrecon.kernels.rays.cuda import selfcheck
+from mvrecon.kernels.cuda.bricks import Rule
 from mvrecon.visual_hull import hull, noise
 from mvrecon.visual_hull.footprints import prints_of, summed_area_tables
 from mvrecon.visual_hull.judging import counted, counted_at_once
@@ -60,16 +60,16 @@ def test_the_same_counts_are_in_every_brick(kind, host):
 
 def test_wrong_counts_are_not_used(host, monkeypatch):
     monkeypatch.setattr(noise, "counted_at_once", bricks.count)
-    assert selfcheck.reason("cpu", "counts", torch.float64, tried=noise._tried) is None
-    selfcheck.forget()
+    assert self_test.failure("cpu", "counts", torch.float64, noise._self_test) is None
+    self_test.forget()
     monkeypatch.setattr(noise, "counted_at_once", lambda *arguments: bricks.count(*arguments) + 1)
-    why = selfcheck.reason("cpu", "counts", torch.float64, tried=noise._tried)
+    why = self_test.failure("cpu", "counts", torch.float64, noise._self_test)
     assert "counts differs" in str(why)
 
 
 def test_a_wrong_hull_is_not_used(host, monkeypatch):
-    assert selfcheck.reason("cpu", "hull", tried=hull._tried) is None
-    selfcheck.forget()
+    assert self_test.failure("cpu", "hull", torch.float64, hull._self_test) is None
+    self_test.forget()
     right = bricks.judge
     monkeypatch.setattr(bricks, "judge", lambda *arguments: ~right(*arguments))
-    assert "hull differs" in str(selfcheck.reason("cpu", "hull", tried=hull._tried))
+    assert "hull differs" in str(self_test.failure("cpu", "hull", torch.float64, hull._self_test))

@@ -9,19 +9,23 @@ import pytest
 import torch
 
 from mvrecon.geometry.box import Box
-from mvrecon.kernels.cuda.field import Field
-from mvrecon.kernels.cuda.layer import Layer
+from mvrecon.kernels.cuda.launch import Field, Scene
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.cuda import operators as cuda
-from mvrecon.kernels.rays.cuda.scene import Scene
-from mvrecon.kernels.rays.cuda.selfcheck import one_by_one
 from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.kernels.rays.ops import one_by_one
 from tests.kernels.cuda.host import Driver
 from tests.kernels.cuda.scenes import CASES, METHODS, RIGS, difference, scene, whole
 from tests.kernels.cuda.waits import Waits
 
 #: One volume, and a whole group of four and a part of one.
 PRECISIONS = [(torch.float64, 1, 1e-11), (torch.float32, 5, 3e-6)]
+
+
+def occupied(volume: torch.Tensor) -> torch.Tensor:
+    """The code of the box of what is not zero."""
+    rays = torch.zeros(0, 4, 3, 3, dtype=torch.float64), [0.0, 1.0], [1, 1], "joseph"
+    return cuda.occupied(volume, *rays, "auto")
 
 
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
@@ -34,11 +38,11 @@ def test_views_volumes_and_pose_gradients_are_those_of_the_reference(
     part = whole(shape)
     views = reference.project(x.double(), moving, window, detector, method)
     volume = reference.backproject(y.double(), lines, window, shape, method)
-    assert difference(cuda.project(x, lines, window, part, detector, method), views) < bound
-    assert difference(cuda.backproject(y, lines, window, part, method), volume) < bound
+    assert difference(cuda.project(x, lines, window, detector, method, part), views) < bound
+    assert difference(cuda.backproject(y, lines, window, shape, method, part), volume) < bound
     if kind != "axial":  # rays through voxels' centres have two derivatives
         (change,) = torch.autograd.grad((views * y).sum(), moving)
-        assert difference(cuda.lines_vjp(x, y, lines, window, part, method), change) < bound
+        assert difference(cuda.lines_vjp(x, y, lines, window, method, part), change) < bound
 
 
 @pytest.mark.parametrize("kind", ["dome", "wide", "dcspect80"])
@@ -54,17 +58,17 @@ def test_the_rigs_have_views_of_several_main_axes(kind):
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
 def test_rays_given_one_by_one_are_those_of_the_camera(method, dtype, count, bound, host):
     x, y, lines, window, detector = scene("dome", dtype, count)
-    single, part = one_by_one(lines, detector), whole(x.shape[1:])
+    single, shape, part = one_by_one(lines, detector), list(x.shape[1:]), whole(x.shape[1:])
     z = y.flatten(1)[..., None, None]
     views = reference.project(x.double(), lines, window, detector, method)
-    one = cuda.project(x, single, window, part, [1, 1], method)
+    one = cuda.project(x, single, window, [1, 1], method, part)
     assert difference(one.flatten(1), views.flatten(1)) < bound
     volume = reference.backproject(y.double(), lines, window, list(x.shape[1:]), method)
-    assert difference(cuda.backproject(z, single, window, part, method), volume) < bound
+    assert difference(cuda.backproject(z, single, window, shape, method, part), volume) < bound
     moving = single.clone().requires_grad_()
     again = reference.project(x.double(), moving, window, [1, 1], method)
     (change,) = torch.autograd.grad((again * z).sum(), moving)
-    assert difference(cuda.lines_vjp(x, z, single, window, part, method), change) < bound
+    assert difference(cuda.lines_vjp(x, z, single, window, method, part), change) < bound
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -77,18 +81,18 @@ def test_a_part_of_a_volume_is_read_and_written_alone(kind, method, host):
     box, all_ = Box((1, 0, 2), (4, 3, 5)), whole(x.shape[1:])
     part, inside = Occupancy(all_.shape, box), torch.zeros_like(x)
     inside[:, *box.slices] = x[:, *box.slices]
-    code = cuda.occupied_code(inside)
+    code = occupied(inside)
     rays = lines, window
-    views = cuda.project(inside, *rays, all_, detector, method)
-    assert torch.equal(cuda.project(inside, *rays, all_, detector, method, code), views)
+    views = cuda.project(inside, *rays, detector, method, all_)
+    assert torch.equal(cuda.project(inside, *rays, detector, method, all_, code), views)
     cut = inside[:, *box.slices]
-    assert torch.equal(cuda.project(cut, *rays, part, detector, method), views)
-    volume = cuda.backproject(y, *rays, all_, method)[:, *box.slices]
-    assert torch.equal(cuda.backproject(y, *rays, part, method), volume)
-    change = cuda.lines_vjp(inside, y, *rays, all_, method)
+    assert torch.equal(cuda.project(cut, *rays, detector, method, part), views)
+    volume = cuda.backproject(y, *rays, all_.box.shape, method, all_)[:, *box.slices]
+    assert torch.equal(cuda.backproject(y, *rays, part.box.shape, method, part), volume)
+    change = cuda.lines_vjp(inside, y, *rays, method, all_)
     for few in (
-        cuda.lines_vjp(inside, y, *rays, all_, method, code),
-        cuda.lines_vjp(cut, y, *rays, part, method),
+        cuda.lines_vjp(inside, y, *rays, method, all_, code),
+        cuda.lines_vjp(cut, y, *rays, method, part),
     ):
         assert difference(few, change) < 1e-6
 
@@ -96,15 +100,15 @@ def test_a_part_of_a_volume_is_read_and_written_alone(kind, method, host):
 def test_the_box_of_what_is_not_zero_is_that_of_the_reference(host):
     x = torch.zeros(2, 5, 6, 7)
     x[0, 2, 1, 3], x[1, 3, 4, 6], x[1, 3, 5, 5] = 1e-30, float("nan"), -1
-    found = Occupancy.decoded(cuda.occupied_code(x))
+    found = Occupancy.decoded(occupied(x))
     assert found.box == Box.around(x != 0) and found.shape == (5, 6, 7) and found.bricks is None
-    nothing = Occupancy.decoded(cuda.occupied_code(torch.zeros(1, 5, 6, 7)))
+    nothing = Occupancy.decoded(occupied(torch.zeros(1, 5, 6, 7)))
     assert nothing.box.size == 0
     _, _, lines, window, detector = scene("cone")
     empty = torch.zeros(1, *RIGS["cone"][0].shape)
-    code = cuda.occupied_code(empty)
+    code = occupied(empty)
     assert not cuda.project(
-        empty, lines, window, whole(empty.shape[1:]), detector, "joseph", code
+        empty, lines, window, detector, "joseph", whole(empty.shape[1:]), code
     ).any()
 
 
@@ -114,21 +118,22 @@ def test_half_volumes_are_read_as_they_are(method, dtype, count, host):
     """Not by way of a copy in float32: to the bits of one."""
     x, y, lines, window, detector = scene("dome", torch.float32, count)
     half, part = x.to(dtype), whole(x.shape[1:])
-    views = cuda.project(half, lines, window, part, detector, method)
+    views = cuda.project(half, lines, window, detector, method, part)
     assert views.dtype == torch.float32
-    assert torch.equal(views, cuda.project(half.float(), lines, window, part, detector, method))
-    change = cuda.lines_vjp(half, y, lines, window, part, method)
-    assert torch.equal(change, cuda.lines_vjp(half.float(), y, lines, window, part, method))
+    assert torch.equal(views, cuda.project(half.float(), lines, window, detector, method, part))
+    change = cuda.lines_vjp(half, y, lines, window, method, part)
+    assert torch.equal(change, cuda.lines_vjp(half.float(), y, lines, window, method, part))
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_views_in_pieces_give_the_same_volume(method, host, monkeypatch):
     _, y, lines, window, _ = scene("dcspect80", torch.float32, 5)
-    part = whole(RIGS["dcspect80"][0].shape)
-    volume = cuda.backproject(y, lines, window, part, method)
+    shape = RIGS["dcspect80"][0].shape
+    part = whole(shape)
+    volume = cuda.backproject(y, lines, window, shape, method, part)
     host.launches.clear()
     monkeypatch.setattr(cuda, "SHARE", 0.0)
-    assert difference(cuda.backproject(y, lines, window, part, method), volume) < 1e-6
+    assert difference(cuda.backproject(y, lines, window, shape, method, part), volume) < 1e-6
     assert host.launches == ["survey", *["record", "gather"] * len(lines)]
 
 
@@ -136,10 +141,10 @@ def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_no
     x, y, lines, window, detector = scene("cone", torch.float32)
     part = whole(x.shape[1:])
     with Waits() as waits:
-        code = cuda.occupied_code(x)
-        cuda.project(x, lines, window, part, detector, "joseph", code)
-        cuda.backproject(y, lines, window, part, "joseph")
-        cuda.lines_vjp(x, y, lines, window, part, "joseph", code)
+        code = occupied(x)
+        cuda.project(x, lines, window, detector, "joseph", part, code)
+        cuda.backproject(y, lines, window, part.box.shape, "joseph", part)
+        cuda.lines_vjp(x, y, lines, window, "joseph", part, code)
     assert waits.names == []
     assert host.launches == [
         *("occupy", "bound"),
@@ -150,7 +155,7 @@ def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_no
     assert set(host.streams) == {7} and host.modules == 1
 
 
-@pytest.mark.parametrize("packed", [Scene, Field, Layer])
+@pytest.mark.parametrize("packed", [Scene, Field])
 def test_the_packed_structure_is_that_of_the_source(packed, libraries):
     fields = [getattr(packed, name[0]).offset for name in packed._fields_]
     layout = (c_int * (1 + len(fields))).in_dll(libraries[packed], f"layout_{packed.__name__}")
@@ -160,11 +165,11 @@ def test_the_packed_structure_is_that_of_the_source(packed, libraries):
 def test_no_rays_and_no_voxels_launch_nothing(host):
     x, y, lines, window, detector = scene("cone", torch.float32)
     part = whole(x.shape[1:])
-    assert cuda.project(x, lines[:0], window, part, detector, "joseph").shape == (1, 0, *detector)
-    assert not cuda.backproject(y[:, :0], lines[:0], window, part, "joseph").any()
-    assert cuda.lines_vjp(x, y[:, :0], lines[:0], window, part, "joseph").shape == (0, 4, 3, 3)
+    assert cuda.project(x, lines[:0], window, detector, "joseph", part).shape == (1, 0, *detector)
+    assert not cuda.backproject(y[:, :0], lines[:0], window, part.box.shape, "joseph", part).any()
+    assert cuda.lines_vjp(x, y[:, :0], lines[:0], window, "joseph", part).shape == (0, 4, 3, 3)
     nothing = Occupancy(part.shape, Box((0, 0, 0), (0, 0, 0)))
-    views = cuda.project(x[:, :0, :0, :0], lines, window, nothing, detector, "siddon")
+    views = cuda.project(x[:, :0, :0, :0], lines, window, detector, "siddon", nothing)
     assert not views.any()
 
 
@@ -179,5 +184,5 @@ def test_a_thread_without_a_context_enters_that_of_its_device(host, monkeypatch)
     monkeypatch.setattr(
         Driver, "cuCtxSetCurrent", lambda *_: entered.append(1) and 0 or 0, raising=False
     )
-    views = cuda.project(x, lines, window, whole(x.shape[1:]), detector, "joseph")
+    views = cuda.project(x, lines, window, detector, "joseph", whole(x.shape[1:]))
     assert views.any() and len(entered) == 2  # at loading, and after the refusal

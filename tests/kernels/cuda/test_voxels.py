@@ -32,12 +32,12 @@ def test_volumes_and_the_transpose_are_those_of_the_reference(kind, dtype, bound
     y = torch.randn(2, len(cameras), *cameras.shape, dtype=dtype)
     for weighted in (False, True):
         wide = y.double().requires_grad_()
-        volumes = reference.look(wide, maps, window, weighted, list(grid.shape))
+        volumes = reference.backproject(wide, maps, window, weighted, list(grid.shape))
         x = torch.randn(volumes.shape, dtype=dtype)
         (views,) = torch.autograd.grad((volumes * x).sum(), wide)
         rest = maps, window, weighted
-        assert difference(cuda.look(y, *rest, list(grid.shape)), volumes) < bound
-        assert difference(cuda.show(x, *rest, list(cameras.shape)), views) < bound
+        assert difference(cuda.backproject(y, *rest, list(grid.shape)), volumes) < bound
+        assert difference(cuda.project(x, *rest, list(cameras.shape)), views) < bound
 
 
 def test_a_back_projection_launches_one_kernel_and_waits_for_none(host):
@@ -45,10 +45,10 @@ def test_a_back_projection_launches_one_kernel_and_waits_for_none(host):
     rest = image_maps(cameras, grid), list(cameras.ray_extent), True
     y = torch.randn(1, len(cameras), *cameras.shape)
     with Waits() as waits:
-        x = cuda.look(y, *rest, list(grid.shape))
-        cuda.show(x, *rest, list(cameras.shape))
+        x = cuda.backproject(y, *rest, list(grid.shape))
+        cuda.project(x, *rest, list(cameras.shape))
     assert waits.names == [] and host.launches == ["look", "show"]
-    assert not cuda.look(y[:, :0], rest[0][:0], *rest[1:], list(grid.shape)).any()
+    assert not cuda.backproject(y[:, :0], rest[0][:0], *rest[1:], list(grid.shape)).any()
 
 
 def test_a_beam_wider_than_its_source_is_near_has_its_transpose(host):
@@ -58,6 +58,6 @@ def test_a_beam_wider_than_its_source_is_near_has_its_transpose(host):
     maps, window = image_maps(near, grid), list(near.ray_extent)
     x = torch.randn(1, *grid.shape, dtype=torch.float64)
     y = torch.randn(1, len(near), *near.shape, dtype=torch.float64)
-    one = (cuda.look(y, maps, window, False, list(grid.shape)) * x).sum()
-    two = (cuda.show(x, maps, window, False, list(near.shape)) * y).sum()
+    one = (cuda.backproject(y, maps, window, False, list(grid.shape)) * x).sum()
+    two = (cuda.project(x, maps, window, False, list(near.shape)) * y).sum()
     assert one.abs() > 1e-3 and (one - two).abs() < 1e-11 * x.norm() * y.norm()

@@ -9,8 +9,6 @@ from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.kernels.warps import cuda, reference
-from mvrecon.kernels.warps.warp import warp
-from mvrecon.testing.as_gpu import AsGpu, on_gpu
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
 from tests.kernels.warps.scenes import OTHER, RIGS, SMALL, generic, lattices
@@ -32,7 +30,7 @@ def compared(maps: torch.Tensor, of, to, dtype: torch.dtype, channels: int) -> d
     volumes, change = torch.autograd.grad((values * y.double()).sum(), (wide, moving))
     return {
         "warp": difference(cuda.warp(x, maps, list(to)), values),
-        "back": difference(cuda.warp_back(y, maps, list(of)), volumes),
+        "back": difference(cuda.warp_transpose(y, maps, list(of)), volumes),
         "vjp": difference(cuda.warp_vjp(x, y, maps), change),
     }
 
@@ -76,24 +74,11 @@ def test_a_warp_launches_one_kernel_and_waits_for_none(host):
     x, y = torch.randn(2, 2, 3, *SMALL), torch.randn(2, 2, 2, 3, *OTHER)
     with Waits() as waits:
         cuda.warp(x, maps, OTHER)
-        cuda.warp_back(y, maps, SMALL)
+        cuda.warp_transpose(y, maps, SMALL)
         cuda.warp_vjp(x, y, maps)
     assert waits.names == []
     assert host.launches == ["warp", "invert", "warp_back", "warp_vary"]
     assert set(host.streams) == {7} and host.modules == 1
-
-
-def test_a_half_volume_on_a_gpu_is_read_as_it_is():
-    """No copy in float32 comes before the kernel; one in the volume's type behind it."""
-    maps = lifted_maps(generic())
-    x = torch.randn(2, 2, 3, *SMALL, dtype=torch.bfloat16)
-    with AsGpu() as gpu:
-        leaf = on_gpu(x).requires_grad_()
-        values = warp(leaf, on_gpu(maps), OTHER)
-        assert gpu.launches == {"warp": 1, "_to_copy": 1} and not gpu.waits
-        values.float().square().sum().backward()
-    assert values.dtype == leaf.grad.dtype == torch.bfloat16
-    assert torch.equal(values.values, warp(x, maps, OTHER))
 
 
 def test_what_is_beyond_a_volume_is_not_read_and_nothing_launches_nothing(host):
@@ -105,4 +90,4 @@ def test_what_is_beyond_a_volume_is_not_read_and_nothing_launches_nothing(host):
     assert seen[1, :, :, 1].isfinite().all() and seen[0].isnan().any()
     host.launches.clear()
     assert cuda.warp(x[:0], maps, OTHER).shape == (0, 2, 2, 2, *OTHER) and not host.launches
-    assert not cuda.warp_back(x[:, :, None][:, :, :0], maps[:, :0], OTHER).any()
+    assert not cuda.warp_transpose(x[:, :, None][:, :, :0], maps[:, :0], OTHER).any()

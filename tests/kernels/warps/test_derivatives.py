@@ -24,7 +24,7 @@ def test_gradients_by_values_and_by_homography():
     x = torch.randn(1, 2, 2, *SMALL, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x, H: warp(x, lifted_maps(H), OTHER, "cpu"), (x, H))
     y = torch.randn(1, 2, 2, 2, *OTHER, dtype=torch.float64, requires_grad=True)
-    back = torch.ops.mvrecon.warp_back
+    back = torch.ops.mvrecon.warp_transpose
     assert torch.autograd.gradcheck(lambda y, H: back(y, lifted_maps(H), list(SMALL)), (y, H))
     by_H = [
         torch.autograd.grad(warp(x, lifted_maps(H), OTHER, b).square().sum(), H)[0]
@@ -79,7 +79,7 @@ def test_torch_accepts_the_operators():
     y = torch.randn(2, 2, 2, 1, *OTHER, dtype=torch.float64, requires_grad=True)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
     opcheck(torch.ops.mvrecon.warp.default, (x, maps, OTHER), test_utils=checks)
-    opcheck(torch.ops.mvrecon.warp_back.default, (y, maps, list(SMALL)), test_utils=checks)
+    opcheck(torch.ops.mvrecon.warp_transpose.default, (y, maps, list(SMALL)), test_utils=checks)
     opcheck(
         torch.ops.mvrecon.warp_vjp.default,
         (x.detach(), y.detach(), maps.detach()),

@@ -13,8 +13,7 @@ from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.geometry.sample import normalised, sample
-from mvrecon.kernels.warps import ops as warp_ops
-from mvrecon.kernels.warps.warp import warp
+from mvrecon.kernels.warps.warp import WARP, warp
 from tests.kernels.warps.scenes import (
     DEPTH,
     OTHER,
@@ -70,9 +69,9 @@ def test_warp_back_is_the_transpose(kind):
         maps = lattice_maps(of, to)
         for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-5)):
             x = torch.randn(2, len(maps), 2, *of.shape, dtype=dtype)
-            Ax = warp_ops.warp(x, maps, list(to.shape))
+            Ax = WARP.forward(x, maps, list(to.shape))
             y = torch.randn_like(Ax)
-            one, two = (Ax * y).sum(), (x * warp_ops.warp_back(y, maps, list(of.shape))).sum()
+            one, two = (Ax * y).sum(), (x * WARP.transpose(y, maps, list(of.shape))).sum()
             assert (one - two).abs() < tolerance * Ax.norm() * y.norm()
             assert Ax.norm() > 0.1 * x.norm()
 
@@ -88,11 +87,11 @@ def test_threads_change_no_bit(threads, monkeypatch):
         threads(count)
         results.append(
             (
-                warp_ops.warp(x, maps, list(frusta.shape)),
-                warp_ops.warp_back(y, maps, list(GRID.shape)),
+                WARP.forward(x, maps, list(frusta.shape)),
+                WARP.transpose(y, maps, list(GRID.shape)),
             )
         )
-        results[-1] += (warp_ops.warp_vjp(x, y, maps),)
+        results[-1] += (WARP.vjp(x, y, maps),)
     for others in results[1:]:
         assert all(torch.equal(one, other) for one, other in zip(results[0], others, strict=True))
 
@@ -139,9 +138,9 @@ def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
     )
     maps = lifted_maps(generic())
     x, y = torch.randn(1, 2, 1, *SMALL), torch.randn(1, 2, 2, 1, *OTHER)
-    narrow = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_back(y, maps, SMALL)
+    narrow = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_transpose(y, maps, SMALL)
     monkeypatch.setattr(warp_cpu, "steps", lambda shape: padding.steps(shape).astype("int64"))
-    wide = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_back(y, maps, SMALL)
+    wide = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_transpose(y, maps, SMALL)
     assert all(torch.equal(one, other) for one, other in zip(narrow, wide, strict=True))
 
 
@@ -163,7 +162,7 @@ def test_the_identity_changes_no_bit():
     maps = lifted_maps(torch.eye(4, dtype=torch.float64)[None, None])
     x = torch.randn(2, 1, 3, *SMALL)
     assert torch.equal(warp(x, maps, SMALL, "cpu")[:, :, 0], x)
-    assert torch.equal(warp_ops.warp_back(x[:, :, None], maps, list(SMALL)), x)
+    assert torch.equal(WARP.transpose(x[:, :, None], maps, list(SMALL)), x)
 
 
 def test_what_lies_behind_a_source_is_not_seen():

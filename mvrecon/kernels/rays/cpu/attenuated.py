@@ -23,18 +23,18 @@ from mvrecon.kernels.rays.cpu.attenuated_loops import (
     Matter,
     backproject_slabs,
     bend_slabs,
+    path_of,
     project_rows,
 )
 from mvrecon.kernels.rays.cpu.loops import room_of
-from mvrecon.kernels.rays.cpu.nonzero import box_of, readable
 from mvrecon.kernels.rays.cpu.operators import Copy, copies, piece_sizes
 from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, part_of, store
 from mvrecon.kernels.rays.cpu.plan import Plan, Scene, whole_plan_of
 from mvrecon.kernels.rays.cpu.rig import Rig, Slabs, Units, bounds_of
-from mvrecon.kernels.rays.cpu.transmission import path_of
+from mvrecon.kernels.rays.cpu.skip_policy import box_of, readable
 from mvrecon.kernels.rays.occupancy import DENSE, Occupancy, boxes_of
 from mvrecon.kernels.rays.trace import Space
-from mvrecon.kernels.threads import share
+from mvrecon.kernels.threads import parallel_for
 
 Spread = Callable[[Store, Copy, Desk, Slabs], None]
 
@@ -52,15 +52,7 @@ def _desk(rig: Rig, values: Store, layers: Tensor) -> Desk:
     return Desk(room, path_of(room), layers.detach().double().numpy())
 
 
-def project(
-    volume: Float[Tensor, "n d h w"],
-    mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 c"],
-    layers: Float[Tensor, "m k"],
-    window: Sequence[float],
-    detector: Sequence[int],
-    method: str,
-) -> Float[Tensor, "n m v u k"]:
+def project(volume, mu, lines, layers, window, detector, method):
     """Attenuated line integrals; see `attenuated_reference.project`."""
     both = torch.cat([wide(volume), mu.to(wide(volume[:0]).dtype)[None]])
     plan, occupancy = _plan(lines, window, detector, method, mu)
@@ -82,18 +74,11 @@ def project(
             units, desk = Units(copy.axes, first, last), _desk(copy.rig, copy.store, layers)
             project_rows(emission, matter, copy.rig, desk, reads, views, units)
 
-        share(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
+        parallel_for(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
     return torch.from_numpy(views)
 
 
-def backproject(
-    views: Float[Tensor, "n m v u k"],
-    mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 c"],
-    layers: Float[Tensor, "m k"],
-    window: Sequence[float],
-    method: str,
-) -> Float[Tensor, "n d h w"]:
+def backproject(views, mu, lines, layers, window, method):
     """The exact transpose of `project` in the emission."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
     values = np.ascontiguousarray(views.numpy())
@@ -106,20 +91,12 @@ def backproject(
     return _gathered(made, spread, Spreading(len(views), views.numel(), layers))
 
 
-def mu_vjp(
-    volume: Float[Tensor, "n d h w"],
-    views: Float[Tensor, "n m v u k"],
-    mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 c"],
-    layers: Float[Tensor, "m k"],
-    window: Sequence[float],
-    method: str,
-) -> Float[Tensor, "d h w"]:
+def mu_vjp(volume, views, mu, lines, layers, window, method):
     """The derivative of <views, project(volume, mu)> by the attenuation mu."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
     emitting = occupancy if method.endswith(DENSE) else _emitting(volume)
     if not emitting.box.size:
-        return wide(mu).new_zeros(mu.shape)
+        return torch.zeros_like(mu)
     plan = replace(plan, boxes=boxes_of(emitting))
     space = Space(plan.rig.window, plan.rig.sizes, bounds_of(emitting))
     values = np.ascontiguousarray(views.numpy())
@@ -130,7 +107,7 @@ def mu_vjp(
 
     both = torch.cat([wide(volume).to(views.dtype), mu.to(views.dtype)[None]])
     made = copies(both, occupancy, plan)
-    return _gathered(made, spread, Spreading(1, views.numel(), layers))[0]
+    return _gathered(made, spread, Spreading(1, views.numel(), layers))[0].to(mu.dtype)
 
 
 def _emitting(volume: Float[Tensor, "n d h w"]) -> Occupancy:
@@ -168,7 +145,7 @@ def _gathered(
                         Slabs(axis, low, high),
                     )
 
-                share(fill, (x, y, z)[axis], spreading.values * max(x, y, z))
+                parallel_for(fill, (x, y, z)[axis], spreading.values * max(x, y, z))
         inner = part_of(into, near, (slice(0, x), slice(0, y), slice(0, z)))
         add(inner, near, volume, 0, y)
     return torch.from_numpy(volume)

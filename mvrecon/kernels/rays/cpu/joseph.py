@@ -1,18 +1,127 @@
-"""Joseph's method on one ray of the CPU, its cells in a room; the step is `methods/joseph.py`.
+"""Joseph's method: in a slab of the main axis, bilinear in the two other axes.
 
-`cells` writes where the ray goes; `sum`, `spread` and `slopes` read it. The two corners of a cell
+P. M. Joseph, An improved algorithm for reprojecting rays through pixel images, IEEE Trans. Med.
+Imaging 1, 1982.
+
+`cells` writes where a ray goes; `sum`, `spread` and `slopes` read it. The two corners of a cell
 that lie beside each other in memory are fetched as one complex number, and all arithmetic is left
-to loops without gathers, which every CPU vectorises.
+to loops without gathers, which every CPU vectorises. `real` and `whole` are the types of weights
+and of flat indices.
 """
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.rays.cpu.lanes import LANES, between, mix, more, plus, put, take, times
 from mvrecon.kernels.rays.cpu.summation import fold
-from mvrecon.kernels.rays.methods import joseph as step
-from mvrecon.kernels.rays.methods.strides import flat_index
-from mvrecon.kernels.rays.pose_gradient import Slopes
+from mvrecon.kernels.rays.trace import Slopes, flat_index
+
+
+class Cell(NamedTuple):
+    """A bilinear cell: its lower corner along the far and the near axis, and the place in it
+    towards the upper one.
+    """
+
+    iy: Any
+    iz: Any
+    y: Any
+    z: Any
+
+
+class Course(NamedTuple):
+    """Where a ray runs, see `trace.Ray`, in the type of weights."""
+
+    b: Any
+    slope_b: Any
+    c: Any
+    slope_c: Any
+    begin: Any
+    end: Any
+    centre: Any
+
+
+@scalar
+def course_of(ray, real):
+    """The course of a ray."""
+    b, slope_b, c, slope_c = real(ray.b), real(ray.slope_b), real(ray.c), real(ray.slope_c)
+    return Course(b, slope_b, c, slope_c, real(ray.begin), real(ray.end), real(ray.centre))
+
+
+@scalar
+def overlap(begin, end, s, half):
+    """The length of a ray from begin to end in the slab about s, in voxels; half = 0.5 as a number
+    of their type.
+    """
+    return min(end, s + half) - max(begin, s - half)
+
+
+@scalar
+def split(place, real):
+    """The lower neighbour of a padded place along an axis, and the weight of the upper one."""
+    cell = np.int32(place)
+    return cell, place - real(cell)
+
+
+@scalar
+def cell(course, s, real):
+    """The bilinear cell that a ray meets at s."""
+    iy, y = split(course.b + s * course.slope_b, real)
+    iz, z = split(course.c + s * course.slope_c, real)
+    return Cell(iy, iz, y, z)
+
+
+@scalar
+def hat(t, one):
+    """The weight of a voxel at the distance t along an axis, in voxels: that of `split`."""
+    return max(one - one, one - abs(t))
+
+
+@scalar
+def face(low, beside_low, high, beside_high, y, z):
+    """The bilinear value at the place (y, z) between four corners, and its slopes along the far and
+    the near axis.
+    """
+    low_z, high_z = beside_low - low, beside_high - high
+    lower, upper = low + z * low_z, high + z * high_z
+    return lower + y * (upper - lower), upper - lower, low_z + y * (high_z - low_z)
+
+
+@scalar
+def face_at(flat, k, steps, y, z):
+    """`face` of the cell at the flat index k."""
+    above, near = k + steps.far, steps.near
+    return face(flat[k], flat[k + near], flat[above], flat[above + near], y, z)
+
+
+@scalar
+def bent(sums, course, s, share, place):
+    """Slopes with those of one more slab, at s, of which the ray has a share; place as `face` has
+    it.
+    """
+    value, slope_b, slope_c = place
+    half, none = type(s)(0.5), type(s)(0)
+    along_b, along_c = share * slope_b, share * slope_c
+    return Slopes(
+        sums.total + share * value,
+        sums.by_b + along_b,
+        sums.by_slope_b + s * along_b,
+        sums.by_c + along_c,
+        sums.by_slope_c + s * along_c,
+        sums.at_begin + (value if s - half < course.begin else none),
+        sums.at_end + (value if s + half > course.end else none),
+    )
+
+
+@scalar
+def in_double(sums):
+    """Slopes in double precision, as those of the other methods are."""
+    return Slopes(
+        *(np.float64(sums.total), np.float64(sums.by_b), np.float64(sums.by_slope_b)),
+        *(np.float64(sums.by_c), np.float64(sums.by_slope_c)),
+        *(np.float64(sums.at_begin), np.float64(sums.at_end)),
+    )
 
 
 @scalar
@@ -22,11 +131,11 @@ def cells(ray, count, steps, room):
     """
     index, y, z, share, slab = room.index, room.one, room.two, room.three, room.four
     real, whole = y.dtype.type, index.dtype.type
-    course, half = step.course_of(ray, real), real(0.5)
+    course, half = course_of(ray, real), real(0.5)
     for i in range(np.uint32(count)):
         s = slab[i]
-        iy, iz, y[i], z[i] = step.cell(course, s, real)
-        share[i] = step.overlap(course.begin, course.end, s, half)
+        iy, iz, y[i], z[i] = cell(course, s, real)
+        share[i] = overlap(course.begin, course.end, s, half)
         index[i] = flat_index(steps, np.int32(s + course.centre), iy, iz, whole)
 
 
@@ -118,9 +227,9 @@ def slopes(store, n, steps, count, room, ray):
         room.high_parts,
     )
     real = y.dtype.type
-    course, none = step.course_of(ray, real), real(0)
+    course, none = course_of(ray, real), real(0)
     sums = Slopes(none, none, none, none, none, none, none)
     for i in range(np.uint32(count)):
-        place = step.face(low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1], y[i], z[i])
-        sums = step.bent(sums, course, slab[i], share[i], place)
-    return step.in_double(sums)
+        place = face(low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1], y[i], z[i])
+        sums = bent(sums, course, slab[i], share[i], place)
+    return in_double(sums)

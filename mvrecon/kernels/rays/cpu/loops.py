@@ -12,16 +12,14 @@ from mvrecon.kernels.rays.cpu.lanes import LANES
 from mvrecon.kernels.rays.cpu.packed_volume import Store
 from mvrecon.kernels.rays.cpu.rig import Rig, steps_of
 from mvrecon.kernels.rays.cpu.summation import visit
-from mvrecon.kernels.rays.methods.siddon import slopes as siddon_slopes
-from mvrecon.kernels.rays.methods.trilinear import slopes as trilinear_slopes
 from mvrecon.kernels.rays.occupancy import EDGE
-from mvrecon.kernels.rays.pose_gradient import pull_back
 from mvrecon.kernels.rays.trace import (
     JOSEPH,
     SIDDON,
     TRILINEAR,
     from_centre,
     main_axis,
+    pull_back,
     trace,
     within,
 )
@@ -61,6 +59,14 @@ def walk(rig, spans, unit):
 
 
 @scalar
+def ray_of(rig, reads, view, place, other):
+    """A ray of a unit: its view m, pixel u, v, the view's maps, the pixel from the centre."""
+    u, v = (place, other) if reads.tall[view] else (other, place)
+    m = reads.views[view]
+    return m, u, v, rig.lines[m], from_centre(rig, u, v)
+
+
+@scalar
 def _cells(rig, ray, span, steps, room):
     if rig.method == TRILINEAR:
         return trilinear.cells(ray, span, steps, room)
@@ -89,11 +95,8 @@ def project_rows(store, rig, room, reads, views, units):
     volumes = len(views)
     for unit in range(units.first, units.last):
         view, place, start, stop = walk(rig, reads.spans, unit)
-        m, tall = reads.views[view], reads.tall[view]
-        line = rig.lines[m]
         for other in range(start, stop):
-            u, v = (place, other) if tall else (other, place)
-            pixel = from_centre(rig, u, v)
+            m, u, v, line, pixel = ray_of(rig, reads, view, place, other)
             axis = main_axis(line, pixel[0], pixel[1])
             if not units.axes[axis]:
                 continue
@@ -124,11 +127,8 @@ def backproject_slabs(store, rig, room, reads, views, slabs):
     volumes, steps = len(views), steps_of(rig, store, slabs.axis)
     for unit in range(len(reads.views) * max(rig.detector)):
         view, place, start, stop = walk(rig, reads.spans, unit)
-        m, tall = reads.views[view], reads.tall[view]
-        line = rig.lines[m]
         for other in range(start, stop):
-            u, v = (place, other) if tall else (other, place)
-            pixel = from_centre(rig, u, v)
+            m, u, v, line, pixel = ray_of(rig, reads, view, place, other)
             if silent(views, m, v, u) or main_axis(line, pixel[0], pixel[1]) != slabs.axis:
                 continue
             ray = trace(line, slabs.axis, store.near, pixel, rig, rig.method)
@@ -160,11 +160,8 @@ def vary_rows(store, rig, room, reads, views, change, units):
     """
     for unit in range(units.first, units.last):
         view, place, start, stop = walk(rig, reads.spans, unit)
-        m, tall = reads.views[view], reads.tall[view]
-        line = rig.lines[m]
         for other in range(start, stop):
-            u, v = (place, other) if tall else (other, place)
-            pixel = from_centre(rig, u, v)
+            m, u, v, line, pixel = ray_of(rig, reads, view, place, other)
             axis = main_axis(line, pixel[0], pixel[1])
             if not units.axes[axis]:
                 continue
@@ -179,8 +176,8 @@ def vary_rows(store, rig, room, reads, views, change, units):
                 if rig.method == JOSEPH:
                     slopes = joseph.slopes(store, n, steps, count, room, ray)
                 elif rig.method == TRILINEAR:
-                    slopes = trilinear_slopes(store, n, ray, steps)
+                    slopes = trilinear.slopes(store, n, ray, steps)
                 else:
-                    slopes = siddon_slopes(store, n, ray, steps)
+                    slopes = siddon.slopes(store, n, ray, steps)
                 value = views[n, m, v, u]
                 pull_back(line, ray, p, rig.window, value, slopes, change[m, place])

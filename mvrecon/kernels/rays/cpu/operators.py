@@ -5,16 +5,16 @@ Every result is the same to the last bit for any number of threads: each ray's s
 thread, and so does each voxel of the adjoint (a thread owns a range of slabs, one main axis at a
 time, and meets the rays in one order).
 
-Rays read copies of the volume, see `packed_volume.py`, made piece by piece so that little is added
-to the caller's memory.
+The functions have the arguments of the operators, see `rays/ops.py`; a support may be an occupancy
+as such. Rays read copies of the volume, see `packed_volume.py`, made piece by piece so that little
+is added to the caller's memory.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.precision import wide
@@ -23,9 +23,10 @@ from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room
 from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, fill, part_of, store
 from mvrecon.kernels.rays.cpu.plan import Plan, Scene, plan_of, ray_plan_of
 from mvrecon.kernels.rays.cpu.rig import Columns, Reads, Rig, Slabs, Units
+from mvrecon.kernels.rays.cpu.skip_policy import occupancy_of
 from mvrecon.kernels.rays.lines import unshifted
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.kernels.threads import share
+from mvrecon.kernels.threads import parallel_for
 
 #: Rows of a volume of half precision that are widened at a time.
 TOGETHER = 8
@@ -77,21 +78,28 @@ def copies(volume: Tensor, occupancy: Occupancy, plan: Plan) -> Iterator[Copy]:
                 for row in range(first, last, TOGETHER):
                     fill(wide(values[:, :, row : min(row + TOGETHER, last)]).numpy(), near, to, row)
 
-            share(copy, values.shape[2], values.numel(), 4)
+            parallel_for(copy, values.shape[2], values.numel(), 4)
             yield Copy(store(into, near), piece, axes, rows)
 
 
-def project(
-    volume: Float[Tensor, "n d h w"],
-    lines: Float[Tensor, "m 4 3 k"],
-    window: Sequence[float],
-    occupancy: Occupancy,
-    detector: Sequence[int],
-    method: str,
-) -> Float[Tensor, "n m v u"]:
-    """Line integrals of volumes, in mm times their unit; see `reference.project`. `volume` is the
-    occupied box.
-    """
+def occupied(volume, lines, window, detector, method, skip):
+    """Where volumes [n d h w] are not zero, in code; see `skip_policy.occupancy_of`."""
+    return occupancy_of(volume, Scene(lines, window, detector, method), skip).encoded()
+
+
+def _read(
+    volume: Tensor, support: Tensor | Occupancy | None, occupied: Tensor | None
+) -> tuple[Tensor, Occupancy]:
+    """What is to be read of volumes, and where it lies in the whole."""
+    if support is not None or occupied is None:
+        return volume, Occupancy.of(volume.shape[1:], support)
+    occupancy = Occupancy.decoded(occupied)
+    return volume[:, *occupancy.box.slices], occupancy
+
+
+def project(volume, lines, window, detector, method, support=None, occupied=None):
+    """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`."""
+    volume, occupancy = _read(volume, support, occupied)
     real = wide(volume[:0]).numpy().dtype
     plan = plan_of(Scene(lines, window, detector, method), occupancy, len(volume), real.itemsize)
     sizes, reads, columns = plan.rig.sizes, plan.reads, plan.upright
@@ -107,19 +115,16 @@ def project(
             room = column_of(copy.rig, copy.store, len(views))
             project_columns(copy.store, copy.rig, room, columns, views, first, last)
 
-        share(add_rows, plan.units, views.size * max(sizes), 4)
-        share(add_columns, upright if copy.store.near == 2 else 0, views.size * max(sizes), 4)
+        parallel_for(add_rows, plan.units, views.size * max(sizes), 4)
+        parallel_for(
+            add_columns, upright if copy.store.near == 2 else 0, views.size * max(sizes), 4
+        )
     return torch.from_numpy(views)
 
 
-def backproject(
-    views: Float[Tensor, "n m v u"],
-    lines: Float[Tensor, "m 4 3 k"],
-    window: Sequence[float],
-    occupancy: Occupancy,
-    method: str,
-) -> Float[Tensor, "n d h w"]:
-    """The exact transpose of `project`, the same to the last bit for any number of threads."""
+def backproject(views, lines, window, shape, method, support=None):
+    """The exact transpose of `project`."""
+    occupancy = Occupancy.of(shape, support)
     values = np.ascontiguousarray(views.numpy())
     scene = Scene(lines, window, views.shape[2:], method)
     plan = plan_of(scene, occupancy, len(views), values.itemsize)
@@ -130,11 +135,12 @@ def backproject(
             overlap, where = _overlap(occupancy, rows, piece)
             source, part = part_of(into, near, where), volume[:, :, overlap]
             for axis in range(3):
-                if axes[axis]:
-                    _spread_rows(store(into, near), piece, axis, plan.reads[near], values)
-                if near == 2 and axis < 2 and len(plan.upright.views):
-                    _spread_columns(store(into, near), piece, axis, plan.upright, values)
-            share(
+                upright = near == 2 and axis < 2 and len(plan.upright.views)
+                if axes[axis] or upright:
+                    reads = plan.reads[near] if axes[axis] else None
+                    columns = plan.upright if upright else None
+                    _spread(store(into, near), piece, axis, reads, columns, values)
+            parallel_for(
                 lambda a, b, source=source, to=part, near=near: add(source, near, to, a, b),
                 part.shape[2],
                 part.size,
@@ -142,40 +148,32 @@ def backproject(
     return torch.from_numpy(volume)
 
 
-def _spread_rows(values: Store, piece: Rig, axis: int, reads: Reads, views: np.ndarray) -> None:
-    """Spread oblique views along the rays of one main axis, slab by slab."""
-
-    def add_slabs(low: int, high: int) -> None:
-        slabs = Slabs(axis, piece.box[axis] + low, piece.box[axis] + high)
-        backproject_slabs(values, piece, room_of(piece, values), reads, views, slabs)
-
-    share(add_slabs, piece_sizes(piece)[axis], views.size * max(piece.sizes))
-
-
-def _spread_columns(
-    values: Store, piece: Rig, axis: int, columns: Columns, views: np.ndarray
+def _spread(
+    values: Store,
+    piece: Rig,
+    axis: int,
+    reads: Reads | None,
+    columns: Columns | None,
+    views: np.ndarray,
 ) -> None:
-    """Spread upright views along the columns of one main axis, slab by slab."""
+    """Spread views along the rays of one main axis, slab by slab: oblique ones, then upright
+    ones.
+    """
 
     def add_slabs(low: int, high: int) -> None:
-        room = column_of(piece, values, len(views))
         slabs = Slabs(axis, piece.box[axis] + low, piece.box[axis] + high)
-        backproject_columns(values, piece, room, columns, views, slabs)
+        if reads:
+            backproject_slabs(values, piece, room_of(piece, values), reads, views, slabs)
+        if columns:
+            room = column_of(piece, values, len(views))
+            backproject_columns(values, piece, room, columns, views, slabs)
 
-    share(add_slabs, piece_sizes(piece)[axis], views.size * max(piece.sizes))
+    parallel_for(add_slabs, piece_sizes(piece)[axis], views.size * max(piece.sizes))
 
 
-def lines_vjp(
-    volume: Float[Tensor, "n d h w"],
-    views: Float[Tensor, "n m v u"],
-    lines: Float[Tensor, "m 4 3 k"],
-    window: Sequence[float],
-    occupancy: Occupancy,
-    method: str,
-) -> Float[Tensor, "m 4 3 k"]:
-    """The derivative of <views, project(volume, lines)> by the lines, all methods by hand;
-    float64.
-    """
+def lines_vjp(volume, views, lines, window, method, support=None, occupied=None):
+    """The derivative of <views, project(volume, lines)> by the lines [m 4 3 k]; float64."""
+    volume, occupancy = _read(volume, support, occupied)
     values = np.ascontiguousarray(views.numpy())
     scene = Scene(lines, window, views.shape[2:], method)
     plan = ray_plan_of(scene, occupancy, len(volume), wide(volume[:0]).element_size())
@@ -189,7 +187,7 @@ def lines_vjp(
             room, units = room_of(copy.rig, copy.store), Units(copy.axes, first, last)
             vary_rows(copy.store, copy.rig, room, reads[copy.store.near], values, change, units)
 
-        share(vary, plan.units, values.size * max(sizes), 4)
+        parallel_for(vary, plan.units, values.size * max(sizes), 4)
         middle = (copy.rows.start + copy.rows.stop - sizes[1]) / 2
         total += unshifted(torch.from_numpy(change).sum(dim=1), middle)
     return total

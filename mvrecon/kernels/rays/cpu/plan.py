@@ -15,10 +15,10 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box, Three
 from mvrecon.kernels.padding import padded_shape
+from mvrecon.kernels.rays.cpu.columns import columnar
 from mvrecon.kernels.rays.cpu.footprint import spans_of
 from mvrecon.kernels.rays.cpu.lanes import LANES
 from mvrecon.kernels.rays.cpu.rig import Columns, Reads, Rig, bounds_of, rig_of
-from mvrecon.kernels.rays.cpu.upright import columnar
 from mvrecon.kernels.rays.lines import DIRECTION, START, shifted
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of, bricks_of_rig
 from mvrecon.kernels.rays.trace import TRILINEAR

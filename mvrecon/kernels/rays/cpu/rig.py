@@ -9,9 +9,8 @@ from torch import Tensor
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.padding import PAD
 from mvrecon.kernels.rays.cpu.packed_volume import FRONT
-from mvrecon.kernels.rays.methods.strides import Steps
 from mvrecon.kernels.rays.occupancy import Occupancy, bricks_of_rig
-from mvrecon.kernels.rays.trace import numbered
+from mvrecon.kernels.rays.trace import Steps, numbered
 
 #: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a
 #: ray (trilinear); the box of what may be there, see `trace.Space`; bricks, their strides and

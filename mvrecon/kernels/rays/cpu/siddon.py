@@ -1,10 +1,139 @@
-"""Siddon's method on one ray of the CPU, its cells in a room; the step is `methods/siddon.py`."""
+"""Siddon's method: the exact lengths in the cells that a ray crosses in a slab of the main axis.
+
+R. L. Siddon, Fast calculation of the exact radiological path for a three-dimensional CT array, Med.
+Phys. 12, 1985.
+
+Within a slab the ray crosses at most one plane of each other axis, so it meets at most three cells:
+no search, no sorting, no state from slab to slab. Cells are half-open: a ray on a face belongs to
+the cell above it. `real` and `whole` are the types of weights and of flat indices.
+"""
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.rays.cpu.summation import fold
-from mvrecon.kernels.rays.methods import siddon as step
+from mvrecon.kernels.rays.trace import Slopes, flat_index
+
+
+class Course(NamedTuple):
+    """Where a ray runs, see `trace.Ray`, counted from faces, and one over its slopes."""
+
+    b: Any
+    slope_b: Any
+    per_b: Any
+    c: Any
+    slope_c: Any
+    per_c: Any
+    begin: Any
+    end: Any
+    centre: Any
+
+
+class Passage(NamedTuple):
+    """Where a ray begins in a slab, its length there, its way to the plane between the cells b0 and
+    b1 along the far axis, and to that between c0 and c1 along the near one.
+    """
+
+    begin: Any
+    length: Any
+    to_b: Any
+    to_c: Any
+    b0: Any
+    b1: Any
+    c0: Any
+    c1: Any
+
+
+@scalar
+def course_of(ray, real):
+    """The course of a ray; one without slope stays in its cell, and 1 / slope is never used."""
+    half, one, none = real(0.5), real(1), real(0)
+    b, slope_b, c, slope_c = (
+        real(ray.b) + half,
+        real(ray.slope_b),
+        real(ray.c) + half,
+        real(ray.slope_c),
+    )
+    per_b, per_c = one / slope_b if slope_b else none, one / slope_c if slope_c else none
+    return Course(
+        *(b, slope_b, per_b, c, slope_c, per_c),
+        *(real(ray.begin), real(ray.end), real(ray.centre)),
+    )
+
+
+@scalar
+def reach(low, high, before, per_slope, length):
+    """How far into the slab a ray passes from cell `low` to cell `high`; the whole length when it
+    stays.
+    """
+    way = min(max((max(low, high) - before) * per_slope, length * 0), length)
+    return way if low != high else length
+
+
+@scalar
+def crossing(course, s, real):
+    """Where a ray crosses planes in the slab about s."""
+    half = real(0.5)
+    s0, s1 = max(course.begin, s - half), min(course.end, s + half)
+    length = s1 - s0
+    y, z = course.b + s0 * course.slope_b, course.c + s0 * course.slope_c
+    b0, b1 = np.int32(y), np.int32(course.b + s1 * course.slope_b)
+    c0, c1 = np.int32(z), np.int32(course.c + s1 * course.slope_c)
+    to_b = reach(real(b0), real(b1), y, course.per_b, length)
+    to_c = reach(real(c0), real(c1), z, course.per_c, length)
+    return Passage(s0, length, to_b, to_c, b0, b1, c0, c1)
+
+
+@scalar
+def lengths(passage):
+    """A ray's lengths in the cells that it crosses, in order."""
+    one, two = min(passage.to_b, passage.to_c), max(passage.to_b, passage.to_c)
+    return one, two - one, passage.length - two
+
+
+@scalar
+def three(steps, k, passage, whole):
+    """Flat indices of the cells that a ray crosses in slab k, in order."""
+    middle = (
+        flat_index(steps, k, passage.b1, passage.c0, whole)
+        if passage.to_b < passage.to_c
+        else flat_index(steps, k, passage.b0, passage.c1, whole)
+    )
+    return (
+        flat_index(steps, k, passage.b0, passage.c0, whole),
+        middle,
+        flat_index(steps, k, passage.b1, passage.c1, whole),
+    )
+
+
+@scalar
+def slopes(store, n, ray, steps):
+    """How a ray's sum changes with its place, as `pose_gradient.Slopes`: at each plane by the
+    difference of the two cells.
+    """
+    flat, offset, course = store.values, np.int64(n * store.size), course_of(ray, np.float64)
+    total = by_b = by_slope_b = by_c = by_slope_c = at_begin = at_end = 0.0
+    for k in range(ray.first, ray.last):
+        passage = crossing(course, k - ray.centre, np.float64)
+        index, parts = three(steps, k, passage, np.int64), lengths(passage)
+        first_cell, middle, last_cell = (
+            flat[offset + index[0]],
+            flat[offset + index[1]],
+            flat[offset + index[2]],
+        )
+        total += parts[0] * first_cell + parts[1] * middle + parts[2] * last_cell
+        # without a crossing both cells are the same
+        first, last = middle - first_cell, last_cell - middle
+        jump_b, jump_c = (first, last) if passage.to_b < passage.to_c else (last, first)
+        by_b += jump_b * course.per_b
+        by_slope_b += (passage.begin + passage.to_b) * jump_b * course.per_b
+        by_c += jump_c * course.per_c
+        by_slope_c += (passage.begin + passage.to_c) * jump_c * course.per_c
+        at_begin += first_cell if k - ray.centre - 0.5 < ray.begin else 0.0
+        at_end += last_cell if k - ray.centre + 0.5 > ray.end else 0.0
+    return Slopes(total, by_b, by_slope_b, by_c, by_slope_c, at_begin, at_end)
 
 
 @scalar
@@ -23,14 +152,14 @@ def cells(ray, count, steps, room):
     """
     index0, index1, index2, part0, part1, part2 = crossed(room)
     real, whole = part0.dtype.type, index0.dtype.type
-    course = step.course_of(ray, np.float64)
+    course = course_of(ray, np.float64)
     for i in range(np.uint32(count)):
         s = np.float64(room.four[i])
-        passage = step.crossing(course, s, np.float64)
-        one, two, three = step.lengths(passage)
-        part0[i], part1[i], part2[i] = real(one), real(two), real(three)
+        passage = crossing(course, s, np.float64)
+        first, middle, last = lengths(passage)
+        part0[i], part1[i], part2[i] = real(first), real(middle), real(last)
         k = np.int32(s + course.centre)
-        index0[i], index1[i], index2[i] = step.three(steps, k, passage, whole)
+        index0[i], index1[i], index2[i] = three(steps, k, passage, whole)
 
 
 @scalar

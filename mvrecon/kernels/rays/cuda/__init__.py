@@ -1,1 +1,1 @@
-"""The back end of CUDA devices: numba's kernels, a thread a ray or a voxel."""
+"""The back end of CUDA devices: kernels along rays in CUDA C++, a thread a ray or a voxel."""

@@ -16,21 +16,13 @@ from torch import Tensor
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays.cuda.operators import Call
 from mvrecon.kernels.rays.lines import DIRECTION, WORLD
-from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.kernels.rays.occupancy import DENSE, Occupancy
 
 #: Bits of a number in fixed point, without its sign.
 BITS = 62
 
 
-def project(
-    volume: Float[Tensor, "n d h w"],
-    mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 c"],
-    layers: Float[Tensor, "m k"],
-    window: Sequence[float],
-    detector: Sequence[int],
-    method: str,
-) -> Float[Tensor, "n m v u k"]:
+def project(volume, mu, lines, layers, window, detector, method):
     """Attenuated line integrals, in mm times the volumes' unit; see
     `attenuated_reference.project`.
     """
@@ -43,14 +35,7 @@ def project(
     return views
 
 
-def backproject(
-    views: Float[Tensor, "n m v u k"],
-    mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 c"],
-    layers: Float[Tensor, "m k"],
-    window: Sequence[float],
-    method: str,
-) -> Float[Tensor, "n d h w"]:
+def backproject(views, mu, lines, layers, window, method):
     """The exact transpose of `project` in the emission, to 2^-`BITS` of its bound."""
     y, detector = wide(views), views.shape[2:4]
     greatest = _greatest(y) * _longest(lines, detector)
@@ -58,15 +43,7 @@ def backproject(
     return _whole(call, "receive", y / greatest, len(y)) * greatest
 
 
-def mu_vjp(
-    volume: Float[Tensor, "n d h w"],
-    views: Float[Tensor, "n m v u k"],
-    mu: Float[Tensor, "d h w"],
-    lines: Float[Tensor, "m 4 3 c"],
-    layers: Float[Tensor, "m k"],
-    window: Sequence[float],
-    method: str,
-) -> Float[Tensor, "d h w"]:
+def mu_vjp(volume, views, mu, lines, layers, window, method):
     """The derivative of <views, project(volume, mu)> by the attenuation mu."""
     x, detector = wide(volume), views.shape[2:4]
     y, longest = views.to(x.dtype), _longest(lines, detector)
@@ -75,18 +52,12 @@ def mu_vjp(
     seen = _greatest(y) * longest
     both = torch.cat([x / sent, mu.to(x.dtype)[None]])
     call = _call(both, lines, layers, window, detector, method)
-    return _whole(call, "bend", y / seen, 1)[0] * (sent * seen)
+    return _whole(call, "bend", y / seen, 1)[0].mul(sent * seen).to(mu.dtype)
 
 
-def _call(
-    volumes: Tensor,
-    lines: Tensor,
-    layers: Tensor,
-    window: Sequence[float],
-    detector: Sequence[int],
-    method: str,
-) -> Call:
+def _call(volumes, lines, layers, window, detector, method):
     """A call whose volumes, the last of them the attenuation, are where rays read them."""
+    method = method.removesuffix(DENSE)  # nothing is left out in any case
     part, x = Occupancy.whole(volumes.shape[1:]), volumes.detach().contiguous()
     call = Call(x, lines, window, part, detector, method, attenuated=True)
     call.read(x, None)

@@ -1,8 +1,9 @@
 """The compiled operators of CUDA devices: the same three as those of the CPU, on torch's current
 stream, without a wait.
 
-Everything is the same to the last bit in every run: the adjoint goes voxel by voxel. Rays given one
-by one alone spread with atomic additions, in no fixed order.
+The functions have the arguments of the operators, see `rays/ops.py`; a support may be an occupancy
+as such. Everything is the same to the last bit in every run: the adjoint goes voxel by voxel. Rays
+given one by one alone spread with atomic additions, in no fixed order.
 """
 
 import math
@@ -13,14 +14,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.kernels.cuda import driver
+from mvrecon.kernels.cuda.driver import BLOCK, WARP
+from mvrecon.kernels.cuda.launch import NAMES, Scene, Variant, kernels_of
 from mvrecon.kernels.precision import wide
-from mvrecon.kernels.rays.cuda import driver
-from mvrecon.kernels.rays.cuda.kernels import kernels_of
-from mvrecon.kernels.rays.cuda.scene import Scene
-from mvrecon.kernels.rays.cuda.sources import BLOCK, NAMES, QUADS, RUN, TOGETHER, WARP, Variant
 from mvrecon.kernels.rays.occupancy import Occupancy, code_size
-from mvrecon.kernels.rays.trace import numbered
+from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR, numbered
 
+#: Volumes that share a ray, as in `1_scene.cu`; cells that a thread copies, as in `4_project.cu`.
+TOGETHER, RUN = 4, 8
+#: Fours of numbers that are recorded of a ray, by method, as in `5_backproject.cu`.
+QUADS = {JOSEPH: 2, SIDDON: 3, TRILINEAR: 2}
 #: The part of a device's memory that the rays of an adjoint may take.
 SHARE = 1 / 16
 #: Threads of a pose gradient, so that a small view is split over blocks.
@@ -63,7 +67,9 @@ class Call:
         self.real = torch.float64 if dtype == torch.float64 else torch.float32
         self.together = 1 if count == 1 or attenuated else TOGETHER
         self.groups = -(-count // self.together)
-        variant = Variant(self.real, dtype, self.together, self.method, attenuated)
+        purpose = "attenuated" if attenuated else "rays"
+        name = method.partition(":")[0]
+        variant = Variant(purpose, self.real, dtype, self.together, name)
         self.kernels = kernels_of(variant, self.device)
         self.stream = driver.stream_of(self.device)
         maps = lines.detach().double().contiguous()
@@ -121,23 +127,10 @@ class Call:
         self.start("store", runs, 2 * self.groups)
 
 
-def project(
-    volume: Float[Tensor, "n d h w"],
-    lines: Float[Tensor, "m 4 3 k"],
-    window: Sequence[float],
-    occupancy: Occupancy,
-    detector: Sequence[int],
-    method: str,
-    occupied: Tensor | None = None,
-) -> Float[Tensor, "n m v u"]:
-    """Line integrals of volumes, in mm times their unit; see `reference.project`.
-
-    Args:
-        volume: the part that `occupancy` says there is; half volumes are read as they are.
-        occupied: the code of an occupancy on the device, outside of whose box volumes are zero.
-    """
+def project(volume, lines, window, detector, method, support=None, occupied=None):
+    """Line integrals of volumes [n d h w] as views [n m v u]; half volumes are read as they are."""
     x = stored(volume)
-    call = Call(x, lines, window, occupancy, detector, method)
+    call = Call(x, lines, window, Occupancy.of(x.shape[1:], support), detector, method)
     views = call.new(x.shape[0], lines.shape[0], *detector)
     call.read(x, occupied)
     call.scene.views = views.data_ptr()
@@ -145,13 +138,7 @@ def project(
     return views
 
 
-def backproject(
-    views: Float[Tensor, "n m v u"],
-    lines: Float[Tensor, "m 4 3 k"],
-    window: Sequence[float],
-    occupancy: Occupancy,
-    method: str,
-) -> Float[Tensor, "n d h w"]:
+def backproject(views, lines, window, shape, method, support=None):
     """The exact transpose of `project`.
 
     Raises:
@@ -164,8 +151,8 @@ def backproject(
                 "torch.use_deterministic_algorithms was called; it needs cameras, or backend "
                 "'reference'"
             )
-        return scatter(views, lines, window, occupancy, method)
-    y = wide(views).contiguous()
+        return scatter(views, lines, window, shape, method, support)
+    y, occupancy = wide(views).contiguous(), Occupancy.of(shape, support)
     call = Call(y, lines, window, occupancy, views.shape[2:], method)
     volume = call.new(y.shape[0], *occupancy.box.shape, zero=not lines.shape[0])
     call.scene.views, call.scene.results = y.data_ptr(), volume.data_ptr()
@@ -173,11 +160,9 @@ def backproject(
     return volume
 
 
-def scatter(
-    views: Tensor, lines: Tensor, window: Sequence[float], occupancy: Occupancy, method: str
-) -> Float[Tensor, "n d h w"]:
+def scatter(views, lines, window, shape, method, support=None):
     """`backproject` ray by ray, with atomic additions: of any rays."""
-    y = wide(views).contiguous()
+    y, occupancy = wide(views).contiguous(), Occupancy.of(shape, support)
     call = Call(y, lines, window, occupancy, views.shape[2:], method)
     volume = call.new(len(y), *occupancy.box.shape, zero=True)
     call.scene.put(views=y, results=volume)
@@ -208,18 +193,10 @@ def _gather(call: Call) -> None:
         call.start("gather", math.prod(scene.part), call.groups)
 
 
-def lines_vjp(
-    volume: Float[Tensor, "n d h w"],
-    views: Float[Tensor, "n m v u"],
-    lines: Float[Tensor, "m 4 3 k"],
-    window: Sequence[float],
-    occupancy: Occupancy,
-    method: str,
-    occupied: Tensor | None = None,
-) -> Float[Tensor, "m 4 3 k"]:
-    """The derivative of <views, project(volume, lines)> by the lines; float64."""
+def lines_vjp(volume, views, lines, window, method, support=None, occupied=None):
+    """The derivative of <views, project(volume, lines)> by the lines [m 4 3 k]; float64."""
     x = stored(volume)
-    call = Call(x, lines, window, occupancy, views.shape[2:], method)
+    call = Call(x, lines, window, Occupancy.of(x.shape[1:], support), views.shape[2:], method)
     y = views.to(call.real).contiguous()
     call.read(x, occupied)
     m, maps = len(lines), lines.shape[3]
@@ -236,17 +213,18 @@ def lines_vjp(
     return change.sum(dim=1).view(m, 4, 3, maps)
 
 
-def occupied_code(volume: Float[Tensor, "n d h w"]) -> Tensor:
-    """The code of the box outside of which volumes are zero, see `Occupancy`, on their device."""
+def occupied(volume, lines, window, detector, method, skip):
+    """The code of the box outside of which volumes are zero, see `Occupancy`, on their device: all
+    that a GPU looks for.
+    """
     x = stored(volume)
     shape = list(x.shape[1:])
     code = torch.zeros(code_size(shape), dtype=torch.int32, device=x.device)
     flags = torch.zeros(6, dtype=torch.int32, device=x.device)
     part = tuple(shape[::-1])
     scene = Scene().put(volumes=x, flags=flags, occupied=code, part=part, n_volumes=len(x))
-    kernels = kernels_of(
-        Variant(torch.promote_types(x.dtype, torch.float32), x.dtype, 1, 0), x.device
-    )
+    variant = Variant("rays", torch.promote_types(x.dtype, torch.float32), x.dtype)
+    kernels = kernels_of(variant, x.device)
     driver.launch(kernels["occupy"], scene, -(-math.prod(shape) // BLOCK), 1, x.device)
     driver.launch(kernels["bound"], scene, 1, 1, x.device)
     return code

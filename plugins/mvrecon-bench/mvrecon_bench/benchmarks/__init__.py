@@ -1,1 +1,1 @@
-"""Benchmarks: run time, memory and error of projectors and models."""
+"""Benchmarks: run time, memory and error of projectors and methods."""

@@ -102,7 +102,7 @@ METHODS_KEYS = (
 
 #: `bench=methods`.
 METHODS = {
-    "part": "reconstructor, by its name in the registry",
+    "part": "method, by its name in the registry",
     "options": OPERATORS["options"],
     **{name: OPERATORS[name] for name in ("scene", "camera", "n")},
     "slices": "voxels along z; 0: n",
@@ -133,9 +133,7 @@ SKIP = {
     "support given once; "
     "adjoint: A^T y inside the support, given once, y white noise; sirt20: 20 iterations of SIRT "
     "inside the hull of "
-    "the views; cross_view: the model end to end on scenes that are ever new; cross_view_static: "
-    "on scenes that fill "
-    "the same box, whose geometry it has kept",
+    "the views; cross_view: the model end to end",
     "mode": "off: nothing is skipped; cropped: nothing, on the volume cropped to the box around "
     "what is there; others: "
     "`skip` of the projector, of the model its `support`",
@@ -175,7 +173,7 @@ PRECISION = {
     "task": "what is computed",
     "precision": "in which volumes, views and weights are stored; autocast: in which networks "
     "compute",
-    "n": "voxels along each edge; of a checkpoint's model its own",
+    "n": "voxels along each edge; of a checkpoint its own",
     "device": OPERATORS["device"],
     "threads": OPERATORS["threads"],
     "status": OPERATORS["status"],

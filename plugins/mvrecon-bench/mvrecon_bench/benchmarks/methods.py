@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.parts import RECONSTRUCTORS
+from mvrecon.models.method import build_method
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.benchmarks import report
@@ -71,10 +71,10 @@ def measurement_of(case: Case, rays: int) -> Measurement:
 
 
 class Methods:
-    """Every reconstructor on every case of a plan, those of one case timed in turns.
+    """Every method on every case of a plan, those of one case timed in turns.
 
     Args:
-        parts: the reconstructors `{name: ..., peer: ..., **options}`, see `Part.of`; `peer` is the
+        parts: the methods `{name: ..., peer: ..., **options}`, see `Part.of`; `peer` is the
             name of the part that a row's time is divided by.
         base: the case that the plan begins with, options of `Case`.
         plan: blocks `{about: {...}, vary: {axis: [values]}}`, see `cases.expand`.
@@ -148,11 +148,11 @@ class Methods:
         views = data.views.to(job.case.device)
         fewer = {} if iterations is None else {"iterations": iterations}
 
+        method = build_method({"name": job.part.name, **job.part.options, **fewer})
+
         def call() -> Tensor:
             with torch.no_grad():
-                return RECONSTRUCTORS.build(
-                    job.part.name, A, views, **{**job.part.options, **fewer}
-                )
+                return method(views, A).volume
 
         return call
 

@@ -18,14 +18,14 @@ from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, th
 from mvrecon_bench.benchmarks.precision_tasks import (
     PRECISIONS,
     Task,
-    model_task,
+    method_task,
     net_task,
     operator_tasks,
 )
 from mvrecon_bench.benchmarks.rows import Row
 from mvrecon_bench.benchmarks.trial import reason
 
-NETS = ("unet", "model")
+NETS = ("unet", "cross_view")
 #: All ratios are to it, and all errors to what float64 gives.
 USUAL, TRUTH = "float32", "float64"
 
@@ -50,11 +50,11 @@ class Precision:
     """Every task in every precision, timed in turns.
 
     Args:
-        tasks: "<method> forward", "<method> adjoint", "unet", "model".
+        tasks: "<method> forward", "<method> adjoint", "unet", "cross_view".
         precisions: of `precision_tasks.PRECISIONS`.
         base: n (voxels along an edge, of operators), views, device (or auto), threads (0: all).
         unet: n, and options of the U-Net.
-        model: n, rig, and the model's name and options; or its trained `checkpoint`.
+        cross_view: n, rig, and the method's name and options; or its trained `checkpoint`.
         repeats: least number of calls of which a time is the median.
 
     Raises:
@@ -71,7 +71,7 @@ class Precision:
         precisions: Sequence[str],
         base: Mapping[str, Any],
         unet: Mapping[str, Any],
-        model: Mapping[str, Any],
+        cross_view: Mapping[str, Any],
         repeats: int = 5,
     ):
         case = Case(
@@ -81,7 +81,9 @@ class Precision:
         self.made: dict[str, tuple[int, Callable[[], Task]]] = {
             name: (case.n, make) for name, make in operator_tasks(case).items()
         }
-        for name, make, options in zip(NETS, (net_task, model_task), (unet, model), strict=True):
+        for name, make, options in zip(
+            NETS, (net_task, method_task), (unet, cross_view), strict=True
+        ):
             self.made[name] = options["n"], partial(make, options, self.device)
         for what, names, known in (
             ("task", tasks, self.made),

@@ -12,8 +12,9 @@ from torch import Tensor, nn
 
 from mvrecon.engine.checkpoints import load
 from mvrecon.metrics import volume_metrics
-from mvrecon.models.networks import UNet3d
-from mvrecon.parts import MODELS, PROJECTORS, SCENES
+from mvrecon.models.method import build_method
+from mvrecon.models.unet import PlainUNet
+from mvrecon.parts import PROJECTORS, SCENES
 from mvrecon.projectors.integrals import METHODS
 from mvrecon.scenes.voxelise import voxelise
 from mvrecon_bench.benchmarks.cases import Case
@@ -71,26 +72,24 @@ def net_task(options: Mapping[str, Any], device: str) -> Task:
     """A U-Net with random weights on noise."""
     torch.manual_seed(0)
     n, inputs = options["n"], options["inputs"]
-    net = UNet3d(inputs, 1, options["width"]).to(device).eval()
+    net = PlainUNet(3, inputs, 1, options["widths"]).to(device).eval()
     x = torch.rand(1, inputs, n, n, n, dtype=torch.float64, device=device)
     return Task(lambda precision: _run(net, x, precision))
 
 
-def model_task(settings: Mapping[str, Any], device: str) -> Task:
+def method_task(settings: Mapping[str, Any], device: str) -> Task:
     """The cross-view model on one scene: trained, or with random weights in all of its layers."""
     if trained := settings.get("checkpoint") is not None:
         module = load(Path(settings["checkpoint"])).module
-        A, net, scale = module.projector, module.model, module.hparams["data_range"]
+        A, net, scale = module.projector, module.method, module.hparams["data_range"]
     else:
         grid = cube({}, settings["n"])
         A = PROJECTORS.build(
             "drr", grid=grid, cameras=rig(settings["rig"], edge(grid), settings["n"])
         )
         torch.manual_seed(0)
-        net, scale = MODELS.from_config(settings["model"], projector=A), 1.0
-        for (
-            parameter
-        ) in net.parameters():  # the last layers start from zero, and would hide the rest
+        net, scale = build_method(settings["method"]), 1.0
+        for parameter in net.parameters():  # the last layers start from zero, and would hide others
             nn.init.normal_(parameter, std=0.1)
     sample = SCENES.build("ellipsoids").sample(0, 1, A.grid, A.cameras)
     views = sample.views[None].double().to(device)
@@ -98,12 +97,11 @@ def model_task(settings: Mapping[str, Any], device: str) -> Task:
     def score(volume: Tensor) -> float:
         return volume_metrics(volume[0].float().cpu(), sample.volume, sample.inside, scale)["psnr"]
 
-    return Task(
-        lambda precision: _run(net.to(device).eval(), views, precision), score if trained else None
-    )
+    net, A = net.to(device).eval(), A.to(device)
+    return Task(lambda precision: _run(net, views, precision, A), score if trained else None)
 
 
-def _run(net: nn.Module, x: Tensor, precision: str) -> Callable[[], Tensor]:
+def _run(net: nn.Module, x: Tensor, precision: str, *others: Any) -> Callable[[], Tensor]:
     """A network in a precision; halves are stored, and computed in float32 but for autocast."""
     stored, auto = PRECISIONS[precision]
     kept = stored if stored == torch.float64 else torch.float32
@@ -112,7 +110,7 @@ def _run(net: nn.Module, x: Tensor, precision: str) -> Callable[[], Tensor]:
 
     def call() -> Tensor:
         with torch.autocast(device, dtype=auto, enabled=auto is not None):
-            answer = own(operand)
+            answer = own(operand, *others)
         return getattr(answer, "volume", answer)
 
     return call

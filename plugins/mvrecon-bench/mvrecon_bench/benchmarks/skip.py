@@ -19,13 +19,10 @@ from mvrecon_bench.benchmarks.columns import SKIP, SKIP_KEYS
 from mvrecon_bench.benchmarks.measure import load_average, threads
 from mvrecon_bench.benchmarks.rows import Row
 from mvrecon_bench.benchmarks.skip_measure import compared
-from mvrecon_bench.benchmarks.skip_model import CHANGING, STATIC, Learned
+from mvrecon_bench.benchmarks.skip_model import CROSS_VIEW, Learned
 from mvrecon_bench.benchmarks.skip_scenes import Filled, cube, edge, filled, rig
 from mvrecon_bench.benchmarks.skip_tasks import DENSE, TASKS, Bed, Trial, reconstruction
 from mvrecon_bench.benchmarks.trial import reason
-
-#: The tasks that are not an operator's.
-MODEL = (CHANGING, STATIC)
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ class Skip:
         tasks: name of `skip_tasks.TASKS` -> methods of the projector.
         modes: of the projector's `skip`, besides off and cropped.
         base: n, device (or auto), threads (0: all).
-        cross_view: model, n, rig, modes (kinds of support), `checkpoints` (scene -> file), `cases`
+        cross_view: method, n, rig, modes (kinds of support), `checkpoints` (scene -> file), `cases`
             over which a trained model's PSNR is averaged; null leaves it out.
         repeats: least number of calls of which a time is the median.
 
@@ -114,19 +111,14 @@ class Skip:
             if self.learned:
                 trained = self.learned["checkpoints"].get(name) is not None
                 n = None if trained else self.learned["n"]
-                for task in MODEL:
-                    key = {
-                        "rig": "trained" if trained else "model",
-                        "method": "joseph",
-                        "task": task,
-                    }
-                    groups.append(
-                        [Job(name, **key, mode=mode, n=n, **where) for mode in self._modes(task)]
-                    )
+                known = {"rig": "trained" if trained else "model", "method": "joseph"}
+                modes = self._modes(CROSS_VIEW)
+                jobs = [Job(name, **known, task=CROSS_VIEW, mode=m, n=n, **where) for m in modes]
+                groups.append(jobs)
         return groups
 
     def _modes(self, task: str) -> list[str]:
-        return [*DENSE, *self.learned["modes"]] if task in MODEL and self.learned else self.modes
+        return [*DENSE, *self.learned["modes"]] if task == CROSS_VIEW else self.modes
 
     def label(self, row: Row) -> str:
         """A row's case and mode, short."""
@@ -143,7 +135,9 @@ class Skip:
         common: Row = {"load": load_average()}
         with threads(first.threads), torch.no_grad():
             try:
-                setup, known = self._model(first) if first.task in MODEL else self._operator(first)
+                setup, known = (
+                    self._model(first) if first.task == CROSS_VIEW else self._operator(first)
+                )
                 figures = compared(setup, self._modes(first.task), self.repeats, first.device)
                 common |= known
             except Exception as error:  # what a scene, a rig or a file raises is its rows' status
@@ -169,9 +163,7 @@ class Skip:
         checkpoint = self.learned["checkpoints"].get(job.scene)
         learned = Learned.of(self.scenes[job.scene], self.learned, checkpoint, job.device)
         known = facts(learned.first.source, learned.first.volume[0] != 0, learned.A.cameras)
-        return partial(learned.trial, job.task), known | {
-            "support": learned.support("hull").fraction
-        }
+        return learned.trial, known | {"support": learned.support("hull").fraction}
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """Write `speedups.png` where matplotlib is installed; the texts of the tables by name."""

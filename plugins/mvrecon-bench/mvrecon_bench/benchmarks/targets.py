@@ -208,11 +208,6 @@ SKIP = (
         1 / 3,
     ),
     Target(
-        "head_neck, cross_view_static: time / off's on the full cube",
-        _greatest(_time_over("over_full"), "head_neck", ["cross_view_static"]),
-        1 / 3,
-    ),
-    Target(
         "head_neck, cross_view: PSNR lost, dB",
         _greatest(lambda row: number(row, "psnr_loss"), "head_neck", ["cross_view"]),
         0.1,

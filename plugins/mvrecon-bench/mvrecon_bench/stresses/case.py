@@ -8,7 +8,7 @@ import torch
 
 #: What a case is about: a part of that kind, or what is under all parts (tensors, geometry,
 #: threads), stressed once.
-KINDS = ("projector", "camera", "scene", "head", "model", "mvrecon")
+KINDS = ("projector", "camera", "scene", "head", "method", "mvrecon")
 #: Relative, where a case does not say otherwise; halves are storage, summed in float32.
 PRECISE = {torch.float64: 1e-12, torch.float32: 1e-5, torch.bfloat16: 1e-5, torch.float16: 1e-5}
 

@@ -1,7 +1,7 @@
-"""Heads and models under stress, on small frusta and a small rig, with random weights."""
+"""Heads and methods under stress, on small frusta and a small rig, with random weights."""
 
 import inspect
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -12,15 +12,17 @@ from mvrecon.cameras.camera import Cameras
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.models.frusta import Frusta
-from mvrecon.parts import MODELS, PROJECTORS
+from mvrecon.models.method import build_method
+from mvrecon.models.output import Reconstruction
+from mvrecon.parts import METHODS, PROJECTORS
 from mvrecon.projectors.operator import Projector
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject, gap
 
 #: No two sizes alike; the detectors see beside it.
 GRID = Grid.centred(size=(10, 9, 8), spacing=2.0)
-#: What a model is given that needs it, or has a dearer default, and was not given it.
-NEEDED = {"head": {"name": "softmax_depth"}}
+#: Options of methods that require them, and cheaper defaults.
+NEEDED = {"n_cameras": 3, "method": {"name": "sirt", "iterations": 8}}
 CHEAPER = {"iterations": 8, "start": 4}
 
 
@@ -59,59 +61,78 @@ class HeadSubject(Subject):
         )
 
 
-class ModelSubject(Subject):
-    """A model under stress."""
+class MethodSubject(Subject):
+    """A method under stress."""
 
-    def projector(self, cameras: Cameras | None = None) -> Projector:
+    def need_module(self) -> None:
+        """Raise DoesNotApply for a function: of these, some subdivide the views, take counts alone,
+        or weigh a prior in the unit of the volume.
+        """
+        if not inspect.isclass(METHODS.get(self.name)):
+            raise DoesNotApply("it is a classical method")
+
+    def operator(self, cameras: Cameras | None = None) -> Projector:
         """The operator of the small rig, or of another one."""
         return PROJECTORS.build("drr", grid=GRID, cameras=cameras or small_rig()).to(self.device)
 
-    def model(self, cameras: Cameras | None = None, **options: Any) -> nn.Module:
-        """A new model with its first weights, the same each time, in evaluation.
+    @cached_property
+    def A(self) -> Projector:
+        """The operator of the small rig."""
+        return self.operator()
+
+    def method(self, **options: Any) -> nn.Module:
+        """A new method with its first weights, the same each time, in evaluation.
 
         Raises:
-            DoesNotApply: it needs an option that it was not given, or (`needs_circle`) sources on a
-                circle.
+            DoesNotApply: a required option that it was not given.
         """
-        kind = MODELS.get(self.name)
-        if cameras is not None and getattr(kind, "needs_circle", False):
-            if len(cameras.source.unique(dim=0)) < 3:
-                raise DoesNotApply("it takes rigs whose sources lie on a circle alone")
+        kind = METHODS.get(self.name)
         settings = {**self.options, **options}
         for name, parameter in inspect.signature(kind).parameters.items():
-            if name in ("projector", *settings) or parameter.kind in (
-                parameter.VAR_KEYWORD,
-                parameter.VAR_POSITIONAL,
-            ):
+            if name in settings:
                 continue
             if name in CHEAPER and isinstance(parameter.default, int):
                 settings[name] = CHEAPER[name]
-            elif parameter.default is parameter.empty:
+            elif inspect.isclass(kind) and parameter.default is parameter.empty:
                 if name not in NEEDED:
                     raise DoesNotApply(
                         f"it needs {name}; stress it as "
-                        f"{{kind: model, name: {self.name}, {name}: ..}}"
+                        f"{{kind: method, name: {self.name}, {name}: ..}}"
                     )
                 settings[name] = NEEDED[name]
         torch.manual_seed(0)
-        return (
-            self.build(**{**settings, "projector": self.projector(cameras)})
-            .to(self.device, self.dtype)
-            .eval()
-        )
+        method = build_method({"name": self.name, **settings})
+        return method.to(self.device, self.dtype).eval()
 
-    def stirred(self, cameras: Cameras | None = None, **options: Any) -> nn.Module:
-        """A new model with random weights, so that layers which start at zero take part."""
-        model, rng = self.model(cameras, **options), torch.Generator().manual_seed(1)
+    def stirred(self, **options: Any) -> nn.Module:
+        """A new method with random weights, so that layers which start at zero take part."""
+        method, rng = self.method(**options), torch.Generator().manual_seed(1)
         with torch.no_grad():
-            for parameter in model.parameters():
+            for parameter in method.parameters():
                 parameter += 0.1 * torch.randn(parameter.shape, generator=rng).to(parameter)
-        return model
+        return method
 
     @cached_property
-    def used(self) -> nn.Module:
-        """One such model, for cases that leave it as it is."""
-        return self.stirred()
+    def used(self) -> "partial[Reconstruction]":
+        """Such a method with the operator of the small rig, for cases that leave it as it is.
+
+        Raises:
+            DoesNotApply: it refuses the small rig.
+        """
+        method = self.stirred()
+        self.accepts(method, self.views[:1], self.A)
+        return partial(method, A=self.A)
+
+    def accepts(self, method: nn.Module, views: Tensor, A: Projector) -> Reconstruction:
+        """The reconstruction from valid views.
+
+        Raises:
+            DoesNotApply: the method refuses the rig.
+        """
+        try:
+            return method(views, A)
+        except ValueError as error:
+            raise DoesNotApply(f"it refuses this rig: {error}") from error
 
     @cached_property
     def truth(self) -> Float[Tensor, "3 1 d h w"]:
@@ -123,7 +144,7 @@ class ModelSubject(Subject):
     @cached_property
     def views(self) -> Float[Tensor, "3 1 m v u"]:
         """Their views."""
-        return self.projector()(self.truth)
+        return self.A(self.truth)
 
     @cached_property
     def scales(self) -> bool:

@@ -14,18 +14,8 @@ from mvrecon_bench.stresses.subject import Subject, subject_of
 #: The files of cases, in the plan's order.
 FILES = (
     *("rays", "segments", "scales", "algebra", "accuracy", "derivatives"),
-    *(
-        "cameras",
-        "images",
-        "poses",
-        "scenes",
-        "heads",
-        "models",
-        "model_state",
-        "counts",
-        "line_integrals",
-    ),
-    *("tensors", "dtypes", "values", "sizes", "repeatability", "gpu"),
+    *("cameras", "images", "poses", "scenes", "heads", "methods", "method_state", "counts"),
+    *("line_integrals", "tensors", "dtypes", "values", "sizes", "repeatability", "gpu"),
 )
 
 

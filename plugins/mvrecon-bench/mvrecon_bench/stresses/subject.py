@@ -245,7 +245,7 @@ SUBJECTS = {
     "camera": "mvrecon_bench.stresses.camera_subject:CameraSubject",
     "scene": "mvrecon_bench.stresses.scene_subject:SceneSubject",
     "head": "mvrecon_bench.stresses.learned_subjects:HeadSubject",
-    "model": "mvrecon_bench.stresses.learned_subjects:ModelSubject",
+    "method": "mvrecon_bench.stresses.learned_subjects:MethodSubject",
 }
 
 

@@ -17,9 +17,8 @@ MODEL = (
     "{n: 16, rig: {name: circular, n_views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, "
     "pixels: 12}, "
     "cases: 2,"
-    " modes: [auto, hull], checkpoints: {heart: null}, model: {name: single_pass, head: {name: "
-    "softmax_depth},"
-    " opinion: {width: 4}, refine: 4, start: 2, consistency: 1}}"
+    " modes: [auto, hull], checkpoints: {heart: null}, method: {name: cross_view, "
+    "widths: [4, 8], depth_widths: [4], weight_widths: [4], scale: 1, start: 2, consistency: 1}}"
 )
 SMALL = (
     "bench=skip",
@@ -58,9 +57,9 @@ def test_every_case_has_a_row_for_every_mode(run):
     cases = {(row["scene"], row["rig"], row["method"], row["task"]): [] for row in rows}
     for row in rows:
         cases[row["scene"], row["rig"], row["method"], row["task"]].append(row["mode"])
-    models = [modes for (*_, task), modes in cases.items() if task.startswith("cross_view")]
-    assert models == [["off", "cropped", "auto", "hull"]] * 6
-    others = {case: modes for case, modes in cases.items() if not case[3].startswith("cross_view")}
+    models = [modes for (*_, task), modes in cases.items() if task == "cross_view"]
+    assert models == [["off", "cropped", "auto", "hull"]] * 3
+    others = {case: modes for case, modes in cases.items() if case[3] != "cross_view"}
     assert set(map(tuple, others.values())) == {tuple(MODES)} and len(others) == 3 * 5
     assert {task for *_, task in others} == set(TASKS)
 
@@ -72,9 +71,7 @@ def test_every_figure_is_there(run):
         assert 0 < float(row["occupancy"]) <= float(row["box"]) <= 1
         builds = row["task"] != "forward" and row["mode"] not in ("off", "cropped")
         assert (row["build_ms"] != "") == builds and row["chosen"]
-        assert (row["support"] != "") == (
-            row["task"] in ("sirt20", "cross_view", "cross_view_static")
-        )
+        assert (row["support"] != "") == (row["task"] in ("sirt20", "cross_view"))
     assert {row["source"] for row in rows} >= {
         "derenzo",
         "body of 9%",
@@ -103,7 +100,7 @@ def test_skipping_is_exact(run):
     for row in (
         rows
     ):  # sums in another order, or about another centre: 1e-5 of what the longest ray can hold
-        if not row["task"].startswith("cross_view"):
+        if row["task"] != "cross_view":
             assert float(row["error"]) < 1e-5 * 1.5 * 512 * 3**0.5
 
 
@@ -167,14 +164,8 @@ def trained(tmp_path):
         },
         "projector": {"name": "drr"},
     }
-    model = {
-        "name": "single_pass",
-        "head": {"name": "softmax_depth"},
-        "opinion": {"width": 4},
-        "refine": 4,
-        "start": 2,
-    }
-    module = ReconstructionModule(geometry, model, {}, {"name": "adamw"}, 1.0)
+    method = {"name": "cross_view", "widths": [4, 8], "depth_widths": [4], "scale": 1, "start": 2}
+    module = ReconstructionModule(geometry, method, {}, {"name": "adamw"}, 1.0)
     path = tmp_path / "cross_view.ckpt"
     known = {
         "state_dict": module.state_dict(),
@@ -200,7 +191,7 @@ def test_a_trained_model_brings_its_grid_and_is_scored(tmp_path, trained, call):
         "+bench.tasks={}",
         f"bench.cross_view.checkpoints.heart={trained}",
     )
-    assert [row["status"] for row in rows] == ["ok"] * 8, rows
+    assert [row["status"] for row in rows] == ["ok"] * 4, rows
     assert {(row["rig"], row["grid"], row["views"], row["n"]) for row in rows} == {
         ("trained", "8x12x12", "3x12x12", "")
     }

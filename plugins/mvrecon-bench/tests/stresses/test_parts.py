@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mvrecon.cameras.rigs import circular
-from mvrecon.parts import CAMERAS, MODELS, PROJECTORS, SCENES
+from mvrecon.parts import CAMERAS, METHODS, PROJECTORS, SCENES
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.operator import Wrapped
 from mvrecon.scenes.ellipsoids import RandomEllipsoids
@@ -69,10 +69,17 @@ def test_wrong_options_of_a_user_are_a_failure_and_no_excuse(plugin):
     assert verdicts("many", n_views=3, detector=DETECTOR)["cameras far away"]["verdict"] == FAIL
 
 
-def test_a_model_that_needs_other_options_is_left_out(monkeypatch):
-    monkeypatch.setitem(MODELS._parts, "mine", lambda projector, atlas: torch.nn.Identity())
+class OfAnAtlas(torch.nn.Module):
+    """A method with a required option of its own."""
+
+    def __init__(self, atlas):
+        super().__init__()
+
+
+def test_a_method_that_needs_other_options_is_left_out(monkeypatch):
+    monkeypatch.setitem(METHODS._parts, "mine", OfAnAtlas)
     with pytest.raises(DoesNotApply, match="it needs atlas"):
-        subject_of("model", "mine", {}, "cpu", torch.float32).model()
+        subject_of("method", "mine", {}, "cpu", torch.float32).method()
 
 
 class Fussy(Drr):

@@ -11,7 +11,7 @@ from torch import Tensor
 from mvrecon.cameras.formats.world import to_ras
 from mvrecon.files.checks import Refused
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.attenuated import check_mu
+from mvrecon_spect.attenuated import check_mu
 from mvrecon_spect.files.interfile import numbers_of, read_header, write_interfile
 
 #: 1/cm in 1/mm.

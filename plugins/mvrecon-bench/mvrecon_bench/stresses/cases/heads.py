@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.models.frusta import Frusta
-from mvrecon.models.weighting import fuse
+from mvrecon.models.pooling import fuse
 from mvrecon.testing import check_head
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.learned_subjects import GRID, HeadSubject, small_rig
@@ -102,13 +102,13 @@ def bad_logits(subject: HeadSubject) -> float:
 def no_ray_hits(subject: HeadSubject) -> float:
     """Frusta of which no bin may hold anything."""
     frusta = Frusta.of(GRID, small_rig(), depth=10).to(subject.device, subject.dtype)
-    none = replace(frusta, touching=torch.zeros_like(frusta.occupied[None]))
+    none = replace(frusta, bins=replace(frusta.bins, end=0 * frusta.bins.end))
     density = subject.head(*subject.given, none)
     return float((density != 0).sum())  # true of NaN, too
 
 
 def fused_weights(subject: Subject) -> float:
-    """The weights of three cameras' opinions from logits of any size: one in sum where any sees."""
+    """The weights of three cameras from logits of any size sum to one where any sees."""
     visible = subject.random(3, 1, 4, 5, 6) < 0.5
     errors = []
     for size in (0.0, 1e4, -1e4, 1e30, -1e30):

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import MODELS, PROJECTORS, SCENES
+from mvrecon.models.method import build_method
+from mvrecon.parts import PROJECTORS, SCENES
 from mvrecon.projectors.ray_transform import RayTransform
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from mvrecon_bench.stresses.case import Case, DoesNotApply
@@ -152,7 +153,7 @@ def draws_nothing(subject: ProjectorSubject) -> float:
 
 
 def evaluation_draws_nothing(subject: Subject) -> float:
-    """Scenes by index, evaluation of a model, pictures, and what is written to the board."""
+    """Scenes by index, evaluation of a method, pictures, and writing to TensorBoard."""
     from mvrecon.engine.evaluation import evaluate
     from mvrecon.engine.loggers import Board
     from mvrecon.viz import review
@@ -160,7 +161,7 @@ def evaluation_draws_nothing(subject: Subject) -> float:
     grid = Grid.centred(size=(9, 8, 7), spacing=1.0)
     rig = rig_about(grid)
     A = PROJECTORS.build("drr", grid=grid, cameras=rig)
-    model = MODELS.build("backprojection", projector=A)
+    method = build_method({"name": "backprojection"})
     with undrawn() as drawn, TemporaryDirectory() as folder:
         scene = SCENES.build("ellipsoids").sample(3, 5, grid, rig)
         batch = {
@@ -169,9 +170,9 @@ def evaluation_draws_nothing(subject: Subject) -> float:
             "inside": scene.inside[None],
             "name": ["0"],
         }
-        scores = evaluate({"model": model}, [batch], A, 1.0)
+        scores = evaluate({"method": method}, [batch], A, 1.0)
         board = Board(folder)
-        board.log_metrics({"psnr": scores["model"][0]["psnr"]}, 0)
+        board.log_metrics({"psnr": scores["method"][0]["psnr"]}, 0)
         predicted = A(scene.volume[None])[0, 0]
         picture = review.views(scene.views[0], predicted, "0", "mm")
         board.experiment.add_image("views", picture, 0, dataformats="HWC")

@@ -1,0 +1,105 @@
+"""Whether the CUDA back end may be trusted on a device: each operator is tried once against the
+reference.
+"""
+
+import logging
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from threading import Lock
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+logger = logging.getLogger(__name__)
+
+#: The greatest difference to the reference, by its greatest value: rounding, and where a ray falls
+#: on an edge.
+TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
+#: Types that kernels read; another is cast to float32 first.
+STORED = (torch.float64, torch.float16, torch.bfloat16)
+
+#: Names of what was tried, and the greatest differences to the reference, see `error_of`.
+Errors = Iterator[tuple[str, float]]
+#: A self-test, of (device, type that volumes are stored in, purpose).
+Tests = Callable[[str, torch.dtype, str], Errors]
+
+
+class Case(NamedTuple):
+    """What is tried at once: kernels for a purpose, on a device, of numbers stored in a type."""
+
+    device: str
+    purpose: str
+    dtype: torch.dtype
+
+
+class Verdict(NamedTuple):
+    """Why kernels cannot be used, or None, and whether that is so for good."""
+
+    why: str | None
+    lasting: bool
+
+
+_verdicts: dict[Case, str | None] = {}
+_lock = Lock()
+
+
+@torch.compiler.assume_constant_result
+def failure(
+    device: torch.device | str, purpose: str, dtype: torch.dtype, tests: Tests
+) -> str | None:
+    """Why kernels cannot be used on a device, or None. Tried once, which compiles them; logged
+    once. Only what is true of the device is remembered.
+
+    Args:
+        device: a CUDA device.
+        purpose: what the kernels are for: a method of rays, "warp" ...
+        dtype: of the volumes or views.
+        tests: what is tried.
+    """
+    place = torch.device(device)
+    if place.type == "cuda" and place.index is None:
+        place = torch.device(
+            "cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0
+        )
+    case = Case(str(place), purpose, dtype if dtype in STORED else torch.float32)
+    with _lock:
+        if case in _verdicts:
+            return _verdicts[case]
+        # in a thread of its own: inference mode, autocast, derivatives and maps of `torch.func`
+        # hold for the thread that asks, and a test inside them would fail
+        with ThreadPoolExecutor(1) as fresh:
+            verdict = fresh.submit(partial(_verdict_on, case, tests)).result()
+        if verdict.lasting:
+            _verdicts[case] = verdict.why
+    if verdict.why:
+        what = f"{case.purpose} of {case.dtype} on {place}"
+        logger.warning("The reference computes %s: %s", what, verdict.why)
+    return verdict.why
+
+
+def forget() -> None:
+    """Forget every verdict, so that the next call tries again."""
+    with _lock:
+        _verdicts.clear()
+
+
+def _verdict_on(case: Case, tests: Tests) -> Verdict:
+    bound = TOLERANCE[torch.promote_types(case.dtype, torch.float32)]
+    try:
+        for what, error in tests(case.device, case.dtype, case.purpose):
+            if not error <= bound:
+                why = f"{what} differs from the reference by {error:.1e}, expected at most "
+                return Verdict(f"{why}{bound:.0e}", lasting=True)
+    except torch.OutOfMemoryError as problem:  # another time there may be room
+        return Verdict(str(problem), lasting=False)
+    # a missing package, no driver, no compiler, a kernel that fails: all mean the same
+    except Exception as problem:
+        return Verdict(f"{type(problem).__name__}: {problem}", lasting=True)
+    return Verdict(None, lasting=True)
+
+
+def error_of(got: Tensor, expected: Tensor) -> float:
+    """The greatest difference, by the greatest value of what is expected."""
+    return float((got - expected.detach()).abs().max() / expected.detach().abs().max())

@@ -1,0 +1,241 @@
+"""3-D U-Nets of the literature, at their published sizes by default: of Cicek and others, and the
+residual one of Lee and others in the form of pytorch-3dunet.
+"""
+
+from itertools import count
+from math import gcd
+from typing import Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvrecon.models.unet import trimmed
+from mvrecon.registry import check_choice
+
+Norm = Literal["batch", "group", "none"]
+Padding = Literal["valid", "same"]
+
+#: Groups of channels in group normalisation, as in pytorch-3dunet; fewer where a width is no
+#: multiple of it.
+GROUPS = 8
+
+
+class CicekUNet3d(nn.Module):
+    """The 3-D U-Net of Cicek and others.
+
+    Two 3x3x3 convolutions, normalisation and ReLU at every level; channels double before each
+    max-pooling; 2x2x2 up-convolutions without bias; skips are concatenated. With its defaults, 3
+    channels in and 3 labels out it is the published network: 132 x 132 x 116 voxels give
+    44 x 44 x 28, from 19 069 955 parameters besides those of the normalisation.
+
+    Source: O. Cicek, A. Abdulkadir, S. Lienkamp, T. Brox, O. Ronneberger, "3D U-Net: learning dense
+    volumetric segmentation from sparse annotation", MICCAI 2016.
+
+    Args:
+        inputs: channels in.
+        outputs: channels out.
+        width: channels of the first convolution.
+        levels: scales, the finest included.
+        norm: "batch" as published, "group" where a batch is small, or "none".
+        padding: "valid" as published, whose output lacks a border, or "same" for an output of the
+            input's size, whatever that is.
+
+    Raises:
+        ValueError: an unknown norm or padding, no level; at the call, with "valid", a size whose
+            halves are odd or that is too small.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        width: int = 32,
+        levels: int = 4,
+        norm: Norm = "batch",
+        padding: Padding = "valid",
+    ):
+        super().__init__()
+        check_options(width, levels, norm)
+        check_choice("padding", padding, get_args(Padding))
+        self.padding: Padding = padding
+        first = [inputs, *(width * 2**level for level in range(1, levels))]
+        last = [width * 2 ** (level + 1) for level in range(levels)]
+
+        def pair(before: int, between: int, after: int) -> nn.Sequential:
+            return nn.Sequential(
+                *self._step(before, between, norm), *self._step(between, after, norm)
+            )
+
+        self.down = nn.ModuleList(
+            pair(before, after // 2, after) for before, after in zip(first, last, strict=True)
+        )
+        self.expand = nn.ModuleList(
+            nn.ConvTranspose3d(c, c, 2, stride=2, bias=False) for c in last[1:]
+        )
+        self.up = nn.ModuleList(
+            pair(coarse + fine, fine, fine) for fine, coarse in zip(last, last[1:], strict=False)
+        )
+        self.last = nn.Conv3d(last[0], outputs, 1)
+
+    def _step(self, before: int, after: int, norm: Norm) -> list[nn.Module]:
+        """A convolution, its normalisation and ReLU."""
+        return [
+            nn.Conv3d(before, after, 3, padding=self.padding),
+            normalisation(norm, after),
+            nn.ReLU(inplace=True),
+        ]
+
+    def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o e j x"]:
+        if self.padding == "valid":
+            for size in x.shape[2:]:
+                valid_size(size, len(self.down))
+        skips: list[Tensor] = []
+        for level, block in enumerate(self.down):
+            if level:
+                skips.append(x)
+                x = pooled(x)
+            x = block(x)
+        for level in reversed(range(len(self.up))):
+            x = self.expand[level](x)
+            if self.padding == "same":
+                x = trimmed(x, skips[level].shape[2:])
+            x = self.up[level](torch.cat([middle(skips[level], x.shape[2:]), x], dim=1))
+        return self.last(x)
+
+
+class ResidualUNet3d(nn.Module):
+    """The residual 3-D U-Net of Lee and others.
+
+    One residual block at every level, after a 1x1x1 convolution to the level's channels;
+    max-pooling between; 3x3x3 up-convolutions, whose outputs are added to the skips. Layers and
+    their order are those of pytorch-3dunet's `ResidualUNet3D`: normalisation, convolution, ReLU,
+    the last ReLU behind the sum. Any spatial size: an up-convolution gives its skip's size, where
+    pytorch-3dunet repeats nearest voxels.
+
+    Source: K. Lee, J. Zung, P. Li, V. Jain, H. S. Seung, "Superhuman accuracy on the SNEMI3D
+    connectomics challenge", arXiv 1706.00120; A. Wolny and others, eLife 9:e57613 (2020).
+
+    Args:
+        inputs: channels in.
+        outputs: channels out.
+        width: channels of the finest level; each coarser level has twice as many.
+        levels: scales, the finest included.
+        norm: "group", "batch" or "none".
+
+    Raises:
+        ValueError: an unknown norm, or no level.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, width: int = 64, levels: int = 5, norm: Norm = "group"
+    ):
+        super().__init__()
+        check_options(width, levels, norm)
+        widths = [width * 2**level for level in range(levels)]
+        self.down = nn.ModuleList(
+            ResidualBlock(a, b, norm) for a, b in zip([inputs, *widths], widths, strict=False)
+        )
+        self.expand = nn.ModuleList(
+            nn.ConvTranspose3d(b, a, 3, stride=2, padding=1, bias=False)
+            for a, b in zip(widths, widths[1:], strict=False)
+        )
+        self.up = nn.ModuleList(ResidualBlock(a, a, norm) for a in widths[:-1])
+        self.last = nn.Conv3d(width, outputs, 1)
+
+    def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o d h w"]:
+        skips: list[Tensor] = []
+        for level, block in enumerate(self.down):
+            if level:
+                skips.append(x)
+                x = pooled(x)
+            x = block(x)
+        for level in reversed(range(len(self.up))):
+            size = list(skips[level].shape[2:])
+            x = self.up[level](self.expand[level](x, output_size=size) + skips[level])
+        return self.last(x)
+
+
+class ResidualBlock(nn.Module):
+    """Two normalised 3x3x3 convolutions with a residual path around them."""
+
+    def __init__(self, inputs: int, outputs: int, norm: Norm):
+        super().__init__()
+        bias = norm == "none"
+        self.widen = nn.Identity() if inputs == outputs else nn.Conv3d(inputs, outputs, 1)
+        self.change = nn.Sequential(
+            normalisation(norm, outputs),
+            nn.Conv3d(outputs, outputs, 3, padding=1, bias=bias),
+            nn.ReLU(inplace=True),
+            normalisation(norm, outputs),
+            nn.Conv3d(outputs, outputs, 3, padding=1, bias=bias),
+        )
+
+    def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o d h w"]:
+        x = self.widen(x)
+        return F.relu(x + self.change(x))
+
+
+def normalisation(norm: Norm, channels: int) -> nn.Module:
+    """A normalisation layer."""
+    if norm == "batch":
+        return nn.BatchNorm3d(channels)
+    return nn.GroupNorm(gcd(GROUPS, channels), channels) if norm == "group" else nn.Identity()
+
+
+def check_options(width: int, levels: int, norm: str) -> None:
+    """Refuse a U-Net without channels or levels, and an unknown normalisation.
+
+    Raises:
+        ValueError: one of them.
+    """
+    if min(width, levels) < 1:
+        raise ValueError(
+            f"A U-Net needs at least one channel and one level, got width={width}, levels={levels}"
+        )
+    check_choice("norm", norm, get_args(Norm))
+
+
+def pooled(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
+    """Maxima of 2x2x2 voxels; at odd ends, of as many as there are."""
+    return F.max_pool3d(x, 2, ceil_mode=True)
+
+
+def middle(x: Float[Tensor, "n c d h w"], size: torch.Size) -> Float[Tensor, "n c e i x"]:
+    """Middle part of volumes, so many voxels along (z, y, x)."""
+    for axis, (whole, part) in enumerate(zip(x.shape[2:], size, strict=True), start=2):
+        x = x.narrow(axis, (whole - part) // 2, part)
+    return x
+
+
+def valid_size(size: int, levels: int) -> int:
+    """Size of the output along an axis, in voxels, where no convolution pads.
+
+    Args:
+        size: of the input, in voxels.
+        levels: scales of a U-Net with two 3x3x3 convolutions at each.
+
+    Raises:
+        ValueError: a pooling would meet an odd size, or nothing would be left; the message names
+            the next larger size that fits.
+    """
+    answer = _answer_size(size, levels)
+    if answer is None:
+        larger = next(n for n in count(size + 1) if _answer_size(n, levels) is not None)
+        raise ValueError(
+            f"A U-Net of {levels} levels with padding 'valid' expected an even size before each "
+            f"pooling, along every axis, and more than its border; got {size} voxels, the next "
+            f"larger size that fits is {larger}; padding 'same' takes any"
+        )
+    return answer
+
+
+def _answer_size(size: int, levels: int) -> int | None:
+    for _ in range(levels - 1):
+        size -= 4
+        if size < 2 or size % 2:
+            return None
+        size //= 2
+    answer = (size - 4) * 2 ** (levels - 1) - 4 * (2 ** (levels - 1) - 1)
+    return answer if min(size - 4, answer) > 0 else None

@@ -1,0 +1,167 @@
+"""Unrolled iterations: networks between steps of filtered back-projection (ItNet), and learned
+primal-dual.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mvrecon.models.geometry import geometry_of, kept, validated
+from mvrecon.models.output import Reconstruction
+from mvrecon.models.start import content_scale, nonzero
+from mvrecon.projectors.operator import Projector
+from mvrecon.reconstructors.filtered.filters import Filter
+from mvrecon_baselines.sparse_view import filtered, full_precision, scaled, sinograms
+from mvrecon_baselines.unet2d import UNet2d, by_slices
+
+
+class ItNet(nn.Module):
+    """Iterations of a network and a filtered back-projection of the residual, x <- x + U(x), then
+    x <- x + lambda_k FBP(y - A x), in the unit of (views / mm).
+
+    The first x is FBP(y), the last operation a step towards the data. The lengths lambda_k are
+    learned, in units of 1 / growth, the greatest factor by which FBP A amplifies a volume: it is
+    far above one where views are few, since filtered back-projection then overshoots near the axis.
+    The network hands a few channels on to its next call (Genzel, Guehring, Macdonald
+    and Maerz, Near-exact recovery for tomographic inverse problems via deep learning, ICML 2022).
+
+    Args:
+        iterations: of network and step.
+        memory: channels from one call of the network to the next.
+        shared: one network for all iterations, or one each.
+        width, levels: of the network on slices, see `UNet2d`.
+        filter: window of the ramp, as in `fbp`.
+
+    Raises:
+        ValueError: no iteration, or a negative number of channels.
+    """
+
+    def __init__(
+        self,
+        iterations: int = 4,
+        memory: int = 5,
+        shared: bool = True,
+        width: int = 32,
+        levels: int = 4,
+        filter: Filter = "ram-lak",
+    ):
+        super().__init__()
+        if iterations < 1 or memory < 0:
+            raise ValueError(
+                f"Expected at least one iteration and at least 0 channels of memory, got "
+                f"iterations {iterations}, memory {memory}"
+            )
+        self.memory = memory
+        self.filter: Filter = filter
+        self.lengths = nn.Parameter(torch.ones(iterations))
+        self.nets = nn.ModuleList(
+            UNet2d(1 + memory, 1 + memory, width, levels, zero=1)
+            for _ in range(1 if shared else iterations)
+        )
+
+    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+        y = validated(views, A, self.lengths)
+        with full_precision(y):
+            y, start, scale = scaled(A, y, self.filter)
+            longest = kept(A, ("growth", self.filter), lambda: growth(A, self.filter))
+            x = start
+            state = x.new_zeros(len(x), self.memory, *x.shape[2:])
+            for number, length in enumerate(self.lengths):
+                answer = self.nets[number % len(self.nets)](torch.cat([x, state], dim=1))
+                x, state = x + answer[:, :1], answer[:, 1:]
+                x = x + length / longest * filtered(A, y - A(x), self.filter)
+        return Reconstruction(x * scale, start=start * scale)
+
+
+@torch.no_grad()
+def growth(A: Projector, filter: Filter = "ram-lak", iterations: int = 15) -> float:
+    """The greatest factor by which FBP A amplifies a volume, without unit, by the power method; one
+    where it is less.
+
+    With steps of at most 2 / growth the iteration x <- x + step FBP(y - A x) stays bounded.
+    """
+    random = torch.Generator().manual_seed(0)
+    x = torch.rand(1, 1, *A.domain_shape, generator=random).to(A.device)
+    factor = torch.ones(())
+    for _ in range(iterations):
+        image = filtered(A, A(x), filter)
+        factor = image.norm() / x.norm()
+        if not factor > 0:  # the views show nothing of the grid
+            break
+        x = image / image.norm()
+    return max(1.0, factor.item())
+
+
+class PrimalDual(nn.Module):
+    """Learned primal-dual: unrolled iterations of small networks on sinograms and on slices, with A
+    and A^T between them, in the unit of (views / mm).
+
+    h <- h + D_k(h, A f_2, y), f <- f + P_k(f, A^T h_1), several channels of each, zero at first; A
+    over the upper bound of its norm. Any rig (Adler and Oektem, IEEE Trans. Med. Imaging 37, 2018,
+    algorithm 3).
+
+    Args:
+        iterations: as published 10.
+        channels: of primal and of dual variables, at least 2.
+        width: channels between the three convolutions of each network.
+
+    Raises:
+        ValueError: no iteration, or too few channels.
+    """
+
+    def __init__(self, iterations: int = 10, channels: int = 5, width: int = 32):
+        super().__init__()
+        if iterations < 1 or channels < 2 or width < 1:
+            raise ValueError(
+                f"Expected iterations of at least 1, channels of at least 2 and a width of at "
+                f"least 1, got {iterations}, {channels} and {width}"
+            )
+        self.channels = channels
+        self.dual = nn.ModuleList(
+            SliceNetwork(channels + 2, channels, width) for _ in range(iterations)
+        )
+        self.primal = nn.ModuleList(
+            SliceNetwork(channels + 1, channels, width) for _ in range(iterations)
+        )
+
+    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+        y = validated(views, A, next(self.parameters()))
+        norm = kept(A, ("norm bound", y.dtype), lambda: norm_bound(A, y.dtype))
+        start = geometry_of(y, A).direction(y).detach()
+        scale = content_scale(start)
+        y = y / (scale * norm)
+        f = y.new_zeros(len(y), self.channels, *A.domain_shape)
+        h = y.new_zeros(len(y), self.channels, *A.range_shape)
+        for dual, primal in zip(self.dual, self.primal, strict=True):
+            projected = A(f[:, 1:2]) / norm
+            h = h + sinograms(dual(sinograms(torch.cat([h, projected, y], dim=1))))
+            f = f + primal(torch.cat([f, A.T(h[:, :1]) / norm], dim=1))
+        return Reconstruction(f[:, :1] * scale * nonzero(views), start=start)
+
+
+class SliceNetwork(nn.Module):
+    """Three 3x3 convolutions with PReLU between them, applied to slices one by one."""
+
+    def __init__(self, inputs: int, outputs: int, width: int):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(inputs, width, 3, padding=1),
+            nn.PReLU(width),
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.PReLU(width),
+            nn.Conv2d(width, outputs, 3, padding=1),
+        )
+
+    def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o d h w"]:
+        return by_slices(self.layers, x)
+
+
+@torch.no_grad()
+def norm_bound(A: Projector, dtype: torch.dtype = torch.float32) -> Float[Tensor, "#b 1 1 1 1"]:
+    """An upper bound of the norm of A, in mm: the root of its greatest row sum times its greatest
+    column sum (Schur's test); one where A is zero.
+    """
+    rows = A(torch.ones(1, 1, *A.domain_shape, dtype=dtype, device=A.device))
+    columns = A.T(torch.ones_like(rows))
+    bound = rows.amax((1, 2, 3, 4), keepdim=True) * columns.amax((1, 2, 3, 4), keepdim=True)
+    return torch.where(bound > 0, bound, 1).sqrt()

@@ -1,0 +1,1 @@
+"""Measurements of mvrecon on a GPU, and a stand-in for one."""

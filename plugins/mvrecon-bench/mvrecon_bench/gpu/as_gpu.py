@@ -1,0 +1,268 @@
+"""A stand-in for a GPU that counts what a program would wait for: tensors that say that they are on
+a GPU, and keep their numbers in main memory. It needs neither a GPU nor a build of torch for one.
+
+    with AsGpu() as gpu:
+        loss = model(on_gpu(views)).volume.sum()
+        loss.backward()
+    assert not gpu.waits
+
+What runs has real values, and so the real flow of control, with derivatives. A tensor in main
+memory that meets one of the device is an error, as on a GPU. Random numbers are those of main
+memory. Convention: C++ takes these tensors for torch's "meta" ones, Python for those of "cuda:0".
+"""
+
+import traceback
+from collections import Counter
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+from mvrecon.kernels import self_test
+
+GPU = torch.device("cuda", 0)
+#: Operators that take tensors of both memories.
+MIXED = {"copy_", "_to_copy", "index", "index_put", "index_put_", "_index_put_impl_"}
+#: Operators of mvrecon that read whole numbers (where a support lies) from main memory.
+ALONG_RAYS = {"project", "backproject", "lines_vjp"}
+#: Operators whose result, or its size, the host waits for.
+WAITING = {
+    *("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "bincount"),
+    *("_unique", "_unique2", "unique_dim", "unique_consecutive", "histc"),
+}
+#: Functions of torch that ask the device whether a matrix was regular, or an iteration converged.
+CHECKED = {f"linalg_{name}" for name in ("inv", "solve", "cholesky", "eigh", "eigvalsh", "svd")}
+CHECKED |= {"inverse", "linalg_pinv", "linalg_svdvals"}
+#: Products, which a GPU has of floating numbers alone.
+PRODUCTS = {"mm", "mv", "bmm", "dot", "addmm", "addmv", "baddbmm"}
+#: Operators that launch nothing.
+NOTHING = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "detach"}
+COPIED = "copied from main memory"
+#: The part of a file's path from which on a place in the program is named.
+PACKAGE = "mvrecon"
+
+
+class OnGpu(Tensor):
+    """A tensor in main memory that says that it is on a GPU."""
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore
+    values: Tensor
+    device = property(lambda self: GPU)  # pyright: ignore[reportAssignmentType]
+    is_cuda = property(lambda self: True)  # pyright: ignore[reportAssignmentType]
+    is_cpu = property(lambda self: False)  # pyright: ignore[reportAssignmentType]
+    is_meta = property(lambda self: False)  # pyright: ignore[reportAssignmentType]
+
+    @staticmethod
+    def __new__(cls, values: Tensor) -> "OnGpu":
+        layout = {"strides": values.stride(), "storage_offset": values.storage_offset()}
+        tensor = Tensor._make_wrapper_subclass(  # pyright: ignore[reportAttributeAccessIssue]
+            cls, values.shape, **layout, dtype=values.dtype, device=torch.device("meta")
+        )
+        tensor.values = values
+        return tensor
+
+    def __init__(self, values: Tensor):
+        super().__init__()
+
+    def __repr__(self, **_: Any) -> str:
+        return f"OnGpu({tuple(self.shape)})"
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        raise RuntimeError(f"{func} of a tensor of the stand-in for a GPU, outside of AsGpu")
+
+
+def on_gpu(x: Any) -> Any:
+    """A tensor as if on a GPU; anything else as it is."""
+    return OnGpu(x) if isinstance(x, Tensor) and not isinstance(x, OnGpu) else x
+
+
+def in_memory(x: Any) -> Any:
+    """The numbers of a tensor in main memory; anything else as it is."""
+    return x.values if isinstance(x, OnGpu) else x
+
+
+class AsGpu:
+    """Context in which tensors made on "cuda" are `OnGpu`, the CUDA back end serves them as one
+    that has passed its check, and waits and launches are counted.
+
+    What an opaque operator of mvrecon launches counts as one.
+    """
+
+    def __init__(self) -> None:
+        self.waits: Counter[tuple[str, str]] = Counter()
+        self.launches: Counter[str] = Counter()
+
+    def __enter__(self) -> "AsGpu":
+        self._before = torch.cuda._lazy_init, self_test.failure
+        torch.cuda._lazy_init = lambda: None
+        self_test.failure = lambda *_: None  # pyright: ignore[reportAttributeAccessIssue]
+        self._modes = _Operators(self), _Calls(self)
+        for mode in self._modes:
+            mode.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        for mode in reversed(self._modes):
+            mode.__exit__(*error)
+        torch.cuda._lazy_init, self_test.failure = self._before
+
+    def put(self, module: nn.Module) -> nn.Module:
+        """A module as if moved to the GPU; the counts begin anew."""
+        module._apply(on_gpu)
+        if hasattr(module, "_device"):  # a LightningModule
+            module._device = GPU  # pyright: ignore[reportArgumentType]
+        self.waits.clear()
+        self.launches.clear()
+        return module
+
+    def wait(self, why: str) -> None:
+        """Count a wait of the host, at the innermost line of mvrecon that is at work."""
+        lines = [f for f in traceback.extract_stack() if f"/{PACKAGE}/" in f.filename]
+        inner = [f for f in lines if f.filename != __file__]
+        place = "-"
+        if inner:
+            place = f"{inner[-1].filename.rpartition(f'/{PACKAGE}/')[2]}:{inner[-1].lineno}"
+        self.waits[place, why] += 1
+
+
+class _Operators(TorchDispatchMode):
+    """Runs operators in main memory, and counts what they would cost."""
+
+    def __init__(self, gpu: AsGpu):
+        super().__init__()
+        self.gpu = gpu
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs, name = kwargs or {}, str(func.overloadpacket).partition(".")[2]
+        tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+        device = any(isinstance(x, OnGpu) for x in tensors)
+        read = name in ALONG_RAYS
+        away = [x for x in tensors if not isinstance(x, OnGpu) and x.ndim]
+        host = [tuple(x.shape) for x in away if not (read and x.dtype == torch.int32)]
+        if device and host and name not in MIXED:
+            raise RuntimeError(f"{func}: tensors on cuda:0 and in main memory, {host}")
+        if device and name in PRODUCTS and not tensors[0].is_floating_point():
+            raise RuntimeError(f"{func}: a GPU has none of {tensors[0].dtype}")
+        if device:
+            self._count_waits(name, args)
+        wanted = kwargs.get("device")
+        if name == "_to_copy" and wanted is not None and device != _is_gpu(wanted):
+            self.gpu.wait("copied to main memory" if device else COPIED)
+        plain, options = tree_map(in_memory, (args, kwargs))
+        if _is_gpu(wanted):
+            options = {**options, "device": torch.device("cpu")}
+        result = func(*plain, **options)
+        stays = _is_gpu(wanted) if wanted is not None else device
+        if result is None or name == "_local_scalar_dense" or not stays:
+            return result
+        if name not in NOTHING and not func.is_view:
+            self.gpu.launches[name] += 1
+        if name.endswith("_") and not name.endswith("__"):
+            return args[0]
+        return tree_map(on_gpu, result)
+
+    def _count_waits(self, name: str, args: tuple) -> None:
+        if name in WAITING:
+            self.gpu.wait(name)
+        if name == "copy_" and isinstance(args[0], OnGpu) != isinstance(args[1], OnGpu):
+            self.gpu.wait("copied between the memories")
+        if name == "repeat_interleave":  # of a tensor of repeats
+            self.gpu.wait(name)
+        indices = args[1] if name.startswith(("index", "_index")) and len(args) > 1 else ()
+        tensors = [i for i in tree_leaves(indices) if isinstance(i, Tensor)]
+        # a scalar at the places of a mask is a fill
+        if any(i.dtype == torch.bool for i in tensors) and "put" not in name:
+            self.gpu.wait("an index that is a mask")
+        if name != "index_select" and any(not isinstance(i, OnGpu) for i in tensors):
+            self.gpu.wait(f"an index {COPIED}")
+
+
+class _Calls(TorchFunctionMode):
+    """Answers what a tensor of the stand-in cannot be asked, and what no operator shows."""
+
+    def __init__(self, gpu: AsGpu):
+        super().__init__()
+        self.gpu = gpu
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs, name = kwargs or {}, getattr(func, "__name__", "").strip("_")
+        if args and isinstance(args[0], OnGpu) and name in self.ANSWERS:
+            return self.ANSWERS[name](self, func, *args, **kwargs)
+        if name in CHECKED and any(isinstance(x, OnGpu) for x in tree_leaves((args, kwargs))):
+            self.gpu.wait(name)
+        if name == "to":
+            args, kwargs = tree_map(_numbered, (args, kwargs))
+        if name in ("tensor", "as_tensor") and _is_gpu(kwargs.get("device")):
+            source, dtype = args[0], kwargs.get("dtype")
+            if not isinstance(source, OnGpu):
+                self.gpu.wait(f"torch.{name}, {COPIED}")
+            return OnGpu(func(in_memory(source), dtype=dtype))
+        return func(*args, **kwargs)
+
+    def _tolist(self, func: Any, tensor: OnGpu) -> Any:
+        self.gpu.wait("tolist")
+        return tensor.values.tolist()
+
+    def _numpy(self, func: Any, tensor: OnGpu, **_: Any) -> Any:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    def _new_tensor(self, func: Any, tensor: OnGpu, data: Any, dtype: Any = None, **_: Any) -> Any:
+        self.gpu.wait(f"new_tensor, {COPIED}")
+        return OnGpu(torch.tensor(data, dtype=dtype or tensor.dtype))
+
+    def _to(self, func: Any, tensor: OnGpu, *args: Any, **kwargs: Any) -> Any:
+        """C++ would copy what is on the device already."""
+        device, dtype, _, layout = torch._C._nn._parse_to(  # pyright: ignore
+            *args, **{k: v for k, v in kwargs.items() if k != "copy"}
+        )
+        copy = kwargs.get("copy", False)
+        if device is not None and not _is_gpu(device):
+            return func(tensor, *args, **kwargs)
+        options = {} if layout is None else {"memory_format": layout}
+        return func(tensor, dtype or tensor.dtype, copy=copy, **options)
+
+    def _cuda(self, func: Any, tensor: OnGpu, *_: Any, **__: Any) -> Any:
+        return tensor
+
+    def _unravel(self, func: Any, tensor: OnGpu, shape: Any) -> Any:
+        for _ in range(2):
+            self.gpu.wait(f"unravel_index, {COPIED}")
+        return tuple(map(OnGpu, func(tensor.values, shape)))
+
+    def _index(self, func: Any, tensor: OnGpu, index: Any, *value: Any) -> Any:
+        many = isinstance(index, tuple)
+        moved = tuple(map(self._moved, index if many else (index,)))
+        return func(tensor, moved if many else moved[0], *value)
+
+    def _moved(self, index: Any) -> Any:
+        """An index as it gets onto the device."""
+        host = isinstance(index, Tensor) and not isinstance(index, OnGpu) and index.ndim
+        if not host and not isinstance(index, list):
+            return index
+        self.gpu.wait(f"an index {COPIED}")
+        return OnGpu(torch.as_tensor(index))
+
+    ANSWERS = {
+        "tolist": _tolist,
+        "numpy": _numpy,
+        "new_tensor": _new_tensor,
+        "to": _to,
+        "cuda": _cuda,
+        "unravel_index": _unravel,
+        "getitem": _index,
+        "setitem": _index,
+    }
+
+
+def _is_gpu(device: Any) -> bool:
+    """Whether a device is named that the stand-in serves."""
+    return device is not None and torch.device(device).type in ("cuda", "meta")
+
+
+def _numbered(x: Any) -> Any:
+    """ "cuda" with the number of the device, for which C++ would ask; anything else as it is."""
+    return GPU if isinstance(x, str | torch.device) and str(x) == "cuda" else x

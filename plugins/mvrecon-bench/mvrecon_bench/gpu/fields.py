@@ -1,0 +1,112 @@
+"""The kernels beside those of plain rays on a device: attenuated rays, warps, voxel-driven
+back-projection, hull; part of `check.py`.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import mvrecon as mv
+from mvrecon.cameras.frusta import frusta_lattice
+from mvrecon.geometry.frustum import depth_edges
+from mvrecon.geometry.lattice import grid_lattice, lattice_maps
+from mvrecon.kernels import self_test
+from mvrecon.kernels.rays import attenuated_ops
+from mvrecon.kernels.voxels import ops as voxels
+from mvrecon.kernels.warps import warp as warps
+from mvrecon.kernels.warps.warp import warp
+from mvrecon.projectors.voxel_driven import backproject
+from mvrecon.visual_hull.hull import visual_hull
+from mvrecon_bench.gpu.measuring import Results, throughput
+from mvrecon_spect.attenuated import AttenuatedTransform
+
+#: What the kernels for a purpose are tried on before their first use.
+TESTS = {
+    "attenuated": attenuated_ops.self_test,
+    "warp": warps.self_test,
+    "look": voxels.self_test,
+}
+#: Linear attenuation in 1/mm of attenuated rays.
+MU = 0.015
+BRICK = 4
+
+
+def agreement(call: Callable[[Tensor], Tensor], x: Tensor, device: str) -> dict[str, Any]:
+    """Greatest differences of a value and its gradient from the CPU's, relative to the greatest
+    value, and ms of the value on the device.
+    """
+    results = []
+    for place in ("cpu", device):
+        leaf = x.to(place).requires_grad_()
+        value = call(leaf)
+        (gradient,) = torch.autograd.grad(value.square().sum(), leaf)
+        results.append((value.detach().cpu(), gradient.cpu()))
+    (value, gradient), (other, other_gradient) = results
+    with torch.no_grad():
+        there = x.to(device)
+        ms, _ = throughput(lambda: call(there), device)
+    return {
+        "value": float((other - value).abs().max() / value.abs().max()),
+        "gradient": float((other_gradient - gradient).abs().max() / gradient.abs().max()),
+        "ms": ms,
+    }
+
+
+def warped(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Tensor]:
+    """Values of the grid in the rig's frusta, or back."""
+    frusta = frusta_lattice(rig, grid, depth_edges(rig.depth_range(grid), 16))
+    ways = (frusta, grid_lattice(grid)) if back else (grid_lattice(grid), frusta)
+    maps, shape = lattice_maps(*ways), ways[1].shape
+    return lambda x: warp(x, maps.to(x.device), shape)
+
+
+def attenuated(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Tensor]:
+    """Attenuated integrals of a grid full of `MU`, or their transpose."""
+    operators, mu = {}, torch.full(grid.shape, MU)
+
+    def call(x: Tensor) -> Tensor:
+        A = operators.setdefault(x.device, AttenuatedTransform(grid, rig, mu).to(x.device))
+        return A.T(x) if back else A(x)
+
+    return call
+
+
+def same_hull(grid: mv.Grid, rig: mv.Cameras, views: Tensor, device: str) -> dict[str, Any]:
+    """Bricks that differ from the CPU's, and ms on the device."""
+    exact, there = visual_hull(views, rig, grid, BRICK), views.to(device)
+    differ = exact != visual_hull(there, rig, grid, BRICK).cpu()
+    ms, _ = throughput(lambda: visual_hull(there, rig, grid, BRICK), device)
+    return {"bricks": exact.numel(), "differ": int(differ.sum()), "ms": ms}
+
+
+def check_fields(
+    results: Results, grid: mv.Grid, rig: mv.Cameras, x: Tensor, views: Tensor, device: str
+) -> None:
+    """What these kernels say of themselves, and how they agree with the CPU.
+
+    Args:
+        results: where they are written.
+        grid, rig: of a cone beam.
+        x: volumes [b 1 d h w].
+        views: of that rig, [b 1 m v u], with zeros beside the object.
+        device: where they run.
+    """
+    for purpose, tests in TESTS.items() if device.startswith("cuda") else ():
+        results.attempt(
+            f"self-check {purpose}",
+            lambda p=purpose, t=tests: self_test.failure(device, p, torch.float32, t) or "right",
+        )
+    world, frusta = warped(grid, rig, back=False), warped(grid, rig, back=True)
+    lifted = world(x[:, None])[:, 0]
+    calls = {
+        "attenuated rays": (attenuated(grid, rig, back=False), x),
+        "attenuated rays, back": (attenuated(grid, rig, back=True), views),
+        "warp to frusta": (world, x[:, None]),
+        "warp to the grid": (frusta, lifted),
+        "back-projection": (lambda y: backproject(y, rig, grid, "distance"), views),
+    }
+    for name, (call, values) in calls.items():
+        results.attempt(f"agrees {name}", lambda c=call, v=values: agreement(c, v, device))
+    results.attempt("hull", lambda: same_hull(grid, rig, views, device))

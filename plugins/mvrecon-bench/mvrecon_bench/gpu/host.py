@@ -1,0 +1,72 @@
+"""What Python costs in a call of a projection, its adjoint and its pose gradient: microseconds of
+processor time, over a driver that does nothing. Needs no GPU.
+
+    python -m mvrecon_bench.gpu.host [--calls 200] [--rounds 40]
+"""
+
+import argparse
+import ctypes
+import time
+from collections.abc import Callable
+from ctypes import c_void_p
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+
+import mvrecon as mv
+from mvrecon.kernels.cuda import driver
+from mvrecon.kernels.cuda.launch import KERNELS
+from mvrecon.kernels.rays.cuda import operators
+from mvrecon.kernels.rays.lines import lines_of
+
+
+def without_a_device() -> None:
+    """Kernels that are none, by a driver whose launch is a foreign call that does nothing."""
+    none = {name: c_void_p() for name in KERNELS["rays"]}
+    stub = SimpleNamespace(cuLaunchKernel=ctypes.CDLL(None).abs)
+    driver.library = lambda: stub
+    driver.stream_of = lambda device: 0
+    driver.memory_of = lambda device: 2**36
+    operators.kernels_of = lambda variant, device: none
+
+
+def calls() -> dict[str, Callable[[], Any]]:
+    """The operators of a small cone beam, of one volume."""
+    grid = mv.Grid.centred(8, spacing=1.0)
+    rig = mv.circular(6, 50.0, 75.0, {"pixels": [8, 8], "pixel_mm": 2.0})
+    lines, shape = lines_of(rig, grid), list(grid.shape)
+    x, y = torch.rand(1, *grid.shape), torch.rand(1, len(rig), *rig.shape)
+    scene = lines, list(rig.ray_extent)
+    return {
+        "projection": lambda: operators.project(x, *scene, list(rig.shape), "joseph"),
+        "adjoint": lambda: operators.backproject(y, *scene, shape, "joseph"),
+        "pose gradient": lambda: operators.lines_vjp(x, y, *scene, "joseph"),
+    }
+
+
+def microseconds(call: Callable[[], Any], count: int, rounds: int) -> float:
+    """Of one call; the least of some rounds."""
+    times = []
+    for _ in range(rounds + 1):  # the first one warms up
+        start = time.process_time()
+        for _ in range(count):
+            call()
+        times.append(time.process_time() - start)
+    return 1e6 * min(times[1:]) / count
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--calls", type=int, default=200)
+    parser.add_argument("--rounds", type=int, default=40)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    without_a_device()
+    for what, call in calls().items():
+        print(f"{what}: {microseconds(call, options.calls, options.rounds):.1f} us", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""What the kernels of the CUDA back end are made of: registers, local memory, instructions, float64
+ones among them, and those of the innermost loops. Needs no GPU.
+
+    pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm       # extra `dev` has both on Linux
+    python -m mvrecon_bench.gpu.machine_code [--capability 90]
+"""
+
+import argparse
+import re
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from mvrecon.kernels.cuda import nvrtc
+from mvrecon.kernels.cuda.launch import Variant, text_of
+from mvrecon.kernels.rays.trace import METHODS
+
+#: Kernels along rays that are shown.
+SHOWN = ("store", "project", "record", "gather", "scatter", "vary")
+STORED = ((torch.float32, 1), (torch.float32, 4), (torch.bfloat16, 4))
+#: What reads numbers stored in half precision, beside the kernels along rays.
+HALF = ("warp",)
+#: Patterns of instructions.
+DOUBLE, LOAD = r"\bD(?:FMA|MUL|ADD|SETP)\b|F64|64H", r"\bLDG\b"
+LOCAL, CALL, ATOMIC = r"\b(?:LDL|STL)\b", r"\bCALL\b", r"\b(?:ATOM|ATOMG|REDG?)\b"
+
+
+class Kernel(NamedTuple):
+    """The machine code of a kernel.
+
+    Args:
+        registers: of a thread.
+        instructions: all.
+        loops: those of each innermost loop.
+    """
+
+    registers: int
+    instructions: list[str]
+    loops: list[list[str]]
+
+
+def disassembler() -> Path:
+    """NVIDIA's disassembler, out of its wheel.
+
+    Raises:
+        OSError: it is not installed.
+    """
+    paths = [path for root in nvrtc.roots() for path in root.rglob("nvdisasm") if path.is_file()]
+    if not paths:
+        raise OSError("nvdisasm is not installed: pip install nvidia-cuda-nvdisasm")
+    return paths[0]
+
+
+def compiled(source: str, capability: int) -> dict[str, Kernel]:
+    """The kernels of a text in CUDA C++ by name.
+
+    Raises:
+        OSError: no NVRTC, or no disassembler.
+    """
+    tool = disassembler()
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "rays.cubin"
+        file.write_bytes(nvrtc.build(source, f"sm_{capability}"))
+        shown = subprocess.run([str(tool), str(file)], capture_output=True, check=True).stdout
+    text = shown.decode()
+    counts = re.findall(r"REGCOUNT.*?index@\((\w+)\).*?\.word\s+(0x\w+)", text, re.S)
+    registers = {name: int(number, 16) for name, number in counts}
+    parts = re.split(r"\.section\s+\.text\.(\w+)", text)[1:]
+    bodies = zip(parts[::2], parts[1::2], strict=True)
+    return {name: Kernel(registers[name], *loops(body)) for name, body in bodies}
+
+
+def loops(body: str) -> tuple[list[str], list[list[str]]]:
+    """Instructions of a kernel, and those of its innermost loops."""
+    labels: dict[str, int] = {}
+    instructions: list[str] = []
+    ends: list[tuple[int, int]] = []
+    for line in body.splitlines():
+        if label := re.match(r"\s*\.(L_x_\d+):", line):
+            labels[label[1]] = len(instructions)
+        if code := re.match(r"\s*/\*[0-9a-f]+\*/\s+(.*);", line):
+            jump = re.search(r"BRA.*`\(\.(L_x_\d+)\)", code[1])
+            if jump and jump[1] in labels:
+                ends.append((labels[jump[1]], len(instructions) + 1))
+            instructions.append(code[1])
+    inner = [(a, b) for a, b in ends if not any(a <= c < d < b or a < c < d <= b for c, d in ends)]
+    return instructions, [instructions[a:b] for a, b in inner if b - a > 4]
+
+
+def count(pattern: str, instructions: list[str]) -> int:
+    """How many instructions match."""
+    return sum(bool(re.search(pattern, one)) for one in instructions)
+
+
+def row(name: str, kernel: Kernel) -> str:
+    """A kernel's line of a table."""
+    code = kernel.instructions
+    steps = "; ".join(
+        f"{len(loop)} ({count(DOUBLE, loop)} float64, {count(LOAD, loop)} loads)"
+        for loop in kernel.loops
+    )
+    numbers = f"{kernel.registers} | {count(LOCAL, code)} | {len(code)} | {count(DOUBLE, code)}"
+    return f"| {name} | {numbers} | {steps} |"
+
+
+def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """What is compiled at once: its title, its text, and the kernels that are shown."""
+    single, half = torch.float32, torch.bfloat16
+    for method in METHODS:
+        for stored, together in STORED:
+            variant = Variant("rays", single, stored, together, method)
+            yield f"{method}, {stored}, {together} a ray", text_of({"": variant}), SHOWN
+    for method in ("joseph", "siddon"):
+        variant = Variant("attenuated", single, single, 1, method)
+        title = f"{method}, attenuated, {single}"
+        yield title, text_of({"": variant}), ("weaken", "receive", "bend")
+    for purpose in ("warp", "look", "hull"):
+        for stored in (single, half) if purpose in HALF else (single,):
+            variant = Variant(purpose, single, stored)
+            yield f"{purpose}, {stored}", text_of({"": variant}), variant.names
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--capability", type=int, default=90)
+    options = parser.parse_args()
+    for title, source, names in texts():
+        print(f"\n{title}\n")
+        print("| kernel | registers | local memory | instructions | float64 | inner loops |")
+        print("|---|---:|---:|---:|---:|---|")
+        kernels = compiled(source, options.capability)
+        print("\n".join(row(name, kernels[name]) for name in names), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""What the scripts share: results that are written as they come, and times on either device."""
+
+import csv
+import faulthandler
+import json
+import statistics
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+#: Seconds after which a script begins nothing new, and those after which it is ended.
+SLICE, END = 500.0, 540.0
+
+
+def on_device(device: str) -> str:
+    """The device, if this machine has it; from now on the script's clock runs.
+
+    Args:
+        device: "cuda", "cpu", or "dry": a stand-in for "cuda", which needs none.
+
+    Raises:
+        SystemExit: "cuda" where torch sees no GPU.
+    """
+    if device == "dry":
+        from mvrecon_bench.gpu.dry import stand_in
+
+        stand_in()
+        device = "cuda"
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        sys.exit(
+            f"{Path(sys.argv[0]).name} needs a GPU, and torch {torch.__version__} sees none here; "
+            "--device dry tries the script on a stand-in, where its numbers mean nothing"
+        )
+    faulthandler.dump_traceback_later(END, exit=True)
+    return device
+
+
+class Results:
+    """Results that are on the disk after each: `<name>.json`, and `<name>.csv` for rows; and the
+    script's clock.
+    """
+
+    def __init__(self, folder: Path, name: str):
+        self.begun = time.perf_counter()
+        folder.mkdir(parents=True, exist_ok=True)
+        self.json, self.csv = folder / f"{name}.json", folder / f"{name}.csv"
+        self.facts: dict[str, Any] = {}
+        self.rows: list[dict[str, Any]] = []
+
+    def left(self) -> float:
+        """Seconds until nothing new is begun."""
+        return SLICE - (time.perf_counter() - self.begun)
+
+    def add(self, what: str, value: Any) -> None:
+        """Print and write one result."""
+        self.facts[what] = value
+        print(f"{what}: {value}", flush=True)
+        self.json.write_text(json.dumps(self.facts, indent=1, default=str) + "\n")
+
+    def row(self, **values: Any) -> None:
+        """Print and write one row."""
+        self.rows.append(values)
+        names = list(dict.fromkeys(key for row in self.rows for key in row))
+        with open(self.csv, "w", newline="") as file:
+            writer = csv.DictWriter(file, names)
+            writer.writeheader()
+            writer.writerows(self.rows)
+        shown = (f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
+        print("  ".join(shown), flush=True)
+
+    def attempt(self, what: str, measure: Callable[[], Any]) -> Any:
+        """What `measure` returns; a failure is a result too, and the script goes on."""
+        if self.left() < 0:
+            self.add(what, "no time left")
+            return None
+        try:
+            value = measure()
+        except Exception as error:
+            stack = traceback.extract_tb(error.__traceback__)[-3:]
+            places = [f"{Path(frame.filename).name}:{frame.lineno}" for frame in stack]
+            self.add(what, f"FAILED {reason(error)} at {places}")
+            return None
+        if value is not None:
+            self.add(what, value)
+        return value
+
+
+def reason(error: Exception) -> str:
+    """An error in one line."""
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:300]}"
+
+
+def wait(device: str) -> None:
+    """Wait until the device has nothing more to do."""
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+
+
+def latency(call: Callable[[], Any], device: str, rounds: int = 9) -> float:
+    """Milliseconds of one call from an idle device to its end; the median."""
+    call()
+    times = []
+    for _ in range(rounds):
+        wait(device)
+        start = time.perf_counter()
+        call()
+        wait(device)
+        times.append(time.perf_counter() - start)
+        if sum(times) > 3:
+            break
+    return 1e3 * statistics.median(times)
+
+
+def throughput(call: Callable[[], Any], device: str, seconds: float = 0.15) -> tuple[float, float]:
+    """Milliseconds a call when many are queued, on the device and on the host; the second is what
+    Python spends.
+    """
+    if not device.startswith("cuda"):
+        start = time.perf_counter()
+        call()
+        took = 1e3 * (time.perf_counter() - start)
+        return took, took
+    one = latency(call, device, 2) / 1e3
+    count = max(2, min(300, int(seconds / max(one, 1e-6))))
+    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    torch.cuda.synchronize()
+    begin.record()
+    start = time.perf_counter()
+    for _ in range(count):
+        call()
+    host = time.perf_counter() - start
+    end.record()
+    end.synchronize()
+    return begin.elapsed_time(end) / count, 1e3 * host / count
+
+
+def peak_mb(call: Callable[[], Any], device: str) -> float:
+    """MB of the device's memory that a call needs at most beside what is there."""
+    if not device.startswith("cuda"):
+        return float("nan")
+    torch.cuda.synchronize()
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    call()
+    torch.cuda.synchronize()
+    return (torch.cuda.max_memory_allocated() - before) / 2**20

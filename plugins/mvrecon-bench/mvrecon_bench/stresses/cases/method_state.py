@@ -1,0 +1,49 @@
+"""State of a method: weights saved and loaded, the same views twice, the global generator."""
+
+import io
+
+import torch
+
+from mvrecon_bench.stresses.case import Case
+from mvrecon_bench.stresses.cases.methods import SINGLE
+from mvrecon_bench.stresses.learned_subjects import MethodSubject
+from mvrecon_bench.stresses.subject import bits
+
+
+def saved(subject: MethodSubject) -> float:
+    """Weights saved, and loaded into a new method: its volume differs in so many values."""
+    file = io.BytesIO()
+    torch.save(subject.used.func.state_dict(), file)
+    file.seek(0)
+    other = subject.method()
+    other.load_state_dict(torch.load(file, weights_only=True))
+    with torch.no_grad():
+        volume = other(subject.views[:1], subject.A).volume
+        return bits(volume, subject.used(subject.views[:1]).volume)
+
+
+def twice(subject: MethodSubject) -> float:
+    """The same views twice: volumes, and gradients by the views, differ in so many values."""
+    runs = []
+    for _ in range(2):
+        views = subject.views[:1].clone().requires_grad_()
+        volume = subject.used(views).volume
+        slope = torch.autograd.grad(volume.sum(), views)[0] if volume.requires_grad else views
+        runs.append(torch.cat([volume.detach().flatten(), slope.detach().flatten()]))
+    return bits(*runs)
+
+
+def randomness(subject: MethodSubject) -> float:
+    """Evaluation draws nothing from the global generator."""
+    method, views = subject.used, subject.views[:1]  # making it draws its weights
+    before = torch.random.get_rng_state()
+    with torch.no_grad():
+        method(views)
+    return bits(torch.random.get_rng_state(), before)
+
+
+CASES = (
+    Case(70, "weights saved and loaded", "the same volume", "method", saved, dtypes=SINGLE),
+    Case(74, "twice the same", "the same volume and gradients", "method", twice),
+    Case(75, "the global generator", "is left alone", "method", randomness),
+)

@@ -1,0 +1,203 @@
+"""The attenuated ray transform: emission along rays, weakened on the way to the detector."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from types import ModuleType
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.cameras.camera import Cameras
+from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.cameras.symmetry import Mirror
+from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.operator import choose_backend
+from mvrecon.kernels.precision import wide
+from mvrecon.kernels.rays import attenuated_ops, attenuated_reference, ops
+from mvrecon.kernels.rays.occupancy import DENSE
+from mvrecon.projectors.checks import check, check_floating
+from mvrecon.projectors.operator import LinearOperator, Projector
+from mvrecon.projectors.pixel_integral import PixelIntegral
+from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.projectors.skipping import Skipped, verify, within
+
+#: Linear attenuation in 1/mm that nothing in a patient reaches from 70 keV up (cortical bone 0.058,
+#: titanium 0.07), and that water and tissue in 1/cm exceed.
+DENSEST = 0.1
+#: The options of `RayTransform` that an operator for some of the cameras shares.
+OPTIONS = ("method", "backend", "rays_per_pixel", "skip", "support")
+
+
+class AttenuatedTransform(RayTransform):
+    """Attenuated integrals along rays, integral of lambda(s) exp(-integral of mu from s to the
+    detector) ds, in (unit of lambda) * mm.
+
+    On each segment mu is constant: what it emits counts exp(-A) (1 - exp(-mu D)) / mu, A the depth
+    of those between it and the detector (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). A
+    segment is a slab's for "joseph", a cell's for "siddon". Differentiable in lambda, mu and, by
+    the reference, the cameras. Where mu is zero it is `RayTransform` to the last bit, and costs the
+    same. The CPU leaves out rays beside the box of what emits, and what lies behind it on others;
+    that changes no bit. `skip="off"` switches it off, "verify" compares, and all else is "auto".
+
+    Convention: counts run along a ray towards growing w, see `Cameras`: to the pinhole and the
+    detector behind it, or to a collimator's end plane w = 1.
+
+    Args:
+        grid, cameras, options: as in `RayTransform`; without the method "trilinear".
+        mu: linear attenuation on the grid, in 1/mm; values written into it later count.
+
+    Raises:
+        ValueError: mu of another shape, negative, not finite, or in another unit; or as
+            `RayTransform`.
+    """
+
+    mu: Tensor
+
+    def __init__(
+        self,
+        grid: Grid,
+        cameras: Cameras | ExplicitRays,
+        mu: Float[Tensor, "d h w"],
+        **options: Any,
+    ):
+        super().__init__(grid, cameras, **options)
+        if self.method.startswith("trilinear"):
+            raise ValueError(
+                f"Attenuated rays need method 'joseph' or 'siddon', got {self.method!r}"
+            )
+        check_mu(mu, grid)
+        self.register_buffer("mu", mu.to(self.device), persistent=False)
+        self._seen: tuple[Tensor | None, int, bool] = None, 0, False
+        _ = self.clear
+
+    @property
+    def clear(self) -> bool:
+        """Whether mu is zero everywhere and no gradient by it is asked for; looked up again after a
+        write to it, which graphs of `torch.compile` and tensors of inference mode do not notice.
+        """
+        mu, (seen, version, clear) = self.mu, self._seen
+        if torch.compiler.is_compiling():
+            return clear
+        now = 0 if mu.is_inference() else mu._version
+        if seen is not mu or version != now:
+            clear = not mu.requires_grad and not bool((mu != 0).any())
+            self._seen = mu, now, clear
+        return clear
+
+    @property
+    def skipped(self) -> Skipped:
+        """Voxels that the last call skipped, and why."""
+        report = super().skipped
+        if self.clear or report.mode == "off":
+            return report
+        return replace(report, why="attenuated rays leave out what is beside or behind the box")
+
+    def project_along(
+        self,
+        volume: Float[Tensor, "b c d h w"],
+        lines: Float[Tensor, "r 4 3 k"],
+        detector: Sequence[int],
+    ) -> Float[Tensor, "n r v u"]:
+        """Attenuated integrals along rays in voxel space."""
+        if self.clear:
+            return super().project_along(volume, lines, detector)
+        check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
+        check_floating(volume, "a volume")
+        x = volume.flatten(0, 1)
+        x = wide(x if self.support is None else within(x, self.support))
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector)
+        self._last = None
+        name, kernels = self._operators(volume, lines)
+        if name != "cpu":
+            return kernels.project(x, self.mu, *rays, self.kernel)[..., 0]
+        if self.skip != "off":
+            window = lines.detach(), self.ray_extent, list(detector), self.kernel
+            self._last = ops.occupied(x.detach(), *window, "box")
+        dense = self.kernel + DENSE
+        method = dense if self.skip == "off" else self.kernel
+        views = attenuated_ops.project(x, self.mu, *rays, method)[..., 0]
+        if self.skip == "verify":
+            verify(views, attenuated_ops.project(x, self.mu, *rays, dense)[..., 0], self.skipped)
+        return views
+
+    def backproject_along(
+        self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]
+    ) -> Float[Tensor, "n d h w"]:
+        """The transpose of `project_along`."""
+        if self.clear:
+            return super().backproject_along(views, lines)
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, self.kernel
+        _, kernels = self._operators(views, lines)
+        volumes = kernels.backproject(views[..., None], self.mu, *rays)
+        return volumes if self.support is None else within(volumes, self.support)
+
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
+        """The same for emission in a box and for some cameras; all of the attenuation stays."""
+        if self.clear:
+            return super().cropped(box, views)
+        part = self if views is None else self._of_views(list(views))
+        return LinearOperator.cropped(part, box)
+
+    def mirror(self) -> Mirror | None:
+        """A plane that mirrors the attenuation into itself, too."""
+        mirror = super().mirror()
+        return mirror if mirror and torch.equal(mirror.volume(self.mu), self.mu) else None
+
+    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+        """mu, where it is not zero everywhere."""
+        return None if self.clear else self.mu
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """None: the pixels are no plain integrals, but where nothing attenuates."""
+        return super().pixel_integral() if self.clear else None
+
+    def _of_views(self, views: list[int]) -> "AttenuatedTransform":
+        rig = self.cameras
+        options = {name: getattr(self, name) for name in OPTIONS}
+        cameras = rig[torch.tensor(views, device=rig.source.device)]
+        return AttenuatedTransform(self.grid, cameras, self.mu, **options).to(self.device)
+
+    def _operators(self, tensor: Tensor, lines: Tensor) -> tuple[str, ModuleType]:
+        """The back end that serves a tensor, and its operators."""
+        chosen = attenuated_kernels(tensor, self.backend, lines.requires_grad)
+        self.last_backend = chosen[0]
+        return chosen
+
+
+def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str, ModuleType]:
+    """The back end's name and its operators along attenuated rays, for a tensor; raises as
+    `choose_backend`.
+
+    Args:
+        tensor: volumes or views.
+        backend: as of `choose_backend`.
+        moving: whether a gradient by the rays is asked for, which the reference alone has.
+    """
+    name = choose_backend(tensor, backend, "attenuated", attenuated_ops.self_test)
+    if moving or name == "reference":
+        return "reference", attenuated_reference
+    return name, attenuated_ops
+
+
+def check_mu(mu: Tensor, grid: Grid) -> None:
+    """Check linear attenuation in 1/mm: its shape, and that its values can be that.
+
+    Raises:
+        ValueError: another shape or dtype, values not finite, negative, or above 0.1 / mm.
+    """
+    if tuple(mu.shape) != tuple(grid.shape):
+        raise ValueError(f"Expected mu [d h w] of sizes {grid.shape}, got {tuple(mu.shape)}")
+    check_floating(mu, "mu")
+    if not mu.isfinite().all():
+        raise ValueError("Expected finite attenuation in 1/mm, got values that are not")
+    least, most = mu.detach().min().item(), mu.detach().max().item()
+    if least < 0:
+        raise ValueError(f"Expected attenuation in 1/mm, zero or more, got {least:g}; is it HU?")
+    if most > DENSEST:
+        raise ValueError(
+            f"Expected attenuation in 1/mm, at most {DENSEST:g} (water at 140.5 keV: 0.01536), got "
+            f"{most:g}; is it in 1/cm, or HU?"
+        )

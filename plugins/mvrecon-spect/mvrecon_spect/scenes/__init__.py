@@ -1,0 +1,1 @@
+"""Scenes of SPECT: what emits, and the matter that attenuates it."""

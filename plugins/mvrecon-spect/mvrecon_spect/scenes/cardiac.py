@@ -1,0 +1,330 @@
+"""Cardiac SPECT: a heart with or without a defect in a torso with lungs and liver, and the matter
+that attenuates.
+
+The heart's own axes: z from the base, z = 0, to the apex; x from the left ventricle to the right
+one; its origin is in the middle of the base. The patient's axes are the world's: x to the right
+side, y to the front, z to the head; the heart is at the origin.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import euler_degrees, euler_rotation, random_in_ball, unit
+from mvrecon.scenes.analytic import generator, uniform
+from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon_spect.scenes.attenuating import AttenuatingScene
+
+#: Semi-axes and centres in mm of the mean patient.
+TORSO, TORSO_CENTRE = (145.0, 112.0, 120.0), (40.0, -42.0, 0.0)
+RIGHT_LUNG, RIGHT_LUNG_CENTRE = (48.0, 75.0, 80.0), (115.0, -42.0, 37.0)
+LEFT_LUNG, LEFT_LUNG_CENTRE = (50.0, 38.0, 80.0), (-20.0, -85.0, 37.0)
+LIVER, LIVER_CENTRE = (75.0, 68.0, 43.0), (75.0, -38.0, -102.0)
+#: The left lung begins so far behind the heart's centre, in mm.
+BEHIND = 60.0
+#: From the heart's base to its apex: to the left, to the front, downwards.
+LONG_AXIS = (-0.62, 0.62, -0.48)
+#: 1/mm at 140.5 keV: water (NIST XCOM), and inflated lung, 0.26 of its density.
+WATER, LUNG = 0.01536, 0.0042
+#: From and to: the heart's sizes in mm, torso in mean torsos, uptakes of the heart's wall.
+RADIUS, LENGTH, WALL, SCALE = (28.0, 33.0), (66.0, 78.0), (8.0, 12.0), (0.93, 1.07)
+UPTAKES = {"body": (0.05, 0.15), "lung": (0.02, 0.05), "liver": (0.3, 0.8), "right": (0.3, 0.6)}
+#: Most turns of the heart about each axis in degrees, and its way from the origin in mm.
+TURN, AWAY = 12.0, 5.0
+
+
+@dataclass(frozen=True)
+class Defect:
+    """A part of the left ventricle's wall with less uptake.
+
+    Args:
+        azimuth_degrees: of its middle about the long axis, from x towards y.
+        width_degrees: about the long axis, below 180.
+        low: its basal end along the long axis, 0 at the base and 1 at the apex.
+        high: its apical end.
+        contrast: the share of the wall's uptake that is lost; 0: no defect.
+
+    Raises:
+        ValueError: a width not in (0, 180), ends that do not ascend in [0, 1], a contrast not in
+            [0, 1].
+    """
+
+    azimuth_degrees: float = 0.0
+    width_degrees: float = 60.0
+    low: float = 0.3
+    high: float = 0.7
+    contrast: float = 0.0
+
+    def __post_init__(self) -> None:
+        wide, along = 0 < self.width_degrees < 180, 0 <= self.low < self.high <= 1
+        if not (wide and along and 0 <= self.contrast <= 1):
+            raise ValueError(
+                f"Expected a defect of 0 to 180 degrees, with ends that ascend in [0, 1] and a "
+                f"contrast in [0, 1], got {self}"
+            )
+
+    def half_spaces(self, length: float) -> Float[Tensor, "4 4"]:
+        """The half-spaces n.X <= c, in the heart's axes, that hold it in a ventricle so long."""
+        first, last = (
+            math.radians(self.azimuth_degrees + sign * self.width_degrees / 2) for sign in (-1, 1)
+        )
+        return torch.tensor(
+            [
+                [math.sin(first), -math.cos(first), 0, 0],
+                [-math.sin(last), math.cos(last), 0, 0],
+                [0, 0, -1, -self.low * length],
+                [0, 0, 1, self.high * length],
+            ],
+            dtype=torch.float64,
+        )
+
+
+class Uptake(NamedTuple):
+    """Activity in the parts of the heart, of one unit.
+
+    Args:
+        wall: of the left ventricle.
+        right: the wall of the right ventricle.
+        blood: in both cavities.
+        around: of what surrounds the heart, to which its solids add.
+    """
+
+    wall: float = 1.0
+    right: float = 0.5
+    blood: float = 0.0
+    around: float = 0.0
+
+
+@dataclass(frozen=True)
+class Heart:
+    """Sizes of a heart in mm.
+
+    Args:
+        radius: outer radius of the left ventricle at its base.
+        length: from the base to the outer apex.
+        wall: thickness of the left ventricle's wall.
+        right_width: of the right ventricle, from the left one outwards.
+        right_wall: thickness of its wall.
+        defect: in the left ventricle's wall.
+
+    Raises:
+        ValueError: sizes that are not positive, or walls thicker than what they are around.
+    """
+
+    radius: float = 31.0
+    length: float = 73.0
+    wall: float = 10.0
+    right_width: float = 20.0
+    right_wall: float = 4.0
+    defect: Defect = Defect()
+
+    def __post_init__(self) -> None:
+        left, right = min(self.radius, self.length), min(self.right_width, self.radius)
+        if not (0 < self.wall < left < math.inf and 0 < self.right_wall < right):
+            raise ValueError(f"Expected positive walls below the ventricles' radii, got {self}")
+
+    def solids(self, uptake: Uptake) -> tuple[Solids, ...]:
+        """Half ellipsoids in the heart's axes: walls, cavities, and the defect in the left wall."""
+        wall, right, blood, around = uptake
+        left = [_ellipsoid(self.radius - t, self.length - t) for t in (0.0, self.wall)]
+        base = torch.tensor([[0.0, 0, -1, 0]], dtype=torch.float64)
+        values = left[0].new_tensor([wall - around, blood - wall])
+        whole = _half(left, values, base)
+        lost = self.defect.contrast * wall
+        scar = _half(left, values.new_tensor([-lost, lost]), self._defect())
+        beside = torch.cat([base, base.new_tensor([[-1.0, 0, 0, -self.radius]])])
+        size = base.new_tensor([self.right_width, self.radius, 0.8 * self.length])
+        outer = [size, size - self.right_wall]
+        crescent = _half(outer, values.new_tensor([right - around, blood - right]), beside)
+        crescent = _shifted(crescent, self.radius)
+        return (whole, crescent) if lost == 0 else (whole, scar, crescent)
+
+    def _defect(self) -> Float[Tensor, "4 4"]:
+        return self.defect.half_spaces(self.length)
+
+
+def _ellipsoid(radius: float, length: float) -> Float[Tensor, "3"]:
+    return torch.tensor([radius, radius, length], dtype=torch.float64)
+
+
+def _half(
+    sizes: list[Float[Tensor, "3"]], values: Float[Tensor, " n"], cuts: Float[Tensor, "k 4"]
+) -> Solids:
+    """Ellipsoids about the origin, all cut by the same planes."""
+    n = len(sizes)
+    places, turns = torch.zeros(n, 3), torch.eye(3).expand(n, 3, 3)
+    return Solids("ellipsoid", places, turns, torch.stack(sizes), values, cuts.expand(n, -1, -1))
+
+
+def _shifted(solids: Solids, x: float) -> Solids:
+    """Ellipsoids moved along x, their planes left where they are."""
+    moved = torch.zeros(len(solids.values), 3, dtype=torch.float64)
+    moved[:, 0] = x
+    return Solids(
+        solids.kind, moved, solids.rotations, solids.semi_axes, solids.values, solids.cuts
+    )
+
+
+class Patient(NamedTuple):
+    """One random patient.
+
+    Args:
+        heart: its sizes.
+        R: from the heart's axes to the world's.
+        t: the middle of the heart's base, in world mm.
+        scale: of the torso along x and y.
+        uptake: of body, lung, liver and right ventricle, in parts of the left ventricle's wall.
+    """
+
+    heart: Heart
+    R: Float[Tensor, "3 3"]
+    t: Float[Tensor, "3"]
+    scale: float
+    uptake: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomCardiac(AttenuatingScene):
+    """Cases of random patients about a heart at the world's origin: sizes, place and turn of the
+    heart, uptakes, torso, and in some a defect of random place, extent and contrast.
+
+    The heart's wall has `value`; what attenuates is water and lung. Lengths are those of an adult:
+    the grid must hold the torso, 310 x 240 x 240 mm, as 64^3 voxels of 5 mm about (40, -40, 0) do.
+    It holds the pinholes of `dcspect80` outside.
+
+    Convention: x to the patient's right, y to the front, z to the head, as in NIfTI.
+
+    Args:
+        defects: the share of cases that have one.
+        contrast: of a defect, least and greatest share of the wall's uptake that is lost.
+        attenuates: whether the torso does.
+
+    Raises:
+        ValueError: a share that is not in [0, 1], contrasts that do not ascend in [0, 1].
+    """
+
+    defects: float = 0.5
+    contrast: tuple[float, float] = (0.3, 0.9)
+    attenuates: bool = True
+    field: float = 0.5
+    unit: str = "activity"
+    kind = "cardiac"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.defects <= 1 or not 0 <= self.contrast[0] <= self.contrast[1] <= 1:
+            raise ValueError(
+                f"Expected a share of defects in [0, 1] and contrasts that ascend in it, got "
+                f"{self.defects} and {self.contrast}"
+            )
+
+    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """The patient's activity.
+
+        Raises:
+            ValueError: the grid does not hold the torso.
+        """
+        patient = self._patient(rng, grid)
+        share = {name: self.value * part for name, part in patient.uptake.items()}
+        uptake = Uptake(self.value, share["right"], share["body"], share["body"])
+        heart = (solids.moved(patient.R, patient.t) for solids in patient.heart.solids(uptake))
+        organs = share["body"], share["lung"] - share["body"], share["liver"] - share["body"]
+        return Phantom((*_torso(patient.scale, *organs), *heart))
+
+    def matter(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """The patient's attenuation in 1/mm.
+
+        Raises:
+            ValueError: the grid does not hold the torso.
+        """
+        patient = self._patient(rng, grid)
+        organs = (WATER, LUNG - WATER, 0.0) if self.attenuates else (0.0, 0.0, 0.0)
+        return Phantom(_torso(patient.scale, *organs))
+
+    def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
+        """Pose of the heart (place in mm of the middle of its base, ZYZ Euler angles in degrees),
+        its sizes in mm, defect and uptakes of a case.
+        """
+        patient = self._patient(generator(seed, index), grid)
+        places = dict(zip(("x_mm", "y_mm", "z_mm"), patient.t.tolist(), strict=True))
+        angles = euler_degrees(patient.R).tolist()
+        turns = dict(zip(("phi_degrees", "theta_degrees", "psi_degrees"), angles, strict=True))
+        heart, defect = patient.heart, patient.heart.defect
+        sizes = {"radius_mm": heart.radius, "length_mm": heart.length, "wall_mm": heart.wall}
+        lost = {f"defect_{name}": value for name, value in vars(defect).items()}
+        uptakes = {f"uptake_{name}": value for name, value in patient.uptake.items()}
+        return {**places, **turns, **sizes, **lost, **uptakes, "torso": patient.scale}
+
+    def _patient(self, rng: torch.Generator, grid: Grid) -> Patient:
+        scale = uniform(rng, *SCALE)
+        _check_room(grid)
+        uptake = {name: uniform(rng, *between) for name, between in UPTAKES.items()}
+        ill, loss = uniform(rng, 0, 1) < self.defects, uniform(rng, *self.contrast)
+        low, width = uniform(rng, 0.0, 0.6), uniform(rng, 30, 120)
+        middle, extent = uniform(rng, 0, 360), uniform(rng, 0.2, 0.4)
+        defect = Defect(middle, width, low, low + extent, loss if ill else 0.0)
+        sizes = (uniform(rng, *between) for between in (RADIUS, LENGTH, WALL))
+        heart = Heart(*sizes, defect=defect)
+        R = euler_rotation([uniform(rng, -TURN, TURN) for _ in range(3)], "zyx") @ _upright()
+        t = random_in_ball(rng, AWAY) - R[:, 2] * heart.length / 2
+        return Patient(heart, R, t, scale, uptake)
+
+
+def _upright() -> Float[Tensor, "3 3"]:
+    """From the mean heart's axes to the patient's: the right ventricle is to the right in front."""
+    z = unit(torch.tensor(LONG_AXIS, dtype=torch.float64))
+    towards = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
+    x = unit(towards - z * (z @ towards))
+    return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
+
+
+def _torso(scale: float, body: float, lung: float, liver: float) -> tuple[Solids, ...]:
+    """An elliptic cylinder of `body`, two lungs and a liver that add to it; all of it scaled."""
+    grow = torch.tensor([scale, scale, 1.0], dtype=torch.float64)
+    trunk = _one("cylinder", TORSO_CENTRE, TORSO, body, grow)
+    behind, bottom = [[0.0, 1, 0, -BEHIND]], [[0.0, 0, -1, TORSO[2]]]
+    return (
+        trunk,
+        _one("ellipsoid", RIGHT_LUNG_CENTRE, RIGHT_LUNG, lung, grow),
+        _one("ellipsoid", LEFT_LUNG_CENTRE, LEFT_LUNG, lung, grow, behind),
+        _one("ellipsoid", LIVER_CENTRE, LIVER, liver, grow, bottom),
+    )
+
+
+def _one(
+    kind: str,
+    centre: tuple[float, float, float],
+    semi_axes: tuple[float, float, float],
+    value: float,
+    grow: Float[Tensor, "3"],
+    cuts: list[list[float]] | None = None,
+) -> Solids:
+    place, size = (grow * torch.tensor([list(v)], dtype=torch.float64) for v in (centre, semi_axes))
+    half_spaces = None if cuts is None else torch.tensor([cuts], dtype=torch.float64)
+    turn = torch.eye(3, dtype=torch.float64)[None]
+    return Solids(kind, place, turn, size, place.new_tensor([value]), half_spaces)
+
+
+def _check_room(grid: Grid) -> None:
+    """Refuse a grid that does not hold the largest torso.
+
+    Raises:
+        ValueError: the box of the grid is smaller; the message names one that is not.
+    """
+    grow = torch.tensor([SCALE[1], SCALE[1], 1.0], dtype=torch.float64)
+    middle, half = grow * torch.tensor(TORSO_CENTRE).double(), grow * torch.tensor(TORSO).double()
+    ends = grid.to_index(torch.stack([middle - half, middle + half]))
+    last = torch.tensor(grid.shape[::-1]) - 0.5
+    if (ends.amin(dim=0) < -0.5).any() or (ends.amax(dim=0) > last).any():
+        edges = [math.ceil(2 * x) for x in half.tolist()]
+        raise ValueError(
+            f"Expected a grid that holds a torso of {edges} mm about "
+            f"{[round(x, 1) for x in middle.tolist()]}, such as size [64, 64, 64], spacing 5, "
+            f"centre [40, -40, 0], got size {grid.size}, spacing {grid.spacing}, centre "
+            f"{[round(x, 1) for x in grid.centre.tolist()]}"
+        )

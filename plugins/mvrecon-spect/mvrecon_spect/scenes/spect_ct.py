@@ -1,0 +1,124 @@
+"""Cases of SPECT/CT: patients whose attenuation a transmission scan has measured."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.acquisition.detector import detected
+from mvrecon.acquisition.settings import Acquisition
+from mvrecon.cameras.camera import Cameras
+from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at
+from mvrecon.geometry.grid import Grid
+from mvrecon.parts import CAMERAS, SCENES
+from mvrecon.projectors.drr import Drr
+from mvrecon.reconstructors.iterative import sirt
+from mvrecon.scenes.analytic import generator, mixed
+from mvrecon.scenes.sample import Mapped, Pooling, Rays, Sample
+
+#: The series of the scan's noise, apart from those that draw the patients.
+SCAN = 0x63745F73
+
+
+class SpectCt:
+    """Cases of another scene, with the attenuation in 1/mm that a transmission scan measures.
+
+    X-ray views of the case's matter at 70 keV, from voxels half as wide, with Poisson noise; SIRT
+    with momentum; Hounsfield units; attenuation at 140.5 keV by the two lines of
+    `mvrecon.data.attenuation`, at most that of cortical bone. The scene's own attenuation makes the
+    views of the emission.
+
+    Args:
+        scene: name and options of a scene with matter: cardiac, nema, spect_labels.
+        camera: name and options of the X-ray rig.
+        photons: on a pixel in air.
+        iterations: of SIRT.
+
+    Raises:
+        LookupError, TypeError: no such scene or camera, or no such option of it.
+        ValueError: a scene without matter, photons or iterations that are not positive.
+    """
+
+    def __init__(
+        self,
+        scene: Mapping[str, Any],
+        camera: Mapping[str, Any],
+        photons: float = 1e4,
+        iterations: int = 20,
+    ):
+        made: Any = SCENES.from_config(scene)
+        if not isinstance(made, Mapped) or not isinstance(made, Pooling):
+            raise ValueError(
+                f"Expected a scene with matter, such as cardiac, nema or spect_labels, got "
+                f"{scene['name']!r}"
+            )
+        if iterations < 1:
+            raise ValueError(f"Expected 1 iteration or more, got {iterations}")
+        self.scene: Any = made
+        self.cameras: Cameras = CAMERAS.from_config(camera)
+        self.detector, self.iterations = Acquisition(photons=photons), iterations
+        self._operators: tuple[Grid, Drr, Drr] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_operators": None}
+
+    @property
+    def data_range(self) -> float:
+        """The fixed range of values that PSNR and SSIM refer to."""
+        return self.scene.data_range
+
+    @property
+    def unit(self) -> str:
+        """Unit of the volume's values."""
+        return self.scene.unit
+
+    @property
+    def length(self) -> int | None:
+        """How many cases there are; None: endless."""
+        return self.scene.length
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
+        """The case `index` of the series `seed`, with its scan."""
+        return self._scanned(self.scene.sample(index, seed, grid, cameras), index, seed, grid)
+
+    def maps(
+        self, index: int, seed: int, grid: Grid, factor: int = 1
+    ) -> dict[str, Float[Tensor, "1 d h w"]]:
+        """The true linear attenuation of a case in 1/mm on `grid.refined(factor)`."""
+        return self.scene.maps(index, seed, grid, factor)
+
+    def finer(
+        self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
+    ) -> Float[Tensor, "1 d h w"]:
+        """The case's values on `grid.refined(factor)`."""
+        return self.scene.finer(index, seed, grid, cameras, factor)
+
+    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
+        """The case without views, its truth averaged from the values on a finer grid, its scan."""
+        return self._scanned(self.scene.pooled(index, seed, grid, fine), index, seed, grid)
+
+    def _scanned(self, sample: Sample, index: int, seed: int, grid: Grid) -> Sample:
+        scan = {"mu_measured": self.measured(index, seed, grid)}
+        return replace(sample, maps={**sample.maps, **scan})
+
+    @torch.no_grad()
+    def measured(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "1 d h w"]:
+        """Linear attenuation of a case at 140.5 keV in 1/mm as its scan measures it."""
+        fine, coarse = self._on(grid)
+        mu = self.scene.maps(index, seed, grid, 2)["mu"]
+        at_70 = at_energy(mu, SPECT_KEV, CT_KEV)
+        noise = generator(SCAN, mixed(seed, index))
+        views = detected(fine(at_70[None])[0], self.detector, self.cameras, noise)
+        scanned = sirt(coarse, views[None], self.iterations, momentum=True)[0]
+        known = at_energy(scanned, CT_KEV, SPECT_KEV)
+        return known.clamp(max=tissue_at(SPECT_KEV).bone)
+
+    def _on(self, grid: Grid) -> tuple[Drr, Drr]:
+        """The scan's operators on the finer grid and on the grid."""
+        if self._operators is None or self._operators[0] is not grid:
+            pair = Drr(grid.refined(2), self.cameras), Drr(grid, self.cameras)
+            self._operators = (grid, *pair)
+        return self._operators[1], self._operators[2]

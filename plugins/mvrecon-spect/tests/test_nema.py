@@ -1,0 +1,41 @@
+"""NEMA's spheres: volumes, contrast, places."""
+
+import math
+
+import pytest
+import torch
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.scenes.analytic import generator
+from mvrecon.scenes.voxelise import voxelise
+from mvrecon_spect.scenes.nema import CIRCLE, DIAMETERS, Nema
+
+
+def test_spheres_have_their_volumes_and_the_contrast_to_the_body():
+    grid = Grid.centred(size=(54, 50, 34), spacing=4.0, centre=(7, -5, 3))
+    scene = Nema(value=8.0)
+    phantom = scene.phantom(generator(0, 0), grid)
+    angles = 2 * math.pi * torch.arange(6, dtype=torch.float64) / 6
+    ring = CIRCLE * torch.stack([angles.cos(), angles.sin(), 0 * angles], dim=-1)
+    assert phantom.values(ring + grid.centre).tolist() == pytest.approx([8.0] * 6)
+    assert phantom.values(grid.centre[None]).item() == pytest.approx(2.0)
+    spheres = sum(math.pi / 6 * d**3 for d in DIAMETERS)
+    total = 2 * math.pi * 100 * 90 * 120 + 6 * spheres
+    assert voxelise(phantom, grid).sum().item() * 64 == pytest.approx(total, rel=2e-3)
+    mu = scene.maps(0, 0, grid)["mu"]
+    assert mu.max().item() == pytest.approx(0.01536, rel=1e-6)
+    body = math.pi * 100 * 90 * 120 * 0.01536
+    assert mu.sum().item() * 64 == pytest.approx(body, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Nema(contrast=1.0), "contrast above 1"),
+        (lambda: Nema(body_mm=(70, 90, 60)), "in the body"),
+        (lambda: Nema(circle_mm=20), "do not overlap"),
+    ],
+)
+def test_sizes_that_make_no_sense_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,91 @@
+"""The transmission of frusta: the share of each bin's emission that reaches the detector."""
+
+import pytest
+import torch
+from torch.nn.functional import avg_pool3d
+
+from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.models.cross_view import PerViewEstimates
+from mvrecon.models.frusta import Frusta
+from mvrecon.models.geometry import Geometry
+from mvrecon.models.method import build_method
+from mvrecon.models.view_frames import LEAST, ViewFrames, transmission
+from mvrecon.projectors.drr import Drr
+from mvrecon.projectors.operator import PerSample
+from mvrecon_spect.attenuated import AttenuatedTransform
+
+WATER = 0.01536
+GRID = Grid.centred(32, spacing=6.0)
+DETECTOR = {"pixels": [12, 12], "pixel_mm": [24.0, 24.0]}
+RIGS = {
+    "pinholes": lambda: dcspect80(pixels=[12, 12], columns=[0, 7, 13], rows=[0, 2]),
+    "cone": lambda: circular(3, sid=400.0, sdd=600.0, detector=DETECTOR),
+    "parallel": lambda: parallel(3, detector={"pixels": [12, 12], "pixel_mm": [14.0, 14.0]}),
+}
+
+
+def ball(radius, at=(0.0, 0.0, 0.0)):
+    """A smooth ball of 1 on the grid, at a place (x, y, z) in mm."""
+    far = (voxel_centres(GRID).double() - torch.tensor(at)).norm(dim=-1)
+    return torch.sigmoid((radius - far) / 4.0)[None, None]
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_the_transmitted_density_of_a_frustum_sums_to_the_attenuated_view(rig):
+    cameras, emission, mu = RIGS[rig](), ball(45.0, (20.0, -10.0, 5.0)), WATER * ball(80.0)
+    frusta = Frusta.of(GRID, cameras, 64)
+    frusta = frusta.to(torch.float64)
+    density = frusta.to_frusta(emission[:, None]) * frusta.occupied
+    views = AttenuatedTransform(GRID, cameras, mu[0, 0])(emission)
+    seen = frusta.integrate(density * transmission(frusta, mu))
+    assert (seen - views).norm() < 0.015 * views.norm()
+    assert (frusta.integrate(density) - views).norm() > 0.5 * views.norm()
+
+
+def test_only_an_operator_that_attenuates_has_a_transmission():
+    cameras = RIGS["pinholes"]()
+    clear = AttenuatedTransform(GRID, cameras, torch.zeros(GRID.shape))
+    assert clear.attenuation() is None and Drr(GRID, cameras).attenuation() is None
+    A = 2.0 * AttenuatedTransform(GRID, cameras, torch.full(GRID.shape, WATER))
+    assert torch.equal(A.attenuation(), A.A.mu)
+    frames = [ViewFrames.of(Geometry.of(B), scale=1, binning=1, depths=8) for B in (clear, A)]
+    assert frames[0].transmission is None
+    assert LEAST <= frames[1].transmission.min() < 0.2 < frames[1].transmission.max() <= 1
+
+
+@torch.no_grad()
+def test_a_start_that_is_too_faint_is_raised_by_its_lack_at_any_depth():
+    """By each camera's estimate before training, as well through attenuating matter as without."""
+    cameras = dcspect80(pixels=[16, 16], columns=[0, 7, 13], rows=[0, 2])
+    truth = ball(25.0, (-40.0, 30.0, 0.0)).float()
+    estimates = PerViewEstimates((4,), 0, 1, 32, 1, "softmax_depth")
+    expected, errors = avg_pool3d(truth, 2)[:, None], []
+    for density in (0.0, WATER):
+        A = 2.0 * AttenuatedTransform(GRID, cameras, density * ball(85.0)[0, 0].float())
+        g, views, x = Geometry.of(A), A(truth), 0.7 * truth
+        r = views - A(x)
+        change, *_ = estimates(estimates.frames(g), g, views, r, x, g.direction(r))
+        error = avg_pool3d(x, 2)[:, None] + change - expected
+        errors.append((error.norm() / expected.norm()).item() / 6**0.5)
+    assert errors[1] < 1.2 * errors[0]
+
+
+@torch.no_grad()
+def test_each_sample_of_a_batch_is_reconstructed_with_its_own_attenuation():
+    detector = {"pixels": [12, 12], "pixel_mm": [24.0, 24.0]}
+    grid, cameras = Grid.centred(12, spacing=12.0), circular(4, 400.0, 600.0, detector)
+    body = torch.zeros(grid.shape)
+    body[2:10, 2:10, 2:10] = WATER
+    operators = [AttenuatedTransform(grid, cameras, factor * body) for factor in (1.0, 0.3)]
+    torch.manual_seed(0)
+    method = build_method({"name": "cross_view", "widths": [4, 6], "depth_widths": [4], "scale": 1})
+    for parameter in method.parameters():
+        parameter += 0.1 * torch.randn_like(parameter)
+    both, volume = PerSample(operators), torch.rand(2, 1, *grid.shape)
+    views = both(volume)
+    batch = method(views, both).volume
+    for i, A in enumerate(operators):
+        alone = method(views[i : i + 1], A).volume
+        torch.testing.assert_close(batch[i : i + 1], alone, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,63 @@
+"""What is made of a rig once on each device."""
+
+import gc
+import weakref
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.kernels import device_cache as module
+from mvrecon.kernels.device_cache import device_cached, grid_key
+from tests.projectors.rigs import CONE
+
+
+@pytest.fixture
+def rig():
+    return replace(CONE, source=CONE.source.clone())
+
+
+def counted(rig, key=(), like=None):
+    """How often something is made in three calls."""
+    made = []
+    for _ in range(3):
+        device_cached(rig, key, torch.zeros(1) if like is None else like, lambda: made.append(1))
+    return len(made)
+
+
+def test_it_is_made_once_for_a_key_and_a_device(rig):
+    assert counted(rig) == 1 and counted(rig) == 0
+    assert counted(rig, "another") == 1
+    assert counted(rig, like=torch.zeros(1, device="meta")) == 1
+
+
+def test_cameras_that_were_written_to_or_may_move_have_nothing_known(rig):
+    assert counted(rig) == 1
+    rig.source.mul_(1.1)
+    assert counted(rig) == 1
+    rig.source.requires_grad_()
+    assert counted(rig) == 3
+
+
+def test_what_evaluation_made_has_derivatives_in_training(rig):
+    with torch.inference_mode():
+        device_cached(rig, "ones", torch.zeros(1), lambda: torch.ones(3))
+    kept = device_cached(rig, "ones", torch.zeros(1), lambda: None)
+    x = torch.ones(3, requires_grad=True)
+    assert (x * kept).sum().backward() is None and x.grad is not None
+
+
+def test_it_goes_with_its_rig(rig):
+    other, result = rig[[0]], torch.ones(1)
+    device_cached(other, (), torch.zeros(1), lambda: result)
+    gone, count = weakref.ref(other), len(module._results)
+    del other
+    gc.collect()
+    assert gone() is None and len(module._results) < count
+
+
+def test_grids_are_told_apart_by_where_their_voxels_lie():
+    grids = [Grid.centred(4, spacing=s, centre=(c, 0, 0)) for s in (1.0, 2.0) for c in (0.0, 1.0)]
+    assert len({grid_key(grid) for grid in grids}) == 4
+    assert grid_key(Grid.centred(4, spacing=1.0)) == grid_key(grids[0])
