@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from mvrecon.metrics import coverage, opinion_spread, ssim_map, view_metrics, volume_metrics
+from mvrecon.metrics import coverage, per_view_spread, ssim_map, view_metrics, volume_metrics
 
 
 def case(shape=(1, 8, 9, 10)):
@@ -170,8 +170,8 @@ def test_intervals_of_a_gaussian_cover_their_share():
     assert math.isnan(coverage(error[:0], sigma[:0], 0.68))
 
 
-def test_the_spread_of_opinions_is_their_standard_deviation_over_their_mean():
-    opinions = torch.tensor([1.0, 3.0, 9.0]).reshape(1, 3, 1, 1, 1, 1)
+def test_the_spread_of_per_view_estimates_is_their_standard_deviation_over_their_mean():
+    estimates = torch.tensor([1.0, 3.0, 9.0]).reshape(1, 3, 1, 1, 1, 1)
     weights = torch.tensor([0.5, 0.5, 0.0]).reshape(1, 3, 1, 1, 1, 1)
-    assert opinion_spread(opinions, weights) == pytest.approx(0.5)
-    assert opinion_spread(0 * opinions, weights) == 0
+    assert per_view_spread(estimates, weights) == pytest.approx(0.5)
+    assert per_view_spread(0 * estimates, weights) == 0

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from mvrecon.models.bounded import within_one
 from mvrecon.models.geometry import Geometry
+from mvrecon.reconstructors.division import divided
 from mvrecon.reconstructors.iterative import inverse_sums
 from mvrecon.registry import check_options
 
@@ -71,31 +72,19 @@ class Consistency(nn.Module):
         geometry: Geometry,
         volume: Float[Tensor, "b 1 d h w"],
         views: Float[Tensor, "b 1 m v u"],
-        sigma: Float[Tensor, "b 1 1 1 1"] | None = None,
     ) -> Float[Tensor, "b 1 d h w"]:
-        """The volume after the steps.
-
-        With `sigma`, the noise of the views in their unit, a sample takes no further step once
-        chi^2 per measurement, the mean of ((y - A x) / sigma)^2, is at most 1. In training every
-        sample takes every step.
-        """
+        """The volume after the steps."""
         if self.em and len(self.lengths):
             volume, views = volume.clamp_min(0), views.clamp_min(0)
         for number, length in enumerate(self.lengths):
             expected = geometry.A(volume)
             if self.poisson and not self.em and number == 0:
                 geometry = weighted_for_counts(geometry, expected)
-            residual = views - expected
-            unmet = torch.ones_like(residual[:, :, :1, :1, :1], dtype=torch.bool)
-            if sigma is not None and not self.training:
-                unmet = (residual / sigma).square().mean(dim=(1, 2, 3, 4), keepdim=True) > 1
-                if not unmet.any():
-                    break
             if self.em:
                 change = em_change(geometry, volume, views, expected, self.background)
-                volume = volume + within_one(length) * unmet * change
+                volume = volume + within_one(length) * change
             else:
-                volume = volume + length * unmet * geometry.direction(residual)
+                volume = volume + length * geometry.direction(views - expected)
         return volume
 
 
@@ -143,14 +132,12 @@ def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]
 
     Args:
         geometry: with R and C of SIRT.
-        expected: counts; at least a hundredth of the mean of those that rays of the mask make.
+        expected: counts; at least a hundredth of the mean of those that rays of the mask make. A
+            sample that expects none has weights of zero.
     """
     reached = geometry.row > 0
     number = reached.expand_as(expected).sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
     total = (expected.clamp_min(0) * reached).sum(dim=(1, 2, 3, 4), keepdim=True)
-    least = (LEAST * total / number).clamp_min(torch.finfo(expected.dtype).tiny)
-    row = reached / expected.maximum(least)
-    chords = torch.where(reached, 1 / torch.where(reached, geometry.row, 1), 0)
-    sums = geometry.A.T(row * chords)
-    column = inverse_sums(sums) * (geometry.column > 0)
+    row = reached * divided(1.0, expected.maximum(LEAST * total / number))
+    column = inverse_sums(geometry.A.T(row * geometry.sums)) * (geometry.column > 0)
     return replace(geometry, row=row, column=column)

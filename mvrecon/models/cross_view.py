@@ -116,7 +116,8 @@ class CrossView(nn.Module):
         nn.init.zeros_(self.entry.weight)  # before training: SIRT
         self.volume_net = PlainUNet(3, 3, 1, widths, zero=1, precision=precision)
         self.step = nn.Parameter(torch.ones(()))
-        self.log_strength = nn.Parameter(torch.zeros(())) if weigh_rays else None
+        unequal = weigh_rays and fusion == "weighted"
+        self.log_strength = nn.Parameter(torch.zeros(())) if unequal else None
         self.consistency = Consistency(consistency)
         self.start = ClassicalStart(start, counts=self.consistency.poisson)
         self.support, self.noise, self.crop = support, noise, crop
@@ -244,7 +245,7 @@ class PerViewEstimates(nn.Module):
         check_choice("depth", depth, ("learned", "uniform"))
         if n_cameras is not None and n_cameras < 1:
             raise ValueError("Expected n_cameras for networks that are not shared, got none")
-        self.cut = scale, binning, depths
+        self.cut, self.n_cameras = (scale, binning, depths), n_cameras
         self.binning, self.uniform = binning, depth == "uniform"
         self.sizes = [1, self.confidences + features]
         self.head = HEADS.from_config({"name": head} if isinstance(head, str) else head)
@@ -259,7 +260,13 @@ class PerViewEstimates(nn.Module):
         self.image, self.unet = for_cameras(n_cameras, image), for_cameras(n_cameras, unet)
 
     def frames(self, g: Geometry) -> ViewFrames:
-        """The frames of an operator's cameras, of these bins and cells."""
+        """The frames of an operator's cameras, of these bins and cells.
+
+        Raises:
+            ValueError: a number of cameras other than that of the networks.
+        """
+        if self.n_cameras not in (None, len(g.A.cameras)):
+            raise ValueError(f"Expected {self.n_cameras} cameras, got {len(g.A.cameras)}")
         return ViewFrames.of(g, *self.cut)
 
     def forward(
@@ -325,10 +332,7 @@ class OneEach(nn.Module):
         self.networks = nn.ModuleList(make() for _ in range(count))
 
     def forward(self, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
-        count = len(self.networks)
-        if len(x) % count:
-            raise ValueError(f"Expected views of {count} cameras, as many as networks")
-        parts = x.unflatten(0, (-1, count)).unbind(1)
+        parts = x.unflatten(0, (-1, len(self.networks))).unbind(1)
         pairs = zip(self.networks, parts, strict=True)
         return torch.stack([network(part) for network, part in pairs], dim=1).flatten(0, 1)
 

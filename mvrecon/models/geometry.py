@@ -17,6 +17,7 @@ from mvrecon.cameras.views import check_finite
 from mvrecon.kernels.rays.lines import writes
 from mvrecon.projectors.checks import check_floating, check_measured
 from mvrecon.projectors.operator import LinearOperator, Projector
+from mvrecon.reconstructors.division import divided
 from mvrecon.reconstructors.iterative import SirtWeights, inverse_sums, sirt_weights
 from mvrecon.visual_hull.support import support_masks
 
@@ -64,12 +65,14 @@ class Geometry:
             longest: where views are wrong, rays that graze the region measure more than their
             chords explain.
         column: C, the inverse column sums of A, zero outside the support.
+        sums: the row sums of A, in mm, also of short chords.
         support: voxels whose density may differ from zero; None: all.
     """
 
     A: Projector
     row: Float[Tensor, "#b 1 m v u"]
     column: Float[Tensor, "#b 1 d h w"]
+    sums: Float[Tensor, "#b 1 m v u"]
     support: Bool[Tensor, "b 1 d h w"] | None = None
 
     @classmethod
@@ -83,10 +86,9 @@ class Geometry:
         row, column = kept(A, ("sirt weights", dtype), lambda: sirt_weights(A, dtype))
         if support is not None:
             with torch.no_grad():
-                sums = A(support.to(dtype))
-            row, column = inverse_sums(sums), column * support
+                row, column = inverse_sums(A(support.to(dtype))), column * support
         longest = torch.where(row > 0, row, torch.inf).amin((1, 2, 3, 4), keepdim=True)
-        return cls(A, row.minimum(longest / SHORTEST), column, support)
+        return cls(A, row.minimum(longest / SHORTEST), column, divided(1.0, row), support)
 
     @property
     def weights(self) -> SirtWeights:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
+from mvrecon.parts import METHODS, PROJECTORS
 
 
 def reconstruct(

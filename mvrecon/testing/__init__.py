@@ -5,5 +5,4 @@ from mvrecon.testing.head import check_head as check_head
 from mvrecon.testing.method import check_method as check_method
 from mvrecon.testing.network import check_network as check_network
 from mvrecon.testing.projector import check_projector as check_projector
-from mvrecon.testing.reconstructor import check_reconstructor as check_reconstructor
 from mvrecon.testing.scene import check_scene as check_scene

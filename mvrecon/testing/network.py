@@ -15,7 +15,7 @@ TOLERANCE = 1e-5
 def check_network(name: str, seed: int = 0, **options: Any) -> None:
     """Raise AssertionError unless the named network can serve in a method.
 
-    A finite answer of the input's size, odd sizes included unless the network tells a `multiple`;
+    A finite answer of the input's size, odd sizes included unless the network names a `multiple`;
     a start at zero where it is asked for; in evaluation the same bits when it is called twice, and
     a sample's answer that does not depend on the others; gradients that reach every parameter.
 
@@ -25,8 +25,7 @@ def check_network(name: str, seed: int = 0, **options: Any) -> None:
         options: of the network.
     """
     torch.manual_seed(seed)
-    config = {"name": name, **options}
-    network = network_by_name(config, 2, 3, zero=1).eval()
+    network = network_by_name({"name": name, **options}, 2, 3, zero=1).eval()
     x = torch.randn(2, 2, 9, 4, 6)
     with torch.no_grad():
         answer = network(x)

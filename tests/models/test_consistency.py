@@ -1,20 +1,20 @@
 """Consistency steps weighted for counts: stable, exact where they must be, and of no scale."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from mvrecon.losses import ReconstructionLoss
 from mvrecon.models.consistency import Consistency, em_change, weighted_for_counts
-from mvrecon.models.geometry import whole_geometry
+from mvrecon.models.geometry import Geometry
 from mvrecon.models.output import Reconstruction
-from mvrecon.parts import MODELS
 from mvrecon.projectors.operator import Scaled
+from mvrecon.reconstructors.iterative import sirt_weights
 from mvrecon.reconstructors.mlem import mlem
 from mvrecon.reconstructors.poisson import negative_log_likelihood
-from mvrecon.testing import check_model
-from tests.models.cross_view.test_model import SMALL
-from tests.models.rig import small_projector
-from tests.models.test_single_pass import OPTIONS
+from mvrecon.testing import check_method
+from tests.models.rig import SMALL, small, small_projector
 
 COUNTED = {"steps": 3, "noise": "poisson"}
 EM = {**COUNTED, "rule": "em"}
@@ -22,7 +22,7 @@ EM = {**COUNTED, "rule": "em"}
 
 @pytest.fixture(scope="module")
 def geometry():
-    return whole_geometry(small_projector())
+    return Geometry.of(small_projector())
 
 
 def volume(geometry, batch: int = 1) -> torch.Tensor:
@@ -31,11 +31,14 @@ def volume(geometry, batch: int = 1) -> torch.Tensor:
 
 
 def test_for_a_uniform_volume_the_weights_are_those_of_sirt(geometry):
-    """It makes expect its value times each chord, so R is that of SIRT but for a factor."""
+    """The counts that it makes are its value times each chord, so R is that of SIRT but for a
+    factor.
+    """
     flat = torch.full((1, 1, *geometry.A.grid.shape), 2.5)
     counted, views = weighted_for_counts(geometry, geometry.A(flat)), geometry.A(volume(geometry))
-    one, other = counted.residual(flat, views), geometry.residual(flat, views)
-    # rays that meet next to nothing are taken to expect more than that
+    plain = replace(geometry, row=sirt_weights(geometry.A).row)  # also of short chords
+    one, other = (g.direction(views - g.A(flat)) for g in (counted, plain))
+    # rays that meet next to nothing count as if they expected more
     assert (one - other).norm() < 0.02 * other.norm()
 
 
@@ -50,6 +53,23 @@ def test_each_step_lowers_the_weighted_residual_and_the_truth_stays(geometry):
     assert all(b < a for a, b in zip(misfits, misfits[1:], strict=False))
     kept = Consistency(COUNTED)(geometry, truth, views)
     torch.testing.assert_close(kept, truth, rtol=1e-4, atol=1e-4)
+
+
+def test_steps_bring_the_volume_towards_the_views(geometry):
+    truth = volume(geometry)
+    views = geometry.A(truth)
+    after = Consistency(5)(geometry, 0.5 * truth, views)
+    before, after = ((geometry.A(x) - views).norm() for x in (0.5 * truth, after))
+    assert after < 0.5 * before
+
+
+def test_a_sample_that_expects_no_counts_stays_finite(geometry):
+    """Where a network makes all of a volume negative."""
+    x, views = torch.ones(2, 1, *geometry.A.grid.shape), geometry.A(volume(geometry, 2))
+    x[1] *= -1
+    both = Consistency(COUNTED)(geometry, x, views)
+    assert torch.equal(both[1], x[1])
+    torch.testing.assert_close(both[:1], Consistency(COUNTED)(geometry, x[:1], views[:1]))
 
 
 def test_it_has_no_scale_and_a_batch_is_its_cases(geometry):
@@ -72,17 +92,14 @@ def test_bright_pixels_count_less_than_with_equal_noise(geometry):
     bright = int(expected.argmax())
     pixel.view(-1)[bright] = 1.0
     counted = weighted_for_counts(geometry, expected)
-    plain, weighted = geometry.back(pixel).abs().sum(), counted.back(pixel).abs().sum()
+    plain, weighted = (g.direction(pixel).abs().sum() for g in (geometry, counted))
     assert weighted < plain
 
 
-@pytest.mark.parametrize("name", ["single_pass", "backprojection_unet", "cross_view"])
-def test_a_model_of_counts_starts_from_osem_and_keeps_the_contract(name):
+@pytest.mark.parametrize(("name", "rule"), [("world_unet", COUNTED), ("mean_fusion", EM)])
+def test_a_method_of_counts_starts_from_osem_and_keeps_the_contract(name, rule):
     start = {"name": "osem", "iterations": 5, "subsets": 2}
-    own = {**OPTIONS, "cross_view": {"rounds": SMALL["M3"]}}.get(name, {})
-    steps = EM if name == "cross_view" else COUNTED
-    options = {**own, "start": start, "consistency": steps}
-    check_model(name, small_projector(), **options)
+    check_method(name, small_projector(), **SMALL[name] | {"start": start, "consistency": rule})
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +110,7 @@ def counted():
     A = small_projector(pixels=8)
     weights = 0.5 + torch.rand(A.range_shape, generator=torch.Generator().manual_seed(3))
     A = Scaled(A, pixels=weights.double())
-    whole = whole_geometry(A)
-    geometry = whole.to(torch.float64)
+    geometry = Geometry.of(A, torch.float64)
     truth = volume(geometry).double()
     truth[..., :3] = 0
     counts = torch.poisson(A(truth), generator=torch.Generator().manual_seed(1))
@@ -146,13 +162,10 @@ def test_em_hides_a_scale_and_what_is_negative_so_the_loss_sees_what_enters_it(c
     x[..., :4] = 0
     wrong = torch.where(x > 0, 5 * x, -10)
     torch.testing.assert_close(step(geometry, wrong, counts), step(geometry, x, counts))
-    projector = small_projector()
-    views = projector(volume(whole_geometry(projector)))
-    models = [
-        MODELS.build("cross_view", projector=projector, rounds=SMALL["M3"], consistency=steps)
-        for steps in (EM, COUNTED)
-    ]
-    entry, none = (model(views).entry for model in models)
+    A = small_projector()
+    views = A(volume(Geometry.of(A)))
+    methods = [small("cross_view", consistency=steps) for steps in (EM, COUNTED)]
+    entry, none = (method(views, A).entry for method in methods)
     assert entry is not None and none is None
     out = Reconstruction(0 * entry, entry=entry - 10)
     error = ReconstructionLoss(1.0, entry=0.01)(out, {"volume": 0 * entry, "views": views})
@@ -192,8 +205,8 @@ def test_a_length_past_one_learns_to_come_back_alone(counted, length, sign, move
     ],
 )
 def test_consistency_that_there_is_not_is_refused(steps, message):
-    """A model refuses consistency steps of another noise or rule, of an unknown option, or fewer
+    """A method refuses consistency steps of another noise or rule, of an unknown option, or fewer
     than none.
     """
     with pytest.raises((TypeError, ValueError), match=message):
-        MODELS.build("backprojection_unet", small_projector(), consistency=steps)
+        small("world_unet", consistency=steps)

@@ -1,57 +1,95 @@
-"""Every built-in model keeps the contract; models that break it are caught."""
+"""Every built-in method keeps the contract; methods that break it are caught."""
 
 import pytest
 import torch
 
 from mvrecon.models.output import Reconstruction
-from mvrecon.parts import MODELS
+from mvrecon.parts import CAMERAS, METHODS, PROJECTORS
 from mvrecon.projectors.checks import check_views
-from mvrecon.testing import check_model
-from tests.models.rig import small_projector
-from tests.models.test_single_pass import OPTIONS
+from mvrecon.testing import check_method
+from tests.models.rig import SMALL, small_projector, small_rig, stirred
+
+QUICK = {"name": "align", "alternations": 1, "iterations": 2}
+OPTIONS = {
+    **SMALL,
+    **{name: {"iterations": 4} for name in ("fista_tv", "pdhg_tv", "tv_map", "bsrem", "mlem")},
+    "aligned": {"method": {"name": "sirt", "iterations": 3}, "correct": QUICK},
+    "uncertain": {"method": {"name": "world_unet", **SMALL["world_unet"]}},
+}
+#: Methods of parallel beams, and methods that name a file.
+ELSEWHERE = {"fbp", "trained"}
+NAMES = [
+    name
+    for name in METHODS.names()
+    if METHODS.origin(name).startswith("mvrecon.") and name not in ELSEWHERE
+]
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in MODELS.names() if MODELS.origin(name).startswith("mvrecon.")]
-)
-def test_built_in_models_keep_the_contract(name):
-    check_model(name, small_projector(), **OPTIONS.get(name, {}))
+@pytest.mark.parametrize("name", NAMES)
+def test_built_in_methods_keep_the_contract(name):
+    check_method(name, small_projector(), **OPTIONS.get(name, {}))
+
+
+def test_parallel_beams_keep_the_contract_too():
+    grid, _ = small_rig()
+    cameras = CAMERAS.build("parallel", n_views=4, detector={"pixels": [12, 12], "pixel_mm": 3.0})
+    A = PROJECTORS.build("radon", grid=grid, cameras=cameras)
+    check_method("fbp", A)
+    check_method("cross_view", A, **SMALL["cross_view"])
+
+
+def test_a_mistyped_option_names_the_nearest_and_all():
+    for name, typed, meant in (
+        ("cross_view", "suport", "support"),
+        ("mean_fusion", "consistancy", "consistency"),
+        ("fdk", "cutof", "cutoff"),
+    ):
+        with pytest.raises(TypeError, match=f"no option '{typed}'; did you mean '{meant}'"):
+            stirred(name, **{typed: 1})
 
 
 class Sound(torch.nn.Module):
     """A back-projection with a weight."""
 
-    def __init__(self, projector):
+    def __init__(self):
         super().__init__()
-        self.projector, self.weight = projector, torch.nn.Parameter(torch.ones(1))
+        self.weight = torch.nn.Parameter(torch.ones(1))
 
-    def volume(self, views):
-        return self.weight * self.projector.T(views)
+    def volume(self, views, A):
+        return self.weight * A.T(views)
 
-    def forward(self, views):
-        check_views(views, self.projector.cameras)
-        return Reconstruction(self.volume(views))
+    def forward(self, views, A):
+        check_views(views, A.cameras)
+        return Reconstruction(self.volume(views, A))
 
 
 class Idle(Sound):
     """A parameter that nothing depends on."""
 
-    def __init__(self, projector):
-        super().__init__(projector)
+    def __init__(self):
+        super().__init__()
         self.spare = torch.nn.Parameter(torch.ones(1))
 
 
 class Lenient(Sound):
-    """Takes whatever its projector takes."""
+    """Takes whatever its operator takes."""
 
-    def forward(self, views):
-        return Reconstruction(self.volume(views.nan_to_num(0.0, 0.0, 0.0)))
+    def forward(self, views, A):
+        return Reconstruction(self.volume(views.nan_to_num(0.0, 0.0, 0.0), A))
 
 
-#: What is done to the volumes of a sound model, and what is told.
+class Remembering(Sound):
+    """Keeps the first operator that it meets."""
+
+    def volume(self, views, A):
+        self.A = getattr(self, "A", A)
+        return super().volume(views, self.A) * (1 + 0.1 * (self.A is not A))
+
+
+#: A change of the volumes of a sound method, and the message about it.
 BROKEN = {
     "shape": (lambda x: x[..., 1:], "the volume is .*, expected"),
-    "dtype": (lambda x: x.double(), "float32 views is torch.float64"),
+    "dtype": (lambda x: x.float(), "float64 views is torch.float32"),
     "NaN": (lambda x: x.where(x < x.max(), torch.nan), "not finite"),
     "random": (lambda x: x * torch.rand(1), "same bits"),
     "square": (lambda x: x**2, r"f\(.* y\) is not .* f\(y\)"),
@@ -66,23 +104,26 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_model_that_breaks_its_contract_is_caught(name, monkeypatch):
+def test_a_method_that_breaks_its_contract_is_caught(name, monkeypatch):
     change, message = BROKEN[name]
-    monkeypatch.setattr(
-        Sound, "volume", lambda self, views: change(self.weight * self.projector.T(views))
-    )
-    monkeypatch.setitem(MODELS._parts, "broken", Sound)
+    monkeypatch.setattr(Sound, "volume", lambda self, views, A: change(self.weight * A.T(views)))
+    monkeypatch.setitem(METHODS._parts, "broken", Sound)
     with pytest.raises(AssertionError, match=message):
-        check_model("broken", small_projector())
+        check_method("broken", small_projector())
 
 
 @pytest.mark.parametrize(
     ("part", "message"),
-    [(Idle, "no gradient reaches spare"), (Lenient, "views with NaN are not refused")],
+    [
+        (Idle, "no gradient reaches spare"),
+        (Lenient, "views with NaN are not refused"),
+        (Remembering, "a batch of operators"),
+        (lambda A, views: 0 * A.T(views), "no better than zero"),
+    ],
 )
-def test_an_idle_parameter_and_bad_views_let_in_are_caught(part, message, monkeypatch):
-    monkeypatch.setitem(MODELS._parts, "sound", Sound)
-    check_model("sound", small_projector())
-    monkeypatch.setitem(MODELS._parts, "broken", part)
+def test_what_else_the_contract_forbids_is_caught(part, message, monkeypatch):
+    monkeypatch.setitem(METHODS._parts, "sound", Sound)
+    check_method("sound", small_projector())
+    monkeypatch.setitem(METHODS._parts, "broken", part)
     with pytest.raises(AssertionError, match=message):
-        check_model("broken", small_projector())
+        check_method("broken", small_projector())

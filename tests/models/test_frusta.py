@@ -45,7 +45,7 @@ def test_warp_of_a_linear_field_is_exact_where_seen():
     frusta = Frusta.of(grid, cameras, 12)
     depth, v, u = frusta.shape
     ramp = torch.arange(depth, dtype=torch.float32)[:, None, None].expand(depth, v, u)
-    world = frusta.to_world(ramp.expand(1, len(cameras), 1, -1, -1, -1))
+    world = frusta.to_volume(ramp.expand(1, len(cameras), 1, -1, -1, -1))
     uvz = cameras.project(voxel_centres(grid))
     edges = depth_edges(cameras.depth_range(grid), depth)
     expected = depth_index(uvz[..., 2], edges).float()
@@ -55,14 +55,14 @@ def test_warp_of_a_linear_field_is_exact_where_seen():
     assert torch.allclose(world[0, :, 0][inner], expected[inner], atol=2e-4)
 
 
-def test_world_to_frustum_to_world_converges_to_second_order():
+def test_world_to_frustum_to_volume_converges_to_second_order():
     errors = []
     for size in (12, 24, 48):
         grid, cameras = small_rig(n_views=3, size=size, pixels=2 * size)
         frusta = Frusta.of(grid, cameras, 2 * size)
         r2 = voxel_centres(grid).float().square().sum(-1)
         blob = torch.exp(-r2 / (2 * (0.3 * size) ** 2))[None, None, None]
-        back = frusta.to_world(frusta.to_frusta(blob))[:, :, :, 1:-1, 1:-1, 1:-1]
+        back = frusta.to_volume(frusta.to_frusta(blob))[:, :, :, 1:-1, 1:-1, 1:-1]
         errors.append((back - blob[..., 1:-1, 1:-1, 1:-1]).abs().max().item())
     assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3.5
 
@@ -87,8 +87,8 @@ def test_pinholes_behind_their_detectors_lift_like_any_other():
 def test_casting_the_module_costs_its_geometry_no_digit(dtype):
     grid, cameras = small_rig()
     frusta = torch.rand(1, len(cameras), 1, 12, *cameras.shape)
-    expected = Frusta.of(grid, cameras, 12).to_world(frusta)
-    assert torch.equal(Frusta.of(grid, cameras, 12).to(dtype).to_world(frusta), expected)
+    expected = Frusta.of(grid, cameras, 12).to_volume(frusta)
+    assert torch.equal(Frusta.of(grid, cameras, 12).to(dtype).to_volume(frusta), expected)
 
 
 def test_warps_compile_into_one_graph():
@@ -96,9 +96,9 @@ def test_warps_compile_into_one_graph():
     frusta = Frusta.of(grid, cameras, 12)
     volumes = torch.rand(1, 1, 2, *grid.shape)
     compiled = torch.compile(
-        lambda x: frusta.to_world(frusta.to_frusta(x)), fullgraph=True, backend="aot_eager"
+        lambda x: frusta.to_volume(frusta.to_frusta(x)), fullgraph=True, backend="aot_eager"
     )
-    assert torch.equal(compiled(volumes), frusta.to_world(frusta.to_frusta(volumes)))
+    assert torch.equal(compiled(volumes), frusta.to_volume(frusta.to_frusta(volumes)))
 
 
 def test_one_volume_for_all_cameras_is_one_for_each():

@@ -1,20 +1,20 @@
-"""Methods take a network by name, a plugin's too, for volumes of any size, with a start at zero."""
+"""Methods take a network by name, a plugin's too; they see to sizes and to the start at zero."""
 
 import pytest
 import torch
 from torch import nn
 
-from mvrecon.models.method import build_method
 from mvrecon.models.network import network_by_name
 from mvrecon.parts import NETWORKS
 from mvrecon.testing import check_method, check_network
-from tests.models.rig import small_projector
+from tests.models.rig import SMALL, blob, small, small_projector
 
-OPTIONS = {"unet": {"widths": [4, 6]}, "tiny": {}}
+TINY, UNET = {"name": "tiny"}, {"name": "unet", "widths": [4, 6]}
+WITH_NETWORK = ("world_unet", "geometry_free")
 
 
 class Tiny(nn.Module):
-    """A plugin's network, of sizes that 4 divides."""
+    """A plugin's network, for sizes that 4 divides."""
 
     multiple = 4
 
@@ -28,37 +28,45 @@ class Tiny(nn.Module):
         return nn.functional.interpolate(coarse, scale_factor=4.0, mode="nearest")
 
 
+class Smaller(nn.Conv3d):
+    """A network whose answer is smaller than its input."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__(inputs, outputs, 5)
+
+
 @pytest.fixture(autouse=True)
-def tiny(monkeypatch):
-    """The plugin, for one test."""
+def registered(monkeypatch):
+    """The networks by name, for one test."""
     monkeypatch.setitem(NETWORKS._parts, "tiny", Tiny)
+    monkeypatch.setitem(NETWORKS._parts, "smaller", Smaller)
 
 
-@pytest.mark.parametrize("name", OPTIONS)
-def test_networks_keep_the_contract(name):
-    check_network(name, **OPTIONS[name])
+@pytest.mark.parametrize("config", [TINY, UNET], ids=lambda config: config["name"])
+def test_networks_keep_the_contract(config):
+    check_network(**config)
 
 
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("world_unet", {"network": {"name": "tiny"}}),
-        ("geometry_free", {"network": {"name": "tiny", "channels": 2}, "n_cameras": 4}),
-    ],
-)
-def test_a_method_with_a_network_by_name_keeps_the_contract(name, options):
-    check_method(name, small_projector(), **options)
+@pytest.mark.parametrize("name", WITH_NETWORK)
+def test_a_method_with_a_network_by_name_keeps_the_contract(name):
+    check_method(name, small_projector(), **SMALL[name] | {"network": TINY})
 
 
 def test_before_training_any_network_leaves_the_start():
+    """The change of it is zero, so the volume is the same with any network."""
     A = small_projector()
-    views = A(torch.rand(1, 1, *A.grid.shape))
-    networks = (None, *({"name": name, **options} for name, options in OPTIONS.items()))
-    first, *others = (
-        build_method({"name": "world_unet", "network": network})(views, A).volume
-        for network in networks
-    )
-    assert first.any() and all(torch.equal(first, other) for other in others)
+    views = A(blob(A))
+    volumes = [small("world_unet", network=network)(views, A).volume for network in (None, TINY)]
+    assert torch.equal(*volumes) and volumes[0].any()
+
+
+@pytest.mark.parametrize("sizes", [(1, 1, 1), (6, 5, 7)])
+def test_volumes_of_any_size_are_padded_and_cropped(sizes):
+    torch.manual_seed(0)
+    network, x = network_by_name(TINY, 2, 3, zero=1), torch.randn(2, 2, *sizes)
+    answer = network(x)
+    assert answer.shape == (2, 3, *sizes)
+    assert not answer[:, 0].any() and answer[:, 1:].any()
 
 
 @pytest.mark.parametrize(
@@ -66,18 +74,18 @@ def test_before_training_any_network_leaves_the_start():
     [
         ({"name": "unit"}, LookupError, "did you mean 'unet'"),
         ({"widths": [3]}, TypeError, "A network needs a 'name'"),
-        ({"name": "unet", "widht": [3]}, TypeError, "did you mean 'widths'"),
+        ({"name": "unet", "width": [3]}, TypeError, "did you mean 'widths'"),
     ],
 )
-def test_a_network_that_there_is_not_is_refused(network, error, message):
-    """Unknown, without a name, or with a misspelt option."""
+@pytest.mark.parametrize("name", WITH_NETWORK)
+def test_a_network_that_a_method_cannot_use_is_refused(name, network, error, message):
+    """A network that is unknown, without a name, or misspelt in an option."""
     with pytest.raises(error, match=message):
-        build_method({"name": "world_unet", "network": network})
+        small(name, network=network)
 
 
-def test_an_answer_of_another_size_is_refused(monkeypatch):
+def test_an_answer_of_another_size_is_refused():
     """With both sizes."""
-    monkeypatch.setitem(NETWORKS._parts, "valid", lambda i, o: nn.Conv3d(i, o, 3))
-    network = network_by_name({"name": "valid"}, 1, 1)
-    with pytest.raises(ValueError, match=r"\(1, 1, 8, 8, 8\).* got \(1, 1, 6, 6, 6\)"):
+    network = network_by_name({"name": "smaller"}, 1, 1)
+    with pytest.raises(ValueError, match=r"\(1, 1, 8, 8, 8\).* got \(1, 1, 4, 4, 4\)"):
         network(torch.zeros(1, 1, 8, 8, 8))

@@ -1,7 +1,6 @@
 import torch
-from mvrecon.models.weighting import fuse
 
-from mvrecon.models.pooling import leave_one_out, pooled
+from mvrecon.models.pooling import fuse, leave_one_out, pooled
 
 
 def _volumes(m: int = 5) -> tuple[torch.Tensor, torch.Tensor]:

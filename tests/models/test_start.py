@@ -1,18 +1,16 @@
-"""Classical starts: what a training keeps of them, and what they do not depend on."""
+"""Classical starts: by number and by name, on a finer grid, and kept during a training."""
 
 import pytest
 import torch
-from mvrecon.models.cross_view.model import CrossView
 from torch.nn.functional import avg_pool3d
 
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon.models import start as starts
-from mvrecon.models.geometry import whole_geometry
+from mvrecon.models.geometry import Geometry
 from mvrecon.models.start import ClassicalStart
-from mvrecon.parts import MODELS, RECONSTRUCTORS
+from mvrecon.parts import METHODS
 from mvrecon.reconstructors.iterative import sirt
-from tests.models.cross_view.test_model import blob
-from tests.models.rig import small_projector
+from tests.models.rig import blob, small, small_projector
 
 SIRT = {"name": "sirt", "iterations": 3}
 LONG = {"name": "sirt", "iterations": 25, "momentum": True}
@@ -20,20 +18,20 @@ LONG = {"name": "sirt", "iterations": 25, "momentum": True}
 
 @pytest.fixture
 def made(monkeypatch):
-    """The views of every volume that a reconstructor has made."""
-    views, build = [], RECONSTRUCTORS.from_config
+    """The views of every volume that a classical method has reconstructed."""
+    views, build = [], METHODS.from_config
 
     def counted(config, A, own, **options):
         views.append(own)
         return build(config, A, own, **options)
 
-    monkeypatch.setattr(RECONSTRUCTORS, "from_config", counted)
+    monkeypatch.setattr(METHODS, "from_config", counted)
     return views
 
 
 def test_in_training_a_case_is_reconstructed_once_whatever_its_batch(made):
     projector = small_projector()
-    geometry, views = whole_geometry(projector), projector(blob(projector, 3))
+    geometry, views = Geometry.of(projector), projector(blob(projector, 3))
     views = views * torch.tensor([1.0, 2.0, 3.0])[:, None, None, None, None]
     start = ClassicalStart(SIRT)
     first = start(geometry, views, training=True).volume
@@ -44,9 +42,9 @@ def test_in_training_a_case_is_reconstructed_once_whatever_its_batch(made):
     assert torch.allclose(first, sirt(projector, views, 3), rtol=1e-4, atol=1e-6)
 
 
-def test_what_there_is_no_room_for_is_made_anew(made, monkeypatch):
+def test_a_volume_without_room_is_reconstructed_anew(made, monkeypatch):
     projector = small_projector()
-    geometry, views = whole_geometry(projector), projector(blob(projector, 2))
+    geometry, views = Geometry.of(projector), projector(blob(projector, 2))
     views[1] *= 2
     monkeypatch.setattr(starts, "ROOM", 4 * 12**3)
     start = ClassicalStart(SIRT)
@@ -57,36 +55,36 @@ def test_what_there_is_no_room_for_is_made_anew(made, monkeypatch):
 
 def test_a_model_trains_from_a_finer_grid_and_its_start_is_that_of_evaluation(made):
     projector = small_projector()
-    finer = {"name": "finer", "reconstructor": SIRT}
-    torch.manual_seed(0)
-    model, views = CrossView(projector, [{"widths": [4]}], finer), projector(blob(projector))
-    trained = model.train()(views)
+    model = small("cross_view", start={"name": "finer", "method": SIRT})
+    views = projector(blob(projector))
+    trained = model.train()(views, projector)
     trained.volume.sum().backward()
-    again, evaluated = model(views), model.eval()(views)
+    again, evaluated = model(views, projector), model.eval()(views, projector)
     assert torch.equal(again.volume, trained.volume)
     assert torch.equal(evaluated.start, trained.start)
-    assert not torch.allclose(trained.start, CrossView(projector, start=3)(views).start, rtol=1e-2)
+    plain = small("cross_view", start=3)(views, projector).start
+    assert not torch.allclose(trained.start, plain, rtol=1e-2)
     assert len(made) == 4  # "finer" and its method, once in training and once in evaluation
 
 
-def test_a_finer_grid_tells_a_part_of_what_the_grid_misses_of_the_views():
+def test_a_finer_grid_explains_a_part_of_the_views_that_the_grid_misses():
     projector = small_projector(8, size=24, pixels=24)
     fine = projector.refined(4)
     places = voxel_centres(fine.grid) - torch.tensor([1.0, -0.5, 0.3], dtype=torch.float64)
     shells = (places.norm(dim=-1) < 16.0).float() + (places.norm(dim=-1) < 8.0).float()
     views = fine(shells[None, None])
-    geometry, expected = whole_geometry(projector), projector(avg_pool3d(shells[None, None], 4))
+    geometry, expected = Geometry.of(projector), projector(avg_pool3d(shells[None, None], 4))
     x, missed = ClassicalStart(LONG | {"finer_grid": 2})(geometry, views)
     assert (views - missed - expected).norm() < 0.75 * (views - expected).norm()
-    # what the volume misses of these views is what that on the finer grid misses of the measured
+    # the volume's residual of these views is that on the finer grid of the measured ones
     two = projector.refined(2)
     residual = views - two(sirt(two, views, 25, momentum=True))
     assert torch.allclose(views - missed - projector(x), residual, atol=1e-3 * views.max().item())
 
 
-def test_what_a_finer_grid_told_is_kept_with_the_volume(made):
+def test_the_missed_views_of_a_finer_grid_are_kept_with_the_volume(made):
     projector = small_projector()
-    geometry, views = whole_geometry(projector), projector(blob(projector, 2))
+    geometry, views = Geometry.of(projector), projector(blob(projector, 2))
     start = ClassicalStart(SIRT | {"finer_grid": 2})
     first, again = (start(geometry, views, training=True) for _ in range(2))
     assert len(made) == 2
@@ -99,8 +97,8 @@ def test_a_finer_grid_is_a_whole_number(number):
         ClassicalStart(SIRT | {"finer_grid": number})
 
 
-@pytest.mark.parametrize("model", ["cross_view", "backprojection_unet"])
-def test_counts_have_no_difference_of_views(model):
+@pytest.mark.parametrize("name", ["cross_view", "world_unet"])
+def test_counts_have_no_difference_of_views(name):
     options = {"start": SIRT | {"finer_grid": 2}, "consistency": {"steps": 1, "noise": "poisson"}}
     with pytest.raises(ValueError, match="line integrals.* got counts"):
-        MODELS.build(model, projector=small_projector(), **options)
+        small(name, **options)

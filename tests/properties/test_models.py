@@ -1,17 +1,16 @@
-"""Conservation: what is lifted along rays gives the views back, and what all cameras say is what
-they say together.
+"""Conservation: what is lifted along rays gives the views back, and the mean over cameras is one
+of all.
 """
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mvrecon.models.weighting import fuse
 
 from mvrecon.geometry.lattice import enclosed
 from mvrecon.kernels.warps.reference import normalised_places
 from mvrecon.models.frusta import Frusta
-from mvrecon.models.pooling import leave_one_out, pooled
+from mvrecon.models.pooling import fuse, leave_one_out, pooled
 from mvrecon.parts import HEADS
 from tests.projectors.cases import Case
 from tests.properties.strategies import SEEDS, cases, real, volumes
@@ -92,29 +91,29 @@ def seen(shape, seed: int, share: float) -> torch.Tensor:
     shape=SHAPES, size=SIZES, shift=st.sampled_from([0.0, 1e5, -1e5]), share=real(0, 1), seed=SEEDS
 )
 def test_fusion_is_a_mean(shape, size, shift, share, seed):
-    """Weights sum to one over those that see; equal opinions are kept; no mean leaves the opinions'
+    """Weights sum to one over those that see; equal estimates are kept; no mean leaves the estimates'
     range.
     """
     visible, rng = seen(shape, seed, share), torch.Generator().manual_seed(seed + 1)
     m, *sizes = shape
     logits = size * torch.randn(2, m, 1, *sizes, generator=rng) + shift
-    opinions = torch.randn(2, m, 1, *sizes, generator=rng)
-    fused, weights = fuse(opinions, logits, visible)
+    estimates = torch.randn(2, m, 1, *sizes, generator=rng)
+    fused, weights = fuse(estimates, logits, visible)
     some = visible.any(dim=0)
     assert (weights >= 0).all() and not (weights * ~visible).any() and not (fused * ~some).any()
     assert ((weights.sum(dim=1) - some.float()).abs() <= 4 * m * EPS).all()
-    low = torch.where(visible, opinions, torch.inf).amin(dim=1)
-    high = torch.where(visible, opinions, -torch.inf).amax(dim=1)
-    slack = 8 * m * EPS * opinions.abs().amax(dim=1)
+    low = torch.where(visible, estimates, torch.inf).amin(dim=1)
+    high = torch.where(visible, estimates, -torch.inf).amax(dim=1)
+    slack = 8 * m * EPS * estimates.abs().amax(dim=1)
     assert (((fused >= low - slack) & (fused <= high + slack)) | ~some).all()
-    equal = opinions[:, :1].expand_as(opinions)
+    equal = estimates[:, :1].expand_as(estimates)
     assert (
         (fuse(equal, logits, visible)[0] - equal[:, 0] * some).abs()
         <= 8 * m * EPS * equal[:, 0].abs()
     ).all()
     order = torch.randperm(m, generator=rng)
     assert torch.allclose(
-        fuse(opinions[:, order], logits[:, order], visible[order])[0], fused, rtol=0, atol=1e-5
+        fuse(estimates[:, order], logits[:, order], visible[order])[0], fused, rtol=0, atol=1e-5
     )
 
 

@@ -1,17 +1,19 @@
 """The transmission of frusta: the share of each bin's emission that reaches the detector."""
 
-import math
-
 import pytest
 import torch
+from torch.nn.functional import avg_pool3d
 
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.models.cross_view import PerViewEstimates
 from mvrecon.models.frusta import Frusta
 from mvrecon.models.geometry import Geometry
+from mvrecon.models.method import build_method
 from mvrecon.models.view_frames import LEAST, ViewFrames, transmission
 from mvrecon.projectors.drr import Drr
+from mvrecon.projectors.operator import PerSample
 from mvrecon_spect.attenuated import AttenuatedTransform
 
 WATER = 0.01536
@@ -31,7 +33,7 @@ def ball(radius, at=(0.0, 0.0, 0.0)):
 
 
 @pytest.mark.parametrize("rig", RIGS)
-def test_what_reaches_the_detector_in_a_frustum_is_the_camera_s_own_view(rig):
+def test_the_transmitted_density_of_a_frustum_sums_to_the_attenuated_view(rig):
     cameras, emission, mu = RIGS[rig](), ball(45.0, (20.0, -10.0, 5.0)), WATER * ball(80.0)
     frusta = Frusta.of(GRID, cameras, 64)
     frusta = frusta.to(torch.float64)
@@ -40,20 +42,6 @@ def test_what_reaches_the_detector_in_a_frustum_is_the_camera_s_own_view(rig):
     seen = frusta.integrate(density * transmission(frusta, mu))
     assert (seen - views).norm() < 0.015 * views.norm()
     assert (frusta.integrate(density) - views).norm() > 0.5 * views.norm()
-
-
-def test_a_density_has_the_transmission_that_its_depth_gives_it():
-    frusta = Frusta.of(GRID, RIGS["parallel"](), 32)
-    share = transmission(frusta, WATER * torch.ones(1, 1, *GRID.shape))[0, 0, 0, :, 6, 6]
-    size = WATER * 6.0
-    expected = torch.exp(-size * torch.arange(31, -1, -1)) * -math.expm1(-size) / size
-    torch.testing.assert_close(share[2:-2], expected[2:-2], rtol=0.06, atol=0)
-    torch.testing.assert_close(share[3:-2] / share[2:-3], share.new_full((27,), math.exp(size)))
-
-
-def test_no_bin_transmits_less_than_the_least():
-    frusta = Frusta.of(GRID, RIGS["cone"](), 8)
-    assert transmission(frusta, torch.full((1, 1, *GRID.shape), 0.1)).min() == LEAST
 
 
 def test_only_an_operator_that_attenuates_has_a_transmission():
@@ -65,3 +53,39 @@ def test_only_an_operator_that_attenuates_has_a_transmission():
     frames = [ViewFrames.of(Geometry.of(B), scale=1, binning=1, depths=8) for B in (clear, A)]
     assert frames[0].transmission is None
     assert LEAST <= frames[1].transmission.min() < 0.2 < frames[1].transmission.max() <= 1
+
+
+@torch.no_grad()
+def test_a_start_that_is_too_faint_is_raised_by_its_lack_at_any_depth():
+    """By each camera's estimate before training, as well through attenuating matter as without."""
+    cameras = dcspect80(pixels=[16, 16], columns=[0, 7, 13], rows=[0, 2])
+    truth = ball(25.0, (-40.0, 30.0, 0.0)).float()
+    estimates = PerViewEstimates((4,), 0, 1, 32, 1, "softmax_depth")
+    expected, errors = avg_pool3d(truth, 2)[:, None], []
+    for density in (0.0, WATER):
+        A = 2.0 * AttenuatedTransform(GRID, cameras, density * ball(85.0)[0, 0].float())
+        g, views, x = Geometry.of(A), A(truth), 0.7 * truth
+        r = views - A(x)
+        change, *_ = estimates(estimates.frames(g), g, views, r, x, g.direction(r))
+        error = avg_pool3d(x, 2)[:, None] + change - expected
+        errors.append((error.norm() / expected.norm()).item() / 6**0.5)
+    assert errors[1] < 1.2 * errors[0]
+
+
+@torch.no_grad()
+def test_each_sample_of_a_batch_is_reconstructed_with_its_own_attenuation():
+    detector = {"pixels": [12, 12], "pixel_mm": [24.0, 24.0]}
+    grid, cameras = Grid.centred(12, spacing=12.0), circular(4, 400.0, 600.0, detector)
+    body = torch.zeros(grid.shape)
+    body[2:10, 2:10, 2:10] = WATER
+    operators = [AttenuatedTransform(grid, cameras, factor * body) for factor in (1.0, 0.3)]
+    torch.manual_seed(0)
+    method = build_method({"name": "cross_view", "widths": [4, 6], "depth_widths": [4], "scale": 1})
+    for parameter in method.parameters():
+        parameter += 0.1 * torch.randn_like(parameter)
+    both, volume = PerSample(operators), torch.rand(2, 1, *grid.shape)
+    views = both(volume)
+    batch = method(views, both).volume
+    for i, A in enumerate(operators):
+        alone = method(views[i : i + 1], A).volume
+        torch.testing.assert_close(batch[i : i + 1], alone, rtol=1e-4, atol=1e-5)

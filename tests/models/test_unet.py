@@ -1,13 +1,26 @@
-"""The U-Net without normalisation: sizes, its start, and the numbers that it convolves in."""
+"""The U-Net without normalisation: sizes, its start, the numbers that it convolves in, and the
+steps between resolutions.
+"""
 
 from types import SimpleNamespace
 
 import pytest
 import torch
-from mvrecon.models.cross_view.unet import Block, PlainUNet, arithmetic
-from mvrecon.models.networks import convolution
+import torch.nn.functional as F
 
-from mvrecon.models.cross_view import unet
+from mvrecon.models import unet
+from mvrecon.models.unet import (
+    ALONE,
+    Block,
+    PlainUNet,
+    arithmetic,
+    convolution,
+    from_cells,
+    halved,
+    padded,
+    to_cells,
+    trimmed,
+)
 
 
 @pytest.mark.parametrize("sizes", [(1, 1), (5, 7), (1, 1, 1), (3, 1, 6)])
@@ -50,11 +63,16 @@ def test_without_normalisation_an_offset_of_the_input_is_not_lost():
     assert (network(x + 10) - network(x)).abs().min() > 1e-3
 
 
-def test_a_volume_that_is_alone_is_convolved_with_the_same_offset():
+@pytest.mark.parametrize("shape", [(1, 3, 9, 5, 6), (1, 3, 2, 4, 4), (1, 3, 1, 4, 4)])
+def test_a_small_volume_that_is_alone_is_convolved_as_any_other(shape):
     torch.manual_seed(0)
     conv = torch.nn.Conv3d(3, 4, 3, padding=1).double()
-    x = torch.rand(1, 3, 7, 6, 5, dtype=torch.float64)
-    assert torch.allclose(convolution(x, conv.weight, conv.bias), conv(x), rtol=1e-12)
+    x = torch.randn(shape, dtype=torch.float64, requires_grad=True)
+    assert shape[1] * shape[2] * shape[3] <= ALONE
+    found, expected = convolution(x, conv.weight, conv.bias), conv(x)
+    torch.testing.assert_close(found, expected)
+    gradients = [torch.autograd.grad(y.square().sum(), x)[0] for y in (found, expected)]
+    torch.testing.assert_close(*gradients)
 
 
 def test_bfloat16_is_taken_only_where_the_processor_has_it_and_it_is_asked_for(monkeypatch):
@@ -101,3 +119,71 @@ def test_bfloat16_needs_an_instruction_that_multiplies_it(monkeypatch, names, ex
         torch.cpu, "get_capabilities", lambda: dict.fromkeys(names, True), raising=False
     )
     assert unet.has_bfloat16.__wrapped__() is expected
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 6, 12), (2, 3, 6, 12, 18)])
+@pytest.mark.parametrize("edge", [1, 2, 3])
+def test_cells_are_taken_apart_without_a_change(shape, edge):
+    x = torch.rand(shape)
+    cells = to_cells(x, edge)
+    axes = len(shape) - 2
+    assert cells.shape == (2, 3 * edge**axes, *(n // edge for n in shape[2:]))
+    assert torch.equal(from_cells(cells, edge), x)
+
+
+def test_cells_of_an_image_have_the_order_of_torch_and_keep_neighbours_together():
+    x = torch.rand(2, 3, 6, 4)
+    assert torch.equal(to_cells(x, 2), F.pixel_unshuffle(x, 2))
+    volume = torch.rand(1, 1, 4, 4, 4)
+    block = volume[0, 0, 2:, :2, 2:].flatten()
+    assert torch.equal(to_cells(volume, 2)[0, :, 1, 0, 1], block)
+
+
+@pytest.mark.parametrize("sizes", [(5,), (1, 7), (3, 1, 8)])
+def test_padding_adds_zeros_behind_and_is_trimmed_off(sizes):
+    x = torch.rand(1, 2, *sizes) + 1
+    y = padded(x, 4)
+    assert all(n % 4 == 0 for n in y.shape[2:])
+    assert torch.equal(trimmed(y, sizes), x)
+    assert float(y.double().sum()) == pytest.approx(float(x.double().sum()))
+
+
+HALVED = [(4, 6, 8), (5, 6, 7), (2, 3, 3)]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", HALVED)
+def test_halving_and_its_derivative_have_the_bits_of_torch(shape, dtype):
+    torch.manual_seed(0)
+    x = torch.randn(2, 3, *shape, dtype=dtype, requires_grad=True)
+    expected, found = F.avg_pool3d(x, 2, ceil_mode=True), halved(x)
+    onto = torch.randn_like(found)
+    assert torch.equal(found, expected)
+    assert torch.equal(
+        torch.autograd.grad(found, x, onto)[0], torch.autograd.grad(expected, x, onto)[0]
+    )
+
+
+@pytest.mark.parametrize("shape", HALVED)
+def test_halving_has_first_and_second_derivatives(shape):
+    x = torch.randn(1, 2, *shape, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(halved, x)
+    assert torch.autograd.gradgradcheck(halved, x)
+
+
+def test_halving_compiles_whole_and_maps_over_an_axis():
+    x = torch.randn(4, 2, 3, 5, 6, 7, requires_grad=True)
+    compiled = torch.compile(halved, backend="aot_eager", fullgraph=True)
+    mapped = torch.stack([halved(one) for one in x])
+    assert torch.equal(torch.vmap(halved)(x), mapped)
+    (expected,) = torch.autograd.grad(halved(x[0]).square().sum(), x)
+    assert torch.equal(torch.autograd.grad(compiled(x[0]).square().sum(), x)[0], expected)
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 3), (1, 1, 1), (5, 2, 1)])
+def test_halving_leaves_an_axis_of_one_voxel(shape):
+    x = torch.rand(2, 3, *shape, dtype=torch.float64, requires_grad=True)
+    assert halved(x).shape[2:] == tuple(-(-n // 2) for n in shape)
+    mean = x[:, :, :2, :2, :2].mean(dim=(2, 3, 4))
+    torch.testing.assert_close(halved(x)[:, :, 0, 0, 0], mean)
+    assert torch.autograd.gradcheck(halved, [x])
