@@ -59,7 +59,7 @@ def test_a_run_folder_holds_what_it_should(run):
     )
     settings = yaml.safe_load((folder / "config.yaml").read_text())
     assert settings["name"] == "smoke" and settings["seed"] == 3 and "hydra" not in settings
-    assert {"planes.png", "mip.png", "views.png", "opinions.png", "weights.png"} <= {
+    assert {"planes.png", "mip.png", "views.png", "per_view.png", "weights.png"} <= {
         p.name for p in next((folder / "review").iterdir()).iterdir()
     }
 
@@ -83,7 +83,7 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     ).Reload()
     tags, results = board.Tags(), test.Tags()
     kinds = [tag.split("/")[0] for tag in tags["images"]]
-    assert sorted(kinds) == ["mip", "opinions", "planes", "views", "weights"]
+    assert sorted(kinds) == ["mip", "per_view", "planes", "views", "weights"]
     assert [tag.split("/")[0] for tag in results["images"]] == ["slices"] * 2
     slices = test.Images(results["images"][0])
     assert [image.step for image in slices] == list(range(17))

@@ -62,7 +62,7 @@ def needed_in(options: dict, above: str = "") -> list[str]:
 NESTED = {"head": "+head@method.head", "network": "+network@method.network"}
 
 
-@pytest.mark.parametrize("group", ["scene", "camera", "projector", "model", *NESTED])
+@pytest.mark.parametrize("group", ["scene", "camera", "projector", "method", *NESTED])
 def test_every_option_of_a_group_names_a_part_and_composes(group: str):
     from mvrecon.parts import REGISTRIES
 
@@ -220,7 +220,11 @@ def test_the_help_shows_every_choice_and_setting_that_the_app_takes():
         for group in groups:
             assert all(file.stem in text for file in (conf_dir() / group).glob("*.yaml")), group
         assert (conf_dir() / f"{app}.yaml").read_text() in text
-    for app, group in {"simulate": "optimizer", "eval": "method", "reconstruct": "optimizer"}.items():
+    for app, group in {
+        "simulate": "optimizer",
+        "eval": "method",
+        "reconstruct": "optimizer",
+    }.items():
         assert not re.search(rf"^  {group} ", help_text(app), re.MULTILINE)
 
 

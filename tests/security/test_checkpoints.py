@@ -108,7 +108,7 @@ def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: P
         **kept,
         "hyper_parameters": {**kept["hyper_parameters"], "method": {"name": "os.system"}},
     }
-    with pytest.raises(Refused, match="No model is named 'os.system'"):
+    with pytest.raises(Refused, match="No method is named 'os.system'"):
         load(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
@@ -198,7 +198,7 @@ def test_weights_that_are_not_finite_are_refused(value: float, kept: dict, tmp_p
         )
         for reader in (load, read_newest):
             with pytest.raises(
-                Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'model.* among them"
+                Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'method.* among them"
             ):
                 reader(path)
 
