@@ -19,7 +19,7 @@ from mvrecon.config.values import fits
 from mvrecon.parts import PROJECTORS
 
 MISTAKES = {
-    "camera.view=4": r"There is no setting 'camera.view'; did you mean 'n_views'\?",
+    "camera.view=4": r"camera \(the camera 'circular'\) has no option 'view'; did you mean 'n_views'\?",
     "method=crossview": r"method has no choice 'crossview'; did you mean 'cross_view'\?",
     "camera.n_views=abc": r"camera.n_views: expected int > 0, got 'abc' \(number of cameras",
     "grid.spacing=x": r"grid.spacing: expected float > 0 or \[float > 0, .*\], got 'x' \(.*mm",
@@ -30,7 +30,7 @@ MISTAKES = {
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
     "methd=sirt": r"There is no setting 'methd'; did you mean 'method'\?",
     "model=sirt": r"'model' is called method now",
-    "model.head=density": r"'model.head' is called method.head now",
+    "model.head=density": r"'model' is called method now",
     "seed=x": r"Value 'x' of type 'str' could not be converted to Integer$",
     "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
     "head=density": r"'head' is a part of a method; to choose it: method.head=...",
