@@ -19,7 +19,7 @@ from mvrecon.config.values import fits
 from mvrecon.parts import PROJECTORS
 
 MISTAKES = {
-    "camera.view=4": r"camera \(the camera 'circular'\) has no option 'view'; did you mean 'n_views'\?",
+    "camera.view=4": r"the camera 'circular'.* has no option 'view'; did you mean 'n_views'\?",
     "method=crossview": r"method has no choice 'crossview'; did you mean 'cross_view'\?",
     "camera.n_views=abc": r"camera.n_views: expected int > 0, got 'abc' \(number of cameras",
     "grid.spacing=x": r"grid.spacing: expected float > 0 or \[float > 0, .*\], got 'x' \(.*mm",
