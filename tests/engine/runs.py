@@ -47,7 +47,7 @@ def trained_for_a_step(folder, *methods, options=()):
     """A run folder of so many methods of the smoke experiment, each trained for one step, with more
     options.
     """
-    others = [f"+model@compare.{name}={name}" for name in methods if name != "cross_view_small"]
+    others = [f"+method@compare.{name}={name}" for name in methods if name != "cross_view_small"]
     length = ("trainer.max_steps=1", "trainer.val_check_interval=1")
     settings = compose("experiment=smoke", *others, *length, *options)
     run_folder.start(folder, settings)

@@ -1,12 +1,10 @@
-"""Corrections before a reconstruction: the same for an app, a model and a table."""
+"""Corrections before a reconstruction: the same for an app, a method and a table."""
 
 import json
 from dataclasses import replace
 
 import pytest
 import torch
-from mvrecon.engine.trained_correction import corrected_by
-from mvrecon.models.corrected import Corrected
 
 import mvrecon as mv
 import mvrecon.reconstruction
@@ -17,6 +15,7 @@ from mvrecon.data.attenuation import WATER
 from mvrecon.data.volume_files import read_volume
 from mvrecon.engine.export import save_views
 from mvrecon.engine.wrong_cameras import camera_row, cameras_of, sentences
+from mvrecon.models.aligned import Aligned
 from mvrecon.parts import PROJECTORS, SCENES
 from mvrecon.reconstructors.iterative import sirt
 from tests.engine.runs import call, trained_for_a_step
@@ -24,7 +23,7 @@ from tests.models.rig import small_rig
 
 SHIFT, GAIN = torch.zeros(1, 8, 2), torch.ones(1, 8)
 SHIFT[0, 2], SHIFT[0, 5], GAIN[0, 5] = torch.tensor([0.9, -0.7]), torch.tensor([-0.6, 0.8]), 1.05
-SIRT = "reconstructor=sirt", "reconstructor.momentum=true", "reconstructor.iterations=20"
+SIRT = "method=sirt", "method.momentum=true", "method.iterations=20"
 WRONG = (SHIFT != 0).any(dim=-1) | (GAIN != 1)
 
 
@@ -77,12 +76,12 @@ def test_the_app_tells_wrong_cameras_and_moves_views_or_cameras(case, tmp_path, 
     assert max(moved, calibrated) < 0.85 * plain and abs(moved - calibrated) < 0.1 * plain
 
 
-def test_a_model_on_corrected_views_is_the_model_of_these_views(case):
+def test_a_method_on_aligned_views_is_the_method_of_these_views(case):
     A, _, views = case
     options = {"name": "sirt", "iterations": 5}
-    model = Corrected(A, options).eval()
+    method = Aligned(options).eval()
     corrected, by = self_aligned(A, views)
-    out = model(views)
+    out = method(views, A)
     torch.testing.assert_close(out.volume, sirt(A, corrected, 5))
     assert out.alignment is not None and torch.equal(out.alignment.gain, by.gain)
 
@@ -90,18 +89,13 @@ def test_a_model_on_corrected_views_is_the_model_of_these_views(case):
 def test_in_training_a_view_is_aligned_once(case, monkeypatch):
     A, _, views = case
     batch = torch.cat([views, views.flip(-1)])
-    model = Corrected(A, {"name": "sirt", "iterations": 2}).train()
-    first = model(batch)
-    monkeypatch.setattr(model, "_corrected", None)  # a second computation would fail
-    again = model(batch.flip(0))
+    method = Aligned({"name": "sirt", "iterations": 2}).train()
+    first = method(batch, A)
+    monkeypatch.setattr(method, "_corrected", None)  # a second computation would fail
+    again = method(batch.flip(0), A)
     assert torch.equal(again.volume.flip(0), first.volume)
-    torch.testing.assert_close(
-        first.volume, model.eval().__class__(A, model_of(model))(batch).volume
-    )
-
-
-def model_of(model: Corrected) -> dict:
-    return {"name": "sirt", "iterations": model.model.iterations}
+    fresh = Aligned({"name": "sirt", "iterations": 2}).eval()
+    torch.testing.assert_close(first.volume, fresh(batch, A).volume)
 
 
 def test_the_table_has_the_figures_where_the_truth_is_known(case):
@@ -122,49 +116,32 @@ def test_the_table_has_the_figures_where_the_truth_is_known(case):
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    """One step of a model whose cameras correct views and which tells its uncertainty, and of one
-    that does neither.
-    """
-    folder, tells = tmp_path_factory.mktemp("run"), "model.uncertainty=true"
-    return trained_for_a_step(folder, "cross_view_small", "geometry_free", options=(tells,))
+def run(tmp_path_factory):
+    """One step of a method that estimates its uncertainty."""
+    small = "method@compare.uncertain.method=cross_view_small"
+    return trained_for_a_step(tmp_path_factory.mktemp("run"), "uncertain", options=(small,))
 
 
-def test_views_are_corrected_by_the_cameras_of_a_trained_model(runs):
-    module = mv.load(runs, "cross_view_small").module.eval()
-    views = module.projector(torch.rand(1, 1, *module.projector.grid.shape))
-    with torch.inference_mode():
-        expected = module(views).corrected_views[-1]
-    assert torch.equal(
-        corrected_by(module.projector, views, str(runs), "cross_view_small").views, expected
-    )
-
-
-def test_the_app_writes_the_standard_deviation_beside_the_volume(runs, tmp_path):
+def test_the_app_writes_the_standard_deviation_beside_the_volume(run, tmp_path):
     """In the volume's unit: 1000 HU are 0.0192/mm where all that may be is less than water."""
-    A = mv.load(runs, "cross_view_small").module.projector
+    module = mv.load(run, "uncertain").module.eval()
+    A = module.projector
     truth = torch.full((1, 1, *A.grid.shape), 0.01)
-    of_run = f"reconstructor.checkpoint={runs}", "reconstructor.method=cross_view_small"
-    method = "reconstructor=trained", *of_run
+    method = "method=trained", f"method.checkpoint={run}", "method.method=uncertain"
     reconstructed((A, truth, A(truth)), tmp_path, "unit=HU", method=method)
     saved, grid = read_volume(tmp_path / "run" / "volume.sigma.nii.gz")
     with torch.inference_mode():
-        out = mv.load(runs, "cross_view_small").module.eval()(A(truth))
+        out = module(A(truth))
     light = (out.volume + out.sigma < WATER)[0, 0]
     assert light.any() and torch.allclose(grid.affine, A.grid.affine)
     expected = out.sigma[0, 0][light] * 1000 / WATER
     assert expected.min() > 0 and torch.allclose(saved[light], expected, rtol=1e-3, atol=0.1)
 
 
-def test_a_correction_that_does_not_fit_is_refused(case, runs, tmp_path, capsys):
-    """A model that corrects no view, a calibration without an alignment and an unknown option are
-    refused.
-    """
-    A = mv.load(runs, "cross_view_small").module.projector
-    with pytest.raises(ValueError, match="whose cameras correct"):
-        corrected_by(A, torch.ones(1, 1, *A.range_shape), str(runs), "geometry_free")
+def test_a_correction_that_does_not_fit_is_refused(case, tmp_path, capsys):
+    """A calibration without an alignment and an unknown option are refused."""
     with pytest.raises(TypeError, match="alternations"):
-        Corrected(case[0], correct={"name": "align", "alternation": 2})
+        Aligned({"name": "sirt"}, correct={"name": "align", "alternation": 2})
     with pytest.raises(AssertionError):
         reconstructed(case, tmp_path, "self_calibrate=true")
     assert "correct=align" in capsys.readouterr().err

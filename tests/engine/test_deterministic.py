@@ -82,25 +82,30 @@ SMALL = (
     "camera.detector.pixel_mm=22.0",
     "data.sizes={train: 2, val: 1, test: 1}",
 )
-MODELS = {
-    "single_pass": (),
-    "single_pass in its hull": ("model.support=hull",),
-    "single_pass, unmasked in its box": ("model.support=box", "model.masked=false"),
-    "backprojection_unet": (),
+METHODS = {
+    "cross_view": (),
+    "cross_view in its hull": ("method.support=hull",),
+    "cross_view, cropped to its hull": ("method.support=hull", "method.crop=true"),
+    "world_unet": (),
     "geometry_free": (),
     "mean_fusion": (),
 }
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_no_layer_is_refused_on_a_gpu(model, taken_for_a_gpu):
-    settings = compose(f"model={model.split(maxsplit=1)[0].strip(',')}", *SMALL, *MODELS[model])
+def composed(name):
+    """The settings of a method on a small rig."""
+    return compose(f"method={name.replace(',', ' ').split()[0]}", *SMALL, *METHODS[name])
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_no_layer_is_refused_on_a_gpu(name, taken_for_a_gpu):
+    settings = composed(name)
     data = fit.build_data(settings)
     data.setup("fit")
-    module = fit.build_module(settings, settings["model"], data.data_range)
+    module = fit.build_module(settings, settings["method"], data.data_range)
     batch = next(iter(data.train_dataloader()))
     with Recorded() as seen:
-        module.loss(module.model(batch["views"]), batch)["total"].backward()
+        module.terms(batch)["total"].backward()
     assert "convolution_backward" in seen.names
     assert seen.names & REFUSED == set()
 
@@ -162,16 +167,16 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
     )
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_volumes_and_gradients_have_the_same_bits_in_one_order(model, threads):
-    settings = compose(f"model={model.split(maxsplit=1)[0].strip(',')}", *SMALL, *MODELS[model])
-    module = fit.build_module(settings, settings["model"], 1.0)
+@pytest.mark.parametrize("name", METHODS)
+def test_volumes_and_gradients_have_the_same_bits_in_one_order(name, threads):
+    settings = composed(name)
+    module = fit.build_module(settings, settings["method"], 1.0)
     views, answers = torch.rand(2, 1, 4, 12, 12, generator=torch.Generator().manual_seed(0)), []
     for number in (1, 2, 3, 7):
         threads(number)
         module.zero_grad()
         with in_one_order():
-            volume = module.model(views).volume
+            volume = module(views).volume
             volume.square().sum().backward()
         answers.append([volume, *[p.grad for p in module.parameters() if p.grad is not None]])
     assert all(
@@ -198,5 +203,5 @@ def test_methods_without_a_network_have_the_same_bits_on_any_number_of_threads(m
     for number in (1, 2, 3, 7):
         threads(number)
         volume = torch.rand(2, 1, 40, 40, 40, generator=torch.Generator().manual_seed(0))
-        volumes.append(module.model(module.projector(volume)).volume)
+        volumes.append(module(module.projector(volume)).volume)
     assert volumes[0].any() and all(torch.equal(volumes[0], other) for other in volumes[1:])

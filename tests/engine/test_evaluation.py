@@ -25,6 +25,9 @@ SHAPE = (8, 8, 8)
 class Shadow(nn.Module):
     """The sum along z, seen by two equal cameras."""
 
+    def for_case(self, case):
+        return self
+
     def forward(self, volume):
         return volume.sum(dim=2)[:, :, None].expand(-1, -1, 2, -1, -1)
 
@@ -36,7 +39,7 @@ class Scaled(nn.Module):
         super().__init__()
         self.factor = factor
 
-    def forward(self, views):
+    def forward(self, views, A):
         volume = views[:, :, :1].expand(-1, -1, SHAPE[0], -1, -1) / SHAPE[0]
         return Reconstruction(volume=self.factor * volume)
 

@@ -5,37 +5,44 @@ import math
 
 import pytest
 import torch
+from torch import nn
 
 from mvrecon.comparison.rows import read
 from mvrecon.config import compose
+from mvrecon.data.dataset import single_cases
 from mvrecon.engine import evaluation, fit, report, run_folder
 from mvrecon.metrics import UNITS
 from mvrecon.models.output import Reconstruction
-from mvrecon.parts import METRICS
+from mvrecon.parts import METHODS, METRICS
 from tests.engine.test_evaluation import shown
 
 
 @pytest.fixture
 def settings():
     """Four test scenes, two methods that learn nothing."""
-    return compose("experiment=smoke", "model=backprojection", "data.sizes.test=4")
+    return compose("experiment=smoke", "method=backprojection", "data.sizes.test=4")
 
 
 @pytest.fixture
 def spoilt(monkeypatch):
     """Lets backprojection know the truth, but for one voxel of each second scene."""
-    made, scenes = evaluation.reconstructed, []
+    scenes = []
 
-    def reconstructed(method, scene):
-        if method.options["name"] != "backprojection":
-            return made(method, scene)
-        (name,) = scene["name"]
-        scenes.extend([name] if name not in scenes else [])
-        volume = 0.999 * scene["volume"]
-        volume[..., 0, 0, 0] = [0.0, math.nan, 0.0, math.inf][scenes.index(name)]
-        return Reconstruction(volume, sigma=torch.ones_like(volume))
+    def seen(batch):
+        for case in single_cases(batch):
+            scenes.append(case)
+            yield case
 
-    monkeypatch.setattr(evaluation, "reconstructed", reconstructed)
+    class Spoilt(nn.Module):
+        def forward(self, views, A):
+            volume = 0.999 * scenes[-1]["volume"]
+            volume[..., 0, 0, 0] = [0.0, math.nan, 0.0, math.inf][len(scenes) - 1]
+            return Reconstruction(volume, sigma=torch.ones_like(volume))
+
+    parts = {name: part for name, part in METHODS._parts.items() if name != "backprojection"}
+    monkeypatch.setattr(METHODS, "_parts", parts)
+    METHODS.register("backprojection")(Spoilt)
+    monkeypatch.setattr(evaluation, "single_cases", seen)
 
 
 def test_a_failed_volume_is_counted_shown_and_never_averaged_away(settings, spoilt, tmp_path):

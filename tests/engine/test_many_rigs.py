@@ -4,22 +4,28 @@ import warnings
 
 import pytest
 import torch
-from mvrecon.engine.on_rig import with_weights_of
-from torch.nn.utils import parameters_to_vector
 
 import mvrecon as mv
 import mvrecon.eval
 from mvrecon.config import compose
 from mvrecon.engine import fit, run_folder
-from mvrecon.engine.trained_method import trained
+from mvrecon.engine.trained_method import TrainedMethod
 from mvrecon.files import places
 from mvrecon.files.checks import Refused
-from mvrecon.parts import MODELS, PROJECTORS
+from mvrecon.models.method import build_method
+from mvrecon.parts import PROJECTORS
 from tests.cameras.rigs import OPTIONS
 from tests.engine.runs import call
 from tests.models.rig import small_projector
 
-CAMERAS = "{name: rays2d, widths: [4], depths: 4}"
+SMALL = {
+    "widths": [4, 8],
+    "depth_widths": [4],
+    "weight_widths": [4],
+    "scale": 1,
+    "depths": 4,
+    "start": 2,
+}
 SETTINGS = (
     "camera=random",
     "callbacks=quiet",
@@ -28,10 +34,8 @@ SETTINGS = (
     "trainer={max_steps: 3, val_check_interval: 3, accelerator: cpu}",
     "camera.n_views=[3,4]",
     "camera.pixels=[13,17]",
-    "model=cross_view",
-    f"model.rounds=[{{resolution: half, widths: [4], cameras: {CAMERAS}}}]",
-    "model.start=2",
-    "loss.corrected_views=10.0",
+    "method=cross_view",
+    *(f"method.{name}={value}" for name, value in SMALL.items()),
     "grid.size=[8,8,8]",
     "grid.spacing=16.0",
     "data={rigs: 3, sizes: {train: 6, val: 1, test: 1}}",
@@ -56,32 +60,28 @@ def a_rig(n_views):
 
 
 def test_a_step_on_one_rig_is_a_step_of_the_weights_on_all():
-    options = {"name": "cross_view", "rounds": [{"widths": [4], "cameras": {"name": "rays2d"}}]}
+    """Weights trained on one rig reconstruct from another as if they had never been called on the
+    first.
+    """
+    options = {"name": "cross_view", **SMALL}
     A, B = small_projector(4), small_projector(3, pixels=10)
-    state = torch.get_rng_state()
-    model = MODELS.from_config(options, projector=A)
-    torch.set_rng_state(state)
-    other = with_weights_of(model, options, B)
-    assert torch.equal(torch.get_rng_state(), state), "later random numbers stay"
-    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
-    before = parameters_to_vector(model.parameters())
+    method, copy = build_method(options), build_method(options)
+    optimizer = torch.optim.SGD(method.parameters(), lr=0.1)
     truth = torch.rand(1, 1, *B.grid.shape)
-    other(B(truth)).volume.square().mean().backward()
+    before = method(B(truth), B).volume
+    method(A(truth), A).volume.square().mean().backward()
     optimizer.step()
-    copy = MODELS.from_config(options, projector=B)
-    copy.load_state_dict(model.state_dict())
-    assert torch.equal(copy(B(truth)).volume, other(B(truth)).volume)
-    after = parameters_to_vector(model.parameters())
-    assert torch.equal(after, parameters_to_vector(other.parameters()))
+    copy.load_state_dict(method.state_dict())
+    after = method(B(truth), B).volume
+    assert torch.equal(copy(B(truth), B).volume, after)
     assert not torch.equal(after, before)
 
 
-def test_a_network_for_each_camera_is_no_network_for_any_rig():
-    cameras = {"name": "rays2d", "shared": False}
-    options = {"name": "cross_view", "rounds": [{"widths": [4], "cameras": cameras}]}
-    model = MODELS.from_config(options, projector=small_projector(4))
-    with pytest.raises(ValueError, match="do not fit 3 cameras .*need shared: true"):
-        with_weights_of(model, options, small_projector(3))
+def test_networks_for_each_camera_do_not_fit_another_number_of_cameras():
+    options = {"name": "cross_view", **SMALL, "shared": False, "n_cameras": 4}
+    method, A = build_method(options), small_projector(3)
+    with pytest.raises(ValueError, match="Expected 4 cameras, got 3"):
+        method(A(torch.rand(4, 1, *A.grid.shape)), A)
 
 
 def test_weights_in_a_file_are_the_trained_ones_and_fit_a_rig_never_seen(
@@ -91,14 +91,14 @@ def test_weights_in_a_file_are_the_trained_ones_and_fit_a_rig_never_seen(
     ours, first = mv.load(path), mv.load(run)
     assert ours.steps == first.steps == 3
     weights = first.module.state_dict()
-    assert any(value.any() for name, value in weights.items() if name.endswith("trust"))
+    assert any(value.any() for name, value in weights.items() if name.endswith("entry.weight"))
     assert all(torch.equal(value, weights[k]) for k, value in ours.module.state_dict().items())
     monkeypatch.setattr(places, "WEIGHTS", tmp_path)
     A = a_rig(5)
     views = A(torch.full((1, 1, *A.grid.shape), 0.5))
     with warnings.catch_warnings(record=True) as messages:
         warnings.simplefilter("always")
-        volume = trained(A, views, "ours")
+        volume = TrainedMethod("ours")(views, A).volume
     assert volume.shape[2:] == A.grid.shape and volume.isfinite().all() and volume.any()
     words = [str(w.message) for w in messages if "trained with" in str(w.message)]
     assert len(words) == 1 and "another grid" in words[0], "any rig is as in training"

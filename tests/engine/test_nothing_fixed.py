@@ -13,9 +13,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mvrecon.cameras.camera import Cameras
 from mvrecon.config import compose
 from mvrecon.data.dataset import SceneDataset
-from mvrecon.engine import fit
+from mvrecon.engine import callbacks, fit
 from mvrecon.engine.module import ReconstructionModule
-from mvrecon.parts import MODELS, PROJECTORS
+from mvrecon.models.method import build_method
+from mvrecon.parts import PROJECTORS
 from mvrecon.train import train
 from mvrecon.viz import review
 from tests.models.rig import small_rig
@@ -25,7 +26,7 @@ FORWARD, ADJOINT, POSES = (
     "mvrecon::backproject",
     ("mvrecon::lines_vjp", "mvrecon::warp_vjp"),
 )
-PICTURES = ("planes", "projections", "views", "opinions", "weights")
+PICTURES = ("planes", "projections", "views", "per_view", "weights")
 
 
 class Kernels(TorchDispatchMode):
@@ -45,7 +46,7 @@ def settings():
     return compose("experiment=smoke")
 
 
-def test_a_training_step_projects_as_often_as_the_model_says_and_never_asks_for_poses(
+def test_a_training_step_projects_as_often_as_the_method_does_and_never_asks_for_poses(
     settings, tmp_path, monkeypatch
 ):
     steps = []
@@ -57,18 +58,17 @@ def test_a_training_step_projects_as_often_as_the_model_says_and_never_asks_for_
             ReconstructionModule, "on_train_batch_end", lambda *_: steps.append(dict(kernels.calls))
         )
         fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
-    start, consistency = settings["model"]["start"], settings["model"]["consistency"]
-    rounds = len(settings["model"]["rounds"])  # cameras correct in each
-    # A x of: each SIRT iteration of the start; each round's residual; each consistency step; the
-    # truth, for the loss of the corrected views. Back: of each adjoint but the first round's, of
-    # the start's residual, which has no weights before it.
-    forward = start + rounds + consistency + 1 + (2 * rounds - 1) + consistency
-    # A^T of: each SIRT iteration; each round's residual, and what its cameras correct; each
-    # consistency step. Back: of each round's residual but the first, of each consistency step.
-    adjoint = start + 2 * rounds + consistency + (rounds - 1) + consistency
+    start, consistency = settings["method"]["start"], settings["method"]["consistency"]
+    # A x of: each SIRT iteration of the start, the start's residual and each consistency step.
+    # Back: of the adjoint with the rays' weights and of each consistency step's.
+    forward = start + 1 + consistency + 1 + consistency
+    # A^T of: each SIRT iteration, the start's residual without and with the rays' weights, and each
+    # consistency step. Back: of each consistency step's residual.
+    adjoint = start + 2 + consistency + consistency
     assert len(steps) == settings["trainer"]["max_steps"]
-    assert [step[FORWARD] for step in steps] == [forward] * len(steps)
-    assert [step[ADJOINT] for step in steps] == [adjoint] * len(steps)
+    # The first step computes SIRT's weights, A 1 and A^T 1, which stay those of the operator.
+    assert [step[FORWARD] for step in steps] == [forward + 1] + [forward] * (len(steps) - 1)
+    assert [step[ADJOINT] for step in steps] == [adjoint + 1] + [adjoint] * (len(steps) - 1)
     assert not any(step.get(poses) for step in steps for poses in POSES)
 
 
@@ -105,11 +105,10 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
         monkeypatch.setattr(
             ReconstructionModule, name, noted(name, getattr(ReconstructionModule, name))
         )
-    build = MODELS.build
     monkeypatch.setattr(
-        MODELS,
-        "build",
-        lambda name, **options: built.append(name) or build(name, **options),
+        callbacks,
+        "build_method",
+        lambda config: built.append(config["name"]) or build_method(config),
     )
     board = {
         "_target_": "mvrecon.engine.callbacks.BoardReview",
@@ -125,7 +124,7 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
         "validation_step",
         "pictures",
     ] * 3
-    assert built.count("sirt") == 1
+    assert built == ["sirt"]
 
 
 def test_no_case_is_simulated_twice_however_many_methods_see_it(settings, tmp_path, monkeypatch):
@@ -137,7 +136,7 @@ def test_no_case_is_simulated_twice_however_many_methods_see_it(settings, tmp_pa
 
     monkeypatch.setattr(SceneDataset, "made", noted)
     trainer = {**settings["trainer"], "max_steps": 4}  # more than an epoch
-    other = {"name": "backprojection_unet", "width": 4, "start": 2, "consistency": 0}
+    other = {"name": "world_unet", "widths": [4], "start": 2, "consistency": 0}
     train(
         {
             **settings,

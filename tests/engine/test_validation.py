@@ -6,19 +6,19 @@ from dataclasses import fields, replace
 import lightning.pytorch as L
 import pytest
 import torch
-from mvrecon.engine.on_case import joined
 from torch.utils.data import DataLoader
 
+from mvrecon.calibration.alignment import Alignment
 from mvrecon.config import compose
 from mvrecon.engine import fit
 from mvrecon.engine.checkpoints import load
 from mvrecon.engine.module import ReconstructionModule
 
-CORRECTED = (
+ALIGNED = (
     "experiment=smoke",
-    "model=corrected",
-    "model@model.model=cross_view_small",
-    "model.model.uncertainty=true",
+    "method=aligned",
+    "method@method.method=uncertain",
+    "method@method.method.method=cross_view_small",
     "acquisition.disturbed={views: 1, shift_px: 1.0, gain: 0.05, probability: 0.7}",
     "data.sizes.val=5",
 )
@@ -33,12 +33,12 @@ def validated(module, cases, batch_size):
 
 @pytest.fixture(scope="module")
 def validation():
-    """A model that tells its uncertainty and what is wrong with its cameras, and five cases."""
+    """A method that estimates its error and the shifts and gains of its cameras, and five cases."""
     torch.manual_seed(0)
-    settings = compose(*CORRECTED)
+    settings = compose(*ALIGNED)
     data = fit.build_data(settings)
     data.setup("validate")
-    return fit.build_module(settings, settings["model"], data.data_range), data.sets["val"]
+    return fit.build_module(settings, settings["method"], data.data_range), data.sets["val"]
 
 
 def test_no_figure_depends_on_the_batch_size(validation):
@@ -62,14 +62,14 @@ def test_a_failed_volume_spoils_the_mean_but_a_scene_without_an_object_does_not(
     assert empty["val/psnr"] == pytest.approx(whole["val/psnr"], rel=1e-5)
     assert math.isfinite(empty["val/psnr_inside"])
 
-    make = module.model.forward
+    make = module.method.forward
 
-    def spoilt(views):
-        out = make(views)
+    def spoilt(views, A):
+        out = make(views, A)
         out.volume[0, 0, 0, 0, 0] = bad
         return out
 
-    monkeypatch.setattr(module.model, "forward", spoilt)
+    monkeypatch.setattr(module.method, "forward", spoilt)
     failed = validated(module, some, 2)
     names = ("psnr", "ssim", "nrmse", "psnr_inside", "view_nrmse")
     assert all(math.isnan(failed[f"val/{name}"]) for name in names)
@@ -81,16 +81,16 @@ def test_weights_that_fail_in_a_case_are_not_the_best_even_if_they_are_perfect_i
     judge = ReconstructionModule.validation_step
 
     def spoilt_at_step_2(module, batch, index):
-        make = module.model.forward
+        make = module.method.forward
 
-        def perfect_but_for_one(views):
+        def perfect_but_for_one(views, A):
             volume = batch["volume"].clone()
             volume[0, 0, 0, 0, 0] = math.nan
-            return replace(make(views), volume=volume)
+            return replace(make(views, A), volume=volume)
 
         with monkeypatch.context() as patch:
             if module.global_step == 2:
-                patch.setattr(module.model, "forward", perfect_but_for_one)
+                patch.setattr(module.method, "forward", perfect_but_for_one)
             return judge(module, batch, index)
 
     monkeypatch.setattr(ReconstructionModule, "validation_step", spoilt_at_step_2)
@@ -104,14 +104,16 @@ def test_a_batch_split_into_its_cases_is_the_batch_joined_again(validation):
     module, cases = validation
     batch = next(iter(DataLoader(cases, 3)))
     with torch.no_grad():
-        out = module.model(batch["views"])
+        out = module(batch["views"], module.operator(batch))
     parts = out.split()
     assert len(parts) == 3 and all(len(part.volume) == 1 for part in parts)
-    again = joined(parts)
     for field in fields(out):
-        one, other = getattr(out, field.name), getattr(again, field.name)
-        if field.name == "alignment":
-            one, other = one.tensors(), other.tensors()
-        elif field.name == "row":  # the same for all cases
-            one = one.expand_as(other)
-        torch.testing.assert_close(other, one, rtol=0, atol=0)
+        whole = getattr(out, field.name)
+        values = [getattr(part, field.name) for part in parts]
+        if whole is None or field.name == "visible":  # of all cases
+            assert all(value is whole for value in values)
+        elif field.name == "alignment":
+            again = Alignment.joined(values).tensors()
+            torch.testing.assert_close(again, whole.tensors(), rtol=0, atol=0)
+        else:
+            torch.testing.assert_close(torch.cat(values), whole, rtol=0, atol=0)

@@ -6,7 +6,7 @@ import torch
 
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS, METHODS
+from mvrecon.parts import METHODS, PROJECTORS
 from mvrecon.projectors.operator import LinearOperator
 
 GRID = Grid.centred(size=(8, 7, 6), spacing=2.0)

@@ -2,7 +2,6 @@
 NVRTC and its disassembler are installed, as by the extra `dev` on Linux.
 """
 
-
 import pytest
 import torch
 
