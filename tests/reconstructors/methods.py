@@ -6,7 +6,7 @@ import torch
 
 from mvrecon.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS, RECONSTRUCTORS
+from mvrecon.parts import METHODS, PROJECTORS
 from mvrecon.projectors.operator import LinearOperator
 
 GRID = Grid.centred(size=(8, 7, 6), spacing=2.0)
@@ -62,19 +62,18 @@ PROMISES = {
     "bsrem": Promise({"iterations": 100, "weight": 1e-5}, rate=2e-2),
     "tv_map": Promise({"iterations": 300, "weight": 1e-5}, rate=2e-2),
 }
-#: Methods that need a rig of a certain kind, another grid or a checkpoint; they have tests of their
-#: own.
-GEOMETRIC = {"fbp", "fdk", "trained", "finer"}
+#: Methods of certain rigs or of another grid, and one that does not iterate; tests of their own.
+GEOMETRIC = {"fbp", "fdk", "finer", "backprojection"}
 NAMES = [
     name
-    for name in RECONSTRUCTORS.names()
-    if RECONSTRUCTORS.origin(name).startswith("mvrecon.") and name not in GEOMETRIC
+    for name in METHODS.names()
+    if METHODS.origin(name).startswith("mvrecon.reconstructors.") and name not in GEOMETRIC
 ]
 
 
 def run(name: str, A, views, **options):
     """A registered method with the options of its promise."""
-    return RECONSTRUCTORS.build(name, A, views, **{**PROMISES[name].options, **options})
+    return METHODS.build(name, A, views, **{**PROMISES[name].options, **options})
 
 
 def truth(A, batch: int = 1, dtype: torch.dtype = torch.float64) -> torch.Tensor:

@@ -6,8 +6,8 @@ from torch.nn.functional import avg_pool3d
 
 import mvrecon as mv
 from mvrecon.geometry.grid import subdivided
-from mvrecon.parts import RECONSTRUCTORS
-from mvrecon.testing.reconstructor import check_reconstructor
+from mvrecon.parts import METHODS
+from mvrecon.testing import check_method
 from tests.reconstructors.methods import GRID, RIG, Dense, gap, projector, truth
 
 SIRT = {"name": "sirt", "iterations": 20, "momentum": True}
@@ -35,15 +35,15 @@ def test_cut_voxels_are_whole_again_by_their_mean_and_stand_where_the_finer_grid
     assert torch.allclose(centre, GRID.to_world(torch.zeros(3, dtype=torch.float64)))
 
 
-def test_it_keeps_the_promises_of_a_reconstructor():
-    check_reconstructor("finer", projector(), reconstructor=SIRT)
+def test_it_keeps_the_contract_of_methods():
+    check_method("finer", projector(), method=SIRT)
 
 
 def test_it_is_the_method_on_the_finer_operator_within_the_support():
     A, fine = projector(), projector().refined(2)
     views, support = A(truth(A)), torch.zeros(A.domain_shape, dtype=torch.bool)
     support[1:5, 2:6, 1:7] = True
-    volume = mv.finer(A, views, reconstructor=SIRT, support=support)
+    volume = mv.finer(A, views, method=SIRT, support=support)
     own = mv.sirt(fine, views, 20, momentum=True, support=subdivided(support, 2))
     assert torch.equal(volume, avg_pool3d(own, 2)) and not volume[0, 0][~support].any()
     assert torch.equal(mv.finer(A, views, 1, SIRT), mv.sirt(A, views, 20, momentum=True))
@@ -66,12 +66,12 @@ def test_what_the_grid_cannot_hold_of_the_views_spoils_the_volume_less_on_a_fine
     ("A", "options", "error", "text"),
     [
         (projector(), {"fine": 0}, ValueError, "whole number of at least 1, got 0"),
-        (projector(), {"reconstructor": {"name": "sart"}}, LookupError, "sart"),
-        (projector(), {"reconstructor": {"name": "sirt", "iters": 2}}, TypeError, "iters"),
+        (projector(), {"method": {"name": "sart"}}, LookupError, "sart"),
+        (projector(), {"method": {"name": "sirt", "iters": 2}}, TypeError, "iters"),
         (Dense(), {}, ValueError, "2 times finer, such as drr or radon, got Dense"),
     ],
 )
 def test_what_cannot_be_is_refused(A, options, error, text):
     views = torch.ones(1, 1, *A.range_shape)
     with pytest.raises(error, match=text):
-        RECONSTRUCTORS.build("finer", A, views, **options)
+        METHODS.build("finer", A, views, **options)
