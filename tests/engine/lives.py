@@ -26,12 +26,12 @@ METHOD, STEPS = "geometry_free", 14
 #: A run of a second: five steps an epoch, a checkpoint every three, averaged weights, a falling
 #: rate.
 OPTIONS = (
-    "model=geometry_free",
+    "method=geometry_free",
     "callbacks=ema",
     "logger=csv",
     "~callbacks.progress",
     "~callbacks.board",
-    "model.width=4",
+    "method.widths=[4,8]",
     "grid.size=[8,8,8]",
     "grid.spacing=16.0",
     "camera.n_views=3",
@@ -133,7 +133,7 @@ def spoiled(module: Any, n: int) -> None:
         loss = step(self, batch, batch_idx)
         calls.append(1)
         if len(calls) == n:
-            next(self.model.parameters()).register_hook(lambda gradient: gradient * float("nan"))
+            next(self.method.parameters()).register_hook(lambda gradient: gradient * float("nan"))
         return loss
 
     module.training_step = called
@@ -208,7 +208,7 @@ def warmed(*options: str) -> dict[str, Any]:
     torch.set_num_threads(1)
     settings = compose(*options)
     data = fit.build_data(settings)
-    module = fit.build_module(settings, settings["model"], data.data_range)
+    module = fit.build_module(settings, settings["method"], data.data_range)
     data.scenes["train"].sample(0, 0, data.grid, data.cameras)
     torch.optim.AdamW(evaluation.trainable(module) * [*module.parameters()])
     return settings

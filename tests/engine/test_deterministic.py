@@ -82,25 +82,24 @@ SMALL = (
     "camera.detector.pixel_mm=22.0",
     "data.sizes={train: 2, val: 1, test: 1}",
 )
-MODELS = {
-    "single_pass": (),
-    "single_pass in its hull": ("model.support=hull",),
-    "single_pass, unmasked in its box": ("model.support=box", "model.masked=false"),
-    "backprojection_unet": (),
-    "geometry_free": (),
-    "mean_fusion": (),
+METHODS = {
+    "cross_view_small": (),
+    "cross_view_small, cropped to its hull": ("method.support=hull", "method.crop=true"),
+    "world_unet": ("method.widths=[4,8]",),
+    "geometry_free": ("method.widths=[4,8]",),
+    "mean_fusion": ("method.widths=[4]", "method.depths=8"),
 }
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_no_layer_is_refused_on_a_gpu(model, taken_for_a_gpu):
-    settings = compose(f"model={model.split(maxsplit=1)[0].strip(',')}", *SMALL, *MODELS[model])
+@pytest.mark.parametrize("method", METHODS)
+def test_no_layer_is_refused_on_a_gpu(method, taken_for_a_gpu):
+    settings = compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
     data = fit.build_data(settings)
     data.setup("fit")
-    module = fit.build_module(settings, settings["model"], data.data_range)
+    module = fit.build_module(settings, settings["method"], data.data_range)
     batch = next(iter(data.train_dataloader()))
     with Recorded() as seen:
-        module.loss(module.model(batch["views"]), batch)["total"].backward()
+        module.terms(batch)["total"].backward()
     assert "convolution_backward" in seen.names
     assert seen.names & REFUSED == set()
 
@@ -162,16 +161,16 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
     )
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_volumes_and_gradients_have_the_same_bits_in_one_order(model, threads):
-    settings = compose(f"model={model.split(maxsplit=1)[0].strip(',')}", *SMALL, *MODELS[model])
-    module = fit.build_module(settings, settings["model"], 1.0)
+@pytest.mark.parametrize("method", METHODS)
+def test_volumes_and_gradients_have_the_same_bits_in_one_order(method, threads):
+    settings = compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
+    module = fit.build_module(settings, settings["method"], 1.0)
     views, answers = torch.rand(2, 1, 4, 12, 12, generator=torch.Generator().manual_seed(0)), []
     for number in (1, 2, 3, 7):
         threads(number)
         module.zero_grad()
         with in_one_order():
-            volume = module.model(views).volume
+            volume = module(views).volume
             volume.square().sum().backward()
         answers.append([volume, *[p.grad for p in module.parameters() if p.grad is not None]])
     assert all(
@@ -198,5 +197,5 @@ def test_methods_without_a_network_have_the_same_bits_on_any_number_of_threads(m
     for number in (1, 2, 3, 7):
         threads(number)
         volume = torch.rand(2, 1, 40, 40, 40, generator=torch.Generator().manual_seed(0))
-        volumes.append(module.model(module.projector(volume)).volume)
+        volumes.append(module(module.projector(volume)).volume)
     assert volumes[0].any() and all(torch.equal(volumes[0], other) for other in volumes[1:])

@@ -1,4 +1,4 @@
-"""The result table against models whose answers are known."""
+"""The result table against methods whose answers are known."""
 
 import io
 import math
@@ -18,11 +18,12 @@ from mvrecon.engine.report import WIDTH, remarks, table
 from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import UNITS, mean_and_spread
 from mvrecon.models.output import Reconstruction
+from mvrecon.projectors.operator import Projector
 
 SHAPE = (8, 8, 8)
 
 
-class Shadow(nn.Module):
+class Shadow(Projector):
     """The sum along z, seen by two equal cameras."""
 
     def forward(self, volume):
@@ -36,7 +37,7 @@ class Scaled(nn.Module):
         super().__init__()
         self.factor = factor
 
-    def forward(self, views):
+    def forward(self, views, A):
         volume = views[:, :, :1].expand(-1, -1, SHAPE[0], -1, -1) / SHAPE[0]
         return Reconstruction(volume=self.factor * volume)
 

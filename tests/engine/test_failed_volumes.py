@@ -10,32 +10,35 @@ from mvrecon.comparison.rows import read
 from mvrecon.config import compose
 from mvrecon.engine import evaluation, fit, report, run_folder
 from mvrecon.metrics import UNITS
+from mvrecon.models.method import Solver
 from mvrecon.models.output import Reconstruction
 from mvrecon.parts import METRICS
+from mvrecon.reconstructors.iterative import backprojection
 from tests.engine.test_evaluation import shown
 
 
 @pytest.fixture
 def settings():
     """Four test scenes, two methods that learn nothing."""
-    return compose("experiment=smoke", "model=backprojection", "data.sizes.test=4")
+    return compose("experiment=smoke", "method=backprojection", "data.sizes.test=4")
 
 
 @pytest.fixture
 def spoilt(monkeypatch):
-    """Lets backprojection know the truth, but for one voxel of each second scene."""
-    made, scenes = evaluation.reconstructed, []
+    """Lets one voxel of backprojection fail in each second scene."""
+    solve, scenes = Solver.forward, []
 
-    def reconstructed(method, scene):
-        if method.options["name"] != "backprojection":
-            return made(method, scene)
-        (name,) = scene["name"]
-        scenes.extend([name] if name not in scenes else [])
-        volume = 0.999 * scene["volume"]
-        volume[..., 0, 0, 0] = [0.0, math.nan, 0.0, math.inf][scenes.index(name)]
+    def forward(method, views, A):
+        out = solve(method, views, A)
+        if method.solve is not backprojection:
+            return out
+        scene = views.sum().item()
+        scenes.extend([scene] if scene not in scenes else [])
+        volume = out.volume.clone()
+        volume[..., 0, 0, 0] = [0.0, math.nan, 0.0, math.inf][scenes.index(scene)]
         return Reconstruction(volume, sigma=torch.ones_like(volume))
 
-    monkeypatch.setattr(evaluation, "reconstructed", reconstructed)
+    monkeypatch.setattr(Solver, "forward", forward)
 
 
 def test_a_failed_volume_is_counted_shown_and_never_averaged_away(settings, spoilt, tmp_path):

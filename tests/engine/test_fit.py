@@ -42,7 +42,7 @@ def all_plain(value):
 def test_a_checkpoint_loads_with_torch_defaults_and_is_plain(run, settings):
     state = torch.load(checkpoints.finished(run, "cross_view_small"))
     assert state["global_step"] == settings["trainer"]["max_steps"]
-    assert state["hyper_parameters"]["model"] == settings["model"]
+    assert state["hyper_parameters"]["method"] == settings["method"]
     assert all_plain(state["hyper_parameters"]) and all_plain(state["callbacks"])
 
 
@@ -146,13 +146,13 @@ def test_a_label_is_used_once(settings):
 
 
 def test_the_main_method_goes_by_its_file_of_settings_whatever_its_class(settings):
-    """A class has many files: the U-Net in the world is cross_view without cameras' networks."""
-    unet = compose("experiment=smoke", "model=world_unet")
-    assert unet["model"]["name"] == settings["model"]["name"] == "cross_view"
-    assert list(fit.methods(unet)) == ["world_unet", "sirt"]
-    mine = compose("experiment=smoke", "model=world_unet", "label=mine")
+    """A class has several files."""
+    counts = compose("experiment=smoke", "method=cross_view_counts")
+    assert counts["method"]["name"] == settings["method"]["name"] == "cross_view"
+    assert list(fit.methods(counts)) == ["cross_view_counts", "sirt"]
+    mine = compose("experiment=smoke", "method=world_unet", "label=mine")
     assert list(fit.methods(mine)) == ["mine", "sirt"]
-    assert list(fit.methods({**unet, "label": None})) == ["cross_view", "sirt"], "of a run of then"
+    assert list(fit.methods({**counts, "label": None})) == ["cross_view", "sirt"]
 
 
 def test_no_method_is_labelled_as_the_truth(settings):
@@ -180,8 +180,8 @@ def test_a_run_folder_is_found_from_anything_in_it(tmp_path):
 
 
 def test_the_progress_line_has_the_label_of_the_table(settings, tmp_path):
-    compared = {**settings["compare"], "other": settings["model"]}
+    compared = {**settings["compare"], "other": settings["method"]}
     both = {**settings, "compare": compared, "callbacks": compose()["callbacks"]}
-    for label in (settings["model"]["name"], "other"):
+    for label in (settings["method"]["name"], "other"):
         line = fit.build_trainer(both, tmp_path, label).progress_bar_callback
         assert isinstance(line, StepProgress) and line.label == label

@@ -11,7 +11,7 @@ from mvrecon.engine import fit
 from mvrecon.engine.graph import GraphedLoss, Pass, captured, check_graph
 
 TRAINER = {"accelerator": "gpu", "devices": 1, "precision": "bf16-mixed"}
-MODEL, DATA = {"name": "cross_view", "support": "none"}, {"rigs": 0}
+METHOD, DATA = {"name": "cross_view", "support": "none"}, {"rigs": 0}
 
 
 def again(step):
@@ -76,10 +76,9 @@ REFUSED = {
     "no GPU": ({"accelerator": "cpu"}, {}, {}, "a GPU, got a training on a CPU"),
     "several devices": ({"devices": 2}, {}, {}, "one device, got trainer.devices=2"),
     "scaled losses": ({"precision": "16-mixed"}, {}, {}, "got trainer.precision=16-mixed"),
-    "a hull": ({}, {"name": "single_pass", "support": "hull"}, {}, "got model.support=hull"),
-    "a crop": ({}, {"support": "hull", "crop": True}, {}, "got model.crop=true"),
+    "a crop": ({}, {"support": "hull", "crop": True}, {}, "got method.crop=true"),
     "many rigs": ({}, {}, {"rigs": 4}, "one rig, got data.rigs=4"),
-    "alignment": ({}, {"name": "corrected"}, {}, "got corrected"),
+    "alignment": ({}, {"name": "aligned"}, {}, "got aligned"),
 }
 
 
@@ -89,13 +88,14 @@ def test_what_no_graph_can_hold_is_refused(what, monkeypatch):
     step.
     """
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    check_graph(TRAINER, MODEL, DATA)
-    check_graph(TRAINER, {"name": "cross_view", "support": "hull"}, DATA)  # on the whole grid
-    trainer, model, data, words = REFUSED[what]
-    with pytest.raises(ValueError, match=f"trainer.graph=true needs .*{words}; trainer.graph=f"):
-        check_graph({**TRAINER, **trainer}, {**MODEL, **model}, {**DATA, **data})
+    A, own = SimpleNamespace(per_case=False), SimpleNamespace(per_case=True)
+    check_graph(TRAINER, METHOD, DATA, A)
+    check_graph(TRAINER, METHOD | {"support": "hull"}, DATA, A)  # on the whole grid
+    trainer, method, data, message = REFUSED[what]
+    with pytest.raises(ValueError, match=f"trainer.graph=true needs .*{message}; trainer.graph=f"):
+        check_graph(TRAINER | trainer, METHOD | method, DATA | data, A)
     with pytest.raises(ValueError, match="one operator for all cases"):
-        check_graph(TRAINER, MODEL, DATA, own_operators=True)
+        check_graph(TRAINER, METHOD, DATA, own)
 
 
 def test_a_run_on_a_cpu_says_that_it_has_no_graph(tmp_path):

@@ -14,7 +14,7 @@ from mvrecon.engine.program import exported
 from mvrecon.projectors import torch_ops
 
 #: Short, since each step of SIRT is written into the program.
-SHORT = ("model.start=2", "model.consistency=1", "grid.size=[16,16,16]")
+SHORT = ("method.start=2", "method.consistency=1", "grid.size=[16,16,16]")
 RIG = ("camera.n_views=3", "camera.detector.pixels=24", "camera.detector.pixel_mm=11")
 
 
@@ -24,7 +24,7 @@ def method(*options: str) -> ReconstructionModule:
     geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
     torch.manual_seed(0)
     module = ReconstructionModule(
-        geometry, settings["model"], settings["loss"], settings["optimizer"], data_range=1.0
+        geometry, settings["method"], settings["loss"], settings["optimizer"], data_range=1.0
     ).eval()
     with torch.no_grad():
         for parameter in module.parameters():
@@ -37,8 +37,8 @@ def views_of(module: ReconstructionModule) -> torch.Tensor:
 
 
 def test_a_program_has_the_volumes_of_the_cross_view_model():
-    module = method("model=cross_view")
-    program = exported(module.model, torch.ones_like(views_of(module)))
+    module = method("method=cross_view")
+    program = exported(module.method, module.projector, torch.ones_like(views_of(module)))
     called = {str(node.target) for node in program.graph.nodes if node.op == "call_function"}
     assert {"mvrecon.project.default", "mvrecon.backproject.default"} <= called
     views = views_of(module)
@@ -50,7 +50,7 @@ def test_a_program_has_the_volumes_of_the_cross_view_model():
 
 def test_a_program_in_a_file_has_the_volumes_of_its_method(tmp_path: Path):
     assert torch_ops.ops is not None  # all of them are known to torch from here on
-    module = method("model=world_unet")
+    module = method("method=world_unet")
     run = weights_file.write(tmp_path / "a.safetensors", Trained(module, seconds=0.0, steps=0))
     program = torch.export.load(mv.save_program(run, tmp_path / "a.pt2"))
     views = views_of(module)
@@ -64,6 +64,6 @@ def test_a_program_in_a_file_has_the_volumes_of_its_method(tmp_path: Path):
 
 def test_a_method_that_looks_at_its_views_is_not_exported():
     """A method whose steps depend on its views' values is not exported: the error says why."""
-    module = method("model=world_unet", "model.support=hull")
+    module = method("method=world_unet", "method.support=hull")
     with pytest.raises(ValueError, match="no fixed sequence of steps.*support=none"):
-        exported(module.model, torch.ones_like(views_of(module)))
+        exported(module.method, module.projector, torch.ones_like(views_of(module)))

@@ -16,13 +16,13 @@ def scene(error: float) -> tuple[Reconstruction, dict]:
     wrong = torch.full_like(truth, error)
     wrong[..., :2] *= 3
     views = torch.ones(1, 1, 2, 4, 4)
-    opinions = torch.stack([truth + error, truth - error], dim=1)
+    estimates = torch.stack([truth + error, truth - error], dim=1)
     out = Reconstruction(
         truth + wrong,
         sigma=torch.full_like(truth, 1.5 * error),
-        opinions=opinions,
-        weights=torch.full_like(opinions, 0.5),
-        cross_views=views[..., :2, :2] * (1 + error),
+        per_view=estimates,
+        weights=torch.full_like(estimates, 0.5),
+        predictions=views[..., :2, :2] * (1 + error),
     )
     return out, {"volume": truth, "inside": truth > 0, "views": views}
 
@@ -32,7 +32,7 @@ def test_figures_of_a_scene():
     figures = quality_of(out, case)
     assert figures["coverage_68"] == figures["coverage_95"] == 0.5
     assert figures["predicted_nrmse"] == pytest.approx(float(0.15 * 8 / out.volume.norm()))
-    assert figures["opinion_spread"] == pytest.approx(0.1, rel=1e-4)
+    assert figures["per_view_spread"] == pytest.approx(0.1, rel=1e-4)
     assert figures["cross_view_nrmse"] == pytest.approx(0.1, rel=1e-4)
     assert quality_of(Reconstruction(out.volume), case) == {}
 
@@ -61,7 +61,7 @@ def test_ranks_over_the_scenes_and_words():
     assert "rank" not in row["coverage_68"] and len(row["coverage_68"]["values"]) == 4
     words = sentence(row)
     assert words.startswith("intervals of 68 % and 95 % cover 50.0% and 50.0% of the voxels inside")
-    assert "sigma 1.00, spread of opinions 1.00" in words and words.endswith("view NRMSE -1.00")
+    assert "sigma 1.00, spread of per-view estimates 1.00" in words and words.endswith("view NRMSE -1.00")
     plain = [{"nrmse": e, "view_nrmse": e} for e in errors]
     assert sentence(quality_row(plain)["quality"]) == ""
 

@@ -70,9 +70,9 @@ def test_a_run_of_an_older_version_keeps_its_grid(run: Path, tmp_path: Path):
 
 
 def test_a_method_begins_with_the_weights_of_another_on_any_rig(run: Path, tmp_path, monkeypatch):
-    """`init_from`, once; a run that goes on has weights of its own. Another model's are refused."""
+    """`init_from`, once; a run that goes on has weights of its own. Those of another method are refused."""
     options = ("experiment=smoke", "camera.n_views=5", f"init_from={run}", "seed=7")
-    settings, weights = compose(*options), mv.load(run).module.model.state_dict()
+    settings, weights = compose(*options), mv.load(run).module.method.state_dict()
     begun: list[dict[str, torch.Tensor]] = []
 
     class Trainer:
@@ -80,14 +80,14 @@ def test_a_method_begins_with_the_weights_of_another_on_any_rig(run: Path, tmp_p
         save_checkpoint = staticmethod(lambda path: None)
 
         def fit(self, module, **_):
-            begun.append(module.model.state_dict())
+            begun.append(module.method.state_dict())
 
     monkeypatch.setattr(fit, "build_trainer", lambda *_: Trainer())
     fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     assert all(torch.equal(begun[0][name], value) for name, value in weights.items())
-    other = compose(*options, "model=backprojection_unet")
-    with pytest.raises(ValueError, match="weights of the same model.*'backprojection_unet'"):
-        fit.fit("backprojection_unet", other, fit.build_data(other), tmp_path)
+    other = compose(*options, "method=world_unet")
+    with pytest.raises(ValueError, match="weights of the same method.*'world_unet'"):
+        fit.fit("world_unet", other, fit.build_data(other), tmp_path)
 
 
 def test_the_checkpoint_of_the_best_validation_is_kept(run: Path):

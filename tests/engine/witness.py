@@ -15,7 +15,7 @@ STEP = ReconstructionModule.training_step
 
 def weights(self):
     """Write down the weights of this process."""
-    flat = torch.cat([p.detach().flatten() for p in self.model.parameters()])
+    flat = torch.cat([p.detach().flatten() for p in self.method.parameters()])
     torch.save(flat, Path(self.trainer.default_root_dir) / f"weights{self.trainer.global_rank}.pt")
 
 
