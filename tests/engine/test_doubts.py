@@ -11,7 +11,7 @@ from mvrecon.data.projections.views import Corrected
 from mvrecon.engine.doubts import doubts, oriented_nrmse
 from mvrecon.engine.scan import Scan
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS, RECONSTRUCTORS
+from mvrecon.parts import METHODS, PROJECTORS
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.radon import Radon
 from mvrecon.reconstructors.problem import takes
@@ -93,11 +93,11 @@ def test_a_plugins_own_words_decide_what_is_doubted(views, monkeypatch):
     every view is read once.
     """
     monkeypatch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts})
-    monkeypatch.setattr(RECONSTRUCTORS, "_parts", {**RECONSTRUCTORS._parts})
+    monkeypatch.setattr(METHODS, "_parts", {**METHODS._parts})
     PROJECTORS.register("as_lines")(lambda grid, cameras: Drr(grid, cameras))
     PROJECTORS.register("doubled")(lambda grid, cameras: 2 * Drr(grid, cameras))
-    RECONSTRUCTORS.register("of_lines")(lambda A, views: views)
-    RECONSTRUCTORS.register("of_counts")(takes("counts")(lambda A, counts: counts))
+    METHODS.register("of_lines")(lambda A, views: views)
+    METHODS.register("of_counts")(takes("counts")(lambda A, counts: counts))
     counts = (4e4 * torch.exp(-views)).round()
     assert "whole numbers" in "".join(doubts(scan_of(counts, "as_lines"), "of_lines", 0.1))
     assert "whole numbers" not in "".join(doubts(scan_of(counts, "as_lines"), "of_counts", 0.1))

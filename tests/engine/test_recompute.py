@@ -1,7 +1,7 @@
 """Activation checkpointing: the same gradients from less memory."""
 
 import torch
-from mvrecon.models.networks import UNet3d
+from mvrecon.models.unet import PlainUNet
 from torch.autograd.graph import saved_tensors_hooks
 
 from mvrecon.engine.recompute import Recompute
@@ -23,12 +23,12 @@ def gradients(model, x):
 
 def test_recomputed_activations_give_the_same_gradients_from_less_memory():
     torch.manual_seed(0)
-    network, x = UNet3d(1, 1, width=4, levels=2), torch.randn(1, 1, 12, 12, 12)
+    network, x = PlainUNet(3, 1, 1, (4, 8)), torch.randn(1, 1, 12, 12, 12)
     whole, stored = gradients(network, x)
     network.zero_grad()
 
     class Module:
-        model = network
+        method = network
 
     Recompute().setup(None, Module(), "fit")
     again, less = gradients(network, x)
