@@ -19,8 +19,8 @@ from mvrecon.config.values import fits
 from mvrecon.parts import PROJECTORS
 
 MISTAKES = {
-    "camera.view=4": r"There is no setting 'camera.view'; did you mean 'n_views'\?",
-    "model=crossview": r"model has no choice 'crossview'; did you mean 'cross_view'\?",
+    "camera.view=4": r"camera \(the camera 'circular'\) has no option 'view'; did you mean 'n_views'\?",
+    "method=crossview": r"method has no choice 'crossview'; did you mean 'cross_view'\?",
     "camera.n_views=abc": r"camera.n_views: expected int > 0, got 'abc' \(number of cameras",
     "grid.spacing=x": r"grid.spacing: expected float > 0 or \[float > 0, .*\], got 'x' \(.*mm",
     "grid.size=[32,32]": r"grid.size: expected \[int > 0, int > 0, int > 0\] .*got \[32, 32\]",
@@ -28,10 +28,12 @@ MISTAKES = {
     "projector.name=dr": r"projector.name: no projector is 'dr'; did you mean 'drr'\?",
     "+projector.metod=joseph": r"'metod'; did you mean 'method'\?",
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
-    "modle=sirt": r"There is no setting 'modle'; did you mean 'model'\?",
+    "methd=sirt": r"There is no setting 'methd'; did you mean 'method'\?",
+    "model=sirt": r"'model' is called method now",
+    "model.head=density": r"'model' is called method now",
     "seed=x": r"Value 'x' of type 'str' could not be converted to Integer$",
     "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
-    "head=density": r"'head' is a part of a model; to choose it: head@model.head=...",
+    "head=density": r"'head' is a part of a method; to choose it: method.head=...",
     "+foo=1": r"does not use the setting 'foo'",
 }
 
@@ -73,9 +75,9 @@ def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
 def test_an_experiment_of_another_app_is_told_as_one(answer):
     """Hydra alone would propose to override a part of the experiment."""
     text = answer("experiment=smoke", app="simulate")
-    assert "experiment/smoke is for another app: it chooses 'model', which is not here" in text
-    text = answer("model=sirt", app="simulate")
-    assert "This app chooses no 'model'; --help shows what it chooses" in text
+    assert "experiment/smoke is for another app: it chooses 'method', which is not here" in text
+    text = answer("method=sirt", app="simulate")
+    assert "This app chooses no 'method'; --help shows what it chooses" in text
 
 
 def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it():
@@ -88,8 +90,8 @@ def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it(
 
 def test_the_traceback_is_there_where_it_is_asked_for(answer, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    monkeypatch.setattr(sys, "argv", ["mvrecon-train", "model=crossview"])
-    with pytest.raises(Exception, match="Could not find 'model/crossview'"):
+    monkeypatch.setattr(sys, "argv", ["mvrecon-train", "method=crossview"])
+    with pytest.raises(Exception, match="Could not find 'method/crossview'"):
         launch(reached, "train")
 
 
@@ -164,7 +166,7 @@ def test_every_choice_of_ours_fits_the_types_of_its_part():
         "scene",
         "camera",
         "projector",
-        "model",
+        "method",
         "data",
         "acquisition",
         "optimizer",

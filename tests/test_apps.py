@@ -59,7 +59,7 @@ def test_a_run_folder_holds_what_it_should(run):
     )
     settings = yaml.safe_load((folder / "config.yaml").read_text())
     assert settings["name"] == "smoke" and settings["seed"] == 3 and "hydra" not in settings
-    assert {"planes.png", "mip.png", "views.png", "opinions.png", "weights.png"} <= {
+    assert {"planes.png", "mip.png", "views.png", "per_view.png", "weights.png"} <= {
         p.name for p in next((folder / "review").iterdir()).iterdir()
     }
 
@@ -83,7 +83,7 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     ).Reload()
     tags, results = board.Tags(), test.Tags()
     kinds = [tag.split("/")[0] for tag in tags["images"]]
-    assert sorted(kinds) == ["mip", "opinions", "planes", "views", "weights"]
+    assert sorted(kinds) == ["mip", "per_view", "planes", "views", "weights"]
     assert [tag.split("/")[0] for tag in results["images"]] == ["slices"] * 2
     slices = test.Images(results["images"][0])
     assert [image.step for image in slices] == list(range(17))
@@ -102,10 +102,10 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     assert "hp_metric" not in tags["scalars"]
     data = test.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     session = HParamsPluginData.FromString(data).session_start_info.hparams
-    names = {key: session[key].string_value for key in ("method", "model.name", "scene.name")}
+    names = {key: session[key].string_value for key in ("method", "method.name", "scene.name")}
     assert names == {
         "method": "cross_view_small",
-        "model.name": "cross_view",
+        "method.name": "cross_view",
         "scene.name": "ellipsoids",
     }
 
@@ -178,7 +178,7 @@ def test_resume_goes_on_in_the_same_folder(run, tmp_path):
     [
         (mvrecon.eval, ["checkpoint=nowhere.ckpt"], "No checkpoint or run folder is at"),
         (mvrecon.train, ["experiment=smoke", "optimizer.lr=1e30"], "is not finite at step"),
-        (mvrecon.train, ["experiment=smoke", "model.name=cros_view"], "did you mean 'cross_view'"),
+        (mvrecon.train, ["experiment=smoke", "method.name=cros_view"], "did you mean 'cross_view'"),
         (
             mvrecon.train,
             ["experiment=smoke", "test_scene=ellipsoids"],

@@ -58,11 +58,11 @@ def needed_in(options: dict, above: str = "") -> list[str]:
     return inner + [f"{above}{key}" for key, value in options.items() if value == "???"]
 
 
-#: Groups whose part is an option of the model.
-NESTED = {"head": "head@model.head", "network": "network@model.network"}
+#: Groups whose part is an option of the method.
+NESTED = {"head": "+head@method.head", "network": "+network@method.network"}
 
 
-@pytest.mark.parametrize("group", ["scene", "camera", "projector", "model", *NESTED])
+@pytest.mark.parametrize("group", ["scene", "camera", "projector", "method", *NESTED])
 def test_every_option_of_a_group_names_a_part_and_composes(group: str):
     from mvrecon.parts import REGISTRIES
 
@@ -72,15 +72,15 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
         key = NESTED.get(group, group)
         needed = needed_in(yaml.safe_load(file.read_text()))
         node = compose(
-            *(["model=single_pass"] if group in NESTED else []),
+            *(["method=world_unet"] if group in NESTED else []),
             f"{key}={file.stem}",
             *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed),
         )
-        part = node["model"][group] if group in NESTED else node[group]
+        part = node["method"][group] if group in NESTED else node[group]
         assert part["name"] in REGISTRIES[group].names()
 
 
-@pytest.mark.parametrize("choice", ["model=world_unet", "model=single_pass", "camera=random"])
+@pytest.mark.parametrize("choice", ["method=world_unet", "method=mean_fusion", "camera=random"])
 def test_the_smallest_experiment_takes_any_model_and_camera_as_its_file_has_it(choice: str):
     group = choice.partition("=")[0]
     assert compose("experiment=smoke", choice)[group] == compose(choice)[group]
@@ -97,28 +97,20 @@ def test_every_file_of_acquisitions_sets_every_option():
     assert Acquisition.of(compose()["acquisition"]) == Acquisition()
 
 
-def test_head_and_networks_are_chosen_on_the_command_line():
-    plain = "model=single_pass"
-    assert compose(plain, "head@model.head=density")["model"]["head"]["name"] == "density"
-    unchanged, model = (
-        compose(plain, *more)["model"] for more in ((), ("network@model.opinion.network=unet",))
-    )
-    assert "network" not in {*unchanged, *unchanged["opinion"], *model}
-    assert model["opinion"] == {
-        **unchanged["opinion"],
-        "network": {"name": "unet", "width": 16, "levels": 3},
-    }
+def test_every_option_of_a_method_composes_with_every_experiment():
+    """Options are flat, and those of the signature, whatever the files say."""
+    for line in ("method.head=density", "method.fusion=mean", "method.depth=uniform"):
+        key, _, value = line.removeprefix("method.").partition("=")
+        for experiment in ("quickstart", "open_kbp", "smoke"):
+            assert compose(f"experiment={experiment}", line)["method"][key] == value
+    assert compose("camera.arc_degrees=200")["camera"]["arc_degrees"] == 200
+    tv = compose("experiment=wrong_cameras", "compare.tv.iterations=7")["compare"]["tv"]
+    assert tv == {"name": "fista_tv", "weight": 1e-4, "iterations": 7}
 
 
-def test_a_reconstructor_is_chosen_on_the_command_line_with_its_own_options_alone():
-    files = sorted((conf_dir() / "reconstructor").glob("*.yaml"))
-    assert files
-    for file in files:
-        options = yaml.safe_load(file.read_text())
-        needed = [f"model.reconstructor.{name}=x" for name, v in options.items() if v == "???"]
-        choice = f"reconstructor@model.reconstructor={file.stem}"
-        node = compose("model=classical", choice, *needed)["model"]["reconstructor"]
-        assert node == {name: "x" if v == "???" else v for name, v in options.items()}
+def test_a_network_is_chosen_on_the_command_line():
+    line = "+network@method.network=unet"
+    assert compose("method=world_unet", line)["method"]["network"] == {"name": "unet"}
 
 
 def test_a_path_is_one_value_whatever_signs_are_in_it(tmp_path: Path):
@@ -126,11 +118,11 @@ def test_a_path_is_one_value_whatever_signs_are_in_it(tmp_path: Path):
     quotes, is one value on the command line; what is no path is left as it is.
     """
     parser = OverridesParser.create()
-    for name in ("camera.n_views=4,model=sirt", "my scan (2)", "o'brien, {3}"):
+    for name in ("camera.n_views=4,method=sirt", "my scan (2)", "o'brien, {3}"):
         (tmp_path / name).mkdir()
         lines = with_paths_quoted([f"checkpoint={tmp_path / name}"])
         assert parser.parse_overrides(lines)[0].value() == str(tmp_path / name)
-    for line in ("model=sirt,cross_view", "data.sizes={train: 3}", "--config-dir=a,b", "seed=3"):
+    for line in ("method=sirt,cross_view", "data.sizes={train: 3}", "--config-dir=a,b", "seed=3"):
         assert with_paths_quoted([line]) == [line]
 
 
@@ -177,25 +169,8 @@ def test_a_mistyped_override_is_an_error_that_names_it(override: str, message: s
     assert re.search(message, f"{error.value}{error.value.__cause__}")
 
 
-def test_a_model_takes_no_options_that_an_experiment_has_for_another_one(user_conf):
-    """A model that the command line chooses in place of an experiment's own is refused the own
-    one's options, under whose file's name a table would show what it is not.
-    """
-    rounds = "[{resolution: full, widths: [4], cameras: {name: rays2d}}]"
-    mine = user_conf(f"defaults:\n  - override /model: cross_view\nmodel: {{rounds: {rounds}}}")
-    message = r"model.rounds of its model=cross_view; got model={}, expected {} on the command"
-    with pytest.raises(ValueError, match=message.format("world_unet", r"model.rounds=\.\.\.")):
-        compose(*mine, "model=world_unet")
-    with pytest.raises(ValueError, match=message.format("sirt", "~model.rounds")):
-        compose(*mine, "model=sirt")
-    assert compose(*mine, "model=sirt", "~model.rounds")["model"] == compose("model=sirt")["model"]
-    in_world = "model.rounds=[{resolution:full,widths:[4],cameras:null}]"
-    assert compose(*mine, "model=world_unet", in_world)["model"]["rounds"][0]["cameras"] is None
-    assert compose(*mine, "model=cross_view")["model"]["rounds"][0]["widths"] == [4]
-
-
 def test_an_experiment_may_add_compared_models(user_conf):
-    settings = compose(*user_conf("defaults:\n  - /model@compare.sirt: sirt\nname: mine\nseed: 4"))
+    settings = compose(*user_conf("defaults:\n  - /method@compare.sirt: sirt\nname: mine\nseed: 4"))
     assert settings["seed"] == 4
     assert settings["compare"]["sirt"]["name"] == "sirt"
 
@@ -234,10 +209,10 @@ def test_a_plugin_brings_its_own_choices_even_if_its_code_is_broken(
 
 def test_the_help_shows_every_choice_and_setting_that_the_app_takes():
     taken = {
-        "train": {"scene", "camera", "projector", "model", "head", "network", "optimizer"},
+        "train": {"scene", "camera", "projector", "method", "head", "network", "optimizer"},
         "eval": {"scene", "acquisition", "experiment"},
         "simulate": {"scene", "camera", "projector", "acquisition"},
-        "reconstruct": {"camera", "projector", "reconstructor", "correct"},
+        "reconstruct": {"camera", "projector", "method", "correct"},
     }
     for app, groups in taken.items():
         text = help_text(app)
@@ -245,7 +220,11 @@ def test_the_help_shows_every_choice_and_setting_that_the_app_takes():
         for group in groups:
             assert all(file.stem in text for file in (conf_dir() / group).glob("*.yaml")), group
         assert (conf_dir() / f"{app}.yaml").read_text() in text
-    for app, group in {"simulate": "optimizer", "eval": "model", "reconstruct": "model"}.items():
+    for app, group in {
+        "simulate": "optimizer",
+        "eval": "method",
+        "reconstruct": "optimizer",
+    }.items():
         assert not re.search(rf"^  {group} ", help_text(app), re.MULTILINE)
 
 

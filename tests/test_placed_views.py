@@ -21,7 +21,7 @@ GRID = Grid.centred(12, spacing=3.0)
 PARTS = {
     "grid": {"like": None, "size": 12, "spacing": 3.0, "centre": [0.0, 0.0, 0.0]},
     "projector": {"name": "drr"},
-    "reconstructor": {"name": "fdk"},
+    "method": {"name": "fdk"},
 }
 
 

@@ -81,10 +81,10 @@ def error_of(scan, path):
 @pytest.mark.parametrize(
     ("method", "limit"),
     [
-        (("reconstructor=fdk", "reconstructor.filter=hann"), 0.3),
-        (("reconstructor=sirt", "reconstructor.momentum=true"), 0.25),
-        (("reconstructor=cgls", "choose={every: 8}"), 0.25),
-        (("reconstructor=os_sart", "stop.sigma=0.001"), 0.25),
+        (("method=fdk", "method.filter=hann"), 0.3),
+        (("method=sirt", "method.momentum=true"), 0.25),
+        (("method=cgls", "choose={every: 8}"), 0.25),
+        (("method=os_sart", "stop.sigma=0.001"), 0.25),
     ],
 )
 def test_a_scan_as_a_detector_stores_it_comes_back_in_place_and_in_hu(
@@ -206,7 +206,7 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, monkeypatc
     monkeypatch.setattr("mvrecon.engine.doubts.doubts", lambda *_: [])
     read = MeasuredViews.read
     monkeypatch.setattr(MeasuredViews, "read", lambda *a: reads.append(a) or read(*a))
-    options = (f"reconstructor={method}", "views.every=4", f"out={tmp_path}/volume.nii.gz")
+    options = (f"method={method}", "views.every=4", f"out={tmp_path}/volume.nii.gz")
     assert run(scan, tmp_path / "run", *options) == 0
     last = {"fdk": 2}.get(method, 1)  # FDK is streamed: its views need not fit into memory
     assert sum(b - a for _, a, b in reads) == last * 10
@@ -285,7 +285,7 @@ def test_saturated_pixels_are_told_by_every_way_of_reading(scan, tmp_path, metho
             run(
                 scan,
                 tmp_path / "run",
-                f"reconstructor={method}",
+                f"method={method}",
                 "views.saturation=49500",
                 "views.flat=49000",
             )

@@ -44,7 +44,7 @@ def sweep(tmp_path):
     for name, views, values, ms in (("ours", 8, BETTER, 9.0), ("unet", 4, EASY, 3.0)):
         settings = {
             "name": "sweep",
-            "model": {"name": name, "width": views},
+            "method": {"name": name, "width": views},
             "camera": {"n_views": views, "sid": 400.0},
         }
         run(tmp_path / name, settings, **{name: (values, ms), "sirt": (EASY, 100.0)})
@@ -69,19 +69,19 @@ def test_an_interval_of_pairs_does_not_care_how_different_patients_are(sweep):
 
 def test_runs_are_named_by_what_differs(sweep):
     names = {row.run for row in read([sweep])}
-    assert names == {"model=ours, camera.n_views=8", "model=unet, camera.n_views=4"}
+    assert names == {"method=ours, camera.n_views=8", "method=unet, camera.n_views=4"}
     assert {row.run for row in read([sweep / "ours"])} == {"ours"}
 
 
 def test_the_runs_of_a_sweep_have_its_names_and_long_values_numbers(tmp_path):
-    for k, name in enumerate(("model=small", "model=unet", "model=small,views=4")):
+    for k, name in enumerate(("method=small", "method=unet", "method=small,views=4")):
         model = {"name": "cross_view", "rounds": [{"widths": [8 << (k % 2)], "resolution": "half"}]}
-        run(tmp_path / name, {"model": model, "views": k // 2}, cross_view=(EASY, 1.0))
+        run(tmp_path / name, {"method": model, "views": k // 2}, cross_view=(EASY, 1.0))
     names = [row.run for row in read([tmp_path])]
-    assert names == ["model=small", "model=small,views=4", "model=unet"]
-    (tmp_path / "model=small").rename(tmp_path / "first")
+    assert names == ["method=small", "method=small,views=4", "method=unet"]
+    (tmp_path / "method=small").rename(tmp_path / "first")
     names = {row.run for row in read([tmp_path])}
-    texts = ["model.rounds=#1, views=0", "model.rounds=#1, views=1", "model.rounds=#2, views=0"]
+    texts = ["method.rounds=#1, views=0", "method.rounds=#1, views=1", "method.rounds=#2, views=0"]
     assert names == set(texts)
 
 

@@ -110,7 +110,7 @@ WAYS_OUT = ("../../out", "/etc/out", "a/../../b", "..", "a\\..\\b", "a\nb")
 SETTINGS: dict[str, dict[str, Any]] = {
     "an instantiator": {"_instantiator": "os.system", "_class_path": "os.system"},
     "another key": {"checkpoint_path": "x"},
-    "a target": {"model": {"name": "backprojection_unet", "_target_": "os.system"}},
+    "a target": {"method": {"name": "world_unet", "_target_": "os.system"}},
     "an object": {"loss": {"volume": torch.zeros(2)}},
     "a class": {"loss": {"volume": torch.float32}},
 }

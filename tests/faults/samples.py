@@ -46,7 +46,7 @@ METHOD = {
         "camera": {**RIG, "n_views": 2, "detector": {"pixels": [6, 6], "pixel_mm": 9.0}},
         "projector": {"name": "drr"},
     },
-    "model": {"name": "backprojection_unet", "width": 2},
+    "method": {"name": "world_unet", "widths": [2]},
     "loss": {"volume": 1.0},
     "optimizer": {"name": "adamw", "lr": 1e-3, "schedule": "constant", "warmup": 0.0},
     "data_range": 0.04,

@@ -106,9 +106,9 @@ def test_settings_in_a_checkpoint_are_names_and_numbers(name: str, kept: dict, t
 def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: Path):
     evil = {
         **kept,
-        "hyper_parameters": {**kept["hyper_parameters"], "model": {"name": "os.system"}},
+        "hyper_parameters": {**kept["hyper_parameters"], "method": {"name": "os.system"}},
     }
-    with pytest.raises(Refused, match="No model is named 'os.system'"):
+    with pytest.raises(Refused, match="No method is named 'os.system'"):
         load(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
@@ -198,7 +198,7 @@ def test_weights_that_are_not_finite_are_refused(value: float, kept: dict, tmp_p
         )
         for reader in (load, read_newest):
             with pytest.raises(
-                Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'model.* among them"
+                Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'method.* among them"
             ):
                 reader(path)
 
@@ -207,7 +207,7 @@ def without(mapping: dict, name: str) -> dict:
     return {key: value for key, value in mapping.items() if key != name}
 
 
-FUTURE = {"model": {"name": "sirt", "warp": 9}}
+FUTURE = {"method": {"name": "sirt", "warp": 9}}
 #: What is done to a checkpoint whose first weight has this name, and what the refusal names.
 AMISS = {
     "a weight too few": (

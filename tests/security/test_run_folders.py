@@ -65,7 +65,7 @@ def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: 
     name: they stay.
     """
     settings = compose(*OPTIONS)
-    settings |= {"compare": {"Documents": settings["model"]}, "model": {"name": "backprojection"}}
+    settings |= {"compare": {"Documents": settings["method"]}, "method": {"name": "backprojection"}}
     folder = run_folder(tmp_path / "sent", settings)
     (folder / "checkpoints").symlink_to(home)
     before = contents(home)
@@ -131,7 +131,7 @@ def test_only_named_files_are_removed(tmp_path: Path):
 def test_a_label_is_a_name(label: str):
     """The label of a compared method is a name and no path, or nothing is trained."""
     with pytest.raises(Refused, match="has the name"):
-        fit.methods({"model": {"name": "sirt"}, "compare": {label: {"name": "sirt"}}})
+        fit.methods({"method": {"name": "sirt"}, "compare": {label: {"name": "sirt"}}})
 
 
 def outside(home: Path) -> dict[str, dict]:
@@ -254,7 +254,7 @@ def test_a_checkpoint_gives_a_callback_no_place_outside(home: Path, tmp_path: Pa
         "spikes": {"_target_": "lightning.pytorch.callbacks.spike.SpikeDetection"}
     }
     folder = tmp_path / "run"
-    trainer = fit.build_trainer(settings, folder, settings["model"]["name"])
+    trainer = fit.build_trainer(settings, folder, settings["method"]["name"])
     spikes = next(
         callback for callback in trainer.callbacks if type(callback).__name__ == "SpikeDetection"
     )

@@ -23,7 +23,7 @@ UNUSED = [
     ("eval", "+gird.spacing=2.0"),
     ("eval", "+loss.volume=1"),
     ("eval", "+projector.name=drr"),
-    ("eval", "+model.name=sirt"),
+    ("eval", "+methods.name=sirt"),
     ("eval", "+seed=5"),
     ("eval", "+resume=x"),
     ("train", "+checkpoint=x"),
@@ -31,9 +31,9 @@ UNUSED = [
     ("train", "+save=true"),
     ("train", "+camra.n_views=12"),
     ("simulate", "+loss.volume=1"),
-    ("reconstruct", "+model.name=sirt"),
+    ("reconstruct", "+methods.name=sirt"),
     ("reconstruct", "+loss.volume=1"),
-    ("simulate", "+model.name=sirt"),
+    ("simulate", "+methods.name=sirt"),
     ("bench", "+device=cpu"),
     ("stress", "+bench.name=operators"),
 ]
@@ -52,7 +52,7 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("option", ["seed=5", "model=sirt", "loss.volume=2.0", "projector=drr"])
+@pytest.mark.parametrize("option", ["seed=5", "method=sirt", "loss.volume=2.0", "projector=drr"])
 def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
     """The seed, the model, the loss and the projector of an evaluation are those of the run, and
     cannot be typed.

@@ -30,9 +30,9 @@ def test_every_volume_stands_above_its_error():
         assert error.scale.low == -error.scale.high and "1/mm" in error.scale.name
 
 
-def test_opinions_are_differences_from_their_mean():
+def test_per_view_estimates_are_differences_from_their_mean():
     volumes = torch.rand(5, *GRID.shape)
-    mean, *others = review.opinions(CASE, volumes)
+    mean, *others = review.per_view(CASE, volumes)
     assert len(others) == 5
     for k, plane in enumerate(mean.panels):
         together = sum(column.panels[k].pixels for column in others)
@@ -56,8 +56,11 @@ def test_of_many_cameras_a_few_are_shown_with_the_nrmse_of_their_views():
 
 def test_a_title_says_how_many_of_the_cameras_a_sheet_has(monkeypatch):
     monkeypatch.setattr(review, "sheet", lambda title, columns, rows: title)
-    for count, end in ((review.CAMERAS - 1, "opinions"), (8, "opinions, 7 of 8 cameras")):
-        assert review.opinions(CASE, torch.rand(count, *GRID.shape)).endswith(end)
+    for count, end in (
+        (review.CAMERAS - 1, "per-view estimates"),
+        (8, "per-view estimates, 7 of 8 cameras"),
+    ):
+        assert review.per_view(CASE, torch.rand(count, *GRID.shape)).endswith(end)
     views = torch.rand(80, 3, 4)
     assert review.views(views, views).endswith("views, 8 of 80 cameras")
     assert review.weights(CASE, torch.rand(8, *GRID.shape)).endswith("weights of cameras")

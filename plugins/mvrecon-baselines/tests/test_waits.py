@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from mvrecon.testing.as_gpu import AsGpu, on_gpu
+from mvrecon_bench.gpu.as_gpu import AsGpu, on_gpu
 
 from mvrecon.engine.module import ReconstructionModule
 

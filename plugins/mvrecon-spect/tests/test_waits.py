@@ -3,7 +3,7 @@ there, and no answer.
 """
 
 import torch
-from mvrecon.testing.as_gpu import GPU, AsGpu, on_gpu
+from mvrecon_bench.gpu.as_gpu import GPU, AsGpu, on_gpu
 
 from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid

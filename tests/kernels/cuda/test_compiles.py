@@ -2,8 +2,6 @@
 NVRTC and its disassembler are installed, as by the extra `dev` on Linux.
 """
 
-import importlib.util
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +9,6 @@ import torch
 from mvrecon.kernels.cuda import nvrtc
 from mvrecon.kernels.cuda.launch import KERNELS, Variant, text_of
 
-SCRIPT = Path(__file__).parents[3] / "scripts" / "gpu" / "machine_code.py"
 #: Registers of a thread: 65 536 of a multiprocessor for at least 4 blocks of 128 threads.
 MOST = 128
 #: Instructions that read or write local memory, outside the loops of steps.
@@ -28,11 +25,8 @@ PARTS = [Variant("warp", F, B), Variant("look", F), Variant("hull", D)]
 
 @pytest.fixture(scope="module")
 def machine_code():
-    """The script that reads machine code."""
-    spec = importlib.util.spec_from_file_location("machine_code", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    """The module of mvrecon-bench that reads machine code."""
+    module = pytest.importorskip("mvrecon_bench.gpu.machine_code")
     try:
         nvrtc.library(), module.disassembler()
     except OSError as problem:
