@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from mvrecon.engine.trained import load as load
     from mvrecon.engine.trained import save_weights as save_weights
     from mvrecon.geometry.grid import Grid as Grid
+    from mvrecon.models.method import reconstruct as reconstruct
     from mvrecon.projectors.drr import Drr as Drr
     from mvrecon.projectors.operator import LinearOperator as LinearOperator
     from mvrecon.projectors.radon import Radon as Radon
     from mvrecon.reconstructors.bsrem import bsrem as bsrem
-    from mvrecon.reconstructors.by_name import reconstruct as reconstruct
     from mvrecon.reconstructors.cgls import cgls as cgls
     from mvrecon.reconstructors.filtered.fdk import fbp as fbp
     from mvrecon.reconstructors.filtered.fdk import fdk as fdk
@@ -84,7 +84,7 @@ _DOOR = {
     "pdhg_tv": "mvrecon.reconstructors.pdhg_tv:pdhg_tv",
     "random_rig": "mvrecon.cameras.random_rigs:random_rig",
     "read_volume": "mvrecon.data.volume_files:read_volume",
-    "reconstruct": "mvrecon.reconstructors.by_name:reconstruct",
+    "reconstruct": "mvrecon.models.method:reconstruct",
     "save_program": "mvrecon.engine.program:save_program",
     "save_volume": "mvrecon.data.volume_files:save_volume",
     "save_weights": "mvrecon.engine.trained:save_weights",

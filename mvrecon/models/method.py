@@ -12,8 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
 from mvrecon.models.output import Reconstruction
-from mvrecon.parts import METHODS
+from mvrecon.parts import METHODS, PROJECTORS
 from mvrecon.projectors.checks import check_views
 from mvrecon.projectors.operator import Projector
 
@@ -30,7 +32,6 @@ class Solver(nn.Module):
         super().__init__()
         self.solve, self.options = solve, dict(options)
 
-    @torch.no_grad()
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)
         cases = [(A, views)] if not A.per_sample else [
@@ -50,3 +51,34 @@ def build_method(config: Mapping[str, Any]) -> nn.Module:
     name, options = config["name"], {k: v for k, v in config.items() if k != "name"}
     part = METHODS.get(name)
     return part(**options) if inspect.isclass(part) else Solver(part, options)
+
+
+def reconstruct(
+    views: Float[Tensor, "b c m v u"],
+    cameras: Cameras,
+    grid: Grid,
+    method: str = "sirt",
+    **options: Any,
+) -> Float[Tensor, "b c d h w"]:
+    """The volume that a method reconstructs from views, cameras and a grid alone, in the unit of
+    (views / mm)::
+
+        volume = mv.reconstruct(views, cameras, grid, method="fdk")
+
+    The operator is `mv.Drr`, of parallel beams `mv.Radon`, on the views' device.
+
+    Args:
+        views: line integrals.
+        cameras: the rig that measured them.
+        grid: of the volume.
+        method: its name; `mvrecon-list method` shows all, with their options.
+        options: of the method.
+
+    Raises:
+        LookupError: an unknown method; the message gives the nearest name and all names.
+        TypeError: an option that the method does not have.
+        ValueError: views that do not fit the cameras, or are not finite.
+    """
+    name = "radon" if cameras.parallel else "drr"
+    A = PROJECTORS.build(name, grid=grid, cameras=cameras).to(views.device)
+    return build_method({"name": method, **options}).to(views.device)(views, A).volume

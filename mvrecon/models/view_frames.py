@@ -68,17 +68,18 @@ class ViewFrames:
             cameras = replace(A.cameras, shape=(rows, columns)).binned(edge)
             return Frusta.of(A.grid.coarsened(2**scale), cameras, depths).to(like)
 
-        def transmission_of(frusta: Frusta) -> Tensor | None:
+        cut = "frames", scale, edge, depths, like.dtype
+
+        def of_operator() -> tuple[Frusta, Tensor | None]:
+            frusta = device_cached(A.cameras, (cut, grid_key(A.grid)), like, frusta_of_rig)
             mu = A.attenuation()
             if mu is None:
-                return None
+                return frusta, None
             mu = mu.detach().to(like)
             mu = mu[None, None] if mu.ndim == 3 else mu[:, None]
-            return transmission(frusta, coarsened(mu, scale))
+            return frusta, transmission(frusta, coarsened(mu, scale))
 
-        cut = "frames", scale, edge, depths, like.dtype
-        frusta = device_cached(A.cameras, (cut, grid_key(A.grid)), like, frusta_of_rig)
-        share = kept(A, cut, lambda: transmission_of(frusta))
+        frusta, share = kept(A, cut, of_operator)
         frames = cls(frusta, scale, edge, share)
         if g.support is not None:
             support = g.support.to(like)

@@ -31,7 +31,6 @@ OPTIONS = (
     "logger=csv",
     "~callbacks.progress",
     "~callbacks.board",
-    "method.n_cameras=3",
     "method.widths=[4,8]",
     "grid.size=[8,8,8]",
     "grid.spacing=16.0",

@@ -29,7 +29,7 @@ def test_the_board_tells_the_support_at_validation_and_names_the_method(
         callbacks, "named", lambda name, *rest: shown.append(name) or named(name, *rest)
     )
     settings = copy.deepcopy(compose("experiment=smoke"))
-    settings["model"] |= {"support": support}
+    settings["method"] |= {"support": support}
     settings["trainer"] |= {"max_steps": 2}
     board = {"_target_": "mvrecon.engine.callbacks.BoardReview", "baselines": [], "cases": 1}
     settings["callbacks"] = {"board": board}

@@ -45,8 +45,7 @@ def test_voxels_beside_the_field_and_the_support_have_no_gradient():
     assert torch.equal(volume.grad != 0, support & field) and volume.grad.sum() == 2
 
 
-def test_without_a_weight_the_common_field_is_not_computed(monkeypatch):
-    monkeypatch.setattr("mvrecon.engine.module.common_field", lambda *_: pytest.fail("computed"))
+def test_without_a_weight_there_is_no_term():
     plain = ReconstructionModule(
         GEOMETRY, {"name": "sirt", "iterations": 2}, {"volume": 1.0}, {"name": "adamw"}, 2.0
     )

@@ -83,23 +83,17 @@ SMALL = (
     "data.sizes={train: 2, val: 1, test: 1}",
 )
 METHODS = {
-    "cross_view": (),
-    "cross_view in its hull": ("method.support=hull",),
-    "cross_view, cropped to its hull": ("method.support=hull", "method.crop=true"),
-    "world_unet": (),
-    "geometry_free": (),
-    "mean_fusion": (),
+    "cross_view_small": (),
+    "cross_view_small, cropped to its hull": ("method.support=hull", "method.crop=true"),
+    "world_unet": ("method.widths=[4,8]",),
+    "geometry_free": ("method.widths=[4,8]",),
+    "mean_fusion": ("method.widths=[4]", "method.depths=8"),
 }
 
 
-def composed(name):
-    """The settings of a method on a small rig."""
-    return compose(f"method={name.replace(',', ' ').split()[0]}", *SMALL, *METHODS[name])
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_no_layer_is_refused_on_a_gpu(name, taken_for_a_gpu):
-    settings = composed(name)
+@pytest.mark.parametrize("method", METHODS)
+def test_no_layer_is_refused_on_a_gpu(method, taken_for_a_gpu):
+    settings = compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
     data = fit.build_data(settings)
     data.setup("fit")
     module = fit.build_module(settings, settings["method"], data.data_range)
@@ -167,9 +161,9 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
     )
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_volumes_and_gradients_have_the_same_bits_in_one_order(name, threads):
-    settings = composed(name)
+@pytest.mark.parametrize("method", METHODS)
+def test_volumes_and_gradients_have_the_same_bits_in_one_order(method, threads):
+    settings = compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
     module = fit.build_module(settings, settings["method"], 1.0)
     views, answers = torch.rand(2, 1, 4, 12, 12, generator=torch.Generator().manual_seed(0)), []
     for number in (1, 2, 3, 7):

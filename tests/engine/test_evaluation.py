@@ -1,4 +1,4 @@
-"""The result table against models whose answers are known."""
+"""The result table against methods whose answers are known."""
 
 import io
 import math
@@ -18,11 +18,12 @@ from mvrecon.engine.report import WIDTH, remarks, table
 from mvrecon.geometry.grid import Grid
 from mvrecon.metrics import UNITS, mean_and_spread
 from mvrecon.models.output import Reconstruction
+from mvrecon.projectors.operator import Projector
 
 SHAPE = (8, 8, 8)
 
 
-class Shadow(nn.Module):
+class Shadow(Projector):
     """The sum along z, seen by two equal cameras."""
 
     def for_case(self, case):

@@ -146,11 +146,11 @@ def test_a_label_is_used_once(settings):
 
 
 def test_the_main_method_goes_by_its_file_of_settings_whatever_its_class(settings):
-    """A class has many files of settings: the cross-view model on counts is `cross_view`, too."""
+    """A class has several files."""
     counts = compose("experiment=smoke", "method=cross_view_counts")
     assert counts["method"]["name"] == settings["method"]["name"] == "cross_view"
     assert list(fit.methods(counts)) == ["cross_view_counts", "sirt"]
-    mine = compose("experiment=smoke", "method=cross_view_counts", "label=mine")
+    mine = compose("experiment=smoke", "method=world_unet", "label=mine")
     assert list(fit.methods(mine)) == ["mine", "sirt"]
     assert list(fit.methods({**counts, "label": None})) == ["cross_view", "sirt"]
 

@@ -89,15 +89,14 @@ def test_what_no_graph_can_hold_is_refused(what, monkeypatch):
     step.
     """
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    A = small_projector()
+    A, own = SimpleNamespace(per_case=False), SimpleNamespace(per_case=True)
     check_graph(TRAINER, METHOD, DATA, A)
-    check_graph(TRAINER, {"name": "cross_view", "support": "hull"}, DATA, A)  # on the whole grid
-    trainer, method, data, words = REFUSED[what]
-    with pytest.raises(ValueError, match=f"trainer.graph=true needs .*{words}; trainer.graph=f"):
-        check_graph({**TRAINER, **trainer}, {**METHOD, **method}, {**DATA, **data}, A)
-    A.per_case = True
+    check_graph(TRAINER, METHOD | {"support": "hull"}, DATA, A)  # on the whole grid
+    trainer, method, data, message = REFUSED[what]
+    with pytest.raises(ValueError, match=f"trainer.graph=true needs .*{message}; trainer.graph=f"):
+        check_graph(TRAINER | trainer, METHOD | method, DATA | data, A)
     with pytest.raises(ValueError, match="one operator for all cases"):
-        check_graph(TRAINER, METHOD, DATA, A)
+        check_graph(TRAINER, METHOD, DATA, own)
 
 
 def test_a_run_on_a_cpu_says_that_it_has_no_graph(tmp_path):

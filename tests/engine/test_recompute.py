@@ -1,6 +1,7 @@
 """Activation checkpointing: the same gradients from less memory."""
 
 import torch
+from mvrecon.models.unet import PlainUNet
 from torch.autograd.graph import saved_tensors_hooks
 
 from mvrecon.engine.recompute import Recompute
@@ -23,7 +24,7 @@ def gradients(model, x):
 
 def test_recomputed_activations_give_the_same_gradients_from_less_memory():
     torch.manual_seed(0)
-    network, x = UNet3d(1, 1, widths=(4, 8)), torch.randn(1, 1, 12, 12, 12)
+    network, x = PlainUNet(3, 1, 1, (4, 8)), torch.randn(1, 1, 12, 12, 12)
     whole, stored = gradients(network, x)
     network.zero_grad()
 

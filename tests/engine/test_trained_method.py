@@ -1,5 +1,5 @@
-"""A trained network as a method: the same volume as its module's, and warnings where the scan is
-another than in training.
+"""A trained method by its checkpoint: the same volume as its module's, and warnings where the scan
+is another than in training.
 """
 
 import json
@@ -25,6 +25,11 @@ from tests.engine.runs import call, trained_for_a_step
 def run(tmp_path_factory) -> Path:
     """One step of two methods: one that takes any rig, and one that is made for its own."""
     return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view_small", "geometry_free")
+
+
+def trained(A, views: torch.Tensor, *checkpoint: str) -> torch.Tensor:
+    """The volume of a trained method by its checkpoint."""
+    return TrainedMethod(*checkpoint)(views, A).volume
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +113,7 @@ def test_the_loaded_method_and_the_method_by_name_warn_in_the_same_words(run, A,
     assert told("The trained cross_view", lambda: loaded(views, A.cameras, A.grid)) == []
 
 
-def test_a_network_made_for_its_own_cameras_refuses_another_number_of_views(run, A, views):
-    """A network whose weights belong to one rig is not applied to another number of views."""
+def test_a_network_of_a_number_of_cameras_refuses_another(run, A, views):
     other = PROJECTORS.build("drr", grid=A.grid, cameras=A.cameras[:3])
     with (
         pytest.warns(UserWarning, match="trained with another rig"),

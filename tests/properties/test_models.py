@@ -91,8 +91,8 @@ def seen(shape, seed: int, share: float) -> torch.Tensor:
     shape=SHAPES, size=SIZES, shift=st.sampled_from([0.0, 1e5, -1e5]), share=real(0, 1), seed=SEEDS
 )
 def test_fusion_is_a_mean(shape, size, shift, share, seed):
-    """Weights sum to one over those that see; equal estimates are kept; no mean leaves the
-    range of the estimates.
+    """Weights sum to one over the cameras that see a voxel; equal estimates are kept; no mean
+    leaves the range of the estimates.
     """
     visible, rng = seen(shape, seed, share), torch.Generator().manual_seed(seed + 1)
     m, *sizes = shape

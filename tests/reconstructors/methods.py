@@ -62,8 +62,7 @@ PROMISES = {
     "bsrem": Promise({"iterations": 100, "weight": 1e-5}, rate=2e-2),
     "tv_map": Promise({"iterations": 300, "weight": 1e-5}, rate=2e-2),
 }
-#: Methods that need a rig of a certain kind, another grid or a checkpoint; they have tests of their
-#: own.
+#: Methods of certain rigs or of another grid, and one that does not iterate; tests of their own.
 GEOMETRIC = {"fbp", "fdk", "finer", "backprojection"}
 NAMES = [
     name

@@ -35,7 +35,7 @@ def test_cut_voxels_are_whole_again_by_their_mean_and_stand_where_the_finer_grid
     assert torch.allclose(centre, GRID.to_world(torch.zeros(3, dtype=torch.float64)))
 
 
-def test_it_keeps_the_promises_of_a_reconstructor():
+def test_it_keeps_the_contract_of_methods():
     check_method("finer", projector(), method=SIRT)
 
 
