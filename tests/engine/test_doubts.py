@@ -14,7 +14,6 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.parts import METHODS, PROJECTORS
 from mvrecon.projectors.drr import Drr
 from mvrecon.projectors.radon import Radon
-from mvrecon.reconstructors.problem import declares
 
 GRID = Grid.centred(16, spacing=6.0)
 RIG = circular(24, 300.0, 450.0, {"pixels": [24, 26], "pixel_mm": 6.0})

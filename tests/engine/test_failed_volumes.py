@@ -5,11 +5,9 @@ import math
 
 import pytest
 import torch
-from torch import nn
 
 from mvrecon.comparison.rows import read
 from mvrecon.config import compose
-from mvrecon.data.dataset import single_cases
 from mvrecon.engine import evaluation, fit, report, run_folder
 from mvrecon.metrics import UNITS
 from mvrecon.models.method import Solver

@@ -9,7 +9,6 @@ import torch
 from mvrecon.config import compose
 from mvrecon.engine import fit
 from mvrecon.engine.graph import GraphedLoss, Pass, captured, check_graph
-from tests.models.rig import small_projector
 
 TRAINER = {"accelerator": "gpu", "devices": 1, "precision": "bf16-mixed"}
 METHOD, DATA = {"name": "cross_view", "support": "none"}, {"rigs": 0}

@@ -61,7 +61,9 @@ def test_ranks_over_the_scenes_and_words():
     assert "rank" not in row["coverage_68"] and len(row["coverage_68"]["values"]) == 4
     words = sentence(row)
     assert words.startswith("intervals of 68 % and 95 % cover 50.0% and 50.0% of the voxels inside")
-    assert "sigma 1.00, spread of per-view estimates 1.00" in words and words.endswith("view NRMSE -1.00")
+    assert "sigma 1.00, spread of per-view estimates 1.00" in words and words.endswith(
+        "view NRMSE -1.00"
+    )
     plain = [{"nrmse": e, "view_nrmse": e} for e in errors]
     assert sentence(quality_row(plain)["quality"]) == ""
 

@@ -1,11 +1,10 @@
 """Activation checkpointing: the same gradients from less memory."""
 
 import torch
-from mvrecon.models.unet import PlainUNet
 from torch.autograd.graph import saved_tensors_hooks
 
 from mvrecon.engine.recompute import Recompute
-from mvrecon.models.network import UNet3d
+from mvrecon.models.unet import PlainUNet
 
 
 def gradients(model, x):

@@ -70,7 +70,9 @@ def test_a_grid_by_its_shape_is_refused_where_the_order_of_the_axes_matters(run:
 
 
 def test_a_method_begins_with_the_weights_of_another_on_any_rig(run: Path, tmp_path, monkeypatch):
-    """`init_from`, once; a run that goes on has weights of its own. Those of another method are refused."""
+    """`init_from`, once; a resumed run keeps its own weights. Those of another method are
+    refused.
+    """
     options = ("experiment=smoke", "camera.n_views=5", f"init_from={run}", "seed=7")
     settings, weights = compose(*options), mv.load(run).module.method.state_dict()
     begun: list[dict[str, torch.Tensor]] = []

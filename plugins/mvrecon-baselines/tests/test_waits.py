@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from mvrecon_bench.gpu.as_gpu import AsGpu, on_gpu
 
 from mvrecon.engine.module import ReconstructionModule
+from mvrecon_bench.gpu.as_gpu import AsGpu, on_gpu
 
 DETECTOR = {"pixels": [12, 12], "pixel_mm": 5.0}
 CONE = {"name": "circular", "n_views": 3, "sid": 100.0, "sdd": 200.0, "detector": DETECTOR}
