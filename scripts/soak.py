@@ -18,9 +18,9 @@ from pathlib import Path
 
 import torch
 
-from mvrecon import eval as evaluation
-from mvrecon import train
-from mvrecon.config import compose
+from mvrecon.apps import eval as evaluation
+from mvrecon.apps import train
+from mvrecon.apps.config import compose
 
 OPTIONS = (
     "experiment=smoke",

@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from mvrecon.engine.run_folder import versions
-from mvrecon.files.atomic import written_whole
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.training.run_folder import versions
 from mvrecon_bench.benchmarks.report import markdown
 from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, PASS
 

@@ -10,13 +10,12 @@ import pytest
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
-from mvrecon import compare, warmup
-from mvrecon.config import conf_dir, launch
-from mvrecon.config.errors import sentence
-from mvrecon.config.plugins import check_plugins, import_plugins, names
-from mvrecon.config.typed import check_parts
-from mvrecon.config.values import fits
-from mvrecon.parts import PROJECTORS
+from mvrecon.apps import compare, warmup
+from mvrecon.apps.config import conf_dir, launch
+from mvrecon.apps.config.errors import sentence
+from mvrecon.apps.config.typed import check_parts, fits
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.core.plugins import check_plugins, import_plugins, names
 
 MISTAKES = {
     "camera.view=4": r"the camera 'circular'.* has no option 'view'; did you mean 'n_views'\?",
@@ -233,7 +232,7 @@ def test_a_run_that_is_not_there_is_an_error_in_one_line(tmp_path: Path, monkeyp
     assert stop.value.code == 1 and text.count("\n") == 1
     assert text.startswith("mvrecon-compare: FileNotFoundError: ")
     call = (
-        "import atexit, sys, mvrecon.eval as app; sys.argv = ['eval', 'checkpoint=nowhere'];"
+        "import atexit, sys, mvrecon.apps.eval as app; sys.argv = ['eval', 'checkpoint=nowhere'];"
         "atexit.register(lambda: print('torch' in sys.modules)); app.main()"
     )
     done = subprocess.run(

@@ -8,9 +8,9 @@ import pytest
 import torch
 import yaml
 
-import mvrecon.eval
-import mvrecon.train
-from mvrecon.engine import run_folder
+import mvrecon.apps.eval
+import mvrecon.apps.train
+from mvrecon.training import run_folder
 
 FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside", "view_nrmse")
 
@@ -32,7 +32,7 @@ def call(app, folder, *options):
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "smoke"
     return folder, call(
-        mvrecon.train,
+        mvrecon.apps.train,
         folder,
         "experiment=smoke",
         "seed=3",
@@ -136,7 +136,7 @@ def test_results_hold_every_figure_with_units_seed_and_versions(run):
 @pytest.mark.parametrize("part", ["", "checkpoints", "checkpoints/cross_view_small.ckpt"])
 def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
     folder, first = run
-    again = call(mvrecon.eval, tmp_path / "eval", f"checkpoint={folder / part}")
+    again = call(mvrecon.apps.eval, tmp_path / "eval", f"checkpoint={folder / part}")
     assert again["scenes"] == first["scenes"]
     for method, row in first["methods"].items():
         for figure in FIGURES:
@@ -153,7 +153,7 @@ def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
 
 def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
     options = ("scene@test_scene=shepp_logan", "+data.sizes.test=1", "save=true")
-    found = call(mvrecon.eval, tmp_path / "eval", f"checkpoint={run[0]}", *options)
+    found = call(mvrecon.apps.eval, tmp_path / "eval", f"checkpoint={run[0]}", *options)
     assert len(found["scenes"]) == 1 and found["scenes"] != run[1]["scenes"][:1]
     case = next((tmp_path / "eval" / "cases").iterdir())
     assert {"views.png", "planes.png", "truth.nii.gz", "cross_view_small.nii.gz"} <= {
@@ -163,29 +163,33 @@ def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
 
 def test_resume_goes_on_in_the_same_folder(run, tmp_path):
     folder, first = run
-    found, where = mvrecon.train.resumed(str(folder), []), folder
+    found, where = mvrecon.apps.train.resumed(str(folder), []), folder
     assert found == (run_folder.read_settings(folder), where)
-    again = mvrecon.train.train(*found)
+    again = mvrecon.apps.train.train(*found)
     assert again["methods"]["cross_view_small"]["psnr"]["values"] == pytest.approx(
         first["methods"]["cross_view_small"]["psnr"]["values"], abs=1e-6
     )
     with pytest.raises(ValueError, match="but got also trainer.max_steps=9"):
-        mvrecon.train.resumed(str(folder), ["trainer.max_steps=9"])
+        mvrecon.apps.train.resumed(str(folder), ["trainer.max_steps=9"])
 
 
 @pytest.mark.parametrize(
     ("app", "options", "message"),
     [
-        (mvrecon.eval, ["checkpoint=nowhere.ckpt"], "No checkpoint or run folder is at"),
-        (mvrecon.train, ["experiment=smoke", "optimizer.lr=1e30"], "is not finite at step"),
-        (mvrecon.train, ["experiment=smoke", "method.name=cros_view"], "did you mean 'cross_view'"),
+        (mvrecon.apps.eval, ["checkpoint=nowhere.ckpt"], "No checkpoint or run folder is at"),
+        (mvrecon.apps.train, ["experiment=smoke", "optimizer.lr=1e30"], "is not finite at step"),
         (
-            mvrecon.train,
+            mvrecon.apps.train,
+            ["experiment=smoke", "method.name=cros_view"],
+            "did you mean 'cross_view'",
+        ),
+        (
+            mvrecon.apps.train,
             ["experiment=smoke", "test_scene=ellipsoids"],
             "by scene@test_scene=ellipsoids",
         ),
-        (mvrecon.train, ["experiment=smoke", "resume=nowhere"], "but got also"),
-        (mvrecon.train, ["resume=nowhere"], "No checkpoint or run folder is at"),
+        (mvrecon.apps.train, ["experiment=smoke", "resume=nowhere"], "but got also"),
+        (mvrecon.apps.train, ["resume=nowhere"], "No checkpoint or run folder is at"),
     ],
 )
 def test_what_goes_wrong_is_said_and_the_exit_is_not_zero(app, options, message, tmp_path, capsys):

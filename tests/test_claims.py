@@ -4,10 +4,10 @@ import os
 
 import pytest
 
-from mvrecon.files.atomic import claimed
+from mvrecon.core.files.atomic import claimed
 
 CLAIM = (
-    "import sys, pathlib; from mvrecon.files.atomic import claimed\nwith "
+    "import sys, pathlib; from mvrecon.core.files.atomic import claimed\nwith "
     "claimed(pathlib.Path(sys.argv[1])): pass"
 )
 

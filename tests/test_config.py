@@ -15,12 +15,11 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
-from mvrecon import config
-from mvrecon.config import compose, conf_dir, help_text
-from mvrecon.config.arguments import with_flag_first, with_paths_quoted
-from mvrecon.config.plugins import import_plugins
-from mvrecon.config.targets import instantiate
-from mvrecon.registry import GROUP
+from mvrecon.apps import config
+from mvrecon.apps.config import compose, conf_dir, help_text, with_flag_first, with_paths_quoted
+from mvrecon.core.plugins import import_plugins
+from mvrecon.core.registry import GROUP
+from mvrecon.core.targets import instantiate
 
 EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))
 EVALUATIONS = {"chest_ct", "quickstart_rig_errors"}  # experiments of mvrecon-eval
@@ -64,7 +63,7 @@ NESTED = {"head": "+head@method.head", "network": "+network@method.network"}
 
 @pytest.mark.parametrize("group", ["scene", "camera", "projector", "method", *NESTED])
 def test_every_option_of_a_group_names_a_part_and_composes(group: str):
-    from mvrecon.parts import REGISTRIES
+    from mvrecon.core.parts import REGISTRIES
 
     files = sorted((conf_dir() / group).glob("*.yaml"))
     assert files
@@ -87,7 +86,7 @@ def test_the_smallest_experiment_takes_any_model_and_camera_as_its_file_has_it(c
 
 
 def test_every_file_of_acquisitions_sets_every_option():
-    from mvrecon.acquisition.settings import Acquisition
+    from mvrecon.data.acquisition.settings import Acquisition
 
     files = sorted((conf_dir() / "acquisition").glob("*.yaml"))
     assert files

@@ -15,14 +15,14 @@ import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
-from mvrecon import compare, view
-from mvrecon.cameras.rigs import circular
-from mvrecon.config import compose
-from mvrecon.config.typed import check_parts
+from mvrecon.apps import compare, view
+from mvrecon.apps.config import compose
+from mvrecon.apps.config.typed import check_parts
+from mvrecon.apps.list import SETTING
+from mvrecon.core.parts import LISTED, PROJECTORS
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.listing import SETTING
-from mvrecon.parts import LISTED, PROJECTORS
-from mvrecon.reconstructors.iterative import sirt
+from mvrecon.methods.classical.iterative import sirt
 from scripts import site_pages
 
 ROOT = Path(__file__).parents[1]
@@ -204,7 +204,7 @@ def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
 
 
 def test_a_module_or_name_that_is_mentioned_is_there():
-    """`mvrecon.projectors.drr.Drr`, whole, in a page or a docstring."""
+    """`mvrecon.operators.drr.Drr`, whole, in a page or a docstring."""
     missing = {
         f"{page}: {name}"
         for page, text in told().items()

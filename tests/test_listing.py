@@ -9,10 +9,10 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from mvrecon import registry
-from mvrecon.listing import main
-from mvrecon.parts import LISTED, REGISTRIES
-from mvrecon.signatures import GIVEN, describe
+from mvrecon.apps.list import main
+from mvrecon.core import registry
+from mvrecon.core.parts import LISTED, REGISTRIES
+from mvrecon.core.signatures import GIVEN, describe
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.names()]
@@ -60,7 +60,7 @@ def test_without_a_kind_each_part_has_one_line(capsys: pytest.CaptureFixture[str
 
 def test_the_list_imports_no_heavy_library(root):
     code = (
-        "import sys; from mvrecon.listing import main; main([]);"
+        "import sys; from mvrecon.apps.list import main; main([]);"
         "sys.exit(str(sorted({'torch', 'numpy', 'hydra', 'omegaconf'} & set(sys.modules)) or ''))"
     )
     ended = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d
 
-from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.output import Reconstruction
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.training.losses import ReconstructionLoss
 from tests.models.rig import blob, small, small_projector, stirred
 
 

@@ -10,12 +10,11 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from mvrecon.config import check_settings, compose
-from mvrecon.config.typed import check_parts
-from mvrecon.listing import main
-from mvrecon.new_plugin import new_plugin
-from mvrecon.parts import REGISTRIES
-from mvrecon.registry import GROUP
+from mvrecon.apps.config import check_settings, compose
+from mvrecon.apps.config.typed import check_parts
+from mvrecon.apps.list import main, new_plugin
+from mvrecon.core.parts import REGISTRIES
+from mvrecon.core.registry import GROUP
 from tests.faults.plugins import plugin
 
 NAME = "seven_kinds"

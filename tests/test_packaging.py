@@ -70,21 +70,21 @@ def test_the_wheel_says_what_it_is(wheel: zipfile.ZipFile):
     scripts = configparser.ConfigParser()
     scripts.read_string(wheel.read(f"{folder}/entry_points.txt").decode())
     assert dict(scripts["console_scripts"]) == {
-        "mvrecon-train": "mvrecon.train:main",
-        "mvrecon-eval": "mvrecon.eval:main",
-        "mvrecon-simulate": "mvrecon.simulate:main",
-        "mvrecon-reconstruct": "mvrecon.reconstruction:main",
-        "mvrecon-list": "mvrecon.listing:main",
-        "mvrecon-compare": "mvrecon.compare:main",
-        "mvrecon-warmup": "mvrecon.warmup:main",
-        "mvrecon-view": "mvrecon.view:main",
+        "mvrecon-train": "mvrecon.apps.train:main",
+        "mvrecon-eval": "mvrecon.apps.eval:main",
+        "mvrecon-simulate": "mvrecon.apps.simulate:main",
+        "mvrecon-reconstruct": "mvrecon.apps.reconstruct:main",
+        "mvrecon-list": "mvrecon.apps.list:main",
+        "mvrecon-compare": "mvrecon.apps.compare:main",
+        "mvrecon-warmup": "mvrecon.apps.warmup:main",
+        "mvrecon-view": "mvrecon.apps.view:main",
     }
 
 
 def test_an_unpacked_wheel_finds_its_own_configs(wheel: zipfile.ZipFile, tmp_path: Path):
     wheel.extractall(tmp_path)
     code = (
-        "from mvrecon.config import compose, conf_dir; print(conf_dir()); "
+        "from mvrecon.apps.config import compose, conf_dir; print(conf_dir()); "
         "compose('experiment=quickstart')"
     )
     command = [sys.executable, "-c", code]

@@ -5,15 +5,15 @@ import pytest
 import SimpleITK as sitk
 import torch
 
-from mvrecon.cameras.formats import rtk_xml
-from mvrecon.cameras.rigs import circular
+from mvrecon.apps.scan import open_scan
+from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import MeasuredViews
-from mvrecon.engine.scan import open_scan
-from mvrecon.files.checks import Refused
+from mvrecon.geometry.cameras.formats import rtk_xml
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.drr import Drr
-from mvrecon.reconstructors.filtered.fdk import fdk
+from mvrecon.methods.classical.filtered.fdk import fdk
+from mvrecon.operators.drr import Drr
 from tests.cameras.rigs import same
 
 PLATE = {"pixels": [30, 36], "pixel_mm": [2.0, 1.5], "offset_mm": [3.0, -4.5]}

@@ -4,10 +4,10 @@ import.
 
 import pytest
 
-from mvrecon.config.plugins import import_plugins
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.drr import Drr
-from mvrecon.registry import Registry
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.core.plugins import import_plugins
+from mvrecon.core.registry import Registry
+from mvrecon.operators.drr import Drr
 from tests.faults.plugins import plugin
 
 
@@ -53,9 +53,10 @@ BROKEN = {
     "hollow": ("", "has no attribute 'Part'"),
     "exits": ("raise SystemExit(3)\n", "does not import"),
 }
-SOUND = "from mvrecon.projectors.drr import Drr as Part\n"
+SOUND = "from mvrecon.operators.drr import Drr as Part\n"
 HALF = (
-    "from mvrecon.parts import PROJECTORS\n@PROJECTORS.register('half')\ndef half(): ...\n1 / 0\n"
+    "from mvrecon.core.parts import PROJECTORS\n"
+    "@PROJECTORS.register('half')\ndef half(): ...\n1 / 0\n"
 )
 
 

@@ -13,19 +13,19 @@ import torch
 import yaml
 from PIL import Image as Pillow
 
-import mvrecon.reconstruction
-import mvrecon.simulate
-from mvrecon.cameras import files
-from mvrecon.cameras.formats import rtk_xml
+import mvrecon.apps.reconstruct
+import mvrecon.apps.simulate
+from mvrecon.apps.scan import Scan, check_unit, open_scan
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.volume_files import WRITTEN, read_volume
-from mvrecon.engine.scan import Scan, check_unit, open_scan
+from mvrecon.geometry.cameras import files
+from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.operator import Scaled
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.operator import Scaled
 from tests.engine.runs import call
 
 ROOT = Path(__file__).parents[1]
@@ -49,7 +49,7 @@ RIG = ("camera=rtk_xml", "camera.detector.pixel_mm=9.0", "camera.world=IEC")
 def scan(tmp_path_factory):
     """A simulated scan: folder of projections, rig as RTK's XML, and the truth."""
     folder = tmp_path_factory.mktemp("scan")
-    assert call(mvrecon.simulate, *SIMULATED, f"hydra.run.dir={folder}/simulated") == 0
+    assert call(mvrecon.apps.simulate, *SIMULATED, f"hydra.run.dir={folder}/simulated") == 0
     case = next((folder / "simulated" / "cases").iterdir())
     shutil.copytree(case / "projections", folder / "projections")
     shutil.copy(folder / "simulated" / "geometry.xml", folder / "geometry.xml")
@@ -61,7 +61,7 @@ def scan(tmp_path_factory):
 def run(scan, folder, *options, views="projections"):
     """Exit of the app on the scan, with the truth's grid."""
     return call(
-        mvrecon.reconstruction,
+        mvrecon.apps.reconstruct,
         f"views.path={scan / views}",
         *RIG,
         f"camera.path={scan}/geometry.xml",
@@ -109,7 +109,7 @@ def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
         f"out={tmp_path}/stored.nii.gz",
         f"hydra.run.dir={tmp_path}/stored",
     )
-    assert call(mvrecon.reconstruction, *stored) == 0
+    assert call(mvrecon.apps.reconstruct, *stored) == 0
     assert run(scan, tmp_path / "grey", f"out={tmp_path}/grey.nii.gz") == 0
     grey, exact = (read_volume(tmp_path / f"{name}.nii.gz")[0] for name in ("grey", "stored"))
     assert (grey - exact).norm() < 2e-3 * exact.norm()
@@ -128,7 +128,7 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
     )
     rig = files.from_file(scan / "simulated" / "rig.json")
     files.save(rig.shifted(torch.tensor([[-2.0, 0.0]])), tmp_path / "wrong.json")
-    assert call(mvrecon.reconstruction, *options) == 0
+    assert call(mvrecon.apps.reconstruct, *options) == 0
     assert re.search(
         r"offset_u \+(1\.9|2\.0)\d+ pixels, tilt [+-]0\.[0-2]", capsys.readouterr().out
     )
@@ -174,7 +174,7 @@ def test_a_run_that_would_write_to_its_own_rig_is_refused(scan, tmp_path, name, 
         f"hydra.run.dir={tmp_path}/run",
         *(option.format(tmp_path) for option in options),
     )
-    assert call(mvrecon.reconstruction, *stored) == 1
+    assert call(mvrecon.apps.reconstruct, *stored) == 1
     assert f"does not write, got camera.path={rig}" in capsys.readouterr().err
     assert rig.read_bytes() == before
 
@@ -186,7 +186,7 @@ def test_a_place_that_cannot_be_written_is_refused_first(
     """A volume that cannot be written is refused before any view is read."""
     (tmp_path / "file").touch()
     (tmp_path / "folder.nii.gz").mkdir()
-    monkeypatch.setattr("mvrecon.engine.scan.open_scan", lambda _: pytest.fail("views are read"))
+    monkeypatch.setattr("mvrecon.apps.scan.open_scan", lambda _: pytest.fail("views are read"))
     assert run(scan, tmp_path / "run", f"out={tmp_path / place}") == 1
     assert f"{tmp_path / place}: expected" in capsys.readouterr().err
 
@@ -203,7 +203,7 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, monkeypatc
     doubts read in part.
     """
     reads = []
-    monkeypatch.setattr("mvrecon.engine.doubts.doubts", lambda *_: [])
+    monkeypatch.setattr("mvrecon.apps.sanity_checks.doubts", lambda *_: [])
     read = MeasuredViews.read
     monkeypatch.setattr(MeasuredViews, "read", lambda *a: reads.append(a) or read(*a))
     options = (f"method={method}", "views.every=4", f"out={tmp_path}/volume.nii.gz")
@@ -230,7 +230,7 @@ def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
     first = read_volume(tmp_path / "run" / "volume.nii.gz")[0]
     settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
     monkeypatch.chdir(scan / "elsewhere")
-    again = mvrecon.reconstruction.reconstruct(settings, tmp_path / "again")
+    again = mvrecon.apps.reconstruct.reconstruct(settings, tmp_path / "again")
     assert torch.equal(read_volume(again["volume"])[0], first)
 
 
@@ -243,7 +243,7 @@ def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypa
         raise MemoryError("no room left")
 
     with monkeypatch.context() as patch:
-        patch.setattr("mvrecon.engine.solve.solve", fails)
+        patch.setattr("mvrecon.apps.run_method.solve", fails)
         assert run(scan, tmp_path / "run", "views.every=4") == 1
     assert "no room left" in capsys.readouterr().err
     assert {file.name for file in (tmp_path / "run").iterdir()} <= {".lock", "reconstruct.log"}

@@ -4,9 +4,9 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from mvrecon import registry
-from mvrecon.parts import REGISTRIES
-from mvrecon.registry import Registry, importing
+from mvrecon.core import registry
+from mvrecon.core.parts import REGISTRIES
+from mvrecon.core.registry import Registry, importing
 
 
 def ring(views: int = 8, radius: float = 400.0) -> tuple[int, float]:

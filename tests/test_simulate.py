@@ -13,11 +13,11 @@ import torch
 import yaml
 from PIL import Image as Pillow
 
-import mvrecon.simulate
-from mvrecon.cameras.camera import VECTORS
+import mvrecon.apps.simulate
+from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.volume_files import read_volume, save_volume
+from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, SCENES
 
 GRID = ("grid.size=[16,16,16]", "grid.spacing=8")
 PARALLEL = (
@@ -37,7 +37,7 @@ def call(folder, *options):
         ["mvrecon-simulate", *options, f"hydra.run.dir={folder}", "hydra/job_logging=none"],
     )
     try:
-        mvrecon.simulate.main()
+        mvrecon.apps.simulate.main()
     finally:
         patch.undo()
     return yaml.safe_load((folder / "config.yaml").read_text())
@@ -204,7 +204,7 @@ def test_the_app_works_in_foreign_places(root, tmp_path):
         "LANG": "C",
         "PYTHONIOENCODING": "ascii",
     }
-    command = [sys.executable, "-m", "mvrecon.simulate", *options, f"hydra.run.dir='{out}'"]
+    command = [sys.executable, "-m", "mvrecon.apps.simulate", *options, f"hydra.run.dir='{out}'"]
     done = subprocess.run(
         command,
         cwd=here,

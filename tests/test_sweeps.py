@@ -7,9 +7,9 @@ import json
 import pytest
 from omegaconf import OmegaConf
 
-import mvrecon.train
-from mvrecon.config import own_folder
-from mvrecon.engine import fit
+import mvrecon.apps.train
+from mvrecon.apps.config import own_folder
+from mvrecon.training import fit
 from tests.engine.lives import OPTIONS
 from tests.engine.runs import call
 
@@ -19,7 +19,7 @@ def sweep(tmp_path_factory):
     """A sweep over two seeds, and its command line."""
     folder = tmp_path_factory.mktemp("sweep") / "runs"
     options = ["-m", *OPTIONS, "trainer.max_steps=1", "seed=0,1", f"hydra.sweep.dir={folder}"]
-    assert call(mvrecon.train, *options) == 0
+    assert call(mvrecon.apps.train, *options) == 0
     return folder, options
 
 
@@ -39,14 +39,14 @@ def test_a_sweep_that_is_begun_again_runs_only_what_is_missing(sweep, monkeypatc
     seeds = []
     build = fit.build_data
     monkeypatch.setattr(fit, "build_data", lambda s: seeds.append(s["seed"]) or build(s))
-    assert call(mvrecon.train, *options) == 0
+    assert call(mvrecon.apps.train, *options) == 0
     assert seeds == [1] and (folder / "seed=0" / "results.json").read_text() == before
 
 
 def test_sweepers_choose_by_validation_never_by_the_test(sweep):
     """What the app returns is the PSNR of validation scenes: others than those of the table."""
     table = json.loads((sweep[0] / "seed=0" / "results.json").read_text())
-    assert mvrecon.train._score(table) == table["validation_psnr"]
+    assert mvrecon.apps.train._score(table) == table["validation_psnr"]
     assert table["validation_psnr"] not in table["methods"]["geometry_free"]["psnr"]["values"]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.parts import REGISTRIES
+from mvrecon.core.parts import REGISTRIES
 from scripts import site_pages, tutorials
 
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.cameras.files import save
-from mvrecon.view import PICTURES, main, view
-from mvrecon.viz.page import VOXELS, box_matrix, reduced
+from mvrecon.apps.view import PICTURES, main, view
+from mvrecon.geometry.cameras.files import save
+from mvrecon.report.viz.page import VOXELS, box_matrix, reduced
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import torch
 from matplotlib.figure import Figure
 
 import mvrecon as mv
-from mvrecon.engine.export import save_png
-from mvrecon.parts import SCENES
-from mvrecon.viz import montage, review
+from mvrecon.core.parts import SCENES
+from mvrecon.report.viz import montage, review
+from mvrecon.training.export import save_png
 
 grid = mv.Grid.centred(size=(32, 32, 24), spacing=4.0)  # voxels and mm along (x, y, z)
 cameras = mv.circular(12, 400.0, 800.0, {"pixels": [40, 48], "pixel_mm": 6.0})  # mm

@@ -9,15 +9,15 @@ import json
 import math
 
 import mvrecon as mv
-from mvrecon.cameras.field import check_rig_sees
-from mvrecon.cameras.formats import tigre
+from mvrecon.core.parts import SCENES
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.projections.writing import Exposure, write_projections
-from mvrecon.engine.export import save_png
-from mvrecon.parts import SCENES
-from mvrecon.viz import montage, review
-from mvrecon.viz.rig import save_picture
+from mvrecon.geometry.cameras.field import check_rig_sees
+from mvrecon.geometry.cameras.formats import tigre
+from mvrecon.report.viz import montage, review
+from mvrecon.report.viz.rig import save_picture
+from mvrecon.training.export import save_png
 
 geometry = {
     "DSD": 600.0,  # mm, source to detector

@@ -11,11 +11,11 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
-from mvrecon.models.cross_view import CrossView
-from mvrecon.models.frusta import Frusta
-from mvrecon.new_plugin import new_plugin
-from mvrecon.parts import HEADS, PROJECTORS
-from mvrecon.projectors.operator import Wrapped
+from mvrecon.apps.list import new_plugin
+from mvrecon.core.parts import HEADS, PROJECTORS
+from mvrecon.methods.learned.cross_view import CrossView
+from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.operators.operator import Wrapped
 from mvrecon.testing import check_head, check_projector
 
 for file in new_plugin("my_plugin", Path.cwd()):

@@ -8,11 +8,11 @@
 import torch
 
 import mvrecon as mv
-from mvrecon.engine.export import save_png
-from mvrecon.metrics import volume_metrics
-from mvrecon.models.cross_view import CrossView
-from mvrecon.parts import SCENES
-from mvrecon.viz import review
+from mvrecon.core.parts import SCENES
+from mvrecon.methods.learned.cross_view import CrossView
+from mvrecon.report.metrics import volume_metrics
+from mvrecon.report.viz import review
+from mvrecon.training.export import save_png
 
 torch.manual_seed(0)
 grid = mv.Grid.centred(16, spacing=8.0)
@@ -77,4 +77,4 @@ save_png("planes.png", review.planes(case, truth[0, 0], shown))
 # ## What to keep
 #
 # `torch.save(method.state_dict(), ...)` keeps the weights, `torch.compile(method)` treats operators as opaque steps, and
-# `mvrecon.engine.program.exported(method, A, views)` is a program of `torch.export`: [python.md](../python.md).
+# `mvrecon.training.program.exported(method, A, views)` is a program of `torch.export`: [python.md](../python.md).

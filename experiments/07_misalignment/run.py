@@ -13,9 +13,9 @@ import torch
 from PIL import Image
 
 import mvrecon as mv
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
 
 GRID = mv.Grid.centred(size=(96, 96, 96), spacing=1.5)
 RIG = mv.circular(240, 500.0, 800.0, {"pixels": [128, 128], "pixel_mm": 2.0})

@@ -7,13 +7,13 @@ import argparse
 import warnings
 from functools import partial
 
-from mvrecon.calibration.from_data import calibrated
-from mvrecon.cameras.rigs import circular
-from mvrecon.files.tables import write_rows
+from mvrecon.core.files.tables import write_rows
+from mvrecon.core.parts import SCENES
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import SCENES
-from mvrecon.projectors.drr import Drr
-from mvrecon.reconstructors.cgls import cgls
+from mvrecon.methods.calibration.from_data import calibrated
+from mvrecon.methods.classical.cgls import cgls
+from mvrecon.operators.drr import Drr
 
 EDGE = 96.0  # mm of the grid
 OBJECTS = ("shepp_logan", "ellipsoids", "derenzo")

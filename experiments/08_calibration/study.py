@@ -9,17 +9,17 @@ from functools import partial
 
 import torch
 
-from mvrecon.calibration.detection import centroids, helix
-from mvrecon.calibration.from_data import calibrated
-from mvrecon.calibration.markers import from_markers
-from mvrecon.calibration.unknowns import without_motion
-from mvrecon.cameras.misalignment import Misalignment, misaligned, perturbed
-from mvrecon.cameras.rigs import circular
-from mvrecon.files.tables import write_rows
+from mvrecon.core.files.tables import write_rows
+from mvrecon.data.scenes.shepp_logan import shepp_logan
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned, perturbed
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.projectors.drr import Drr
-from mvrecon.scenes.shepp_logan import shepp_logan
-from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon.methods.calibration.detection import centroids, helix
+from mvrecon.methods.calibration.from_data import calibrated
+from mvrecon.methods.calibration.markers import from_markers
+from mvrecon.methods.calibration.unknowns import without_motion
+from mvrecon.operators.drr import Drr
 
 EDGE = 96.0  # mm of the grid
 NOISE = [(None, 0), (1e4, 0), (1e4, 1), (1e4, 2)]  # photons and seed

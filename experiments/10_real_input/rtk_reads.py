@@ -20,7 +20,7 @@ from torch import Tensor
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.grid import Grid
-from mvrecon.viz import review
+from mvrecon.report.viz import review
 
 #: The detector's pixels in mm, and the grey values of the scan's dark and flat field.
 PIXEL, DARK, FLAT = 4.0, 100.0, 50_000.0

@@ -5,8 +5,8 @@ import time
 import torch
 
 import mvrecon as mv
-from mvrecon.files.memory import peak
-from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon.core.files.memory import peak
+from mvrecon.data.scenes.solids import Phantom, Solids
 
 N, N_VIEWS, VALUE = 512, 720, 0.02
 

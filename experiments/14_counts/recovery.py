@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
-from mvrecon.files.tables import write_rows
-from mvrecon.scenes.derenzo import derenzo
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.core.files.tables import write_rows
+from mvrecon.data.scenes.derenzo import derenzo
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon_spect.metrics.contrast import sphere_recovery
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 from mvrecon_spect.metrics.repeated import repeated

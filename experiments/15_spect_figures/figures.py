@@ -12,10 +12,10 @@ from geometry import HOLE, ball, counts_of, geometry
 from PIL import Image
 
 import mvrecon as mv
-from mvrecon.files.tables import read_rows, write_rows
-from mvrecon.scenes.derenzo import derenzo
-from mvrecon.scenes.voxelise import voxelise
-from mvrecon.viz.montage import enlarged, radiographs, tiled
+from mvrecon.core.files.tables import read_rows, write_rows
+from mvrecon.data.scenes.derenzo import derenzo
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.report.viz.montage import enlarged, radiographs, tiled
 from mvrecon_spect.metrics.contrast import count_bias
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 from mvrecon_spect.metrics.edge import ball_mtf

@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
-from mvrecon.cameras.field import sees
-from mvrecon.files.tables import write_rows
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
-from mvrecon.viz.rig import save_picture
+from mvrecon.core.files.tables import write_rows
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.field import sees
+from mvrecon.report.viz.rig import save_picture
 from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.projector import Spect

@@ -13,10 +13,10 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
-from mvrecon.config import compose
-from mvrecon.files.tables import write_rows
+from mvrecon.apps.config import compose
+from mvrecon.apps.simulate import simulate
+from mvrecon.core.files.tables import write_rows
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.simulate import simulate
 from mvrecon_spect.projector import Spect
 
 WATER, FIELD_MM, REPEATS, EVENTS = 0.01536, 192.0, 5, 16

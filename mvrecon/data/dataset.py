@@ -9,12 +9,12 @@ from rich.progress import track
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.files.rank import rank
+from mvrecon.core.files.rank import rank
+from mvrecon.core.random_numbers import case_numbers, generator, mixed
+from mvrecon.data.scenes.sample import Sample, Scene, Thin
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import case_numbers, generator, mixed
-from mvrecon.scenes.sample import Sample, Scene, Thin
-from mvrecon.visual_hull.support import warn_of_gaps
+from mvrecon.operators.visual_hull.support import warn_of_gaps
 
 TENSORS = ("views", "volume", "inside")
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mvrecon.files.checks import EDGE, VOLUME, Refused, blaming
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, blaming
 
 #: Endings of DICOM files; a file of another name is one if it says so from byte 128 on.
 DICOM = (".dcm", ".dicom", ".ima")

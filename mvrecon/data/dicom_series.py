@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, blaming, shown
 from mvrecon.data.dicom import dicom_file, frames_of, header_of, pixels_of, value_of
 from mvrecon.data.orientation import Planes, oriented
 from mvrecon.data.slabs import Slabs, planes
-from mvrecon.files.checks import EDGE, VOLUME, Refused, blaming, shown
 from mvrecon.geometry.grid import Grid
 
 #: mm that slices may be off their places; part of the spacing that gaps between slices may differ.

@@ -18,30 +18,154 @@ none.
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+import re
+import struct
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
 import torch
 
-from mvrecon.data.attenuation import StoredUnit
-from mvrecon.data.hdf5_layout import (
-    EXPECTED,
-    LAYOUT,
-    Texts,
-    attributes_and_names,
-    check_layout,
-    check_names,
-)
-from mvrecon.data.hdf5_reading import reading
-from mvrecon.data.labels import structures_of
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import NAME, SPACING, Refused, blaming, check_file, plain_name, shown
+from mvrecon.data.attenuation import UNITS, StoredUnit
 from mvrecon.data.slabs import Slab, Slabs, planes
 from mvrecon.data.storage import check_chunks, dataset_in
-from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import NAME, SPACING, Refused, blaming, check_file, plain_name
+from mvrecon.data.texts import texts_of, variable
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+#: Offset that ends a heap's list of free blocks.
+END = 1
+
+
+def reading(path: str | Path) -> h5py.File:
+    """HDF5 file, opened for reading.
+
+    Raises:
+        OSError: it cannot be opened as HDF5.
+        Refused: the list of free blocks among the names of its root group is a circle.
+    """
+    with Path(path).open("rb") as file:
+        if _endless(file):
+            raise Refused(
+                f"{path}: expected a list of free blocks that ends, got a circle; is it damaged?"
+            )
+    return h5py.File(path, "r", locking="best-effort")
+
+
+def _endless(file: BinaryIO) -> bool:
+    """Whether the root group's free blocks are a circle; what else is amiss libhdf5 tells.
+
+    A file of the newer formats has none, one with a block of the user's before its signature is not
+    looked into.
+    """
+    head = file.read(100)
+    if len(head) < 100 or head[:8] != SIGNATURE or head[8] > 1 or head[13:15] != b"\x08\x08":
+        return False
+    (heap,) = struct.unpack_from("<Q", head, 88 + 4 * head[8])
+    header = _bytes(file, heap, 32)
+    if header[:4] != b"HEAP":
+        return False
+    offset, blocks = struct.unpack_from("<QQ", header, 16)
+    seen: set[int] = set()
+    while offset != END and offset not in seen:
+        seen.add(offset)
+        following = _bytes(file, blocks + offset, 8)
+        if len(following) < 8:
+            return False
+        (offset,) = struct.unpack("<Q", following)
+    return offset != END
+
+
+def _bytes(file: BinaryIO, place: int, count: int) -> bytes:
+    """Bytes at a place of a file; fewer, or none, behind its end."""
+    if place >= 2**63:
+        return b""
+    file.seek(place)
+    return file.read(count)
+
+
+#: Attributes of every file with the texts that they may be; those of some.
+LAYOUT = {"axes": ("z, y, x",), "units": UNITS}
+OPTIONAL = ("orientation", "labels")
+Texts = dict[str, list[str]]
+EXPECTED = (
+    "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU (or 1/mm, activity), spacing "
+    "[n 3] in mm, id [n], axes z, y, x"
+)
+
+
+def check_layout(path: Path | str, attributes: Mapping[str, str | None]) -> None:
+    """Check the attributes that every file has.
+
+    Raises:
+        Refused: other axes or units.
+    """
+    if any(attributes[key] not in values for key, values in LAYOUT.items()):
+        got = {key: attributes[key] for key in LAYOUT}
+        raise Refused(f"{path}: has the attributes {shown(got)}, expected {LAYOUT}: {EXPECTED}")
+
+
+def check_names(path: Path | str, names: Sequence[str]) -> None:
+    """Check that every volume has a name of its own.
+
+    Raises:
+        Refused: two volumes of one name.
+    """
+    if doubled := [name for name, count in Counter(names).items() if count > 1]:
+        raise Refused(
+            f"{path}: has several volumes of the name {shown(doubled)}; expected every name once"
+        )
+
+
+def attributes_and_names(path: Path, file: h5py.File, names: h5py.Dataset) -> Texts:
+    """The attributes that are read, under "@<name>", and the names of the volumes.
+
+    Raises:
+        Refused: an attribute that is no short text.
+    """
+    kinds = {key: file.attrs.get_id(key) for key in (*LAYOUT, *OPTIONAL) if key in file.attrs}
+    for key, kind in kinds.items():
+        if (
+            kind.shape != ()
+            or h5py.check_string_dtype(kind.dtype) is None
+            or kind.dtype.itemsize > 2**16
+        ):
+            raise Refused(
+                f"{path}: its attribute {key!r} is {kind.dtype} {kind.shape}, expected one short "
+                f"text"
+            )
+    short = [key for key, kind in kinds.items() if not variable(kind.dtype)]
+    fixed = {key: [bytes(file.attrs[key]).decode()] for key in short}  # type: ignore[arg-type]
+    texts = texts_of(path) if len(fixed) < len(kinds) or variable(names.dtype) else {}
+    if not variable(names.dtype):
+        texts["id"] = [name.decode() for name in names[:]]
+    return {**texts, **{f"@{key}": value for key, value in fixed.items()}}
+
+
+#: A label and the name of its structure.
+NAMED = re.compile(r"([1-9][0-9]{0,2})=([^=,]+)")
+
+
+def structures_of(path: Path, text: str | None) -> dict[str, int]:
+    """Label of each structure by its name, from a text such as "1=Brainstem,2=SpinalCord".
+
+    Raises:
+        Refused: no text, another form, labels above 255, or a label or a name that comes twice.
+    """
+    entries = [NAMED.fullmatch(entry.strip()) for entry in (text or "").split(",")]
+    named = {entry[2]: int(entry[1]) for entry in entries if entry}
+    if len(set(named.values())) < len(entries) or max(named.values()) > 255:
+        raise Refused(
+            f"{path}: expected the attribute labels to name each structure once, such as "
+            f"'1=Brainstem,2=SpinalCord' with labels from 1 to 255, got {shown(text)}"
+        )
+    return named
+
 
 #: Bytes of a chunk that is written, unless one plane has more.
 CHUNK = 2**25

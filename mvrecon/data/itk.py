@@ -15,10 +15,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.data.orientation import oriented, right_angled
-from mvrecon.data.slabs import Slabs, planes
-from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import (
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import (
     DEFLATE,
     EDGE,
     VOLUME,
@@ -28,6 +26,8 @@ from mvrecon.files.checks import (
     plain_name,
     shown,
 )
+from mvrecon.data.orientation import oriented, right_angled
+from mvrecon.data.slabs import Slabs, planes
 from mvrecon.geometry.grid import Grid
 
 IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}

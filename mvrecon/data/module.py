@@ -1,27 +1,162 @@
 """Training, validation and test scenes of a run."""
 
+import hashlib
+import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import h5py
 import lightning.pytorch as L
 import torch
 from torch.utils.data import DataLoader
 
 from mvrecon import __version__
-from mvrecon.acquisition.acquired import Acquired
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.core.quantities import NonNegativeInt, PositiveInt
+from mvrecon.core.registry import check_options
 from mvrecon.data import digests as sha256
-from mvrecon.data.case_store import CaseStore
+from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.dataset import EpochOrder, SceneDataset, shared
-from mvrecon.data.loading import Loading
+from mvrecon.data.digests import of_grid, of_rig
+from mvrecon.data.hdf5 import reading
 from mvrecon.data.rigs import ManyRigs, RigOrder, training_rigs
+from mvrecon.data.scenes.sample import Sample, Scene
+from mvrecon.data.storage import dataset_in
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.scenes.sample import Scene
+
+#: Raised where what a scene, a projector or a file of this store is has changed: older files are
+#: not read.
+VERSION = 1
+
+
+class CaseStore:
+    """A folder of cases as a perfect detector measures them, in a file each.
+
+    A file is known by a SHA-256 digest of all that its case depends on: what `made_of` says, index,
+    seed, grid and rig. What a detector adds, and gains that drifted, are not in it. Files are
+    written whole or not at all, so several runs may share a folder; a file that is damaged is made
+    anew.
+
+    Args:
+        folder: of the files; it is made.
+        made_of: settings of scene and projector and digests of their files, as JSON has them.
+        scene: its `seed_of(index, seed)`, where it has one, says on which seed a case depends.
+    """
+
+    def __init__(self, folder: str | Path, made_of: Mapping[str, Any], scene: Scene):
+        self.folder, self.made_of = Path(folder), json.dumps(made_of, sort_keys=True)
+        self.scene = scene
+
+    def __call__(
+        self, index: int, seed: int, grid: Grid, cameras: Any, make: Callable[[], Sample]
+    ) -> Sample:
+        """The case that is kept, or else the one that `make` makes, kept from now on.
+
+        Explicit rays have no digest: their cases are not kept.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        if not isinstance(cameras, Cameras):
+            return make()
+        path = self.path(index, seed, grid, cameras)
+        if path.exists():
+            try:
+                return _read(path, grid, cameras)
+            except Refused:  # cut short or damaged: the case can be made again
+                pass
+        sample = make()
+        _write(path, sample)
+        return sample
+
+    def path(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Path:
+        """The file of a case."""
+        seed = getattr(self.scene, "seed_of", lambda index, seed: seed)(index, seed)
+        case = [VERSION, self.made_of, index, seed, of_grid(grid), of_rig(cameras)]
+        return self.folder / f"{hashlib.sha256(json.dumps(case).encode()).hexdigest()}.h5"
+
+
+def _write(path: Path, sample: Sample) -> None:
+    with written_whole(path) as part, h5py.File(part, "w") as file:
+        tensors = {"views": sample.views, "volume": sample.volume, "inside": sample.inside}
+        for name, tensor in {**tensors, **sample.maps}.items():
+            values = tensor.cpu().numpy()
+            file.create_dataset(name, data=values, fletcher32=True, chunks=(1, *values.shape[1:]))
+        file.attrs["name"] = sample.name
+
+
+def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
+    """The case in a file.
+
+    Raises:
+        Refused: it is damaged, or has another size or type than this case.
+    """
+    volume = (1, *grid.shape)
+    expected = {
+        "views": ((1, len(cameras), *cameras.shape), "float32"),
+        "volume": (volume, "float32"),
+        "inside": (volume, "bool"),
+    }
+    values = {}
+    with blaming(path, "is not a case that can be read"), reading(path) as file:
+        maps = {name: (volume, "float32") for name in file if name not in expected}
+        for name, kind in {**expected, **maps}.items():
+            dataset = dataset_in(path, file, name, "a case")
+            if (dataset.shape, str(dataset.dtype)) != kind:
+                raise Refused(
+                    f"{path}: expected {name} as {kind}, got {dataset.shape}, {dataset.dtype}"
+                )
+            values[name] = torch.from_numpy(dataset[()])
+        held = {name: values.pop(name) for name in maps}
+        return Sample(**values, name=str(file.attrs["name"]), maps=held)
+
+
+@dataclass(frozen=True)
+class Loading:
+    """How cases are made and put into batches.
+
+    Args:
+        batch_size: cases in a batch.
+        workers: processes that make the cases before training, and load batches.
+        cache: folder in which cases are kept from run to run, without their noise; None: they are
+            made anew by every run. All cases of a run are kept in memory either way.
+        rigs: rigs that measure the training cases, of a camera with a `seed`, those of the seeds
+            that follow its own; 0: its own rig, as validation and test have.
+
+    Raises:
+        ValueError: a number that is too small.
+    """
+
+    batch_size: PositiveInt = 1
+    workers: NonNegativeInt = 0
+    cache: str | None = None
+    rigs: NonNegativeInt = 0
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1 or min(self.workers, self.rigs) < 0:
+            raise ValueError(
+                f"Expected a batch_size of at least 1 and workers and rigs of at least 0, got "
+                f"{self.batch_size}, {self.workers} and {self.rigs}"
+            )
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> "Loading":
+        """The options of a mapping.
+
+        Raises:
+            TypeError: an unknown option; the message gives the nearest and all.
+        """
+        check_options("data", options, (field.name for field in fields(cls)))
+        return cls(**options)
+
 
 #: Series of random cases. Every run is judged on the same ones; its own seed makes the cases that
 #: it trains on.

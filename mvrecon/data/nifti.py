@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, blaming, check_file
 from mvrecon.data.orientation import Planes, oriented, right_angled
 from mvrecon.data.slabs import Slabs, planes
-from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, blaming, check_file
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mvrecon.core.files.checks import SPACING, Refused
 from mvrecon.data.slabs import Slab, Slabs
-from mvrecon.files.checks import SPACING, Refused
 from mvrecon.geometry.grid import Grid
 
 #: The cosine up to which voxel axes count as at right angles.

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.parts import CAMERAS
 from mvrecon.data.dataset import EpochOrder, SceneDataset
+from mvrecon.data.scenes.sample import Scene
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS
-from mvrecon.scenes.sample import Scene
 
 
 def camera_of(camera: Mapping[str, Any], rig: int) -> dict[str, Any]:

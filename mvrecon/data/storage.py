@@ -10,7 +10,7 @@ from pathlib import Path
 
 import h5py
 
-from mvrecon.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, shown
+from mvrecon.core.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, shown
 
 #: Filters that every HDF5 has; others would be loaded as libraries from wherever HDF5_PLUGIN_PATH
 #: says.

@@ -6,9 +6,9 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files.checks import Refused
 from mvrecon.data import dicom, dicom_series, itk, nifti
 from mvrecon.data.slabs import Slabs
-from mvrecon.files.checks import Refused
 from mvrecon.geometry.grid import Grid
 
 READ, WRITTEN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"), (".nii", ".nii.gz", ".mha", ".nrrd")

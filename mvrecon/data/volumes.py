@@ -11,26 +11,67 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.random_numbers import generator, uniform
 from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.nifti import ENDING, open_nifti
 from mvrecon.data.orientation import reversed_axes
-from mvrecon.data.placement import Placed, moved
 from mvrecon.data.resample import resample
+from mvrecon.data.scenes.sample import Sample
 from mvrecon.data.slabs import Slabs
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.scenes.analytic import generator, uniform
-from mvrecon.scenes.sample import Sample
+from mvrecon.geometry.rigid import euler_rotation
+from mvrecon.operators.ray_transform import RayTransform
+
+#: How far a varied copy departs from its case: degrees about each axis, part of the size, mm along
+#: each axis.
+TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
+
+
+class Placed(NamedTuple):
+    """A case of a file: its attenuation, where its voxels lie in the file's world and in the
+    case's, in mm, and whether it is mirrored left to right.
+    """
+
+    name: str
+    mu: Slabs
+    source: Grid
+    grid: Grid
+    mirrored: bool = False
+
+
+def moved(
+    grid: Grid,
+    pivot: Float[Tensor, "3"],
+    target: Float[Tensor, "3"],
+    rng: torch.Generator | None,
+    exact: bool = False,
+) -> Grid:
+    """A grid carried from one point to another, with `rng` also turned, scaled and shifted about it
+    at random; an exact move shifts alone, so that axes stay parallel.
+    """
+    linear = torch.eye(3, dtype=torch.float64)
+    if rng is not None and not exact:
+        angles = [uniform(rng, -TURN, TURN) for _ in range(3)]
+        linear = uniform(rng, 1 - SCALE, 1 + SCALE) * euler_rotation(angles, "xyz")
+    if rng is not None:
+        target = target + torch.tensor(
+            [uniform(rng, -SHIFT, SHIFT) for _ in range(3)], dtype=torch.float64
+        )
+    affine = grid.affine.clone()
+    affine[:3, :3] = linear @ affine[:3, :3]
+    affine[:3, 3] = linear @ (affine[:3, 3] - pivot) + target
+    return Grid(grid.shape, affine)
+
 
 #: Tissue begins at -400 HU where the patient is looked for, and at a quarter of water where voxels
 #: are judged.

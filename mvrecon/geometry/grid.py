@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from mvrecon.files.memory import check_memory
+from mvrecon.core.files.memory import check_memory
+from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.rigid import check_rotation
-from mvrecon.quantities import PositiveFloat, PositiveInt, Triple
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,3 +252,20 @@ def pixel_centres(
     """
     v, u = torch.meshgrid(*[torch.arange(n, dtype=dtype) for n in shape], indexing="ij")
     return torch.stack([u, v], dim=-1)
+
+
+def coarse(grid: Grid, most: int) -> Grid:
+    """The same box in mm in at most `most` voxels a side, about as long along all axes; the grid
+    itself where it is as coarse.
+    """
+    lengths = grid.affine.new_tensor(grid.spacing) * grid.affine.new_tensor(grid.size)
+    step = lengths.max() / most
+    counts = [
+        min(n, math.ceil(mm / step - 1e-6))
+        for n, mm in zip(grid.size, lengths.tolist(), strict=True)
+    ]
+    ratio = grid.affine.new_tensor(grid.size) / grid.affine.new_tensor(counts)
+    affine = grid.affine.clone()
+    affine[:3, :3] *= ratio
+    affine[:3, 3] = grid.to_world((ratio - 1) / 2)
+    return Grid((counts[2], counts[1], counts[0]), affine)

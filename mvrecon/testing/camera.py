@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.core.parts import CAMERAS
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import pixel_centres
-from mvrecon.parts import CAMERAS
 
 
 def check_camera(name: str, **options: Any) -> None:

@@ -4,8 +4,8 @@ from typing import Any
 
 import torch
 
-from mvrecon.models.frusta import Frusta
-from mvrecon.parts import HEADS
+from mvrecon.core.parts import HEADS
+from mvrecon.methods.learned.frusta import Frusta
 
 
 def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None:

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.method import build_method
-from mvrecon.models.output import Reconstruction
-from mvrecon.projectors.operator import PerSample, Projector
+from mvrecon.methods.method import build_method
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import PerSample, Projector
 from mvrecon.testing.projector import close
 
 #: Relative, of float32 sums of some thousand products a voxel: of a network, and of a solver, whose

@@ -5,11 +5,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.operator import Projector
+from mvrecon.operators.operator import Projector
 
 #: Relative to |A x| |y|.
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}

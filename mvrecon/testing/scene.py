@@ -4,11 +4,11 @@ from typing import Any
 
 import torch
 
-from mvrecon.cameras.rigs import circular
+from mvrecon.core.parts import SCENES
+from mvrecon.data.scenes.sample import Sample, Scene
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import SCENES
-from mvrecon.projectors.drr import Drr
-from mvrecon.scenes.sample import Sample, Scene
+from mvrecon.operators.drr import Drr
 
 GRID = Grid.centred(24, spacing=5.0)
 RIG = circular(3, 400.0, 800.0, {"pixels": [32, 32], "pixel_mm": 8.0}, start_degrees=17.0)

@@ -7,17 +7,18 @@ import pickle
 import pytest
 import torch
 
-from mvrecon.acquisition.acquired import Acquired
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.config import compose
+from mvrecon.apps.config import compose
+from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.hdf5 import write_volumes
+from mvrecon.data.scenes.analytic import render
+from mvrecon.data.scenes.sample import finer
 from mvrecon.data.volumes import Hdf5Volumes
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, PROJECTORS, SCENES
-from mvrecon.projectors.drr import Drr
-from mvrecon.scenes.analytic import generator, render
-from mvrecon.scenes.sample import finer
+from mvrecon.operators.drr import Drr
 from tests.data.conftest import stored
 
 GRID = Grid.centred((12, 12, 12), 10.0)

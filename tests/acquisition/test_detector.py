@@ -6,10 +6,10 @@ import re
 import pytest
 import torch
 
-from mvrecon.acquisition.detector import WIDTH, blurred, detected
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.cameras.rigs import parallel
-from mvrecon.scenes.analytic import generator
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.acquisition.detector import WIDTH, blurred, detected
+from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.geometry.cameras.rigs import parallel
 
 RIG = parallel(2, {"pixels": [41, 61], "pixel_mm": [0.5, 0.4]}, 100.0)
 FLAT = torch.full((1, 2, 41, 61), 2.0)

@@ -6,15 +6,15 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
-from mvrecon.acquisition.acquired import Acquired
-from mvrecon.acquisition.disturbances import Disturbance, rig_errors
-from mvrecon.acquisition.rig_errors import RigErrors
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.engine.report import remarks
+from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
+from mvrecon.data.acquisition.rig_errors import RigErrors
+from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, PROJECTORS, SCENES
-from mvrecon.projectors.drr import Drr
-from mvrecon.scenes.analytic import generator
+from mvrecon.operators.drr import Drr
+from mvrecon.training.report import remarks
 
 GRID = Grid.centred((12, 12, 12), 10.0)
 DETECTOR = {"pixels": [12, 16], "pixel_mm": 20.0}

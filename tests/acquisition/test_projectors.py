@@ -5,14 +5,14 @@ from typing import Any
 import pytest
 import torch
 
-from mvrecon.acquisition.acquired import Acquired, Projection, source_of
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.parts import PROJECTORS, SCENES
+from mvrecon.data.acquisition.acquired import Acquired, Projection, source_of
+from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.metrics import volume_metrics
-from mvrecon.parts import PROJECTORS, SCENES
-from mvrecon.projectors.drr import Drr
-from mvrecon.reconstructors.iterative import sirt
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.operators.drr import Drr
+from mvrecon.report.metrics import volume_metrics
 
 GRID = Grid.centred(size=(13, 11, 9), spacing=2.0)
 SQUARE = {"pixels": [9, 15], "pixel_mm": 4.0}

@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 
-from mvrecon.calibration.alignment import (
+from mvrecon.methods.calibration.alignment import (
     Alignment,
     aligned,
     alignment,
+    translated,
 )
-from mvrecon.calibration.blur import blurred
-from mvrecon.calibration.translation import translated
+from mvrecon.methods.calibration.blur import blurred
 from tests.models.rig import small_projector
 
 

@@ -5,15 +5,14 @@ from functools import cache, partial
 import pytest
 import torch
 
-from mvrecon.calibration import from_data
-from mvrecon.calibration.from_data import Round, calibrated
-from mvrecon.calibration.linearised import Complement, derivatives
-from mvrecon.calibration.unknowns import unknowns, without_motion
-from mvrecon.cameras.misalignment import Misalignment, misaligned
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.data.scenes.shepp_logan import shepp_logan
+from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.projectors.drr import Drr
-from mvrecon.scenes.shepp_logan import shepp_logan
+from mvrecon.methods.calibration import from_data
+from mvrecon.methods.calibration.from_data import Complement, Round, calibrated, derivatives
+from mvrecon.methods.calibration.unknowns import unknowns, without_motion
+from mvrecon.operators.drr import Drr
 
 GRID = Grid.centred(24, spacing=4.0)
 RIG = circular(20, 400.0, 600.0, {"pixels": [24, 32], "pixel_mm": 6.4})

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from mvrecon.calibration.detection import centroids, helix
-from mvrecon.calibration.markers import dlt, from_markers
-from mvrecon.cameras.misalignment import perturbed
-from mvrecon.cameras.rigs import circular
+from mvrecon.geometry.cameras.misalignment import perturbed
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import pixel_centres
+from mvrecon.methods.calibration.detection import centroids, helix
+from mvrecon.methods.calibration.markers import dlt, from_markers
 from tests.cameras.rigs import same
 
 SHAPE, PIXEL = (96, 128), (1.5, 1.0)

@@ -3,17 +3,16 @@
 import pytest
 import torch
 
-from mvrecon.acquisition.disturbances import Disturbance, rig_errors
-from mvrecon.calibration.alignment import Alignment
-from mvrecon.calibration.self_alignment import (
+from mvrecon.core.parts import PROJECTORS, SCENES
+from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
+from mvrecon.methods.calibration.alignment import Alignment, translated
+from mvrecon.methods.calibration.self_alignment import (
     least_deviations,
     self_aligned,
     self_alignment,
     standing_still,
 )
-from mvrecon.calibration.translation import translated
-from mvrecon.calibration.unknowns import motions
-from mvrecon.parts import PROJECTORS, SCENES
+from mvrecon.methods.calibration.unknowns import motions
 from tests.models.rig import small_rig
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from mvrecon.cameras.camera import Cameras, Extent
+from mvrecon.geometry.cameras.camera import Cameras, Extent
 from mvrecon.geometry.rigid import random_rotation
 
 DETECTOR = {"pixels": [6, 9], "pixel_mm": [2.0, 3.0]}

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.cameras.camera import EXTENTS, VECTORS, Cameras
+from mvrecon.geometry.cameras.camera import EXTENTS, VECTORS, Cameras
 from mvrecon.geometry.grid import Grid, pixel_centres
 from mvrecon.geometry.rigid import random_rotation
 from tests.cameras.rigs import random_cameras, same

@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from mvrecon.cameras.files import save
-from mvrecon.cameras.rigs import circular
-from mvrecon.parts import CAMERAS
-from mvrecon.registry import Registry
+from mvrecon.core.parts import CAMERAS
+from mvrecon.core.registry import Registry
+from mvrecon.geometry.cameras.files import save
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.testing import camera as contract
 from mvrecon.testing.camera import check_camera
 from tests.cameras.rigs import OPTIONS, random_cameras

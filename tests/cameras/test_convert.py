@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from mvrecon.cameras import convert
-from mvrecon.cameras.camera import EXTENTS
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.cameras import convert
+from mvrecon.geometry.cameras.camera import EXTENTS
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from tests.cameras.rigs import DETECTOR, OPTIONS, random_cameras, same
 
 CENTRAL = pytest.mark.parametrize("extent", EXTENTS)

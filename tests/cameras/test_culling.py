@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.camera import Cameras, Extent
-from mvrecon.cameras.culling import seen_depth_range, views_that_see
-from mvrecon.cameras.rigs import circular, dome
+from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.cameras.camera import Cameras, Extent
+from mvrecon.geometry.cameras.culling import seen_depth_range, views_that_see
+from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.parts import CAMERAS, PROJECTORS
 from tests.cameras.rigs import random_cameras
 
 KINDS = [

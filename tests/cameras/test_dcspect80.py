@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.cameras import dcspect80 as module
-from mvrecon.cameras.dcspect80 import dcspect80, modules
+from mvrecon.geometry.cameras import dcspect80 as module
+from mvrecon.geometry.cameras.dcspect80 import dcspect80, modules
 from tests.cameras.rigs import same
 
 

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from mvrecon.cameras.formats import angles, astra, rtk_xml, tigre
-from mvrecon.files.checks import Refused
+from mvrecon.core.files.checks import Refused
+from mvrecon.geometry.cameras.formats import angles, astra, rtk_xml, tigre
 from tests.cameras.rigs import DETECTOR
 
 XML = """<?xml version="1.0"?>

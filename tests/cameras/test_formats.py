@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.cameras.detector import Detector
-from mvrecon.cameras.formats import angles, astra, matrices, rtk_xml, tigre
-from mvrecon.cameras.formats.text import flips_rows
-from mvrecon.cameras.formats.world import to_ras
-from mvrecon.cameras.rigs import circular
-from mvrecon.files.checks import Refused
+from mvrecon.core.files.checks import Refused
+from mvrecon.geometry.cameras.detector import Detector
+from mvrecon.geometry.cameras.formats import angles, astra, matrices, rtk_xml, tigre
+from mvrecon.geometry.cameras.formats.text import flips_rows
+from mvrecon.geometry.cameras.formats.world import to_ras
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.projectors.drr import Drr
+from mvrecon.operators.drr import Drr
 from tests.cameras.rigs import DETECTOR, same
 
 FORMATS = {

@@ -4,9 +4,9 @@ X-ray detector, turned by 180 degrees on a detector behind a pinhole. Depth, too
 import pytest
 import torch
 
-from mvrecon.cameras.files import save
-from mvrecon.cameras.rigs import circular
-from mvrecon.parts import CAMERAS
+from mvrecon.core.parts import CAMERAS
+from mvrecon.geometry.cameras.files import save
+from mvrecon.geometry.cameras.rigs import circular
 from tests.cameras.rigs import DETECTOR, OPTIONS
 
 # Key points (right, up) in mm as a viewer reads the letter: foot, head, ends of the long upper and

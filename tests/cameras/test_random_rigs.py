@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from mvrecon.cameras.random_rigs import PATHS, random_rig
 from mvrecon.data.digests import of_rig
+from mvrecon.geometry.cameras.random_rigs import PATHS, random_rig
 from tests.cameras.rigs import OPTIONS
 
 DRAWS = OPTIONS["random"]

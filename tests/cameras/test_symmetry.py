@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import arc, circular, dome, parallel
-from mvrecon.cameras.symmetry import mirror_pairs
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import arc, circular, dome, parallel
+from mvrecon.geometry.cameras.symmetry import mirror_pairs
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.operators.ray_transform import RayTransform
 from tests.cameras.rigs import DETECTOR, random_cameras
 
 GRID = Grid.centred(size=(8, 5, 6), spacing=(11.0, 9.0, 7.0))

@@ -9,11 +9,11 @@ import xml.etree.ElementTree as ET
 import pytest
 import yaml
 
-from mvrecon import compare
-from mvrecon.comparison import pareto, tables
-from mvrecon.comparison.intervals import mean_interval, t_quantile
-from mvrecon.comparison.rows import FIGURES, read
-from mvrecon.files.checks import Refused
+from mvrecon.apps import compare
+from mvrecon.core.files.checks import Refused
+from mvrecon.report.comparison import pareto, tables
+from mvrecon.report.comparison.rows import FIGURES, read
+from mvrecon.report.comparison.tables import mean_interval, t_quantile
 
 #: PSNR of two methods on four patients of very different difficulty.
 EASY, BETTER = [20.0, 25.0, 30.0, 35.0], [20.9, 26.1, 31.0, 36.0]

@@ -5,13 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.acquisition.acquired import Acquired
-from mvrecon.acquisition.disturbances import Disturbance
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.data.case_store import CaseStore
-from mvrecon.data.module import SceneData
+from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.acquisition.disturbances import Disturbance
+from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.module import CaseStore, SceneData
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, SCENES
 from tests.data.conftest import RIG
 
 GRID = Grid.centred((8, 8, 8), 6.0)

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.dataset import EpochOrder, SceneDataset
-from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.scenes.sample import Sample
+from mvrecon.data.scenes.sample import Sample
 from tests.data.conftest import RIG
 
 
@@ -68,7 +68,7 @@ import sys, torch
 from torch.utils.data import DataLoader
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, SCENES
+from mvrecon.core.parts import CAMERAS, SCENES
 if __name__ == "__main__":
     start, cache, workers = sys.argv[1], sys.argv[2] == "cache", int(sys.argv[4])
     detector = {"pixels": [6, 6], "pixel_mm": 9.0}

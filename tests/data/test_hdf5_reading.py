@@ -7,11 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
+from mvrecon.core.files.checks import Refused
 from mvrecon.data.events.shards import header_of
 from mvrecon.data.hdf5 import VolumeFile
-from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.projections.views import open_projections
 from mvrecon.data.pytorch3dunet import read_example
-from mvrecon.files.checks import Refused
 
 READERS = {
     "views.h5": open_projections,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.data.labels import structures_of
+from mvrecon.data.hdf5 import structures_of
 
 
 def test_names_and_labels_are_read():

@@ -18,8 +18,8 @@ SHAPE = (768, 512, 512)
 CODE = """
 import resource, sys
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.files.checks import Refused
+from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.core.files.checks import Refused
 detector = {"pixels": [4, 4], "pixel_mm": 9.0}
 cameras = CAMERAS.build("circular", n_views=1, sid=300.0, sdd=450.0, detector=detector)
 scene = SCENES.build(sys.argv[1], path=sys.argv[2], vary=True)

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from mvrecon.core.parts import CAMERAS
 from mvrecon.data.module import SceneData
 from mvrecon.data.rigs import camera_of
-from mvrecon.parts import CAMERAS
 from tests.cameras.rigs import OPTIONS
 
 CAMERA = {"name": "random", **OPTIONS["random"], "seed": 5}

@@ -7,10 +7,10 @@ import zipfile
 import numpy as np
 import pytest
 
-from mvrecon.config import compose
+from mvrecon.apps.config import compose
+from mvrecon.core.parts import SCENES
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.volumes import Hdf5Volumes
-from mvrecon.parts import SCENES
 
 
 def load(root, name):

@@ -2,7 +2,7 @@
 
 import pytest
 
-import mvrecon.train
+import mvrecon.apps.train
 from tests.engine.lives import OPTIONS
 from tests.engine.runs import call, rig_file
 
@@ -18,5 +18,5 @@ def run(tmp_path_factory):
         f"hydra.run.dir={place}/run",
         "seed=3",
     ]
-    assert call(mvrecon.train, *options) == 0
+    assert call(mvrecon.apps.train, *options) == 0
     return place / "run", options

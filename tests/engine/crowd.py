@@ -79,8 +79,8 @@ def training(folder: Path, same: bool) -> list[tuple[int, str]]:
     """
     import torch
 
-    from mvrecon import train
-    from mvrecon.config import compose
+    from mvrecon.apps import train
+    from mvrecon.apps.config import compose
     from tests.engine.lives import METHOD, OPTIONS
 
     torch.set_num_threads(1)
@@ -140,7 +140,7 @@ def apps(folder: Path) -> list[tuple[int, str]]:
 
 def resuming(folder: Path) -> list[tuple[int, str]]:
     """One process is at work in a run folder until another has tried to resume it."""
-    from mvrecon.files.atomic import claimed
+    from mvrecon.core.files.atomic import claimed
 
     def hold() -> str:
         with claimed(folder):

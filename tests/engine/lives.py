@@ -72,8 +72,8 @@ def play(
 
 def state(folder: Path) -> dict[str, Any]:
     """Everything that the finished training left, but for how long it took."""
-    from mvrecon.engine.checkpoints import finished
-    from mvrecon.engine.storage import read
+    from mvrecon.training.checkpoints import finished
+    from mvrecon.training.storage import read
 
     found = read(finished(folder, METHOD))
     del found["callbacks"]["Clock"]
@@ -85,7 +85,7 @@ def befall(what: str, n: int) -> None:
     import torch
 
     from mvrecon.data.dataset import SceneDataset
-    from mvrecon.engine.module import ReconstructionModule
+    from mvrecon.training.module import ReconstructionModule
 
     kill = signalled(signal.SIGKILL)
     places = {
@@ -141,8 +141,8 @@ def spoiled(module: Any, n: int) -> None:
 
 def seen(folder: Path) -> dict[str, Any]:
     """Instead of a life, a look at what it would go on from."""
-    from mvrecon.engine.checkpoints import unfinished
-    from mvrecon.engine.storage import previous, read_newest
+    from mvrecon.training.checkpoints import unfinished
+    from mvrecon.training.storage import previous, read_newest
 
     last = unfinished(folder, METHOD)
     begun = last.exists() or previous(last).exists()
@@ -167,7 +167,7 @@ def live(
     options: list[str], settings: dict[str, Any], folder: Path, fate: dict[str, Any]
 ) -> dict[str, Any]:
     """One life, as `mvrecon-train` (where the fate says "app") or straight away: how it ended."""
-    from mvrecon import train
+    from mvrecon.apps import train
 
     if fate.get("what") == "look":
         return seen(folder)
@@ -202,8 +202,8 @@ def warmed(*options: str) -> dict[str, Any]:
     import lightning.pytorch.callbacks  # noqa: F401
     import torch
 
-    from mvrecon.config import compose
-    from mvrecon.engine import evaluation, fit
+    from mvrecon.apps.config import compose
+    from mvrecon.training import evaluation, fit
 
     torch.set_num_threads(1)
     settings = compose(*options)

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.cameras import files
-from mvrecon.config import compose
-from mvrecon.engine import fit, run_folder
-from mvrecon.parts import CAMERAS
+from mvrecon.apps.config import compose
+from mvrecon.core.parts import CAMERAS
+from mvrecon.geometry.cameras import files
+from mvrecon.training import fit, run_folder
 
 RIG = {
     "name": "circular",

@@ -4,9 +4,9 @@ broke off.
 
 import pytest
 
-from mvrecon.config import compose
-from mvrecon.engine import fit
-from mvrecon.engine.module import ReconstructionModule
+from mvrecon.apps.config import compose
+from mvrecon.training import fit
+from mvrecon.training.module import ReconstructionModule
 from tests.engine import lives
 
 #: Every other step, and every epoch.

@@ -4,14 +4,13 @@ pixels.
 
 import torch
 
-from mvrecon.cameras.misalignment import Misalignment, misaligned
-from mvrecon.cameras.rigs import circular
+from mvrecon.apps import calibrate
+from mvrecon.apps.scan import Scan
 from mvrecon.data.projections.views import Corrected
-from mvrecon.engine import calibrate
-from mvrecon.engine.coarse import coarse
-from mvrecon.engine.scan import Scan
-from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.projectors.drr import Drr
+from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
+from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.grid import Grid, coarse, voxel_centres
+from mvrecon.operators.drr import Drr
 
 GRID = Grid.centred(size=(32, 28, 24), spacing=(3.0, 3.0, 4.0))
 RIG = circular(20, 400.0, 600.0, {"pixels": [48, 64], "pixel_mm": 3.2})

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mvrecon.config import compose
-from mvrecon.engine import callbacks, fit
-from mvrecon.engine.callbacks import Clock, outlined
+from mvrecon.apps.config import compose
+from mvrecon.training import callbacks, fit
+from mvrecon.training.callbacks import Clock, outlined
 
 
 def test_an_outline_is_the_masks_outermost_voxels():
@@ -31,7 +31,7 @@ def test_the_board_tells_the_support_at_validation_and_names_the_method(
     settings = copy.deepcopy(compose("experiment=smoke"))
     settings["method"] |= {"support": support}
     settings["trainer"] |= {"max_steps": 2}
-    board = {"_target_": "mvrecon.engine.callbacks.BoardReview", "baselines": [], "cases": 1}
+    board = {"_target_": "mvrecon.training.callbacks.BoardReview", "baselines": [], "cases": 1}
     settings["callbacks"] = {"board": board}
     fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     header = next(tmp_path.rglob("metrics.csv")).read_text().splitlines()[0]
@@ -53,4 +53,4 @@ def test_where_the_system_tells_no_memory_the_clock_logs_the_rest(monkeypatch):
         batch = {"views": torch.zeros(2, 1)}
         Clock().on_train_batch_end(SimpleNamespace(world_size=1), Module(), None, batch, 0)
         assert set(logged) == {"time/step_ms", "time/volumes_per_s", "time/seconds"} | known
-        monkeypatch.setattr("mvrecon.files.memory.resource", None)
+        monkeypatch.setattr("mvrecon.core.files.memory.resource", None)

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.engine.module import ReconstructionModule
-from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.output import Reconstruction
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.training.losses import ReconstructionLoss
+from mvrecon.training.module import ReconstructionModule
 
 GEOMETRY = {
     "grid": {"size": [10, 10, 10], "spacing": 20.0},

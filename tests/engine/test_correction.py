@@ -7,17 +7,17 @@ import pytest
 import torch
 
 import mvrecon as mv
-import mvrecon.reconstruction
-from mvrecon.calibration.self_alignment import self_aligned
-from mvrecon.calibration.translation import translated
-from mvrecon.cameras import files
+import mvrecon.apps.reconstruct
+from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.volume_files import read_volume
-from mvrecon.engine.export import save_views
-from mvrecon.engine.wrong_cameras import camera_row, cameras_of, sentences
-from mvrecon.models.aligned import Aligned
-from mvrecon.parts import PROJECTORS, SCENES
-from mvrecon.reconstructors.iterative import sirt
+from mvrecon.geometry.cameras import files
+from mvrecon.methods.calibration.aligned import Aligned
+from mvrecon.methods.calibration.alignment import translated
+from mvrecon.methods.calibration.self_alignment import self_aligned
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.training.export import save_views
+from mvrecon.training.wrong_cameras import camera_row, cameras_of, sentences
 from tests.engine.runs import call, trained_for_a_step
 from tests.models.rig import small_rig
 
@@ -49,7 +49,7 @@ def reconstructed(case, folder, *options: str, method=SIRT) -> tuple[float, dict
         f"hydra.run.dir={folder}/run",
         "device=cpu",
     )
-    assert call(mvrecon.reconstruction, *fixed, *method, *options) == 0
+    assert call(mvrecon.apps.reconstruct, *fixed, *method, *options) == 0
     volume, _ = read_volume(folder / "run" / "volume.nii.gz")
     table = json.loads((folder / "run" / "results.json").read_text())
     return ((volume - truth[0, 0]).norm() / truth.norm()).item(), table

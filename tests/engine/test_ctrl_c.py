@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.engine.survival import remembered
+from mvrecon.training.resume import remembered
 
 
 @pytest.mark.parametrize("kept", [False, True])

@@ -7,10 +7,10 @@ import torch
 import torch.nn.functional as F
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from mvrecon.config import compose
-from mvrecon.engine import checkpoints, fit
+from mvrecon.apps.config import compose
 from mvrecon.kernels import operator
 from mvrecon.kernels.threads import in_one_order, parallel_for
+from mvrecon.training import checkpoints, fit
 
 #: What torch.use_deterministic_algorithms refuses on CUDA (its documentation, torch 2.13), of what
 #: a network may hold.

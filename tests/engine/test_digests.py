@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-import mvrecon.eval
-import mvrecon.train
-from mvrecon.cameras import files
+import mvrecon.apps.eval
+import mvrecon.apps.train
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.parts import CAMERAS
 from mvrecon.data import digests
-from mvrecon.engine import checkpoints, run_folder
-from mvrecon.files.checks import Refused
-from mvrecon.parts import CAMERAS
+from mvrecon.geometry.cameras import files
+from mvrecon.training import checkpoints, run_folder
 from tests.engine.lives import METHOD
 from tests.engine.runs import RIG, call, rig_file
 
@@ -53,8 +53,8 @@ def test_a_rig_that_has_changed_is_refused(run, kept, tmp_path, capsys):
         rig_file(path.parent, shift=5.0)
         got = digests.of_rig(files.from_file(path))
         for app, options in (
-            (mvrecon.eval, [f"checkpoint={folder}", f"hydra.run.dir={tmp_path}/eval"]),
-            (mvrecon.train, [f"resume={folder}"]),
+            (mvrecon.apps.eval, [f"checkpoint={folder}", f"hydra.run.dir={tmp_path}/eval"]),
+            (mvrecon.apps.train, [f"resume={folder}"]),
         ):
             assert call(app, *options) == 1
             assert (
@@ -63,7 +63,7 @@ def test_a_rig_that_has_changed_is_refused(run, kept, tmp_path, capsys):
     finally:
         rig_file(path.parent)
         (folder / "digests.json").write_bytes(whole)
-    assert call(mvrecon.eval, f"checkpoint={folder}", f"hydra.run.dir={tmp_path}/again") == 0
+    assert call(mvrecon.apps.eval, f"checkpoint={folder}", f"hydra.run.dir={tmp_path}/again") == 0
 
 
 def test_a_digest_of_a_rig_tells_every_part_of_the_record():

@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.field import auto_grid
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.apps.sanity_checks import doubts, oriented_nrmse
+from mvrecon.apps.scan import Scan
+from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.projections.views import Corrected
-from mvrecon.engine.doubts import doubts, oriented_nrmse
-from mvrecon.engine.scan import Scan
+from mvrecon.geometry.cameras.field import auto_grid
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import METHODS, PROJECTORS
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.radon import Radon
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.radon import Radon
 
 GRID = Grid.centred(16, spacing=6.0)
 RIG = circular(24, 300.0, 450.0, {"pixels": [24, 26], "pixel_mm": 6.0})

@@ -11,14 +11,14 @@ from PIL import Image as Pillow
 from rich.console import Console
 from torch import nn
 
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.engine.evaluation import evaluate
-from mvrecon.engine.export import save_case, save_png
-from mvrecon.engine.report import WIDTH, remarks, table
+from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.geometry.grid import Grid
-from mvrecon.metrics import UNITS, mean_and_spread
-from mvrecon.models.output import Reconstruction
-from mvrecon.projectors.operator import Projector
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
+from mvrecon.report.metrics import UNITS, mean_and_spread
+from mvrecon.training.evaluation import evaluate
+from mvrecon.training.export import save_case, save_png
+from mvrecon.training.report import WIDTH, remarks, table
 
 SHAPE = (8, 8, 8)
 

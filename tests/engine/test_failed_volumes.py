@@ -6,14 +6,14 @@ import math
 import pytest
 import torch
 
-from mvrecon.comparison.rows import read
-from mvrecon.config import compose
-from mvrecon.engine import evaluation, fit, report, run_folder
-from mvrecon.metrics import UNITS
-from mvrecon.models.method import Solver
-from mvrecon.models.output import Reconstruction
-from mvrecon.parts import METRICS
-from mvrecon.reconstructors.iterative import backprojection
+from mvrecon.apps.config import compose
+from mvrecon.core.parts import METRICS
+from mvrecon.methods.classical.iterative import backprojection
+from mvrecon.methods.method import Solver
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.report.comparison.rows import read
+from mvrecon.report.metrics import UNITS
+from mvrecon.training import evaluation, fit, report, run_folder
 from tests.engine.test_evaluation import shown
 
 

@@ -5,11 +5,11 @@ import copy
 import pytest
 import torch
 
-from mvrecon.config import compose
-from mvrecon.engine import checkpoints, fit
-from mvrecon.engine.module import ReconstructionModule
-from mvrecon.engine.progress import StepProgress
-from mvrecon.files.runs import folder_of_run
+from mvrecon.apps.config import compose
+from mvrecon.core.files.runs import folder_of_run
+from mvrecon.training import checkpoints, fit
+from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.progress import StepProgress
 
 PLAIN = (dict, list, tuple, str, int, float, bool, type(None), torch.Tensor)
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mvrecon.config import compose
-from mvrecon.engine import fit
-from mvrecon.engine.graph import GraphedLoss, Pass, captured, check_graph
+from mvrecon.apps.config import compose
+from mvrecon.training import fit
+from mvrecon.training.graph import GraphedLoss, Pass, captured, check_graph
 
 TRAINER = {"accelerator": "gpu", "devices": 1, "precision": "bf16-mixed"}
 METHOD, DATA = {"name": "cross_view", "support": "none"}, {"rigs": 0}

@@ -5,10 +5,10 @@ import shutil
 
 import pytest
 
-import mvrecon.train
-from mvrecon.config import compose
-from mvrecon.engine import checkpoints, storage
-from mvrecon.engine.schedule import share
+import mvrecon.apps.train
+from mvrecon.apps.config import compose
+from mvrecon.training import checkpoints, storage
+from mvrecon.training.module import share
 from tests.engine.lives import METHOD, OPTIONS
 from tests.engine.runs import call
 
@@ -25,7 +25,7 @@ def steps(count, schedule):
 def short(tmp_path_factory):
     """A finished run of few steps at a constant rate."""
     folder = tmp_path_factory.mktemp("short")
-    mvrecon.train.train(compose(*PLAIN, *steps(SHORT, "constant")), folder)
+    mvrecon.apps.train.train(compose(*PLAIN, *steps(SHORT, "constant")), folder)
     return folder
 
 
@@ -46,10 +46,10 @@ def test_a_finished_run_goes_on_to_more_steps_as_if_it_had_never_ended(short, tm
     """
     folder, whole = tmp_path / "run", tmp_path / "whole"
     shutil.copytree(short, folder)
-    assert call(mvrecon.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
+    assert call(mvrecon.apps.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
     said = capsys.readouterr().err
     assert f"{SHORT} steps become {LONG}" in said and f"going on from step {SHORT}" in said
-    mvrecon.train.train(compose(*PLAIN, *steps(LONG, "constant")), whole)
+    mvrecon.apps.train.train(compose(*PLAIN, *steps(LONG, "constant")), whole)
     assert all(map(same, kept(folder), kept(whole)))
     rows = [json.loads((f / "results.json").read_text())["methods"] for f in (folder, whole)]
     assert [row[METHOD]["train_steps"] for row in rows] == [LONG, LONG]
@@ -65,7 +65,7 @@ def test_a_run_is_never_shortened_and_takes_nothing_else(short, capsys):
         ([f"trainer.max_steps={SHORT - 1}"], f"expected more, got {SHORT - 1}"),
         ([f"trainer.max_steps={LONG}", "seed=1"], "but got also seed=1"),
     ):
-        assert call(mvrecon.train, f"resume={short}", *options) == 1
+        assert call(mvrecon.apps.train, f"resume={short}", *options) == 1
         assert message in capsys.readouterr().err
     assert (short / "results.json").read_bytes() == before
 
@@ -74,17 +74,17 @@ def test_the_rate_of_a_lengthened_training_is_that_of_the_whole_schedule(short):
     """At step 7 of 14 the cosine is at half of the highest rate, not where it ended at step 7."""
     folder = short.parent / "cosine"
     settings = compose(*PLAIN, *steps(SHORT, "cosine"))
-    mvrecon.train.train(settings, folder)
+    mvrecon.apps.train.train(settings, folder)
     rates = []
-    step = mvrecon.engine.module.ReconstructionModule.training_step
+    step = mvrecon.training.module.ReconstructionModule.training_step
     with pytest.MonkeyPatch.context() as patch:
 
         def watched(module, batch, batch_idx):
             rates.append(module.optimizers().param_groups[0]["lr"])
             return step(module, batch, batch_idx)
 
-        patch.setattr(mvrecon.engine.module.ReconstructionModule, "training_step", watched)
-        assert call(mvrecon.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
+        patch.setattr(mvrecon.training.module.ReconstructionModule, "training_step", watched)
+        assert call(mvrecon.apps.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
     highest = settings["optimizer"]["lr"]
     assert rates == [highest * share("cosine", n, LONG, 0.0) for n in range(SHORT, LONG)]
     assert rates[0] == pytest.approx(highest / 2)

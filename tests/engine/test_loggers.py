@@ -5,9 +5,9 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from mvrecon.engine.loggers import Board
 from mvrecon.geometry.grid import Grid
-from mvrecon.viz import review
+from mvrecon.report.viz import review
+from mvrecon.training.loggers import Board
 
 VOLUMES = {
     "one voxel": torch.rand(1, 1, 1),

@@ -6,14 +6,14 @@ import pytest
 import torch
 
 import mvrecon as mv
-import mvrecon.eval
-from mvrecon.config import compose
-from mvrecon.engine import fit, run_folder
-from mvrecon.engine.trained_method import TrainedMethod
-from mvrecon.files import places
-from mvrecon.files.checks import Refused
-from mvrecon.models.method import build_method
-from mvrecon.parts import PROJECTORS
+import mvrecon.apps.eval
+from mvrecon.apps.config import compose
+from mvrecon.core.files import places
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.methods.method import build_method
+from mvrecon.training import fit, run_folder
+from mvrecon.training.trained_method import TrainedMethod
 from tests.cameras.rigs import OPTIONS
 from tests.engine.runs import call
 from tests.models.rig import small_projector
@@ -142,12 +142,12 @@ def test_no_bit_of_a_file_of_weights_is_outside_its_checksum(run, tmp_path):
 def test_a_run_is_evaluated_on_another_rig_and_grid(run, tmp_path):
     options = ("+camera.n_views=[5,5]", "+grid.size=[9,9,7]", "device=cpu")
     where = f"hydra.run.dir={tmp_path}"
-    assert call(mvrecon.eval, f"checkpoint={run}", *options, where) == 0
-    merged = mvrecon.eval.merged(
+    assert call(mvrecon.apps.eval, f"checkpoint={run}", *options, where) == 0
+    merged = mvrecon.apps.eval.merged(
         run_folder.read_settings(run),
         compose(f"checkpoint={run}", *options, config_name="eval"),
     )
     assert merged["camera"]["n_views"] == [5, 5] and merged["camera"]["pixels"] == [13, 17]
     assert merged["grid"] == {"size": [9, 9, 7], "spacing": 16.0}
     wrong = (f"checkpoint={run}", "+camera.n_view=[5,5]", where + "_2")
-    assert call(mvrecon.eval, *wrong) != 0
+    assert call(mvrecon.apps.eval, *wrong) != 0

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.engine.means import Means
+from mvrecon.training.module import Means
 
 
 def test_a_mean_is_over_cases_whatever_the_batches():

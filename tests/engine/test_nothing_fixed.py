@@ -10,15 +10,15 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.config import compose
+from mvrecon.apps.config import compose
+from mvrecon.apps.train import train
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.dataset import SceneDataset
-from mvrecon.engine import callbacks, fit
-from mvrecon.engine.module import ReconstructionModule
-from mvrecon.models.method import build_method
-from mvrecon.parts import PROJECTORS
-from mvrecon.train import train
-from mvrecon.viz import review
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.methods.method import build_method
+from mvrecon.report.viz import review
+from mvrecon.training import callbacks, fit
+from mvrecon.training.module import ReconstructionModule
 from tests.models.rig import small_rig
 
 FORWARD, ADJOINT, POSES = (
@@ -111,7 +111,7 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
         lambda config: built.append(config["name"]) or build_method(config),
     )
     board = {
-        "_target_": "mvrecon.engine.callbacks.BoardReview",
+        "_target_": "mvrecon.training.callbacks.BoardReview",
         "every": 1,
         "cases": 2,
         "baselines": ["sirt"],

@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
-import mvrecon.eval
-import mvrecon.train
+import mvrecon.apps.eval
+import mvrecon.apps.train
 from mvrecon.data import digests
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.engine.checkpoints import Trained
-from mvrecon.engine.evaluation import seen_in_training
+from mvrecon.training.checkpoints import Trained
+from mvrecon.training.evaluation import seen_in_training
 from tests.engine.lives import OPTIONS
 from tests.engine.runs import call
 
@@ -33,7 +33,7 @@ def patients(tmp_path_factory):
         "data.batch_size=1",
     ]
     options += ["data.sizes={train: 3, val: 1, test: 1}", f"hydra.run.dir={place}/run"]
-    assert call(mvrecon.train, *options) == 0
+    assert call(mvrecon.apps.train, *options) == 0
     return place
 
 
@@ -62,7 +62,12 @@ def test_patients_of_the_training_are_not_called_unseen(patients, tmp_path, caps
         f"+data.sizes.{part}={size}" for part, size in {"train": 0, "val": 0, "test": 5}.items()
     ]
     assert (
-        call(mvrecon.eval, f"checkpoint={patients}/run", *sizes, f"hydra.run.dir={tmp_path}/eval")
+        call(
+            mvrecon.apps.eval,
+            f"checkpoint={patients}/run",
+            *sizes,
+            f"hydra.run.dir={tmp_path}/eval",
+        )
         == 0
     )
     table = json.loads((tmp_path / "eval" / "results.json").read_text())
@@ -84,7 +89,12 @@ def test_patients_of_the_training_are_known_under_other_names(patients, tmp_path
     scene = ("scene@test_scene=hdf5", f"test_scene.path={tmp_path}/copies.h5")
     options = (*scene, "test_scene.crop=none", "+data.sizes.test=5", "acquisition=photons")
     assert (
-        call(mvrecon.eval, f"checkpoint={patients}/run", *options, f"hydra.run.dir={tmp_path}/eval")
+        call(
+            mvrecon.apps.eval,
+            f"checkpoint={patients}/run",
+            *options,
+            f"hydra.run.dir={tmp_path}/eval",
+        )
         == 0
     )
     table = json.loads((tmp_path / "eval" / "results.json").read_text())
@@ -106,10 +116,13 @@ def test_data_that_have_changed_are_refused(patients, tmp_path, capsys):
     write_volumes(path, (volume(f"p{k}", rng) for k in range(7)))
     got = digests.of_file(path)
     for app, options in (
-        (mvrecon.eval, [f"checkpoint={patients}/run", f"hydra.run.dir={tmp_path}/eval"]),
-        (mvrecon.train, [f"resume={patients}/run"]),
+        (mvrecon.apps.eval, [f"checkpoint={patients}/run", f"hydra.run.dir={tmp_path}/eval"]),
+        (mvrecon.apps.train, [f"resume={patients}/run"]),
     ):
         assert call(app, *options) == 1
         assert f"{path}: got sha256 {got[:16]}, expected {expected[:16]}" in capsys.readouterr().err
     path.write_bytes(whole)
-    assert call(mvrecon.eval, f"checkpoint={patients}/run", f"hydra.run.dir={tmp_path}/again") == 0
+    assert (
+        call(mvrecon.apps.eval, f"checkpoint={patients}/run", f"hydra.run.dir={tmp_path}/again")
+        == 0
+    )

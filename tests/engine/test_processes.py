@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
-import mvrecon.train
-from mvrecon.config import compose
+import mvrecon.apps.train
+from mvrecon.apps.config import compose
 from mvrecon.data.dataset import EpochOrder
-from mvrecon.engine import processes
+from mvrecon.training import processes
 from tests.engine.lives import METHOD, OPTIONS, state
 from tests.faults.fault_injection import different
 
@@ -25,7 +25,7 @@ TWO = ("trainer.devices=2", "trainer.strategy=ddp", "data.batch_size=1")
 
 def app(*options, **environment):
     """`mvrecon-train` in a process of its own, as a user calls it."""
-    command = [sys.executable, "-m", "mvrecon.train", *options, "hydra/job_logging=none"]
+    command = [sys.executable, "-m", "mvrecon.apps.train", *options, "hydra/job_logging=none"]
     settings = {**os.environ, "OMP_NUM_THREADS": "2", **environment}
     root = Path(__file__).parents[2]
     return subprocess.run(
@@ -45,7 +45,7 @@ def pair(tmp_path_factory):
     place = tmp_path_factory.mktemp("runs")
     done = app(*PLAIN, *TWO, "plugins=[tests.engine.witness]", f"hydra.run.dir={place}/two")
     assert done.returncode == 0, done.stderr
-    mvrecon.train.train(compose(*PLAIN, "data.batch_size=2"), place / "one")
+    mvrecon.apps.train.train(compose(*PLAIN, "data.batch_size=2"), place / "one")
     return place / "two", place / "one"
 
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.config import compose
-from mvrecon.engine import weights_file
-from mvrecon.engine.checkpoints import Trained
-from mvrecon.engine.module import ReconstructionModule
-from mvrecon.engine.program import exported
-from mvrecon.projectors import torch_ops
+from mvrecon.apps.config import compose
+from mvrecon.operators import torch_ops
+from mvrecon.training import trained as weights_file
+from mvrecon.training.checkpoints import Trained
+from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.program import exported
 
 #: Short, since each step of SIRT is written into the program.
 SHORT = ("method.start=2", "method.consistency=1", "grid.size=[16,16,16]")

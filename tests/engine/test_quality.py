@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from mvrecon.engine.quality import quality_of, quality_row, rank_correlation, sentence
-from mvrecon.engine.wrong_cameras import little_weight
-from mvrecon.models.output import Reconstruction
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.training.quality import quality_of, quality_row, rank_correlation, sentence
+from mvrecon.training.wrong_cameras import little_weight
 
 
 def scene(error: float) -> tuple[Reconstruction, dict]:

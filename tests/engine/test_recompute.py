@@ -3,8 +3,8 @@
 import torch
 from torch.autograd.graph import saved_tensors_hooks
 
-from mvrecon.engine.recompute import Recompute
-from mvrecon.models.unet import PlainUNet
+from mvrecon.methods.learned.unet import PlainUNet
+from mvrecon.training.callbacks import Recompute
 
 
 def gradients(model, x):

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from mvrecon.engine import run_folder
-from mvrecon.engine.loggers import MetricsFile
+from mvrecon.training import run_folder
+from mvrecon.training.loggers import MetricsFile
 
 
 def test_settings_come_back_plain_and_in_order(tmp_path):

@@ -6,11 +6,11 @@ import os
 import pytest
 import yaml
 
-import mvrecon.eval
-import mvrecon.train
-from mvrecon.config import compose
-from mvrecon.engine import fit, run_folder
-from mvrecon.files.atomic import new_folder
+import mvrecon.apps.eval
+import mvrecon.apps.train
+from mvrecon.apps.config import compose
+from mvrecon.core.files.atomic import new_folder
+from mvrecon.training import fit, run_folder
 from tests.engine.lives import METHOD, OPTIONS
 from tests.engine.runs import NOON, call, contents, crowd
 
@@ -22,7 +22,8 @@ def test_settings_that_differ_are_named_and_nothing_is_written(run, capsys):
     folder, options = run
     before = contents(folder)
     assert (
-        call(mvrecon.train, *options, "seed=9", "optimizer.lr=0.5", "+compare.sirt.name=sirt") == 1
+        call(mvrecon.apps.train, *options, "seed=9", "optimizer.lr=0.5", "+compare.sirt.name=sirt")
+        == 1
     )
     message = capsys.readouterr().err
     assert (
@@ -40,7 +41,7 @@ def test_the_same_settings_go_on_and_tell_so(run, capsys):
     """
     folder, options = run
     before = json.loads((folder / "results.json").read_text())
-    assert call(mvrecon.train, *options) == 0
+    assert call(mvrecon.apps.train, *options) == 0
     assert f"{METHOD}: its training has ended already" in capsys.readouterr().err
     again = json.loads((folder / "results.json").read_text())
     assert again["methods"][METHOD]["psnr"] == before["methods"][METHOD]["psnr"]
@@ -57,12 +58,12 @@ def test_a_run_tells_from_which_step_it_goes_on(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(fit.ReconstructionModule, "training_step", breaking)
     with pytest.raises(RuntimeError, match="power cut"):
-        mvrecon.train.train(settings, tmp_path)
+        mvrecon.apps.train.train(settings, tmp_path)
     assert "going on" not in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"got seed=9, expected 0"):
-        mvrecon.train.train({**settings, "seed": 9}, tmp_path)
+        mvrecon.apps.train.train({**settings, "seed": 9}, tmp_path)
     monkeypatch.setattr(fit.ReconstructionModule, "training_step", step)
-    mvrecon.train.train(settings, tmp_path)
+    mvrecon.apps.train.train(settings, tmp_path)
     assert f"{METHOD}: going on from step 6" in capsys.readouterr().err
 
 
@@ -82,7 +83,7 @@ def test_an_evaluation_does_not_write_into_a_run(run, capsys):
     """An evaluation into the folder of a run is refused, and the run's own table stays."""
     folder, _ = run
     before = (folder / "results.json").read_bytes()
-    assert call(mvrecon.eval, f"checkpoint={folder}", f"hydra.run.dir={folder}") == 1
+    assert call(mvrecon.apps.eval, f"checkpoint={folder}", f"hydra.run.dir={folder}") == 1
     assert "of another run without its eval.yaml" in capsys.readouterr().err
     assert (folder / "results.json").read_bytes() == before
 
@@ -130,7 +131,7 @@ def test_a_resumed_run_makes_no_other_folder(run, tmp_path, monkeypatch):
     """A resumed run leaves no folder but its own."""
     folder, _ = run
     monkeypatch.chdir(tmp_path)
-    assert call(mvrecon.train, f"resume={folder}") == 0
+    assert call(mvrecon.apps.train, f"resume={folder}") == 0
     assert list(tmp_path.iterdir()) == [] and not list(folder.glob(".hydra"))
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.engine.schedule import build_optimizer, build_schedule, share
+from mvrecon.training.module import build_optimizer, build_schedule, share
 
 
 def rates(name, steps, **options):

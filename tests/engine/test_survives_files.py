@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.engine import storage
-from mvrecon.engine.survival import RandomNumbers
-from mvrecon.files.atomic import claimed, written_whole
-from mvrecon.files.checks import Refused
+from mvrecon.core.files.atomic import claimed, written_whole
+from mvrecon.core.files.checks import Refused
+from mvrecon.training import storage
+from mvrecon.training.resume import RandomNumbers
 from tests.faults.fault_injection import counted, signalled
 
 SEED = int(os.environ.get("MVRECON_SEED", "0"))

@@ -7,8 +7,8 @@ import torch
 import yaml
 
 import mvrecon as mv
-from mvrecon.config import compose
-from mvrecon.engine import checkpoints, fit
+from mvrecon.apps.config import compose
+from mvrecon.training import checkpoints, fit
 from tests.engine.runs import trained_for_a_step
 
 

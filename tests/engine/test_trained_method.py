@@ -11,13 +11,13 @@ import pytest
 import torch
 
 import mvrecon as mv
-import mvrecon.reconstruction
-from mvrecon.cameras import files
+import mvrecon.apps.reconstruct
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.volume_files import read_volume
-from mvrecon.engine.export import save_views
-from mvrecon.engine.trained_method import TrainedMethod
+from mvrecon.geometry.cameras import files
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
+from mvrecon.training.export import save_views
+from mvrecon.training.trained_method import TrainedMethod
 from tests.engine.runs import call, trained_for_a_step
 
 
@@ -65,7 +65,7 @@ def test_a_checkpoint_reconstructs_a_scan_of_its_own_rig_as_its_module_does(
     )
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        assert call(mvrecon.reconstruction, *options) == 0
+        assert call(mvrecon.apps.reconstruct, *options) == 0
     assert not [w for w in told if "trained" in str(w.message)]
     volume, grid = read_volume(tmp_path / "volume.nii.gz")
     with torch.inference_mode():

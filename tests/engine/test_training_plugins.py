@@ -8,16 +8,17 @@ import json
 import pytest
 import torch
 
-import mvrecon.train
-from mvrecon import load, registry
-from mvrecon.config import compose
-from mvrecon.config.targets import instantiate
-from mvrecon.config.typed import check_parts
-from mvrecon.engine.report import table as report
-from mvrecon.files.checks import Refused
-from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.output import Reconstruction
-from mvrecon.parts import CALLBACKS, LOGGERS
+import mvrecon.apps.train
+from mvrecon import load
+from mvrecon.apps.config import compose
+from mvrecon.apps.config.typed import check_parts
+from mvrecon.core import registry
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.parts import CALLBACKS, LOGGERS
+from mvrecon.core.targets import instantiate
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.training.losses import ReconstructionLoss
+from mvrecon.training.report import table as report
 from tests.engine.lives import METHOD, OPTIONS
 from tests.faults.plugins import plugin
 
@@ -100,7 +101,7 @@ def test_a_training_takes_the_optimiser_callback_logger_and_loss_of_a_plugin(
     """
     settings = compose(*OPTIONS, *CHOSEN)
     check_parts(settings)
-    mvrecon.train.train(settings, tmp_path / "run")
+    mvrecon.apps.train.train(settings, tmp_path / "run")
     assert (tmp_path / "run" / "counted.txt").read_text() == "3"
     assert list((tmp_path / "run").rglob("lightning_logs/*/metrics.csv"))
     with open(tmp_path / "run" / "metrics.csv", newline="") as file:

@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from mvrecon.calibration.alignment import Alignment
-from mvrecon.config import compose
-from mvrecon.engine import fit
-from mvrecon.engine.checkpoints import load
-from mvrecon.engine.module import ReconstructionModule
+from mvrecon.apps.config import compose
+from mvrecon.methods.calibration.alignment import Alignment
+from mvrecon.training import fit
+from mvrecon.training.checkpoints import load
+from mvrecon.training.module import ReconstructionModule
 
 ALIGNED = (
     "experiment=smoke",

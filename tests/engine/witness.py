@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from mvrecon.engine.module import ReconstructionModule
+from mvrecon.training.module import ReconstructionModule
 
 STEP = ReconstructionModule.training_step
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from importlib import invalidate_caches
 from pathlib import Path
 
-from mvrecon.registry import GROUP, installed
+from mvrecon.core.registry import GROUP, installed
 
 
 @contextmanager

@@ -12,17 +12,17 @@ import numpy as np
 import torch
 import yaml
 
-from mvrecon.cameras.files import from_file, save
+from mvrecon.core.files.checks import yaml_of
+from mvrecon.core.parts import CAMERAS
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.nifti import read_nifti
-from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.projections.views import open_projections
 from mvrecon.data.pytorch3dunet import Example, read_example, write_example
 from mvrecon.data.volume_files import read_volume, save_volume
-from mvrecon.engine.checkpoints import load
-from mvrecon.engine.module import ReconstructionModule
-from mvrecon.files.checks import yaml_of
+from mvrecon.geometry.cameras.files import from_file, save
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS
+from mvrecon.training.checkpoints import load
+from mvrecon.training.module import ReconstructionModule
 from tests.data.projections.conftest import dicom_image
 from tests.faults.hostile import pickle_of, saved, with_pickle
 

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, dome
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
 from tests.projectors.cases import METHODS, Case
 
 N = 48

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import parallel
+from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cpu import columns, plan
 from mvrecon.kernels.rays.cpu import operators as cpu
-from mvrecon.projectors.radon import Radon
+from mvrecon.operators.radon import Radon
 
 N = 24
 #: Numbers in front of a copy and behind it: more than a slab.

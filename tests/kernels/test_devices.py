@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.visual_hull.footprints import prints_of
+from mvrecon.operators.visual_hull.footprints import prints_of
 from tests.kernels.cuda.waits import Waits
 from tests.projectors.rigs import CONE, GRID, PARALLEL
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from tests.projectors.cases import CASES, METHODS, OPTIONS, Case, gap, noise
 

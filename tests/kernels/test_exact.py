@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.parts import PROJECTORS
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
 
 BACKENDS = ("reference", "cpu")
 DETECTOR = {"pixels": [24, 24], "pixel_mm": 2.6}

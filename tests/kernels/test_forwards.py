@@ -10,7 +10,7 @@ from torch.autograd import forward_ad
 
 from mvrecon.geometry.lattice import lifted_maps
 from mvrecon.kernels.warps.warp import warp
-from mvrecon.projectors.voxel_driven import backproject
+from mvrecon.operators.voxel_driven import backproject
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
 from tests.projectors.cases import DIFFERENTIABLE, METHODS, gap, noise
 

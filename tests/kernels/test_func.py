@@ -13,7 +13,7 @@ from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from mvrecon.geometry.lattice import lifted_maps
 from mvrecon.kernels.warps.warp import warp
-from mvrecon.projectors.voxel_driven import backproject
+from mvrecon.operators.voxel_driven import backproject
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
 from tests.projectors.cases import DIFFERENTIABLE, METHODS, Case, gap, noise
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.cpu import columns, packed_volume, plan
@@ -15,7 +16,6 @@ from mvrecon.kernels.rays.cpu import operators as cpu
 from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room_of
 from mvrecon.kernels.rays.cpu.rig import Reads, Slabs, Units, rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.parts import PROJECTORS
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from tests.projectors.cases import CASES, OPTIONS, Case, noise
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
 
 DETECTOR = {"pixels": [14, 15], "pixel_mm": 2.1}
 GRID = Grid.centred(size=(22, 20, 18), spacing=(1.0, 1.1, 0.9))

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, dome
+from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cpu import plan
 from mvrecon.kernels.rays.cpu.operators import backproject, project

@@ -5,9 +5,9 @@ import itertools
 import pytest
 import torch
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
 from tests.projectors.cases import CASES, gap, noise
 from tests.projectors.rigs import GRID, RIGS
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mvrecon.parts import PROJECTORS
+from mvrecon.core.parts import PROJECTORS
 from tests.models.rig import small_rig
 
 

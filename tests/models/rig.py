@@ -3,10 +3,10 @@
 import torch
 from torch import nn
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.parts import CAMERAS, PROJECTORS
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.method import build_method
-from mvrecon.parts import CAMERAS, PROJECTORS
+from mvrecon.methods.method import build_method
 
 #: Options of methods with few weights.
 SMALL = {

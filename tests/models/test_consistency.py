@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.consistency import Consistency, em_change, weighted_for_counts
-from mvrecon.models.geometry import Geometry
-from mvrecon.models.output import Reconstruction
-from mvrecon.projectors.operator import Scaled
-from mvrecon.reconstructors.iterative import sirt_weights
-from mvrecon.reconstructors.mlem import mlem
-from mvrecon.reconstructors.poisson import negative_log_likelihood
+from mvrecon.methods.classical.iterative import sirt_weights
+from mvrecon.methods.classical.mlem import mlem
+from mvrecon.methods.classical.poisson import negative_log_likelihood
+from mvrecon.methods.learned.consistency import Consistency, em_change, weighted_for_counts
+from mvrecon.methods.learned.geometry import Geometry
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Scaled
 from mvrecon.testing import check_method
+from mvrecon.training.losses import ReconstructionLoss
 from tests.models.rig import SMALL, small, small_projector
 
 COUNTED = {"steps": 3, "noise": "poisson"}

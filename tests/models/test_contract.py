@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from mvrecon.models.output import Reconstruction
-from mvrecon.parts import CAMERAS, METHODS, PROJECTORS
-from mvrecon.projectors.checks import check_views
+from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.checks import check_views
 from mvrecon.testing import check_method
 from tests.models.rig import SMALL, small_projector, small_rig, stirred
 

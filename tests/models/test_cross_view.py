@@ -11,15 +11,14 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d
 
+from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.cross_view import FASTER, CrossView
-from mvrecon.models.geometry import Geometry
-from mvrecon.models.pooling import leave_one_out
-from mvrecon.models.start import Beginning
-from mvrecon.models.view_frames import coarsened
-from mvrecon.parts import CAMERAS, PROJECTORS
-from mvrecon.projectors.operator import Scaled
-from mvrecon.reconstructors.iterative import SirtWeights, sirt, sirt_weights
+from mvrecon.methods.classical.iterative import SirtWeights, sirt, sirt_weights
+from mvrecon.methods.learned.cross_view import FASTER, CrossView
+from mvrecon.methods.learned.geometry import Geometry
+from mvrecon.methods.learned.start import Beginning
+from mvrecon.methods.learned.view_frames import coarsened, leave_one_out
+from mvrecon.operators.operator import Scaled
 from mvrecon.testing import check_method
 from tests.models.rig import SMALL, ball, blob, small, small_projector, small_rig, stirred
 

@@ -3,11 +3,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.culling import seen_depth_range
+from mvrecon.core.parts import CAMERAS
+from mvrecon.geometry.cameras.culling import seen_depth_range
 from mvrecon.geometry.frustum import depth_edges, depth_index
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.models.frusta import Frusta
-from mvrecon.parts import CAMERAS
+from mvrecon.methods.learned.frusta import Frusta
 from tests.models.rig import small_rig
 
 

@@ -10,11 +10,11 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from mvrecon.models.geometry import Geometry, geometry_of, kept
-from mvrecon.models.view_frames import ViewFrames
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.operator import Scaled
-from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.methods.learned.geometry import Geometry, geometry_of, kept
+from mvrecon.methods.learned.view_frames import ViewFrames
+from mvrecon.operators.operator import Scaled
+from mvrecon.operators.ray_transform import RayTransform
 from tests.models.rig import blob, small, small_projector, small_rig, stirred
 
 SIZE, VIEWS = 24, 10

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from mvrecon.models.frusta import Frusta
-from mvrecon.parts import HEADS
+from mvrecon.core.parts import HEADS
+from mvrecon.methods.learned.frusta import Frusta
 from mvrecon.testing import check_head
 from tests.models.rig import small_rig
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.models.method import build_method
-from mvrecon.projectors.operator import PerSample
+from mvrecon.methods.method import build_method
+from mvrecon.operators.operator import PerSample
 from tests.models.rig import small_projector
 from tests.reconstructors.methods import NAMES
 

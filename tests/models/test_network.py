@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import nn
 
-from mvrecon.models.network import network_by_name
-from mvrecon.parts import NETWORKS
+from mvrecon.core.parts import NETWORKS
+from mvrecon.methods.learned.network import network_by_name
 from mvrecon.testing import check_method, check_network
 from tests.models.rig import SMALL, blob, small, small_projector
 

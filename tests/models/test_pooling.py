@@ -1,6 +1,6 @@
 import torch
 
-from mvrecon.models.pooling import fuse, leave_one_out, pooled
+from mvrecon.methods.learned.view_frames import fuse, leave_one_out, pooled
 
 
 def _volumes(m: int = 5) -> tuple[torch.Tensor, torch.Tensor]:

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, PROJECTORS
-from mvrecon.projectors.operator import Projector
+from mvrecon.operators.operator import Projector
 from tests.models.rig import SMALL, small_projector, stirred
 from tests.models.test_contract import OPTIONS
 

@@ -4,12 +4,12 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d
 
+from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.models import start as starts
-from mvrecon.models.geometry import Geometry
-from mvrecon.models.start import ClassicalStart
-from mvrecon.parts import METHODS
-from mvrecon.reconstructors.iterative import sirt
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.learned import start as starts
+from mvrecon.methods.learned.geometry import Geometry
+from mvrecon.methods.learned.start import ClassicalStart
 from tests.models.rig import blob, small, small_projector
 
 SIRT = {"name": "sirt", "iterations": 3}

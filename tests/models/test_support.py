@@ -5,9 +5,9 @@ import torch
 from torch.nn.functional import max_pool3d
 
 from mvrecon.geometry.box import Box
-from mvrecon.losses import ReconstructionLoss
-from mvrecon.models import geometry
-from mvrecon.visual_hull import support as supports
+from mvrecon.methods.learned import geometry
+from mvrecon.operators.visual_hull import support as supports
+from mvrecon.training.losses import ReconstructionLoss
 from tests.models.rig import stirred
 
 pytestmark = pytest.mark.filterwarnings("ignore:Rays are up to")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.losses import ReconstructionLoss
+from mvrecon.training.losses import ReconstructionLoss
 from tests.models.rig import SMALL, blob, small, small_projector, stirred
 
 LOSS = ReconstructionLoss(1.0, uncertainty=1e-3)

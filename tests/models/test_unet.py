@@ -8,8 +8,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mvrecon.models import unet
-from mvrecon.models.unet import (
+from mvrecon.methods.learned import unet
+from mvrecon.methods.learned.unet import (
     ALONE,
     Block,
     PlainUNet,

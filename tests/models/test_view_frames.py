@@ -4,13 +4,13 @@ import math
 
 import torch
 
-from mvrecon.cameras.rigs import parallel
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.frusta import Frusta
-from mvrecon.models.geometry import Geometry
-from mvrecon.models.view_frames import LEAST, ViewFrames, means, transmission
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.operator import PerSample, Wrapped
+from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.geometry import Geometry
+from mvrecon.methods.learned.view_frames import LEAST, ViewFrames, means, transmission
+from mvrecon.operators.operator import PerSample, Wrapped
 from tests.models.rig import blob, small_projector, small_rig
 
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from mvrecon.cameras.camera import VECTORS, Cameras
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.cameras.rigs import arc, circular, dome, parallel
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.rigs import arc, circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.operators.ray_transform import RayTransform
 from tests.projectors.rigs import AXIAL, GRID, INSIDE
 
 METHODS = ("joseph", "siddon", "trilinear")

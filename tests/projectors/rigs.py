@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import torch
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 
 GRID = Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.box import Box
-from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.operators.ray_transform import RayTransform
 from tests.projectors.sparse import CASES, volumes
 
 

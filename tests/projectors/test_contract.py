@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.drr import Drr
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.operators.drr import Drr
 from mvrecon.testing import check_projector
 from tests.projectors.rigs import CONE, GRID, RIGS
 

@@ -6,11 +6,11 @@ from copy import copy
 import pytest
 import torch
 
-from mvrecon.cameras.camera import VECTORS
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.checks import check_views
-from mvrecon.projectors.selection import view_subset
+from mvrecon.operators.checks import check_views
+from mvrecon.operators.selection import view_subset
 from tests.projectors.cases import curved
 from tests.projectors.rigs import CONE, GRID, PARALLEL
 

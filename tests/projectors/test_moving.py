@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.projectors.selection import ray_subset, view_subset
+from mvrecon.operators.selection import ray_subset, view_subset
 from tests.projectors.cases import DIFFERENTIABLE, Case, noise
 
 KINDS = ("cone", "beams", "explicit")

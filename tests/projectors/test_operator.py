@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.box import Box
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.operator import Cropped, LinearOperator, Scaled
-from mvrecon.projectors.selection import RaySelection, ViewSelection
-from mvrecon.projectors.stacked import Stacked
-from mvrecon.reconstructors.iterative import sirt
-from mvrecon.reconstructors.mlem import mlem
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.mlem import mlem
+from mvrecon.operators.operator import Cropped, LinearOperator, Scaled
+from mvrecon.operators.selection import RaySelection, ViewSelection
+from mvrecon.operators.stacked import Stacked
 from tests.projectors.rigs import CONE, GRID
 
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
-from mvrecon.scenes.solids import Phantom, Solids
 from tests.projectors.cases import (
     CASES,
     DIFFERENTIABLE,

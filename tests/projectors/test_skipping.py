@@ -7,7 +7,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.kernels.rays.cpu import plan
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.projectors import integrals
+from mvrecon.operators import integrals
 from tests.projectors.cases import Case
 from tests.projectors.sparse import CASES, GRID, KINDS, METHODS, WAYS, volumes
 

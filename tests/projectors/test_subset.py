@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mvrecon.kernels.rays.cpu import operators as cpu
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.selection import (
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.selection import (
     RaySelection,
     ViewSelection,
     ordered_subsets,

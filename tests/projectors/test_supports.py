@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import dome
+from mvrecon.geometry.cameras.rigs import dome
 from mvrecon.geometry.grid import Grid
 from tests.projectors.cases import Case
 from tests.projectors.sparse import CASES, GRID, METHODS, volumes

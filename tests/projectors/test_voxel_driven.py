@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.kernels.voxels.cpu import upright
-from mvrecon.projectors.voxel_driven import backproject, image_maps
+from mvrecon.operators.voxel_driven import backproject, image_maps
 from tests.projectors.cases import gap
 from tests.projectors.rigs import CENTRAL, CONE, GRID, PARALLEL, PINHOLES
 

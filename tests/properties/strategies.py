@@ -10,7 +10,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from mvrecon.cameras.camera import EXTENTS, Cameras
+from mvrecon.geometry.cameras.camera import EXTENTS, Cameras
 from mvrecon.geometry.grid import Grid
 from tests.projectors.cases import Case
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from mvrecon.cameras import convert, files
-from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras import convert, files
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import pixel_centres
 from tests.properties.strategies import CUBE, ROTATIONS, SEEDS, cases, radius, vectors
 

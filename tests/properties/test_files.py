@@ -6,10 +6,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mvrecon.core.files.checks import plain_name
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
-from mvrecon.engine import run_folder
-from mvrecon.files.checks import plain_name
 from mvrecon.geometry.grid import Grid
+from mvrecon.training import run_folder
 from tests.properties.strategies import grids, real, volumes
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)

@@ -7,11 +7,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mvrecon.core.parts import HEADS
 from mvrecon.geometry.lattice import enclosed
 from mvrecon.kernels.warps.reference import normalised_places
-from mvrecon.models.frusta import Frusta
-from mvrecon.models.pooling import fuse, leave_one_out, pooled
-from mvrecon.parts import HEADS
+from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.view_frames import fuse, leave_one_out, pooled
 from tests.projectors.cases import Case
 from tests.properties.strategies import SEEDS, cases, real, volumes
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mvrecon.geometry.box import Box
 from mvrecon.kernels.rays.cpu import skip_policy
-from mvrecon.projectors.selection import ray_subset, view_subset
+from mvrecon.operators.selection import ray_subset, view_subset
 from tests.projectors.cases import CASES
 from tests.properties.rays import allowed
 from tests.properties.strategies import DTYPES, METHODS, SEEDS, cases, epsilon, volumes

@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import torch
 
-from mvrecon.cameras.rigs import circular
+from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import METHODS, PROJECTORS
-from mvrecon.projectors.operator import LinearOperator
+from mvrecon.operators.operator import LinearOperator
 
 GRID = Grid.centred(size=(8, 7, 6), spacing=2.0)
 RIG = circular(9, 60.0, 100.0, {"pixels": [9, 11], "pixel_mm": 2.5}, start_degrees=5.0)
@@ -67,7 +67,7 @@ GEOMETRIC = {"fbp", "fdk", "finer", "backprojection"}
 NAMES = [
     name
     for name in METHODS.names()
-    if METHODS.origin(name).startswith("mvrecon.reconstructors.") and name not in GEOMETRIC
+    if METHODS.origin(name).startswith("mvrecon.methods.classical.") and name not in GEOMETRIC
 ]
 
 

@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import avg_pool3d
 
 import mvrecon as mv
+from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import subdivided
-from mvrecon.parts import METHODS
 from mvrecon.testing import check_method
 from tests.reconstructors.methods import GRID, RIG, Dense, gap, projector, truth
 

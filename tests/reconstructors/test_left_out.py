@@ -5,8 +5,8 @@ from functools import partial
 import pytest
 import torch
 
-from mvrecon.reconstructors.iterative import sirt
-from mvrecon.reconstructors.left_out import left_out_residual
+from mvrecon.methods.classical.held_out import left_out_residual
+from mvrecon.methods.classical.iterative import sirt
 from tests.models.rig import small_projector
 
 METHOD = partial(sirt, iterations=20, momentum=True)

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from mvrecon.projectors.selection import distant_order, ordered_subsets, usual_subsets
-from mvrecon.reconstructors.iterative import sirt
-from mvrecon.reconstructors.os_sart import os_sart
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.os_sart import os_sart
+from mvrecon.operators.selection import distant_order, ordered_subsets, usual_subsets
 from tests.reconstructors.methods import Dense, gap, projector, truth
 
 

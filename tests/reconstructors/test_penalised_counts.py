@@ -3,13 +3,12 @@
 import pytest
 import torch
 
-from mvrecon.projectors.operator import LinearOperator
-from mvrecon.reconstructors.bsrem import bsrem
-from mvrecon.reconstructors.mlem import mlem, osem
-from mvrecon.reconstructors.poisson import PoissonLikelihood
-from mvrecon.reconstructors.relative_difference import RelativeDifference
-from mvrecon.reconstructors.total_variation import total_variation, voxel_steps
-from mvrecon.reconstructors.tv_map import tv_map
+from mvrecon.methods.classical.bsrem import RelativeDifference, bsrem
+from mvrecon.methods.classical.mlem import mlem, osem
+from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.methods.classical.total_variation import total_variation, voxel_steps
+from mvrecon.methods.classical.tv_map import tv_map
+from mvrecon.operators.operator import LinearOperator
 from tests.reconstructors.methods import Dense, gap, projector, truth
 
 

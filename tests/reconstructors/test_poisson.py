@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, dome
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.subset import SomePixels, SomeViews
-from mvrecon.reconstructors import mlem as steps
-from mvrecon.reconstructors.mlem import mlem
-from mvrecon.reconstructors.poisson import PoissonLikelihood
+from mvrecon.methods.classical import mlem as steps
+from mvrecon.methods.classical.mlem import mlem
+from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.ray_transform import SomePixels, SomeViews
 
 GRID = Grid.centred(size=(10, 8, 9), spacing=2.0)
 #: Detector columns that stand upright over the volume, and pinholes from above.

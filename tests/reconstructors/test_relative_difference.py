@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.reconstructors.relative_difference import RelativeDifference
+from mvrecon.methods.classical.bsrem import RelativeDifference
 
 SHAPE, STEPS = (4, 5, 6), (2.0, 1.0, 1.0)
 

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from mvrecon.reconstructors.cgls import cgls
-from mvrecon.reconstructors.held_out import held_out
-from mvrecon.reconstructors.iterative import sirt
-from mvrecon.reconstructors.stopping import Curve, combined, corner, discrepancy
-from mvrecon.reconstructors.tikhonov import tikhonov
+from mvrecon.methods.classical.cgls import cgls
+from mvrecon.methods.classical.held_out import held_out
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.stopping import Curve, combined, corner, discrepancy
+from mvrecon.methods.classical.tikhonov import tikhonov
 from tests.reconstructors.methods import NAMES, gap, projector, run, truth
 from tests.reconstructors.test_total_variation import slice_operator
 

@@ -3,21 +3,20 @@
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
-from mvrecon.reconstructors.fista_tv import fista_tv, tv_objective
-from mvrecon.reconstructors.iterative import sirt
-from mvrecon.reconstructors.pdhg_tv import pdhg_tv
-from mvrecon.reconstructors.power import power_norm
-from mvrecon.reconstructors.total_variation import (
+from mvrecon.methods.classical.fista_tv import fista_tv, power_norm, tv_objective
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.pdhg_tv import pdhg_tv
+from mvrecon.methods.classical.total_variation import (
     Shrinkage,
     gradient,
     gradient_adjoint,
     total_variation,
     tv_proximal,
 )
-from mvrecon.reconstructors.weighted_fit import WeightedFit
+from mvrecon.methods.classical.weighted_fit import WeightedFit
 from tests.reconstructors.methods import Dense, gap
 
 STEPS = (1.5, 2.0, 0.5)

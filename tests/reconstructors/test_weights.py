@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.reconstructors import iterative
-from mvrecon.reconstructors.iterative import sirt_weights
+from mvrecon.methods.classical import iterative
+from mvrecon.methods.classical.iterative import sirt_weights
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.ray_transform import RayTransform
 
 GRID = Grid.centred(size=(8, 5, 6), spacing=(11.0, 9.0, 7.0))
 DETECTOR = {"pixels": [5, 9], "pixel_mm": [14.0, 9.0]}

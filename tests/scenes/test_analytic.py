@@ -3,10 +3,11 @@ import math
 import pytest
 import torch
 
+from mvrecon.core.parts import SCENES
+from mvrecon.core.random_numbers import generator, mixed
+from mvrecon.data.scenes.analytic import render
+from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import SCENES
-from mvrecon.scenes.analytic import generator, mixed, render
-from mvrecon.scenes.solids import Phantom, Solids
 
 ENDLESS = ["ellipsoids", "derenzo"]
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from mvrecon.parts import SCENES
-from mvrecon.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.core.parts import SCENES
+from mvrecon.data.scenes.ellipsoids import RandomEllipsoids
 from mvrecon.testing import check_scene
 
 

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from mvrecon.data.scenes.solids import ROUND_AXES, Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.scenes.solids import ROUND_AXES, Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
 
 
 def points(*places):

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.defrise import Defrise
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.defrise import Defrise
-from mvrecon.scenes.voxelise import voxelise
 
 
 def test_discs_are_at_their_pitch_and_nothing_is_between_them():

@@ -3,10 +3,10 @@ import math
 import pytest
 import torch
 
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.derenzo import RandomDerenzo, derenzo, sector_wells
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.derenzo import RandomDerenzo, derenzo, sector_wells
 
 DIAMETERS = (8, 6, 5, 4, 3, 2)
 

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.ellipsoids import RandomEllipsoids
 
 
 @pytest.mark.parametrize("seed", range(60))

@@ -4,8 +4,8 @@ import pytest
 import torch
 import yaml
 
-from mvrecon.parts import SCENES
-from mvrecon.scenes.mixture import Mixture
+from mvrecon.core.parts import SCENES
+from mvrecon.data.scenes.mixture import Mixture
 
 CONF = Path(__file__).parents[2] / "conf" / "scene"
 

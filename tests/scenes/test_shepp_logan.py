@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from mvrecon.data.scenes.shepp_logan import SheppLogan, shepp_logan
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.shepp_logan import SheppLogan, shepp_logan
 
 
 def test_known_places():

@@ -4,8 +4,8 @@ import math
 import pytest
 import torch
 
+from mvrecon.data.scenes.solids import ROUND_AXES, Phantom, Solids
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.scenes.solids import ROUND_AXES, Phantom, Solids
 
 INF = math.inf
 
@@ -160,7 +160,7 @@ def test_shapes_dtypes_and_chunks(mixed, rays, monkeypatch):
     assert whole.shape == (3, 4, 5) and whole.dtype == torch.float64
     assert mixed.integrals(start.float(), end.float()).dtype == torch.float32
     assert mixed.values(start.float()).shape == (3, 4, 5)
-    monkeypatch.setattr("mvrecon.scenes.solids.PAIRS", 30)
+    monkeypatch.setattr("mvrecon.data.scenes.solids.PAIRS", 30)
     torch.testing.assert_close(mixed.integrals(start, end), whole)
     torch.testing.assert_close(
         mixed.integrals(start[0, 0, 0], end), mixed.integrals(start[:1, :1, :1].expand_as(end), end)

@@ -4,11 +4,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-import mvrecon.scenes.voxelise as voxelise_module
+import mvrecon.data.scenes.voxelise as voxelise_module
+from mvrecon.data.scenes.solids import ROUND_AXES, Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.scenes.solids import ROUND_AXES, Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
 
 UNIT_VOLUMES = {"ellipsoid": 4 / 3 * math.pi, "cylinder": 2 * math.pi, "box": 8.0}
 
@@ -80,7 +80,7 @@ def test_solids_that_leave_the_grid_are_cut():
 def test_chunks_change_nothing(monkeypatch):
     grid, phantom = skew_grid(), Phantom((solids("cylinder"),))
     whole = voxelise(phantom, grid)
-    monkeypatch.setattr("mvrecon.scenes.voxelise.POINTS", 200)
+    monkeypatch.setattr("mvrecon.data.scenes.voxelise.POINTS", 200)
     assert torch.equal(voxelise(phantom, grid), whole)
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.engine.checkpoint_check import check_archive
-from mvrecon.engine.checkpoints import finished, load, unfinished
-from mvrecon.engine.storage import read_newest
-from mvrecon.files.checks import Refused
+from mvrecon.core.files.checks import Refused
+from mvrecon.training.checkpoint_check import check_archive
+from mvrecon.training.checkpoints import finished, load, unfinished
+from mvrecon.training.storage import read_newest
 from tests.faults.hostile import SETTINGS, Payload, pickle_of, pickles, saved, with_pickle
 from tests.faults.samples import checkpoint
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.config import compose
-from mvrecon.config.plugins import import_plugins
-from mvrecon.config.targets import instantiate
-from mvrecon.files.checks import Refused, yaml_of
+from mvrecon.apps.config import compose
+from mvrecon.core.files.checks import Refused, yaml_of
+from mvrecon.core.plugins import import_plugins
+from mvrecon.core.targets import instantiate
 from tests.faults.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
 
 
@@ -73,7 +73,7 @@ def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, root: Path, t
     command = [
         sys.executable,
         "-m",
-        "mvrecon.simulate",
+        "mvrecon.apps.simulate",
         f"--config-dir={tmp_path}",
         "experiment=evil",
         "cases=[0]",
@@ -171,8 +171,8 @@ def test_a_pickled_config_is_not_run_again(run_python):
     """A pickled config is not run again."""
     done = run_python(
         "-c",
-        "import sys; sys.argv = ['x', '--experimental-rerun=a.pickle']; import mvrecon.train as "
-        "t; t.main()",
+        "import sys; sys.argv = ['x', '--experimental-rerun=a.pickle']; import "
+        "mvrecon.apps.train as t; t.main()",
     )
     assert done.returncode == 1 and "unpickles a file" in done.stderr
 

@@ -13,12 +13,12 @@ import nibabel
 import numpy as np
 import pytest
 
-from mvrecon.cameras.files import from_file, save
+from mvrecon.core.files import memory
+from mvrecon.core.files.checks import Refused, plain_name, text_of
+from mvrecon.core.parts import CAMERAS
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.nifti import read_nifti
-from mvrecon.files import memory
-from mvrecon.files.checks import Refused, plain_name, text_of
-from mvrecon.parts import CAMERAS
+from mvrecon.geometry.cameras.files import from_file, save
 from tests.data.conftest import RIG, stored
 from tests.faults.damage import DECLARED, HEADERS, instead, nifti
 

@@ -11,20 +11,20 @@ import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
-from mvrecon.config import compose
-from mvrecon.config.targets import instantiate
-from mvrecon.engine import fit
-from mvrecon.engine.callbacks import Confined
-from mvrecon.engine.storage import DurableCheckpoints, previous, remove
-from mvrecon.files.atomic import claimed
-from mvrecon.files.checks import Refused
-from mvrecon.train import resumed, train
+from mvrecon.apps.config import compose
+from mvrecon.apps.train import resumed, train
+from mvrecon.core.files.atomic import claimed
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.targets import instantiate
+from mvrecon.training import fit
+from mvrecon.training.callbacks import Confined
+from mvrecon.training.storage import DurableCheckpoints, previous, remove
 from tests.engine.lives import OPTIONS
 
 CALLBACKS, LOGGERS, OWN = (
     "lightning.pytorch.callbacks",
     "lightning.pytorch.loggers",
-    "mvrecon.engine",
+    "mvrecon.training",
 )
 NAMES = (
     "checkpoints",

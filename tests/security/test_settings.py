@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.config import compose
-from mvrecon.eval import evaluate
+from mvrecon.apps.config import compose
+from mvrecon.apps.eval import evaluate
 
 APPS = {
-    "eval": "mvrecon.eval",
-    "train": "mvrecon.train",
-    "simulate": "mvrecon.simulate",
-    "reconstruct": "mvrecon.reconstruction",
+    "eval": "mvrecon.apps.eval",
+    "train": "mvrecon.apps.train",
+    "simulate": "mvrecon.apps.simulate",
+    "reconstruct": "mvrecon.apps.reconstruct",
     "bench": "mvrecon_bench.bench",
     "stress": "mvrecon_bench.stress",
 }

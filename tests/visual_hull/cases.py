@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.random_numbers import uniform
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_in_ball, random_rotation
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.scenes.analytic import uniform
-from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon.operators.ray_transform import RayTransform
 
 KINDS = ("cone", "inside", "ahead", "beams", "endless beams", "pinholes", "dcspect80")
 

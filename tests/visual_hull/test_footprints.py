@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.data.scenes.solids import Phantom
 from mvrecon.geometry.box import bricks_along
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.solids import Phantom
-from mvrecon.visual_hull.footprints import (
+from mvrecon.operators.visual_hull.footprints import (
     Bricks,
     Footprints,
     footprint_sums,

@@ -6,16 +6,16 @@ import pytest
 import torch
 from torch.nn.functional import max_pool3d
 
-from mvrecon.cameras.rigs import parallel
+from mvrecon.data.scenes.derenzo import derenzo
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.box import bricks_along
+from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.scenes.derenzo import derenzo
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
-from mvrecon.visual_hull import hull
-from mvrecon.visual_hull.footprints import Bricks, footprints
-from mvrecon.visual_hull.hull import expand, visual_hull
+from mvrecon.operators.visual_hull import hull
+from mvrecon.operators.visual_hull.footprints import Bricks, footprints
+from mvrecon.operators.visual_hull.hull import expand, visual_hull
 from tests.visual_hull.cases import KINDS, World, operator, random_world
 
 BRICKS = (1, 3, 4)

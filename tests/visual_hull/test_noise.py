@@ -6,14 +6,14 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d, max_pool3d
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.rigs import circular, dome
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
-from mvrecon.visual_hull import noise
-from mvrecon.visual_hull.hull import expand, visual_hull
-from mvrecon.visual_hull.noise import (
+from mvrecon.operators.visual_hull import noise
+from mvrecon.operators.visual_hull.hull import expand, visual_hull
+from mvrecon.operators.visual_hull.noise import (
     WITNESSES,
     activity_bound,
     bounded_hull,

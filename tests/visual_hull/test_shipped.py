@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import yaml
 
+from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.visual_hull.support import support_from_views
+from mvrecon.operators.visual_hull.support import support_from_views
 
 CONF = Path(__file__).parents[2] / "conf"
 

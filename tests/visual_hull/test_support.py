@@ -6,18 +6,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.cameras.rigs import parallel
+from mvrecon.core.parts import SCENES
 from mvrecon.data.dataset import SceneDataset
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.parts import SCENES
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
-from mvrecon.visual_hull.hull import expand, thin_witnesses, visual_hull
-from mvrecon.visual_hull.noise import noise_threshold
-from mvrecon.visual_hull.support import brick_edge, support_from_views
+from mvrecon.operators.visual_hull.hull import expand, thin_witnesses, visual_hull
+from mvrecon.operators.visual_hull.noise import noise_threshold
+from mvrecon.operators.visual_hull.support import brick_edge, support_from_views
 from tests.visual_hull.cases import World, random_world
 
 SMALL, LARGE = (

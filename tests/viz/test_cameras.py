@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from mvrecon.viz.cameras import EDGE, GREEN, SCALE, WHITE, alignments
-from mvrecon.viz.montage import GAP, LABEL
+from mvrecon.report.viz.montage import GAP, LABEL
+from mvrecon.report.viz.rig import EDGE, GREEN, SCALE, WHITE, alignments
 
 
 def centre(image: np.ndarray, colour: tuple[int, int, int]) -> tuple[float, float]:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.viz import montage
-from mvrecon.viz.montage import GAP, LABEL
+from mvrecon.report.viz import montage
+from mvrecon.report.viz.montage import GAP, LABEL
 
 
 def flat(level, shape=(2, 3)):

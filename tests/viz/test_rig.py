@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.viz.rig import BOX, EDGE, FIRST, STRIP, U, V, picture, save_picture
+from mvrecon.report.viz.rig import BOX, EDGE, FIRST, STRIP, U, V, picture, save_picture
 
 PLATE = {"pixels": [40, 60], "pixel_mm": 4.0}
 

@@ -12,12 +12,12 @@ import h5py
 import torch
 from torch.utils.data import Dataset
 
+from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.registry import hint
 from mvrecon.data.events.shards import EXPECTED, checked, header_of
-from mvrecon.data.hdf5_reading import reading
+from mvrecon.data.hdf5 import reading
 from mvrecon.data.storage import check_chunks
-from mvrecon.files.checks import Refused, blaming
 from mvrecon.geometry.grid import Grid
-from mvrecon.registry import hint
 
 #: Files that a process has open at most.
 OPEN = 16

@@ -21,12 +21,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from mvrecon.data.hdf5 import FORMAT
-from mvrecon.data.hdf5_reading import reading
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import Refused, blaming, shown
+from mvrecon.data.hdf5 import FORMAT, reading
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.data.texts import variable
-from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import Refused, blaming, shown
 
 EXPECTED = "a file of events: HDF5 with truth [n d h w], ideal and counts [n m v u], dose, index"
 KIND = "mvrecon events 1"

@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.data import DataLoader, Dataset
 
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import Refused, shown, text_of
 from mvrecon.data.digests import files_in, of_file
 from mvrecon.data.events.making import EventMaker
 from mvrecon.data.events.shards import Header, fill, header_of, verify, write_shard
-from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import Refused, shown, text_of
 from mvrecon.kernels.threads import in_one_order
 
 #: The file of the shards' SHA-256 digests, as `sha256sum --check` reads it.
@@ -35,7 +35,7 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
     are there are checked first.
 
     Args:
-        folder: of the files; the caller has claimed it (`mvrecon.files.atomic.claimed`).
+        folder: of the files; the caller has claimed it (`mvrecon.core.files.atomic.claimed`).
         maker: of the events.
         made_of: settings of the app, of which the events depend on those of `DEPENDS`.
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from mvrecon.data.hdf5_reading import reading
+from mvrecon.core.files.checks import EDGE, Refused, blaming, check_file
+from mvrecon.data.hdf5 import reading
 from mvrecon.data.itk import itk_image
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.data.storage import check_chunks, dataset_in
-from mvrecon.files.checks import EDGE, Refused, blaming, check_file
 
 EXPECTED = "the views.h5 of mvrecon-simulate: a dataset views [m v u] of floats"
 

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.files.checks import shown
+from mvrecon.core.files.checks import shown
+from mvrecon.geometry.cameras.camera import Cameras
 
 Range = tuple[int, int]
 

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.files.checks import Refused, blaming
-from mvrecon.files.memory import check_memory
+from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.files.memory import check_memory
 
 #: Views that a stack may have.
 VIEWS = 2**16

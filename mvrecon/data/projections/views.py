@@ -9,20 +9,152 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.data.projections.corrections import Fields, fields, integrals, transmission
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.memory import check_memory
+from mvrecon.core.parts import VIEW_FILES
+from mvrecon.data.dicom import dicom_file
+from mvrecon.data.projections.images import PILLOW, ImageFiles, field_files, image_folder
 from mvrecon.data.projections.measured import Field, Kind, Measured
-from mvrecon.data.projections.opening import field_beside, open_projections
 from mvrecon.data.projections.region import Region
 from mvrecon.data.projections.stack import PIXELS, ProjectionStack
-from mvrecon.files.checks import Refused
-from mvrecon.files.memory import check_memory
+from mvrecon.geometry.cameras.camera import Cameras
+
+
+class Fields(NamedTuple):
+    """Dark field D and contrast F - D in grey values, and the pixels that are not dead; the
+    contrast of dead ones is 1.
+    """
+
+    dark: Float[Tensor, "v u"]
+    contrast: Float[Tensor, "v u"]
+    alive: Bool[Tensor, "v u"]
+
+
+def fields(
+    dark: Float[Tensor, "v u"],
+    flat: Float[Tensor, "v u"],
+    where: str,
+    dead: float = 0.0,
+    saturation: float = math.inf,
+) -> Fields:
+    """Dark field and contrast of a detector in grey values, and its dead pixels.
+
+    Args:
+        dark: grey values without a beam.
+        flat: grey values without an object.
+        where: they come from, for messages.
+        dead: pixels whose contrast is at most this part of its median are dead.
+        saturation: grey value; pixels that reach it in the flat field are dead, too.
+
+    Raises:
+        Refused: a flat field that is not above the dark one, or less than half of the pixels left.
+    """
+    contrast = flat - dark
+    middle = contrast.median().item()
+    if not middle > 0:
+        raise Refused(
+            f"{where}: expected a flat field above the dark one, got the medians "
+            f"{flat.median().item():g} and {dark.median().item():g} (zero or swapped?)"
+        )
+    alive = (contrast > max(0.0, dead * middle)) & (flat < saturation)
+    if 2 * int(alive.sum()) < alive.numel():
+        raise Refused(
+            f"{where}: expected at least half of the pixels between dark and saturated, got "
+            f"{int(alive.sum())} of {alive.numel()}; flat field's largest grey value "
+            f"{flat.max().item():g}, saturation {saturation:g}"
+        )
+    return Fields(dark, torch.where(alive, contrast, 1.0), alive)
+
+
+def transmission(raw: Float[Tensor, "m v u"], known: Fields) -> Float[Tensor, "m v u"]:
+    """Transmission from grey values; dead pixels get the mean of their neighbours."""
+    values = (raw - known.dark) / known.contrast
+    return values if known.alive.all() else filled(values, known.alive)
+
+
+def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[Tensor, "m v u"]:
+    """Values whose dead pixels have the mean of the living ones around them (3 x 3 pixels, as often
+    as it takes to fill a cluster from its edge).
+    """
+    weights = alive[None, None].to(values)
+    values = values[:, None] * weights
+    while not (done := weights > 0).all():
+        near = F.avg_pool2d(weights, 3, 1, 1)
+        means = F.avg_pool2d(values, 3, 1, 1) / near.clamp(min=1e-6)
+        values = torch.where(done, values, means)
+        weights = (near > 0).to(values)
+        values = values * weights
+    return values[:, 0]
+
+
+def integrals(
+    values: Float[Tensor, "m v u"], floor: float
+) -> tuple[Float[Tensor, "m v u"], Bool[Tensor, "m v u"]]:
+    """Line integrals -ln of transmissions, of `floor` where less arrives, and where that is."""
+    low = values <= floor
+    return -values.clamp(min=floor).log(), low
+
+
+def open_projections(
+    path: str | Path, pattern: str | None = None, gaps: bool = False
+) -> ProjectionStack:
+    """Projections in the values and the order they are stored in, read view by view.
+
+    The endings of files with one array are those of the registry `VIEW_FILES`, a plugin's among
+    them. A folder of images is in the order of the numbers in their names, without those that begin
+    with dark or flat; a file of several pages or an array, in its own order.
+
+    Args:
+        path: a folder, or a file.
+        pattern: of the names of the views in a folder, such as "scan_*.tif"; none: all images.
+        gaps: allow numbers in unequal steps in a folder.
+
+    Warns:
+        UserWarning: names that differ in more than their numbers.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        ImportError: a library of the extra `io` is not installed.
+        Refused: an empty folder, images of several sizes, missing numbers, other endings, damage.
+    """
+    path = Path(path).expanduser()
+    if path.is_dir():
+        return image_folder(path, pattern, gaps)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file or folder; expected {_expected()}")
+    if pattern is not None:
+        raise Refused(f"{path}: expected a folder for the pattern {pattern!r}, got a file")
+    if (ending := path.suffix.lower().lstrip(".")) in VIEW_FILES.names():
+        return VIEW_FILES.build(ending, path)
+    if path.suffix.lower() in PILLOW or dicom_file(path):
+        return ImageFiles([path])
+    raise Refused(f"{path}: expected {_expected()}")
+
+
+def field_beside(path: Path, field: str) -> ProjectionStack | None:
+    """The field, "dark" or "flat", that lies in a folder of views: a folder of that name, or images
+    whose names begin so; none where there is none.
+    """
+    if not path.is_dir():
+        return None
+    if (path / field).is_dir():
+        return open_projections(path / field)
+    files = field_files(path, field)
+    return ImageFiles(files) if files else None
+
+
+def _expected() -> str:
+    endings = [*PILLOW, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
+    return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
+
 
 #: Part of their size by which pixels may differ between a file and the cameras, for rounding.
 PITCH = 1e-3

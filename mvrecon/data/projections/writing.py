@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.stack import VIEWS
-from mvrecon.files.checks import Refused
 
 #: The largest grey value of 16 bits.
 TOP = 2**16 - 1

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
 
-from mvrecon.files.atomic import written_whole
+from mvrecon.core.files.atomic import written_whole
 
 logger = logging.getLogger(__name__)
 

@@ -14,11 +14,11 @@ import torch.nn.functional as F
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.random_numbers import generator, uniform
+from mvrecon.data.scenes.sample import Sample
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.scenes.analytic import generator, uniform
-from mvrecon.scenes.sample import Sample
+from mvrecon.operators.ray_transform import RayTransform
 
 #: Attenuation in 1/mm of fat, of glands and skin, and of the brightest microcalcification.
 ADIPOSE, FIBROGLANDULAR, BRIGHTEST = 0.0194, 0.0233, 0.026

@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.geometry import validated
-from mvrecon.models.output import Reconstruction
-from mvrecon.models.start import content_scale, nonzero, typical_chord
-from mvrecon.models.unet import PlainUNet, from_cells, trimmed
-from mvrecon.projectors.operator import Projector
-from mvrecon.projectors.voxel_driven import images_of, looked
+from mvrecon.methods.learned.geometry import validated
+from mvrecon.methods.learned.start import content_scale, nonzero, typical_chord
+from mvrecon.methods.learned.unet import PlainUNet, from_cells, trimmed
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
+from mvrecon.operators.voxel_driven import images_of, looked
 
 #: Voxels of the grid, along each axis, in one of the coarse grid of `Svct`.
 COARSE = 2

@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.unet import trimmed
-from mvrecon.registry import check_choice
+from mvrecon.core.registry import check_choice
+from mvrecon.methods.learned.unet import trimmed
 
 Norm = Literal["batch", "group", "none"]
 Padding = Literal["valid", "same"]

@@ -8,16 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.cameras.sinogram import sinogram_rig
+from mvrecon.geometry.cameras.sinogram import sinogram_rig
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.cross_view import GAIN
-from mvrecon.models.geometry import Geometry, geometry_of, kept, validated
-from mvrecon.models.output import Reconstruction
-from mvrecon.models.start import ClassicalStart, Start, normalised, typical_chord
-from mvrecon.models.unet import PlainUNet, Precision
-from mvrecon.projectors.operator import Projector
-from mvrecon.projectors.radon import Radon
-from mvrecon.reconstructors.filtered.filters import Filter
+from mvrecon.methods.classical.filtered.filters import Filter
+from mvrecon.methods.learned.cross_view import GAIN
+from mvrecon.methods.learned.geometry import Geometry, geometry_of, kept, validated
+from mvrecon.methods.learned.start import ClassicalStart, Start, normalised, typical_chord
+from mvrecon.methods.learned.unet import PlainUNet, Precision
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
+from mvrecon.operators.radon import Radon
 from mvrecon_baselines.pixel_aligned import at_voxels
 from mvrecon_baselines.sparse_view import CompletedViews, filtered, full_precision
 

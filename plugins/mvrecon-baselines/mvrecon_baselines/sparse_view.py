@@ -16,16 +16,16 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.rigid import unit
-from mvrecon.models.geometry import kept, validated
-from mvrecon.models.output import Reconstruction
-from mvrecon.models.start import content_scale, nonzero, typical_chord
-from mvrecon.projectors.operator import Projector
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.reconstructors.filtered.fdk import fbp, fdk
-from mvrecon.reconstructors.filtered.filters import Filter
-from mvrecon.reconstructors.filtered.orbit import Orbit, orbit_of
+from mvrecon.methods.classical.filtered.fdk import fbp, fdk
+from mvrecon.methods.classical.filtered.filters import Filter
+from mvrecon.methods.classical.filtered.orbit import Orbit, orbit_of
+from mvrecon.methods.learned.geometry import kept, validated
+from mvrecon.methods.learned.start import content_scale, nonzero, typical_chord
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
+from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_baselines.unet2d import UNet2d
 
 #: A scan is a whole turn if its largest gap is at most so many median steps.

@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.models.geometry import geometry_of, kept, validated
-from mvrecon.models.output import Reconstruction
-from mvrecon.models.start import content_scale, nonzero
-from mvrecon.projectors.operator import Projector
-from mvrecon.reconstructors.filtered.filters import Filter
+from mvrecon.methods.classical.filtered.filters import Filter
+from mvrecon.methods.learned.geometry import geometry_of, kept, validated
+from mvrecon.methods.learned.start import content_scale, nonzero
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
 from mvrecon_baselines.sparse_view import filtered, full_precision, scaled, sinograms
 from mvrecon_baselines.unet2d import UNet2d, by_slices
 

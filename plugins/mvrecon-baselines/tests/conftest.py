@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from mvrecon.core.parts import CAMERAS, PROJECTORS
+from mvrecon.core.registry import GROUP, installed
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, PROJECTORS
-from mvrecon.registry import GROUP, installed
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 

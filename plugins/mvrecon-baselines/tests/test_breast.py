@@ -4,10 +4,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from mvrecon.core.parts import CAMERAS, PROJECTORS
+from mvrecon.core.random_numbers import generator
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, PROJECTORS
-from mvrecon.reconstructors.total_variation import gradient
-from mvrecon.scenes.analytic import generator
+from mvrecon.methods.classical.total_variation import gradient
 from mvrecon_baselines.breast import (
     ADIPOSE,
     BRIGHTEST,

@@ -8,14 +8,14 @@ import torch
 import yaml
 
 import mvrecon_baselines.conf
-from mvrecon.config import compose
-from mvrecon.config.typed import check_parts
-from mvrecon.files.tables import read_rows
-from mvrecon.models.method import build_method
-from mvrecon.models.network import network_by_name
-from mvrecon.parts import NETWORKS
+from mvrecon.apps.config import compose
+from mvrecon.apps.config.typed import check_parts
+from mvrecon.apps.train import train
+from mvrecon.core.files.tables import read_rows
+from mvrecon.core.parts import NETWORKS
+from mvrecon.methods.learned.network import network_by_name
+from mvrecon.methods.method import build_method
 from mvrecon.testing import check_method, check_network
-from mvrecon.train import train
 
 CONF = Path(mvrecon_baselines.conf.__file__).parent
 NET = {"width": 4, "levels": 3}

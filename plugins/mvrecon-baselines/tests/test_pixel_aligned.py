@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.models.method import build_method
-from mvrecon.projectors.drr import Drr
+from mvrecon.methods.method import build_method
+from mvrecon.operators.drr import Drr
 from mvrecon_baselines.pixel_aligned import at_voxels
 
 SMALL = {

@@ -5,7 +5,7 @@ reach.
 import pytest
 import torch
 
-from mvrecon.parts import NETWORKS
+from mvrecon.core.parts import NETWORKS
 from mvrecon_baselines.published import valid_size
 
 NORMS = (torch.nn.BatchNorm3d, torch.nn.GroupNorm)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.method import build_method
-from mvrecon.reconstructors.filtered.fdk import fbp
+from mvrecon.methods.classical.filtered.fdk import fbp
+from mvrecon.methods.method import build_method
 from mvrecon.testing.projector import close
+from mvrecon.training.losses import ReconstructionLoss
 from mvrecon_baselines.breast import BRIGHTEST, BreastSlices
 from mvrecon_baselines.sparse_view import DualDomain, FbpUNet, SinogramUNet, Upsampling
 

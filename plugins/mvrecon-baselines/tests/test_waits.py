@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mvrecon.engine.module import ReconstructionModule
+from mvrecon.training.module import ReconstructionModule
 from mvrecon_bench.gpu.as_gpu import AsGpu, on_gpu
 
 DETECTOR = {"pixels": [12, 12], "pixel_mm": 5.0}

@@ -8,16 +8,16 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.method import build_method
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.projectors.selection import ray_subset, view_subset
-from mvrecon.reconstructors.iterative import sirt
-from mvrecon.reconstructors.mlem import mlem
-from mvrecon.reconstructors.poisson import PoissonLikelihood
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.mlem import mlem
+from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.methods.method import build_method
+from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.operators.selection import ray_subset, view_subset
 from mvrecon_bench.stresses.subject import gap
 
 peers = pytest.importorskip("mvrecon_peers.base")

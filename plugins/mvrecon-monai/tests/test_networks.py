@@ -9,12 +9,12 @@ import pytest
 import torch
 import yaml
 
-from mvrecon.cameras.rigs import circular
+from mvrecon.core.parts import NETWORKS
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.method import build_method
-from mvrecon.models.network import network_by_name
-from mvrecon.parts import NETWORKS
-from mvrecon.projectors.drr import Drr
+from mvrecon.methods.learned.network import network_by_name
+from mvrecon.methods.method import build_method
+from mvrecon.operators.drr import Drr
 from mvrecon.testing import check_network
 
 ROOT = Path(__file__).parents[1]

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.projectors.checks import check_views
-from mvrecon.projectors.operator import Projector
+from mvrecon.operators.checks import check_views
+from mvrecon.operators.operator import Projector
 from mvrecon_peers.astra import Astra
 
 

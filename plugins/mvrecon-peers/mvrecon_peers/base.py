@@ -15,11 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.forward_ad import make_dual, unpack_dual
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.precision import wide
-from mvrecon.projectors.checks import check, check_floating
-from mvrecon.projectors.operator import Projector
+from mvrecon.operators.checks import check, check_floating
+from mvrecon.operators.operator import Projector
 from mvrecon_peers.frame import framed, near, wants_gradient
 from mvrecon_peers.operator import known_by, linear
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Paired, choice, load, quiet
 from mvrecon_peers.frame import plane_of_rows, require_between

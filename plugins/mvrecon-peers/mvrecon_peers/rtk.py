@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import VECTORS, Cameras
-from mvrecon.cameras.detector import detector_centre
-from mvrecon.cameras.formats.rtk_xml import gantry_angles
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.detector import detector_centre
+from mvrecon.geometry.cameras.formats.rtk_xml import gantry_angles
 from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Paired, load
 from mvrecon_peers.frame import require_between

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.checks import check_views
-from mvrecon.projectors.operator import Projector
+from mvrecon.operators.checks import check_views
+from mvrecon.operators.operator import Projector
 from mvrecon_peers.rtk import Rtk
 
 #: RTK's numbers of its Joseph filters, forward and back.

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import parallel
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.radon import Radon
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.operators.radon import Radon
 from mvrecon_peers import astra_methods
 
 VALUE = 0.02

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon_peers.astra import Astra
 from mvrecon_peers.diffdrr import Diffdrr
 from mvrecon_peers.frame import chords, framed, near, plane_of_rows

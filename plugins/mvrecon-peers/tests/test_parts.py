@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
 
 GRID = Grid.centred(size=(7, 7, 5), spacing=2.0)

@@ -11,14 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from mvrecon.cameras.camera import VECTORS, Cameras
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.operators.ray_transform import RayTransform
 
 CENTRE = torch.tensor([7.0, -5.0, 9.0], dtype=torch.float64)
 DETECTOR = {"pixels": [34, 38], "pixel_mm": [1.7, 1.5], "offset_mm": [0.8, -0.6]}

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.drr import Drr
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.operators.drr import Drr
 from mvrecon_peers import rtk_methods
 
 VALUE = 0.02

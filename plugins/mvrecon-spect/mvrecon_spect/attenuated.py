@@ -9,20 +9,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.cameras.symmetry import Mirror
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.symmetry import Mirror
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.operator import choose_backend
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays import attenuated_ops, attenuated_reference, ops
 from mvrecon.kernels.rays.occupancy import DENSE
-from mvrecon.projectors.checks import check, check_floating
-from mvrecon.projectors.operator import LinearOperator, Projector
-from mvrecon.projectors.pixel_integral import PixelIntegral
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.projectors.skipping import Skipped, verify, within
+from mvrecon.operators.checks import check, check_floating
+from mvrecon.operators.operator import LinearOperator, PixelIntegral, Projector
+from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.operators.skipping import Skipped, verify, within
 
 #: Linear attenuation in 1/mm that nothing in a patient reaches from 70 keV up (cortical bone 0.058,
 #: titanium 0.07), and that water and tissue in 1/cm exceed.

@@ -18,14 +18,14 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.precision import wide
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.projectors.checks import check, check_floating
-from mvrecon.projectors.operator import LinearOperator, Projector
-from mvrecon.projectors.selection import ViewSelection
+from mvrecon.operators.checks import check, check_floating
+from mvrecon.operators.operator import LinearOperator, Projector
+from mvrecon.operators.selection import ViewSelection
 from mvrecon_spect.attenuated import attenuated_kernels, check_mu
 from mvrecon_spect.extent import Extent, blurred, blurred_whole, extents_of
 from mvrecon_spect.hole import Hole

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.projectors.operator import LinearOperator, Scaled
+from mvrecon.operators.operator import LinearOperator, Scaled
 from mvrecon_spect.scatter import check_counts
 
 

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.cameras.camera import Cameras
 
 #: Linear attenuation in 1/mm that no collimator reaches from 70 keV up (tungsten above its K edge
 #: 22), and that lead and tungsten at 140.5 keV in 1/cm exceed.

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.core.registry import check_options
 from mvrecon.data.resample import resample
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.drr import Drr
-from mvrecon.registry import check_options
+from mvrecon.operators.drr import Drr
 from mvrecon_spect.attenuated import check_mu
 
 #: Values of the option `mu` that name a map of each case, and its key in a batch.

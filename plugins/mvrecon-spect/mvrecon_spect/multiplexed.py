@@ -3,8 +3,8 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.projectors.operator import Composed, LinearOperator
-from mvrecon.projectors.selection import ViewSelection
+from mvrecon.operators.operator import Composed, LinearOperator
+from mvrecon.operators.selection import ViewSelection
 
 
 class SummedHoles(LinearOperator):

@@ -22,10 +22,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
 from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.blur import BlurredPinholes, Optics
 from mvrecon_spect.hole import Hole

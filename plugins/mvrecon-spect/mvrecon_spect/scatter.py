@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.acquisition.detector import blurred
-from mvrecon.cameras.camera import Cameras
+from mvrecon.data.acquisition.detector import blurred
+from mvrecon.geometry.cameras.camera import Cameras
 
 
 def triple_energy_window(

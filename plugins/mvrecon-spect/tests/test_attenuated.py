@@ -5,16 +5,16 @@ import math
 import pytest
 import torch
 
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import parallel
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.kernels.rays.cpu import attenuated as cpu
 from mvrecon.kernels.rays.cpu.skip_policy import box_of
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.projectors.selection import ray_subset, view_subset
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.operators.selection import ray_subset, view_subset
 from mvrecon_spect.attenuated import AttenuatedTransform
 
 MU = 0.01536

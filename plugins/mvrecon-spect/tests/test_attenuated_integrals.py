@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon_spect.scenes.attenuating import attenuated_integrals
 from mvrecon_spect.scenes.cardiac import RandomCardiac
 

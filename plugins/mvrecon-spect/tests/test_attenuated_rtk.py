@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon_spect.attenuated import AttenuatedTransform
 

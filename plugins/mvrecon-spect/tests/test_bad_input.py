@@ -8,12 +8,12 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.config import compose
+from mvrecon.apps.config import compose
+from mvrecon.apps.simulate import simulate
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import save_volume
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon.simulate import simulate
 from mvrecon_spect.files.interfile_views import InterfileViews
 from mvrecon_spect.files.stir import StirScan, write_stir
 from mvrecon_spect.files.stir_system import StirSystem

@@ -7,11 +7,11 @@ import math
 import pytest
 import torch
 
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.solids import Phantom
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.solids import Phantom
-from mvrecon.scenes.voxelise import voxelise
 from mvrecon_spect.scenes.cardiac import LUNG, WATER, Defect, Heart, RandomCardiac, Uptake
 
 GRID = Grid.centred((64, 64, 64), 5.0, centre=(40, -40, 0))

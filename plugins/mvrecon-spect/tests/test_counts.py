@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from mvrecon.acquisition.detector import blurred, detected
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.data.acquisition.detector import blurred, detected
+from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.reconstructors.mlem import mlem, osem
+from mvrecon.methods.classical.mlem import mlem, osem
 from mvrecon_spect.counts import decay_factors, decaying, thinned
 from mvrecon_spect.projector import Spect
 from mvrecon_spect.scatter import blurred_share, triple_energy_window

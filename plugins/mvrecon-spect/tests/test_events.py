@@ -3,16 +3,16 @@
 import pytest
 import torch
 
-from mvrecon.acquisition.acquired import Acquired
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.config import compose
-from mvrecon.data.case_store import CaseStore
+from mvrecon.apps.config import compose
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.events.making import EventMaker
+from mvrecon.data.module import CaseStore
+from mvrecon.data.scenes.mixture import Mixture
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.mixture import Mixture
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.scenes.attenuating import attenuated_integrals
 from mvrecon_spect.scenes.cardiac import RandomCardiac

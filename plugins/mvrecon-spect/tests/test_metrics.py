@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
+from mvrecon.data.scenes.derenzo import derenzo
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.scenes.derenzo import derenzo
-from mvrecon.scenes.voxelise import voxelise
 from mvrecon_spect.metrics.contrast import (
     ball_means,
     contrast_to_noise,

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.voxelise import voxelise
 from mvrecon_spect.scenes.nema import CIRCLE, DIAMETERS, Nema
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.projections.views import open_projections
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon_spect.files.nm import NmStudy, paired, read_nm
 
 pydicom = pytest.importorskip("pydicom")

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.config import compose
-from mvrecon.config.typed import check_parts
-from mvrecon.engine.evaluation import evaluate
-from mvrecon.engine.fit import build_data, build_module, methods
-from mvrecon.engine.module import build_projector
+from mvrecon.apps.config import compose
+from mvrecon.apps.config.typed import check_parts
+from mvrecon.training.evaluation import evaluate
+from mvrecon.training.fit import build_data, build_module, methods
+from mvrecon.training.module import build_projector
 from mvrecon_spect.matter import CaseAttenuation
 from mvrecon_spect.projector import Spect
 from mvrecon_spect.scenes.spect_ct import SpectCt

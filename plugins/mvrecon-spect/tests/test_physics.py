@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from mvrecon.cameras.dcspect80 import dcspect80
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.box import Box, placed
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.selection import view_subset
+from mvrecon.operators.selection import view_subset
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.multiplexed import Multiplexed
 from mvrecon_spect.projector import Spect

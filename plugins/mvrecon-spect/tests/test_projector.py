@@ -7,9 +7,9 @@ from math import pi
 import pytest
 import torch
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.parts import PROJECTORS
 from mvrecon_spect.projector import Spect, sensitivity
 
 LENGTH, DIAMETER, PIXEL, SIDE, RADIUS = 89.0, 2.3, 0.8, 64, 18.0
@@ -90,7 +90,7 @@ def test_it_is_found_by_name_with_its_options():
 
 
 def test_its_configuration_composes():
-    from mvrecon.config import compose
+    from mvrecon.apps.config import compose
 
     settings = compose("projector=spect", "projector.blur=true")["projector"]
     assert settings == {"name": "spect", "blur": True}

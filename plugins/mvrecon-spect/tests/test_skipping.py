@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from mvrecon.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.projectors.selection import RaySelection
-from mvrecon.reconstructors.iterative import sirt_weights
-from mvrecon.reconstructors.mlem import mlem
-from mvrecon.reconstructors.poisson import PoissonLikelihood
+from mvrecon.methods.classical.iterative import sirt_weights
+from mvrecon.methods.classical.mlem import mlem
+from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.operators.selection import RaySelection
 from mvrecon_spect.projector import Spect
 
 GRID = Grid.centred(size=(8, 12, 10), spacing=12.0)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.config import compose
+from mvrecon.apps.config import compose
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.engine.evaluation import evaluate
-from mvrecon.engine.fit import build_data, build_module, methods
-from mvrecon.engine.module import build_projector
 from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.training.evaluation import evaluate
+from mvrecon.training.fit import build_data, build_module, methods
+from mvrecon.training.module import build_projector
 from mvrecon_spect.scenes.spect_ct import SpectCt
 from mvrecon_spect.scenes.spect_labels import SpectLabels
 

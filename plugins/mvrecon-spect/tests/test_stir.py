@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon import registry
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.config import compose
+from mvrecon.apps.config import compose
+from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.scan import open_scan
+from mvrecon.core import registry
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.parts import CAMERAS
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.data.volume_files import read_volume
-from mvrecon.engine.scan import open_scan
-from mvrecon.files.checks import Refused
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS
-from mvrecon.reconstruction import reconstruct
 from mvrecon_spect.files.interfile_volume import read_interfile, read_mu, write_mu
 from mvrecon_spect.files.interfile_volume import write_interfile_volume as write_volume
 from mvrecon_spect.files.stir import StirScan, read_stir, write_stir

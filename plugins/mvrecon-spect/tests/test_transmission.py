@@ -4,16 +4,16 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d
 
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.models.cross_view import PerViewEstimates
-from mvrecon.models.frusta import Frusta
-from mvrecon.models.geometry import Geometry
-from mvrecon.models.method import build_method
-from mvrecon.models.view_frames import LEAST, ViewFrames, transmission
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.operator import PerSample
+from mvrecon.methods.learned.cross_view import PerViewEstimates
+from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.geometry import Geometry
+from mvrecon.methods.learned.view_frames import LEAST, ViewFrames, transmission
+from mvrecon.methods.method import build_method
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.operator import PerSample
 from mvrecon_spect.attenuated import AttenuatedTransform
 
 WATER = 0.01536

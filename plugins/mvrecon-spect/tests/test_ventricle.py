@@ -3,11 +3,12 @@ import math
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import parallel
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.analytic import render
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.scenes.analytic import generator, render
-from mvrecon.scenes.voxelise import voxelise
 from mvrecon_spect.scenes.ventricle import RandomVentricle, ventricle
 
 #: 4/3 pi (a b c - (a - w)(b - w)(c - w)) in mm^3.

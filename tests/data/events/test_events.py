@@ -15,13 +15,12 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from mvrecon.data.events.making import EventMaker
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.events.making import EventMaker, Sinograms
 from mvrecon.data.events.reading import Events
 from mvrecon.data.events.shards import Header, fill, header_of, write_shard
-from mvrecon.data.events.sinograms import Sinograms
 from mvrecon.data.events.writing import SUMS, write_events
 from mvrecon.data.pytorch3dunet import write_view
-from mvrecon.files.checks import Refused
 from mvrecon.geometry.grid import Grid
 
 DETECTOR = {"pixels": [10, 9], "pixel_mm": 12.0}

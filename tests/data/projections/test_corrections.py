@@ -10,13 +10,12 @@ import torch
 import yaml
 from PIL import Image as Pillow
 
-from mvrecon.data.projections.corrections import Fields, filled, transmission
+from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.region import Region
+from mvrecon.data.projections.views import Fields, filled, open_projections, transmission
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, PROJECTORS
 from tests.data.conftest import RIG
 from tests.data.projections.conftest import VIEWS, grey, opened
 

@@ -10,11 +10,10 @@ import SimpleITK as sitk
 import torch
 from PIL import Image as Pillow
 
-from mvrecon.data.projections.images import INTERLACED, PLAIN
-from mvrecon.data.projections.opening import open_projections
-from mvrecon.data.projections.order import ordered
-from mvrecon.files import memory
-from mvrecon.files.checks import Refused
+from mvrecon.core.files import memory
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.images import INTERLACED, PLAIN, ordered
+from mvrecon.data.projections.views import open_projections
 from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
 
 

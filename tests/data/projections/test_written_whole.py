@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.writing import Exposure, write_projections
-from mvrecon.files.checks import Refused
 
 
 def test_a_scan_is_written_whole_or_not_at_all(tmp_path):

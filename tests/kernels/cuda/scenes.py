@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import circular
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.kernels.rays.occupancy import Occupancy

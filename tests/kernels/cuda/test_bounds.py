@@ -9,7 +9,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.projectors.radon import Radon
+from mvrecon.operators.radon import Radon
 from tests.kernels.test_bounds import GUARD, SLOPES, N, rig
 
 

@@ -11,9 +11,9 @@ from mvrecon.geometry.box import bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Rule
-from mvrecon.visual_hull import hull, noise
-from mvrecon.visual_hull.footprints import prints_of, summed_area_tables
-from mvrecon.visual_hull.judging import counted, counted_at_once
+from mvrecon.operators.visual_hull import hull, noise
+from mvrecon.operators.visual_hull.footprints import prints_of, summed_area_tables
+from mvrecon.operators.visual_hull.judging import counted, counted_at_once
 from tests.kernels.cuda.waits import Waits
 from tests.visual_hull.cases import KINDS, random_world
 

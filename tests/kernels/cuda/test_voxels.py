@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.voxels import cuda, reference
-from mvrecon.projectors.voxel_driven import image_maps
+from mvrecon.operators.voxel_driven import image_maps
 from tests.kernels.cuda.scenes import RIGS, difference
 from tests.kernels.cuda.waits import Waits
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.kernels.warps import cuda, reference
+from mvrecon.methods.learned.frusta import frusta_lattice
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
 from tests.kernels.warps.scenes import OTHER, RIGS, SMALL, generic, lattices

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch.library import opcheck
 
-from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.kernels.warps.warp import warp
+from mvrecon.methods.learned.frusta import frusta_lattice
 from tests.kernels.warps.scenes import (
     DEPTH,
     OTHER,

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import torch
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.solids import Phantom, Solids
 
 VALUE = 0.02  # 1/mm
 SLICE = Grid.centred(size=(64, 64, 1), spacing=1.8)

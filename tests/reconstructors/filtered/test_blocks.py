@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.radon import Radon
-from mvrecon.reconstructors.filtered import streaming
-from mvrecon.reconstructors.filtered.fdk import fbp, fdk
-from mvrecon.reconstructors.filtered.streaming import fdk_streamed
+from mvrecon.methods.classical.filtered import streaming
+from mvrecon.methods.classical.filtered.fdk import fbp, fdk
+from mvrecon.methods.classical.filtered.streaming import fdk_streamed
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.radon import Radon
 from tests.reconstructors.filtered.scans import CONES, VOLUME
 
 SMALL = Grid.centred(size=(5, 4, 8), spacing=3.0)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.rigs import circular
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.projectors.drr import Drr
-from mvrecon.reconstructors.filtered.fdk import fdk
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.methods.classical.filtered.fdk import fdk
+from mvrecon.operators.drr import Drr
 from tests.reconstructors.filtered.scans import views_of
 
 GRID = Grid.centred(48, spacing=2.0)

@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.dcspect80 import dcspect80
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.operator import Scaled
-from mvrecon.projectors.radon import Radon
-from mvrecon.reconstructors.filtered.fdk import fbp, fdk
-from mvrecon.reconstructors.filtered.orbit import orbit_of
-from mvrecon.reconstructors.filtered.scan_weights import scan_of
+from mvrecon.methods.classical.filtered.fdk import fbp, fdk
+from mvrecon.methods.classical.filtered.orbit import orbit_of
+from mvrecon.methods.classical.filtered.scan_weights import scan_of
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.operator import Scaled
+from mvrecon.operators.radon import Radon
 from tests.reconstructors.filtered.scans import CONES, FAN, FANS, LINE, RAYS, SLICE, VOLUME
 
 

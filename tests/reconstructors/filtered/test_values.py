@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular, parallel
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.radon import Radon
-from mvrecon.reconstructors.filtered.fdk import fbp, fdk
-from mvrecon.reconstructors.filtered.scan_weights import redundancy, scan_of
-from mvrecon.scenes.solids import Phantom, Solids
+from mvrecon.methods.classical.filtered.fdk import fbp, fdk
+from mvrecon.methods.classical.filtered.scan_weights import redundancy, scan_of
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.radon import Radon
 from tests.reconstructors.filtered.scans import (
     CONE,
     CONES,

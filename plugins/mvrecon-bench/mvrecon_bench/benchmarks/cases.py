@@ -6,14 +6,14 @@ from typing import Any
 
 import torch
 
-from mvrecon.cameras import rigs
-from mvrecon.cameras.camera import VECTORS, Cameras
-from mvrecon.cameras.dcspect80 import DETECTOR_MM, dcspect80, modules
-from mvrecon.engine.device import device_of
+from mvrecon.core.device import device_of
+from mvrecon.core.parts import SCENES
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras import rigs
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.dcspect80 import DETECTOR_MM, dcspect80, modules
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import SCENES
-from mvrecon.scenes.analytic import generator
-from mvrecon.scenes.solids import Phantom, Solids
 
 #: Edge of the volume in mm; the pinholes of DC-SPECT stand closer.
 FIELD, NEAR_FIELD = 256.0, 160.0

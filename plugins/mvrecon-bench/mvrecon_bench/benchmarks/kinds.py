@@ -1,6 +1,6 @@
 """The benchmarks by name: `bench=<name>` takes its options from `conf/bench/<name>.yaml`."""
 
-from mvrecon.registry import Registry
+from mvrecon.core.registry import Registry
 
 BENCHES = Registry(
     "bench",

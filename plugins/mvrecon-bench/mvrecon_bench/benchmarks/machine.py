@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from mvrecon.engine.run_folder import VERSIONS, versions, write
+from mvrecon.training.run_folder import VERSIONS, versions, write
 
 #: Distributions of other libraries whose projectors take part.
 PEERS = (

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.models.method import build_method
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.methods.method import build_method
+from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.benchmarks import report
 from mvrecon_bench.benchmarks.cases import Case, expand
 from mvrecon_bench.benchmarks.columns import METHODS, METHODS_KEYS

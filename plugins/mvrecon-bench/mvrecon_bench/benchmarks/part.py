@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
 
 
 @dataclass(frozen=True)

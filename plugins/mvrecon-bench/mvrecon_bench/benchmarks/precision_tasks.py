@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mvrecon.engine.checkpoints import load
-from mvrecon.metrics import volume_metrics
-from mvrecon.models.method import build_method
-from mvrecon.models.unet import PlainUNet
-from mvrecon.parts import PROJECTORS, SCENES
-from mvrecon.projectors.integrals import METHODS
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.core.parts import PROJECTORS, SCENES
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.methods.learned.unet import PlainUNet
+from mvrecon.methods.method import build_method
+from mvrecon.operators.integrals import METHODS
+from mvrecon.report.metrics import volume_metrics
+from mvrecon.training.checkpoints import load
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mvrecon.engine.run_folder import write
+from mvrecon.training.run_folder import write
 
 Row = dict[str, Any]
 

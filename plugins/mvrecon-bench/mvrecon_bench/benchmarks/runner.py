@@ -7,8 +7,8 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from mvrecon.engine import run_folder
-from mvrecon.engine.loggers import Board
+from mvrecon.training import run_folder
+from mvrecon.training.loggers import Board
 from mvrecon_bench.benchmarks import machine
 from mvrecon_bench.benchmarks.rows import Row, Rows
 

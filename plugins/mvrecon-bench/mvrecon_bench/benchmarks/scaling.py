@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from mvrecon.cameras.rigs import circular
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon_bench.benchmarks import report, targets
 from mvrecon_bench.benchmarks.cases import DTYPES, FIELD, Case
 from mvrecon_bench.benchmarks.columns import SCALING, SCALING_KEYS

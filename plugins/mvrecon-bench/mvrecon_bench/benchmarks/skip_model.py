@@ -9,14 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mvrecon.engine.checkpoints import load
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.box import Box, placed
-from mvrecon.metrics import volume_metrics
-from mvrecon.models.cross_view import ALIGNED
-from mvrecon.models.method import build_method
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.operator import Projector
-from mvrecon.visual_hull.support import Support, support_from_views
+from mvrecon.methods.learned.cross_view import ALIGNED
+from mvrecon.methods.method import build_method
+from mvrecon.operators.operator import Projector
+from mvrecon.operators.visual_hull.support import Support, support_from_views
+from mvrecon.report.metrics import volume_metrics
+from mvrecon.training.checkpoints import load
 from mvrecon_bench.benchmarks.skip_scenes import Seen, cube, edge, rig, seen
 from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial
 

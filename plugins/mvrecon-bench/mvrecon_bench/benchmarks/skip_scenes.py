@@ -10,16 +10,17 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.core.random_numbers import generator
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.body import body, enclosed
+from mvrecon.data.scenes.analytic import AnalyticScene
+from mvrecon.data.scenes.sample import Scene
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.data.volumes import TISSUE, FileScene
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.projectors.operator import Projector
-from mvrecon.scenes.analytic import AnalyticScene, generator
-from mvrecon.scenes.sample import Scene
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.operators.operator import Projector
 
 #: Edge of the cube in mm, where a scene does not say.
 FIELD = 256.0

@@ -14,12 +14,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
 from mvrecon.geometry.box import Box, placed
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.reconstructors.iterative import sirt
-from mvrecon.visual_hull.support import support_from_views
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.operators.visual_hull.support import support_from_views
 from mvrecon_bench.benchmarks.skip_scenes import Filled
 
 OFF, CROPPED = "off", "cropped"

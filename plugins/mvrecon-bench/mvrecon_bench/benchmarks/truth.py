@@ -12,11 +12,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.data.scenes.solids import Phantom
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.scenes.solids import Phantom
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.benchmarks.cases import Case
 
 #: Views whose derivative by the pose is compared, and rays across a pixel for it.

@@ -20,9 +20,9 @@ from typing import Any
 import torch
 
 import mvrecon as mv
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.integrals import METHODS
-from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.operators.integrals import METHODS
+from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.gpu.fields import check_fields
 from mvrecon_bench.gpu.measuring import Results, on_device, throughput
 

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 import mvrecon as mv
-from mvrecon.cameras.frusta import frusta_lattice
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps
 from mvrecon.kernels import self_test
@@ -17,8 +16,9 @@ from mvrecon.kernels.rays import attenuated_ops
 from mvrecon.kernels.voxels import ops as voxels
 from mvrecon.kernels.warps import warp as warps
 from mvrecon.kernels.warps.warp import warp
-from mvrecon.projectors.voxel_driven import backproject
-from mvrecon.visual_hull.hull import visual_hull
+from mvrecon.methods.learned.frusta import frusta_lattice
+from mvrecon.operators.visual_hull.hull import visual_hull
+from mvrecon.operators.voxel_driven import backproject
 from mvrecon_bench.gpu.measuring import Results, throughput
 from mvrecon_spect.attenuated import AttenuatedTransform
 

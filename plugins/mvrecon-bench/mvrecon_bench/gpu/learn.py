@@ -16,13 +16,12 @@ from typing import Any
 
 import torch
 
-from mvrecon.config import compose
+from mvrecon.apps.config import compose
 from mvrecon.data.module import SceneData
-from mvrecon.engine.evaluation import evaluate
-from mvrecon.engine.fit import build_data, build_module
-from mvrecon.engine.module import ReconstructionModule, Settings
-from mvrecon.engine.schedule import build_optimizer, build_schedule
-from mvrecon.metrics import mean_and_spread
+from mvrecon.report.metrics import mean_and_spread
+from mvrecon.training.evaluation import evaluate
+from mvrecon.training.fit import build_data, build_module
+from mvrecon.training.module import ReconstructionModule, Settings, build_optimizer, build_schedule
 from mvrecon_bench.gpu.measuring import Results, on_device, wait
 
 #: mm along (x, y, z), and of the detector along (v, u).

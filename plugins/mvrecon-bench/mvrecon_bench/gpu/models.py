@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from mvrecon.config import compose
-from mvrecon.engine.fit import build_module
-from mvrecon.engine.module import ReconstructionModule
+from mvrecon.apps.config import compose
+from mvrecon.training.fit import build_module
+from mvrecon.training.module import ReconstructionModule
 from mvrecon_bench.gpu.check import waits
 from mvrecon_bench.gpu.measuring import Results, latency, on_device, wait
 

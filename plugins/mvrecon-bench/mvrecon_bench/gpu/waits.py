@@ -14,14 +14,14 @@ from typing import Any
 import torch
 
 import mvrecon as mv
-from mvrecon.config import compose
-from mvrecon.engine.fit import build_module
-from mvrecon.metrics import volume_metrics
-from mvrecon.projectors.selection import ray_subset, view_subset
-from mvrecon.projectors.voxel_driven import backproject
-from mvrecon.reconstructors.iterative import sirt_weights
-from mvrecon.reconstructors.poisson import PoissonLikelihood
-from mvrecon.visual_hull.support import support_from_views
+from mvrecon.apps.config import compose
+from mvrecon.methods.classical.iterative import sirt_weights
+from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.operators.selection import ray_subset, view_subset
+from mvrecon.operators.visual_hull.support import support_from_views
+from mvrecon.operators.voxel_driven import backproject
+from mvrecon.report.metrics import volume_metrics
+from mvrecon.training.fit import build_module
 from mvrecon_bench.gpu.as_gpu import AsGpu, OnGpu
 from mvrecon_bench.gpu.check import VECTORS
 from mvrecon_bench.gpu.measuring import reason

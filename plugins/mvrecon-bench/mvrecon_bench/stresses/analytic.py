@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.scenes.solids import Phantom, Solids
 
 #: Integer directions, of which all orders and signs are taken.
 DIRECTIONS = ((1, 1, 1), (1, 1, 0), (2, 1, 0), (2, 1, 1), (3, 2, 1), (3, 1, 0))

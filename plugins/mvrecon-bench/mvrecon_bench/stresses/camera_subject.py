@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.files import save
-from mvrecon.cameras.rigs import circular
-from mvrecon.parts import CAMERAS
+from mvrecon.core.parts import CAMERAS
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.files import save
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import DETECTOR, Subject
 

@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.rigs import circular
+from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.frusta import Frusta
-from mvrecon.models.method import build_method
-from mvrecon.models.output import Reconstruction
-from mvrecon.parts import METHODS, PROJECTORS
-from mvrecon.projectors.operator import Projector
+from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.method import build_method
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject, gap
 

@@ -4,9 +4,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
-from mvrecon.parts import REGISTRIES
-from mvrecon.projectors.integrals import METHODS
-from mvrecon.registry import hint
+from mvrecon.core.parts import REGISTRIES
+from mvrecon.core.registry import hint
+from mvrecon.operators.integrals import METHODS
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.stresses.case import KINDS, Case
 from mvrecon_bench.stresses.subject import Subject, subject_of

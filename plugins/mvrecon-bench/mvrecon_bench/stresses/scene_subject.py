@@ -4,9 +4,9 @@ import inspect
 from functools import cached_property
 from typing import Any
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.parts import SCENES
-from mvrecon.scenes.sample import Sample, Scene
+from mvrecon.core.parts import SCENES
+from mvrecon.data.scenes.sample import Sample, Scene
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.testing.scene import GRID, RIG
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject

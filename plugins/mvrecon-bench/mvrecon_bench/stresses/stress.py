@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mvrecon.engine import run_folder
+from mvrecon.training import run_folder
 from mvrecon_bench.benchmarks.report import legend, markdown
 from mvrecon_bench.benchmarks.rows import Row
 from mvrecon_bench.stresses import plan

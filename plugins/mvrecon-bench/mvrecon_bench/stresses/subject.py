@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import VECTORS, Cameras, Extent
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.parts import REGISTRIES
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras, Extent
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import REGISTRIES
 from mvrecon_bench.stresses.case import DoesNotApply
 
 #: No two sizes or spacings alike, off the origin.

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from mvrecon.config import compose
-from mvrecon.parts import PROJECTORS
+from mvrecon.apps.config import compose
+from mvrecon.core.parts import PROJECTORS
 from mvrecon_bench.benchmarks.kinds import BENCHES
 
 pytest.importorskip("matplotlib")

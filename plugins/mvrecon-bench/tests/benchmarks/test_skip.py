@@ -4,8 +4,8 @@ import lightning
 import pytest
 import torch
 
-from mvrecon.config import compose
-from mvrecon.engine.module import ReconstructionModule
+from mvrecon.apps.config import compose
+from mvrecon.training.module import ReconstructionModule
 from mvrecon_bench.benchmarks import skip_report
 from mvrecon_bench.benchmarks.kinds import BENCHES
 from mvrecon_bench.benchmarks.skip_tasks import TASKS

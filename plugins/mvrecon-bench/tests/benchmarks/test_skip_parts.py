@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.config import compose
+from mvrecon.apps.config import compose
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.hdf5 import Stored, write_volumes
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import PROJECTORS
 from mvrecon_bench.benchmarks import skip_report, targets
 from mvrecon_bench.benchmarks.skip_measure import compared, difference
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, filled, phantom_body, rig, seen

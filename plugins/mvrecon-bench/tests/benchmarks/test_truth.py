@@ -6,13 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.camera import VECTORS
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.benchmarks import accuracy, truth
 from mvrecon_bench.benchmarks.cases import RIGS, Case, boxes, expand
 

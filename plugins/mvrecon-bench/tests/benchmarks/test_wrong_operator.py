@@ -1,7 +1,7 @@
 """A row of the benchmark has the error of that very operator beside its time."""
 
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.drr import Drr
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.operators.drr import Drr
 from mvrecon_bench.benchmarks.operators import Operators
 
 BASE = {"n": 8, "views": 2, "device": "cpu", "threads": 1, "scene": "box"}

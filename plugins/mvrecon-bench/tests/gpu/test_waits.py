@@ -5,15 +5,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mvrecon.config import compose
-from mvrecon.engine.callbacks import Clock
-from mvrecon.engine.finite import FiniteLoss
-from mvrecon.engine.fit import build_data
-from mvrecon.engine.module import ReconstructionModule
+from mvrecon.apps.config import compose
+from mvrecon.core.parts import METHODS
 from mvrecon.geometry.lattice import lifted_maps
 from mvrecon.kernels.warps.warp import warp
-from mvrecon.parts import METHODS
-from mvrecon.visual_hull.support import hull_mask
+from mvrecon.operators.visual_hull.support import hull_mask
+from mvrecon.training.callbacks import Clock
+from mvrecon.training.fit import build_data
+from mvrecon.training.module import FiniteLoss, ReconstructionModule
 from mvrecon_bench.gpu.as_gpu import GPU, AsGpu, OnGpu, on_gpu
 
 DETECTOR = {"pixels": [12, 12], "pixel_mm": 5.0}

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.cameras.rigs import circular
-from mvrecon.parts import CAMERAS, METHODS, PROJECTORS, SCENES
-from mvrecon.projectors.drr import Drr
-from mvrecon.projectors.operator import Wrapped
-from mvrecon.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCENES
+from mvrecon.data.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.operator import Wrapped
 from mvrecon_bench.stresses import plan
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import subject_of

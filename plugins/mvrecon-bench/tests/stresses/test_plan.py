@@ -5,7 +5,7 @@ should.
 import pytest
 import torch
 
-from mvrecon.parts import REGISTRIES
+from mvrecon.core.parts import REGISTRIES
 from mvrecon_bench.stresses import plan
 from mvrecon_bench.stresses.subject import subject_of
 from mvrecon_bench.stresses.verdict import FAIL, judge

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mvrecon.cameras.formats.text import number
-from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import EDGE, VOLUME, Refused, plain_name, shown, text_of
-from mvrecon.registry import hint
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, plain_name, shown, text_of
+from mvrecon.core.registry import hint
+from mvrecon.geometry.cameras.formats.text import number
 
 #: Types by the header's words and bytes.
 FORMATS = {

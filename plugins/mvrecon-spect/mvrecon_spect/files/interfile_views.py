@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.stack import ProjectionStack
-from mvrecon.files.checks import Refused
 from mvrecon_spect.files.interfile import numbers_of, read_header
 from mvrecon_spect.files.stir import views_shape
 

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.files.checks import Refused, blaming
 from mvrecon.data.dicom import frames_of, header_of, pixels_of
-from mvrecon.files.checks import Refused, blaming
+from mvrecon.geometry.cameras.camera import Cameras
 
 WINDOW = "EnergyWindowVector"
 VIEW = ("DetectorVector", "RotationVector", "AngularViewVector")

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.files.checks import Refused
+from mvrecon.core.files.checks import Refused
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon_spect.files.interfile import Header, numbers_of, read_header, write_interfile
 from mvrecon_spect.files.stir_system import StirSystem, cameras_of
 from mvrecon_spect.files.stir_text import (

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.operator import LinearOperator, Scaled
+from mvrecon.operators.operator import LinearOperator, Scaled
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of
 from mvrecon_spect.multiplexed import Multiplexed
 from mvrecon_spect.projector import Spect

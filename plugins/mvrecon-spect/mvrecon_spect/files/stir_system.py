@@ -17,10 +17,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.detector import Detector, detector_centre
-from mvrecon.cameras.formats.text import square_pixels
-from mvrecon.cameras.formats.world import from_world, into_world
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.detector import Detector, detector_centre
+from mvrecon.geometry.cameras.formats.text import square_pixels
+from mvrecon.geometry.cameras.formats.world import from_world, into_world
 from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
 
 #: mm, and parts of a unit vector, within which a rig must be STIR's to be written.
@@ -117,7 +117,8 @@ def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
 
     Args:
         system: the geometry.
-        world: axes of the file, see `mvrecon.cameras.formats.world.to_ras`. STIR's are LPS for a
+        world: axes of the file, see `mvrecon.geometry.cameras.formats.world.to_ras`. STIR's are
+            LPS for a
             patient on his back, head first, and RAS for one on his belly, head first.
     """
     openings = sorted(system.collimator.openings, key=lambda hole: hole.detector)

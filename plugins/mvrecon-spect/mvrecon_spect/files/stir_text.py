@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from mvrecon.cameras.formats.text import VIEWS, number
-from mvrecon.files.atomic import written_whole
-from mvrecon.files.checks import Refused, shown, text_of
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import Refused, shown, text_of
+from mvrecon.geometry.cameras.formats.text import VIEWS, number
 
 #: mm in a cm.
 CM = 10.0

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.data.scenes.derenzo import sector_wells
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.geometry.sample import normalised, sample
-from mvrecon.scenes.derenzo import sector_wells
 
 #: Two wells are resolved up to this ratio, as two points are by Rayleigh's criterion.
 RESOLVED = 0.735

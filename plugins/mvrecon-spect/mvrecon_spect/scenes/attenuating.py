@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.analytic import AnalyticScene
+from mvrecon.data.scenes.sample import Rays, Sample
+from mvrecon.data.scenes.solids import PAIRS, Phantom
+from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import AnalyticScene, generator
-from mvrecon.scenes.sample import Rays, Sample
-from mvrecon.scenes.solids import PAIRS, Phantom
-from mvrecon.scenes.voxelise import voxelise
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.random_numbers import generator, uniform
+from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_degrees, euler_rotation, random_in_ball, unit
-from mvrecon.scenes.analytic import generator, uniform
-from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon_spect.scenes.attenuating import AttenuatingScene
 
 #: Semi-axes and centres in mm of the mean patient.

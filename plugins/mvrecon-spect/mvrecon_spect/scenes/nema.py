@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.quantities import PositiveFloat
+from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
-from mvrecon.quantities import PositiveFloat
-from mvrecon.scenes.solids import Phantom, Solids
 from mvrecon_spect.scenes.attenuating import AttenuatingScene
 
 #: Diameters of the six spheres in mm, and the radius of the circle that their centres lie on.

@@ -8,16 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.acquisition.detector import detected
-from mvrecon.acquisition.settings import Acquisition
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.core.random_numbers import generator, mixed
+from mvrecon.data.acquisition.detector import detected
+from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at
+from mvrecon.data.scenes.sample import Mapped, Pooling, Rays, Sample
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.parts import CAMERAS, SCENES
-from mvrecon.projectors.drr import Drr
-from mvrecon.reconstructors.iterative import sirt
-from mvrecon.scenes.analytic import generator, mixed
-from mvrecon.scenes.sample import Mapped, Pooling, Rays, Sample
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.operators.drr import Drr
 
 #: The series of the scan's noise, apart from those that draw the patients.
 SCAN = 0x63745F73

@@ -9,16 +9,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.random_numbers import generator, mixed, uniform
 from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy
 from mvrecon.data.body import body, enclosed
-from mvrecon.data.placement import Placed
 from mvrecon.data.resample import resample
+from mvrecon.data.scenes.sample import Sample
 from mvrecon.data.slabs import Slab, Slabs
-from mvrecon.data.volumes import TISSUE, Hdf5Volumes
+from mvrecon.data.volumes import TISSUE, Hdf5Volumes, Placed
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.scenes.analytic import generator, mixed, uniform
-from mvrecon.scenes.sample import Sample
 
 #: The series of the uptakes, apart from those that move the patients.
 UPTAKE = 0x75707461

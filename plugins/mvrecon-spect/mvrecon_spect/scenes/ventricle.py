@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import torch
 
+from mvrecon.core.quantities import PositiveFloat
+from mvrecon.data.scenes.analytic import AnalyticScene
+from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation, random_in_ball, random_rotation
-from mvrecon.quantities import PositiveFloat
-from mvrecon.scenes.analytic import AnalyticScene
-from mvrecon.scenes.solids import Phantom, Solids
 
 
 def ventricle(

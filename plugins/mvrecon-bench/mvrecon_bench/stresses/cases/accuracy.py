@@ -6,13 +6,13 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from mvrecon.cameras.camera import Cameras
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.integrals import METHODS
-from mvrecon.scenes.solids import Phantom, Solids
-from mvrecon.scenes.voxelise import voxelise
+from mvrecon.operators.integrals import METHODS
 from mvrecon_bench.stresses.analytic import Blob
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.subject import ProjectorSubject, gap

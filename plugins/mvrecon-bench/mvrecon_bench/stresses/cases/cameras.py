@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mvrecon.cameras import convert
-from mvrecon.cameras.camera import VECTORS, Cameras
-from mvrecon.cameras.files import from_file, save
+from mvrecon.core.parts import CAMERAS
+from mvrecon.geometry.cameras import convert
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.files import from_file, save
 from mvrecon.geometry.rigid import inverse, random_rotation
-from mvrecon.parts import CAMERAS
 from mvrecon.testing import check_camera
 from mvrecon_bench.stresses.camera_subject import CameraSubject
 from mvrecon_bench.stresses.case import Case, DoesNotApply

@@ -2,11 +2,11 @@
 
 import torch
 
+from mvrecon.data.scenes.derenzo import derenzo
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.projectors.operator import Projector
-from mvrecon.reconstructors.mlem import mlem
-from mvrecon.reconstructors.poisson import PoissonLikelihood
-from mvrecon.scenes.derenzo import derenzo
+from mvrecon.methods.classical.mlem import mlem
+from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.operators.operator import Projector
 from mvrecon_bench.stresses.case import PRECISE, Case
 from mvrecon_bench.stresses.refusals import none_of, refusal
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from mvrecon.cameras.camera import VECTORS, Cameras
-from mvrecon.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.cases.tensors import EVERY, HALVES, both
 from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, bits, gap, greatest

@@ -6,10 +6,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mvrecon.cameras import convert
-from mvrecon.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras import convert
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.frusta import Frusta
+from mvrecon.methods.learned.frusta import Frusta
 from mvrecon_bench.stresses.camera_subject import CameraSubject
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.cameras import EXACT

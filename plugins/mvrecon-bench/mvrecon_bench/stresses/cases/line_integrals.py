@@ -7,10 +7,10 @@ itself: here is what such logarithms, taken elsewhere, may leave in the views.
 
 import torch
 
-from mvrecon.reconstructors.iterative import sirt, sirt_weights
-from mvrecon.reconstructors.mlem import mlem
-from mvrecon.visual_hull.hull import visual_hull
-from mvrecon.visual_hull.noise import noise_threshold
+from mvrecon.methods.classical.iterative import sirt, sirt_weights
+from mvrecon.methods.classical.mlem import mlem
+from mvrecon.operators.visual_hull.hull import visual_hull
+from mvrecon.operators.visual_hull.noise import noise_threshold
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.counts import ASIDE, operator
 from mvrecon_bench.stresses.refusals import none_of, refusal

@@ -10,9 +10,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from mvrecon.losses import ReconstructionLoss
-from mvrecon.models.output import Reconstruction
-from mvrecon.parts import METHODS
+from mvrecon.core.parts import METHODS
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.training.losses import ReconstructionLoss
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.learned_subjects import MethodSubject, small_rig
 from mvrecon_bench.stresses.refusals import none_of, refusal

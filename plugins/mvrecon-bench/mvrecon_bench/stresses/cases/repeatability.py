@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.geometry.grid import Grid
-from mvrecon.models.method import build_method
-from mvrecon.parts import PROJECTORS, SCENES
-from mvrecon.projectors.ray_transform import RayTransform
+from mvrecon.methods.method import build_method
+from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.fresh_process import LIMIT, python
@@ -154,9 +154,9 @@ def draws_nothing(subject: ProjectorSubject) -> float:
 
 def evaluation_draws_nothing(subject: Subject) -> float:
     """Scenes by index, evaluation of a method, pictures, and writing to TensorBoard."""
-    from mvrecon.engine.evaluation import evaluate
-    from mvrecon.engine.loggers import Board
-    from mvrecon.viz import review
+    from mvrecon.report.viz import review
+    from mvrecon.training.evaluation import evaluate
+    from mvrecon.training.loggers import Board
 
     grid = Grid.centred(size=(9, 8, 7), spacing=1.0)
     rig = rig_about(grid)
@@ -203,7 +203,7 @@ def imported(subject: Subject) -> float:
     """
     code = (
         "import sys, torch\n"
-        "from mvrecon.parts import REGISTRIES as known\n"
+        "from mvrecon.core.parts import REGISTRIES as known\n"
         "parts = [(kind, name) for kind in known for name in known[kind].names()]\n"
         "for kind, name in parts:\n"
         "    if known[kind].origin(name).startswith('mvrecon.'): known[kind].get(name)\n"

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import torch
 
-from mvrecon.scenes.sample import Finer, Sample
+from mvrecon.data.scenes.sample import Finer, Sample
 from mvrecon.testing import check_scene
 from mvrecon.testing.scene import GRID, RIG
 from mvrecon_bench.stresses.case import Case, DoesNotApply

@@ -11,15 +11,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mvrecon.cameras.camera import Cameras
-from mvrecon.cameras.explicit import ExplicitRays
-from mvrecon.cameras.rigs import circular, dome, parallel
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.box import Box
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import ops
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.parts import PROJECTORS
-from mvrecon.projectors.selection import RaySelection, ViewSelection, ordered_subsets
+from mvrecon.operators.selection import RaySelection, ViewSelection, ordered_subsets
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.refusals import refusal
 from mvrecon_bench.stresses.subject import (

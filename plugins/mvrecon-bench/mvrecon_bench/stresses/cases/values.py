@@ -7,8 +7,8 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.grid import Grid
-from mvrecon.projectors.ray_transform import RayTransform
-from mvrecon.projectors.skipping import SKIPS
+from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.operators.skipping import SKIPS
 from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, bits, gap

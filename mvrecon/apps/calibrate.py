@@ -1,0 +1,143 @@
+"""Calibration of a measured scan's rig from its views, before it is reconstructed."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from mvrecon.apps.run_method import bar
+from mvrecon.apps.scan import Scan
+from mvrecon.core.files.memory import check_memory
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.field import resolution
+from mvrecon.geometry.cameras.misalignment import misaligned
+from mvrecon.geometry.grid import Grid, coarse
+from mvrecon.methods.calibration.blur import blurred
+from mvrecon.methods.calibration.from_data import Estimate, calibrated
+from mvrecon.methods.calibration.unknowns import KINDS, unknowns
+
+#: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
+COARSE, ROUNDS = 64, 12
+#: Arrays of the views' size that a fit holds.
+ARRAYS = 8
+
+
+def check(free: Any, scan: Scan) -> None:
+    """Check the setting `calibrate` before any view is read.
+
+    Raises:
+        ValueError: no list of names, names that `unknowns` refuses, parallel beams, or views that
+            do not fit into memory.
+    """
+    if not isinstance(free, Sequence) or isinstance(free, str):
+        raise ValueError(
+            f"Expected calibrate as a list of names, such as calibrate=[offset_u,tilt], got {free}"
+        )
+    numbers = unknowns(scan.cameras, free)
+    misaligned(scan.cameras, numbers.misalignment(torch.zeros(numbers.basis.shape[:2]).double()))
+    check_memory(
+        4 * ARRAYS * len(scan.cameras) * math.prod(scan.cameras.shape),
+        "Calibration holds all views (views.binning=2 or views.every=2 takes fewer; or calibrate "
+        "once so, and give the rig that it writes to the streamed run): it",
+    )
+
+
+def calibrate(scan: Scan, free: Sequence[str], device: str = "cpu") -> tuple[Scan, Estimate]:
+    """The scan with the rig and the gains that its views tell, and the estimate in pixels of the
+    scan and degrees.
+
+    The fit sees the scan's box in at most `COARSE` voxels a side, and as many pixels joined into
+    one as fit into a voxel's image.
+
+    Raises:
+        ValueError: as `calibrated`.
+    """
+    grid = coarse(scan.grid, COARSE)
+    joined = _joined(scan, grid)
+    rig = scan.cameras.binned(joined)
+
+    def operator_of(cameras):
+        return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
+
+    with bar("calibrate", ROUNDS) as advance:
+        views = _filled(scan, joined).to(device)
+        fit = calibrated(
+            operator_of, rig, views, free, rounds=ROUNDS, monitor=lambda r: advance(r.number)
+        )
+    by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
+    cameras = misaligned(scan.cameras, by)
+    measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
+    estimate = fit._replace(cameras=cameras, misalignment=by)
+    return replace(scan, cameras=cameras, measured=measured), estimate
+
+
+def in_words(estimate: Estimate, free: Sequence[str]) -> str:
+    """What was wrong with a rig, in pixels and degrees, and the residual before and after."""
+    parts, by = [], estimate.misalignment
+    for name in free:
+        if name in estimate.kept:
+            parts.append(f"{name} kept at the nominal value")
+        elif name == "shifts":
+            length = by.offset_px.norm(dim=1)
+            parts.append(
+                f"shifts of {length.square().mean().sqrt():.2f} pixels (rms), at most "
+                f"{length.max():.2f} (view {int(length.argmax())})"
+            )
+        elif name == "gains":
+            off = estimate.gains - 1
+            parts.append(
+                f"gains off by {off.square().mean().sqrt():.2%} (rms), at most "
+                f"{off.abs().max():.2%} (view {int(off.abs().argmax())})"
+            )
+        else:
+            kind = KINDS[name]
+            value = getattr(by, kind.field or "")[0, kind.column]
+            unit = "pixels" if kind.field == "offset_px" else "degrees"
+            parts.append(f"{name} {value:+.3f} {unit}")
+    before, after = estimate.residual[0], estimate.residual[-1]
+    rounds = f"{len(estimate.residual) - 1} rounds"
+    return (
+        f"{', '.join(parts)}; residual of the blurred views {before:.3g} before, {after:.3g} after "
+        f"{rounds if estimate.settled else rounds + ', in the last of which the rig still changed'}"
+    )
+
+
+def table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]:
+    """The estimate in words and as plain numbers, for `results.json`."""
+    by = estimate.misalignment
+    return {
+        "words": in_words(estimate, free),
+        "free": list(free),
+        "offset_px": by.offset_px.tolist(),
+        "tilt_degrees": by.tilt_degrees.tolist(),
+        "gains": estimate.gains.tolist(),
+        "residual": estimate.residual,
+        "kept": estimate.kept,
+        "left_out": list(estimate.left_out),
+        "settled": estimate.settled,
+    }
+
+
+def _joined(scan: Scan, grid: Grid) -> int:
+    """Pixels joined into one each way: the most that a voxel's image holds and the detector has a
+    multiple of.
+    """
+    fitting = max(grid.spacing) / resolution(scan.cameras, grid.centre)
+    rows, columns = scan.cameras.shape
+    shared = math.gcd(rows, columns)
+    return max(n for n in range(1, shared + 1) if shared % n == 0 and (n == 1 or n <= fitting))
+
+
+def _filled(scan: Scan, joined: int) -> Float[Tensor, "1 1 m v u"]:
+    """All views, binned, and pixels that were not measured filled from their neighbours."""
+    whole = scan.measured.whole()
+    counts = avg_pool2d(whole.mask.float(), joined)
+    total = avg_pool2d(torch.where(whole.mask, whole.views, 0.0), joined)
+    views = (total / counts.clamp_min(1e-9))[None, None]
+    mask = counts > 0
+    return views if mask.all() else torch.where(mask, views, blurred(views, 2.0, mask))

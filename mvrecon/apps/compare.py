@@ -1,0 +1,101 @@
+"""`mvrecon-compare`: finished runs, or the runs of a sweep, in one table."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+from rich.console import Console
+
+from mvrecon.apps.config.errors import one_line
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.runs import RESULTS
+from mvrecon.core.registry import hint
+from mvrecon.report.comparison import pareto, tables
+from mvrecon.report.comparison.rows import FIGURES, Row, read
+
+#: Columns of a terminal that the table is made for.
+WIDTH = 150
+
+
+def compare(
+    places: Sequence[str | Path],
+    reference: str | None = None,
+    figure: str = "psnr",
+    out: str | Path | None = None,
+) -> tables.Cells:
+    """The table of all methods of finished runs; with `out` also written there as `compare.md`,
+    `compare.csv`, `compare.tex` and, error against time, `pareto.svg`.
+
+    Args:
+        places: run folders, or folders with runs in them.
+        reference: label of the method that the others are compared with; None: the first.
+        figure: of merit whose paired differences are shown.
+        out: folder.
+
+    Raises:
+        FileNotFoundError: a place without a finished run.
+        LookupError: no method of that label.
+        Refused: a file that is none of a run's.
+    """
+    rows = read(places)
+    first = _reference(rows, reference)
+    table = tables.cells(rows, first, figure)
+    if out is not None:
+        texts = {
+            "compare.md": tables.markdown(table),
+            "compare.csv": tables.comma_separated(rows, first),
+            "compare.tex": tables.latex(table),
+            "pareto.svg": pareto.picture(rows, figure),
+        }
+        for name, text in texts.items():
+            with written_whole(Path(out) / name) as part:
+                part.write_text(text, encoding="utf-8")
+    return table
+
+
+def show(table: tables.Cells) -> None:
+    """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
+    console = Console(width=max(Console().width, WIDTH))
+    console.print(tables.terminal(table))
+
+
+class SweepTable(Callback):
+    """Compares the runs of a sweep at its end, in its folder and on the terminal."""
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """The table, if any run of the sweep has results."""
+        folder = Path(config.hydra.sweep.dir)
+        if next(folder.rglob(RESULTS), None) is not None:
+            show(compare([folder], out=folder))
+            Console().print(f"Kept in {folder}", soft_wrap=True, markup=False)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line of `mvrecon-compare`."""
+    made = argparse.ArgumentParser(prog="mvrecon-compare", description=__doc__)
+    made.add_argument("runs", nargs="+", metavar="RUN", help="a run folder, or one of a sweep")
+    made.add_argument("--reference", help="the method that the others are compared with")
+    made.add_argument("--figure", choices=FIGURES, default="psnr", help="compared pair by pair")
+    made.add_argument("--out", help="folder for compare.md, .csv, .tex and pareto.svg")
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `mvrecon-compare`."""
+    options = parser().parse_args(arguments)
+    with one_line("mvrecon-compare"):
+        show(compare(options.runs, options.reference, options.figure, options.out))
+
+
+def _reference(rows: Sequence[Row], label: str | None) -> Row:
+    labels = {row.method for row in rows}
+    if label is not None and label not in labels:
+        raise LookupError(f"No method is labelled {label!r}{hint(label, labels)}")
+    return next(row for row in rows if label in (None, row.method))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,363 @@
+"""Settings of the apps: their YAML files, composed by Hydra to plain dicts, and checked.
+
+Below this door everything is a plain dict of names and numbers, so that checkpoints load with
+torch's defaults and no loop pays for a config object. Importing this file imports neither torch nor
+Lightning.
+"""
+
+import re
+import sys
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from io import TextIOWrapper
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import hydra
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
+
+from mvrecon.apps.config.errors import OF_METHODS, one_line
+from mvrecon.apps.config.guard import guarded
+from mvrecon.apps.config.typed import check_parts
+from mvrecon.core.files.checks import shown, yaml_of
+from mvrecon.core.plugins import check_plugins
+from mvrecon.core.quiet import silence_libraries
+from mvrecon.core.registry import installed, locate
+
+
+@dataclass
+class Measurement:
+    """The top-level keys that the apps share: what is measured, by which rig, and how."""
+
+    name: str = MISSING
+    seed: int = 0
+    grid: Any = None
+    scene: Any = None
+    camera: Any = None
+    projector: Any = None
+    acquisition: Any = None
+    plugins: Any = field(default_factory=list)
+
+
+@dataclass
+class Simulation(Measurement):
+    """Every top-level key of `mvrecon-simulate`."""
+
+    rtk: bool = False
+    cases: list[int] = MISSING
+    events: Any = None
+
+
+@dataclass
+class Settings(Measurement):
+    """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a
+    silent extra.
+    """
+
+    test_scene: Any = None
+    method: Any = None
+    label: str | None = None
+    compare: Any = field(default_factory=dict)
+    loss: Any = field(default_factory=dict)
+    optimizer: Any = None
+    data: Any = None
+    trainer: Any = None
+    callbacks: Any = None
+    logger: Any = None
+    device: str = "auto"
+    init_from: str | None = None
+    resume: str | None = None
+
+
+@dataclass
+class ScanSettings:
+    """Every top-level key of `mvrecon-reconstruct`."""
+
+    name: str = MISSING
+    views: Any = None
+    camera: Any = None
+    projector: Any = None
+    grid: Any = MISSING
+    method: Any = None
+    correct: Any = None
+    self_calibrate: bool = False
+    left_out: bool = False
+    out: str | None = None
+    unit: str = MISSING
+    stop: Any = None
+    choose: Any = None
+    calibrate: Any = None
+    device: str = "auto"
+    plugins: Any = field(default_factory=list)
+
+
+@dataclass
+class Evaluation:
+    """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the method, are
+    not keys.
+    """
+
+    name: str = MISSING
+    checkpoint: str = MISSING
+    test_scene: Any = None
+    acquisition: Any = None
+    camera: Any = None
+    grid: Any = field(default_factory=dict)
+    data: Any = None
+    compare: Any = field(default_factory=dict)
+    device: str = "auto"
+    save: bool = False
+    plugins: Any = field(default_factory=list)
+
+
+SCHEMAS = {
+    "schema": Settings,
+    "evaluation_schema": Evaluation,
+    "simulation_schema": Simulation,
+    "reconstruction_schema": ScanSettings,
+}
+
+
+#: What an unquoted value of Hydra's must not have in it.
+SIGNS = set("=,;()[]{}' ")
+
+
+def with_paths_quoted(arguments: Sequence[str]) -> list[str]:
+    """Arguments in which each value that is the path of a file or folder is quoted where it has to
+    be: the run of a sweep is called camera.n_views=4,model=sirt.
+    """
+    return [_with_path_quoted(argument) for argument in arguments]
+
+
+def _with_path_quoted(argument: str) -> str:
+    key, sign, value = argument.partition("=")
+    if not sign or key.startswith("-") or not SIGNS & set(value):
+        return argument
+    try:
+        is_path = Path(value).expanduser().exists()
+    except (OSError, ValueError):  # too long for a path
+        return argument
+    return f"{key}={quoted(value)}" if is_path else argument
+
+
+def with_options_added(arguments: Sequence[str], sections: Collection[str]) -> list[str]:
+    """Arguments in which an option of one of these sections, such as camera.n_views=12, is set
+    whether the app's own file has it or not, as by Hydra's ++.
+    """
+    return [
+        f"++{argument}"
+        if "." in (key := argument.partition("=")[0]) and key.partition(".")[0] in sections
+        else argument
+        for argument in arguments
+    ]
+
+
+def with_flag_first(arguments: Sequence[str]) -> list[str]:
+    """Arguments with the flag of a sweep before all settings: between two of them Hydra would not
+    know those behind it.
+    """
+    return sorted(arguments, key=lambda argument: argument not in ("-m", "--multirun"))
+
+
+def quoted(value: str | Sequence[str]) -> str:
+    """A value in the grammar of Hydra's command line."""
+    if not isinstance(value, str):
+        return f"[{','.join(map(quoted, value))}]"
+    return "'" + value.replace("'", r"\'") + "'"
+
+
+VERSION_BASE = "1.3"
+#: Settings whose options need not be in a file: those of parts are in their signatures.
+OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
+#: Further such settings of an app: those of the run that it evaluates, or of `EventSettings`.
+OF_RUN = {"eval": ("acquisition", "data", "grid"), "simulate": ("events",)}
+
+
+class PluginConf(SearchPathPlugin):
+    """Adds the config folders of installed plugins to Hydra's search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in plugin_conf_dirs():
+            search_path.append(provider="mvrecon plugin", path=f"file://{folder}")
+
+
+def conf_dir() -> Path:
+    """Where the YAML files are: beside the code in a wheel, one level up in a checkout."""
+    package = Path(__file__).resolve().parents[2]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def plugin_conf_dirs() -> list[Path]:
+    """The config folders that installed plugins declare (entry points named "conf.*"), found
+    without an import.
+    """
+    packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
+    return [
+        Path(folder)
+        for package in packages
+        if package
+        for folder in package.submodule_search_locations or ()
+    ]
+
+
+def app_file(config_name: str) -> Path:
+    """The YAML file of an app's settings: mvrecon's own, or that of an installed plugin.
+
+    Raises:
+        FileNotFoundError: no app has such a file.
+    """
+    folders = [conf_dir(), *plugin_conf_dirs()]
+    for file in (folder / f"{config_name}.yaml" for folder in folders):
+        if file.is_file():
+            return file
+    raise FileNotFoundError(
+        f"No app has the settings {config_name}.yaml in any of {shown(map(str, folders))}"
+    )
+
+
+def prepare_hydra() -> None:
+    """Make the schemas and the plugins' config groups known to Hydra, in this process only."""
+    for name, schema in SCHEMAS.items():
+        ConfigStore.instance().store(name=name, node=schema)
+    Plugins.instance().register(PluginConf)
+
+
+def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
+    """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once.
+
+    Names, options and types of all settings are checked before the task imports anything heavy. An
+    error ends the process with one line; with HYDRA_FULL_ERROR=1 with its traceback. Modules that
+    the command line itself names in `plugins=` may also lie in the current folder.
+
+    Raises:
+        SystemExit: an error, or Ctrl-C.
+    """
+    sys.argv[1:] = arguments = with_options_added(
+        with_paths_quoted(with_flag_first(sys.argv[1:])), (*OF_PARTS, *OF_RUN.get(config_name, ()))
+    )
+    if {"-h", "--help"} & set(arguments):
+        sys.stdout.write(help_text(config_name))
+        return
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(
+            errors="backslashreplace"
+        )  # as stderr: a path that it cannot write must not end a run
+    if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
+        sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
+    prepare_hydra()
+    silence_libraries()
+    guard = guarded(conf_dir(), plugin_conf_dirs(), check_settings)
+    with one_line(f"mvrecon-{config_name}"), guard:
+        if any(argument.startswith("--e") for argument in arguments):
+            raise PermissionError(
+                "--experimental-rerun unpickles a file, which can run anything; use resume=<run "
+                "folder>"
+            )
+        hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(
+            task
+        )()
+
+
+def check_settings(config: DictConfig) -> None:
+    """Check plugins and parts of a composed config, whose missing settings may come later.
+
+    Raises:
+        ImportError, PermissionError: a module of `plugins` that is none.
+        LookupError, TypeError: a part's name, option or value.
+    """
+    plain: Any = OmegaConf.to_container(config, resolve=False)
+    settings = {key: value for key, value in plain.items() if key != "hydra"}
+    if settings.get("plugins") != "???":
+        check_plugins(settings.get("plugins"))
+    check_parts(settings)
+
+
+def help_text(config_name: str) -> str:
+    """The text of `--help`: the config groups that the app takes, with their choices, and all
+    settings with comments.
+    """
+    choices: dict[str, set[str]] = {}
+    for folder in (conf_dir(), *plugin_conf_dirs()):
+        for file in folder.glob("*/*.yaml"):
+            choices.setdefault(file.parent.name, set()).add(file.stem)
+    taken = groups_of(app_file(config_name))
+    groups = "\n".join(
+        f"  {group:<14}{', '.join(sorted(names))}"
+        for group, names in sorted(choices.items())
+        if group in taken
+    )
+    settings = app_file(config_name).read_text(encoding="utf-8")
+    return (
+        f"Usage: mvrecon-{config_name} [group=choice ...] [key=value ...]\n\nGroups and their "
+        f"choices:\n{groups}\n\n"
+        f"{settings}\n"
+        "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of "
+        "your own\n"
+        "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's "
+        "options.\n"
+    )
+
+
+def groups_of(app: Path) -> set[str]:
+    """The config groups in an app's list of defaults, and those that its methods choose from."""
+    entries = yaml_of(app).get("defaults", ())
+    keys = (next(iter(entry)) for entry in entries if isinstance(entry, dict))
+    groups = {re.sub("^override ", "", key).partition("@")[0].strip("/") for key in keys}
+    return groups | (OF_METHODS if "method" in groups else set())
+
+
+def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
+    """The plain settings that a command line with these overrides would run with.
+
+    Raises:
+        RuntimeError: another program in this process is using Hydra; it is left alone.
+    """
+    if GlobalHydra.instance().is_initialized():
+        raise RuntimeError(
+            "Hydra is in use already in this process: compose() must be called outside a Hydra app"
+        )
+    prepare_hydra()
+    guard = guarded(conf_dir(), plugin_conf_dirs())
+    with guard, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
+        added = with_options_added(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+        config = hydra.compose(config_name, added, return_hydra_config=True)
+    choices = dict(config.hydra.runtime.choices)
+    with open_dict(config):
+        del config["hydra"]
+    return labelled(to_plain(config), choices)
+
+
+def labelled(settings: dict[str, Any], choices: Mapping[str, str | None]) -> dict[str, Any]:
+    """Settings of which a null `label` is the name of the main method's file of settings.
+
+    A class serves several such files, as `cross_view_counts`.
+
+    Args:
+        settings: plain.
+        choices: file by config group, as Hydra has them in `hydra.runtime.choices`.
+    """
+    choice = choices.get("method")
+    if not choice or settings.get("label", "") is not None:
+        return settings
+    return {**settings, "label": PurePosixPath(choice).name}
+
+
+def to_plain(config: DictConfig) -> dict[str, Any]:
+    """A composed config as plain dicts, lists, strings and numbers, all references resolved.
+
+    Raises:
+        LookupError: a setting marked `???` was not given.
+    """
+    if missing := OmegaConf.missing_keys(config):
+        raise LookupError(
+            f"These settings must be given: {', '.join(f'{key}=...' for key in sorted(missing))}"
+        )
+    plain = OmegaConf.to_container(config, resolve=True)
+    if not isinstance(plain, dict):
+        raise TypeError(f"Settings must be a mapping, got {type(plain).__name__}")
+    return {str(key): value for key, value in plain.items()}

@@ -1,0 +1,138 @@
+"""Errors of the apps as one line; the environment variable HYDRA_FULL_ERROR=1 shows them whole."""
+
+import os
+import re
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import PurePosixPath
+from typing import Any
+
+from hydra._internal import utils
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from mvrecon.core.registry import hint
+
+#: What a user's settings, files and machine can cause; anything else is a fault of the program.
+EXPECTED = (
+    *(HydraException, OmegaConfBaseException),
+    *(ValueError, TypeError, LookupError, OSError, ImportError, RuntimeError, MemoryError),
+    FloatingPointError,
+)
+#: Kinds of these that only a fault of the program raises.
+FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
+
+#: What OmegaConf adds to its messages for programmers.
+TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
+
+#: Choices of Hydra's own groups that an extra of mvrecon brings.
+EXTRAS = {"joblib": "sweep", "optuna": "sweep"} | dict.fromkeys(
+    ("ray", "submitit_local", "submitit_slurm"), "cluster"
+)
+
+#: Groups whose part is an option of a method; settings of version 0.1.0 and what replaces them.
+OF_METHODS = {"head", "network"}
+RENAMED = {"model": "method", "reconstructor": "method"}
+#: Hydra's words for a group that a run does not take.
+UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean to override)")
+#: Hydra's words for an experiment that chooses what the app does not have.
+FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
+
+
+@contextmanager
+def one_line(app: str) -> Iterator[None]:
+    """Context in which an error that a user can mend ends the process with one line and status 1,
+    and a warning is one line.
+
+    Args:
+        app: begins the line.
+
+    Raises:
+        SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
+    """
+    report, value = utils.run_and_report, JobReturn.return_value
+    shown = warnings.formatwarning
+    warnings.formatwarning = lambda message, category, *_: (
+        f"{app}: {category.__name__}: {message}\n"
+    )
+    # Hydra's own print tracebacks, and a line more
+    utils.run_and_report = lambda function: function()
+    JobReturn.return_value = value.getter(_result)  # type: ignore[method-assign]
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        sys.stderr.write(f"{app}: stopped by Ctrl-C\n")
+        raise SystemExit(130) from stop
+    except EXPECTED as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1" or _is_fault(error):
+            raise
+        sys.stderr.write(f"{app}: {sentence(error)}\n")
+        raise SystemExit(1) from error
+    finally:
+        utils.run_and_report, JobReturn.return_value = report, value  # type: ignore[method-assign]
+        warnings.formatwarning = shown
+
+
+def _result(job: JobReturn) -> Any:
+    """What a job of Hydra's returned, or its error, which in a sweep tells the job."""
+    if job.status == JobStatus.COMPLETED:
+        return job._return_value
+    if job.hydra_cfg is not None and job.hydra_cfg.hydra.mode == RunMode.MULTIRUN:
+        job._return_value.add_note(f"in the job {' '.join(job.overrides or ())}")
+    raise job._return_value
+
+
+def _is_fault(error: BaseException) -> bool:
+    return isinstance(error, FAULTS) and not isinstance(error, OmegaConfBaseException)
+
+
+def sentence(error: BaseException) -> str:
+    """An error's kind and message on one line, with the nearest known name for a mistyped one."""
+    cause = error.__cause__ or error
+    if isinstance(error, MissingConfigException) and error.options is not None:
+        choice = PurePosixPath(str(error.missing_cfg_file))
+        if str(choice.parent).startswith("hydra/") and choice.name in EXTRAS:
+            extra = EXTRAS[choice.name]
+            return f"{choice} is not installed; pip install 'mvrecon[{extra}]' brings it"
+        known = [PurePosixPath(option).name for option in error.options]
+        return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
+    if isinstance(cause, ConfigKeyError | ConfigAttributeError):
+        parent = cause.parent_node
+        old, _, rest = str(cause.full_key).partition(".")
+        if old in RENAMED:
+            return f"{cause.full_key!r} is called {RENAMED[old]}{'.' * bool(rest)}{rest} now"
+        known = {str(key) for key in parent or ()} - {"hydra"}
+        if not known:  # as the camera of an evaluation, which is the run's
+            return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
+        inside = [f"{part}.{cause.key}" for part in known if str(cause.key) in _keys(parent, part)]
+        if inside and cause.full_key == cause.key:
+            return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
+        return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
+    if part := UNMATCHED.match(str(error)):
+        if part[1] in RENAMED:
+            return f"{part[1]!r} is called {RENAMED[part[1]]!r} now: {RENAMED[part[1]]}=..."
+        if part[1] in OF_METHODS:
+            return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
+        return f"This app chooses no {part[1]!r}; --help shows what it chooses"
+    if foreign := FOREIGN.match(str(error)):
+        return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
+    if isinstance(error, HydraException):
+        texts = [str(error), str(cause) if cause is not error else ""]
+        return _joined([TAIL.sub("", text) for text in texts])
+    return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
+
+
+def _keys(settings: Any, part: str) -> set[str]:
+    """The settings of a part, where it has any."""
+    inner = None if OmegaConf.is_missing(settings, part) else settings._get_node(part)
+    return {str(key) for key in inner} if isinstance(inner, DictConfig) else set()
+
+
+def _joined(texts: list[str]) -> str:
+    lines = (" ".join(text.split()) for text in texts)
+    return "; ".join(line.rstrip(".") for line in lines if line)

@@ -1,0 +1,118 @@
+"""`mvrecon-eval`: the result table of a run again, from its checkpoints, on its own test scenes or
+on others.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from mvrecon.apps.config import launch, to_plain
+from mvrecon.core.files.places import of_weights
+from mvrecon.core.files.runs import EVALUATION, folder_of_run
+from mvrecon.core.plugins import import_plugins
+
+
+def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Evaluate a run's methods and write `results.json` (with `save`, the cases too) into a folder.
+
+    Args:
+        options: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the
+            run: `test_scene`, `acquisition`, `camera`, `grid`, `data`, further `compare`; `device`
+            and `save`.
+        folder: where the results go, with `eval.yaml`, which is `options`, and `versions.txt`.
+
+    Raises:
+        FileNotFoundError: no checkpoint or no run is there.
+        RuntimeError: another process is at work in the folder.
+        ValueError: an unknown device; the run's rig or data have changed since; weights that do not
+            fit the camera or the grid; the folder is another evaluation's; settings for a method
+            that the run has trained, which its checkpoint decides.
+        FileExistsError: the folder is a run's own.
+    """
+    import_plugins(options["plugins"])
+    from mvrecon.core.device import device_of
+    from mvrecon.training import checkpoints, evaluation, export, fit, run_folder
+
+    device = device_of(options["device"])
+    run = folder_of_run(options["checkpoint"])
+    described = (label for label, model in options["compare"].items() if model)
+    if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
+        raise ValueError(
+            f"compare describes {trained}, which the run has trained already; expected other labels"
+        )
+    trained = run_folder.read_settings(run)
+    settings = merged(trained, options)
+    import_plugins(settings["plugins"])
+    data = fit.build_data(settings)
+
+    def save(scene: dict[str, Any], volumes: dict[str, Any]) -> None:
+        export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
+
+    see = save if options["save"] else None
+    elsewhere = bool(options["camera"] or options["grid"])
+    run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
+    with run_folder.taken(folder, options, EVALUATION):
+        table = evaluation.results(settings, run, data, device, see, elsewhere)
+        table["checkpoint"] = str(run)
+        table["acquisition_of_run"] = trained["acquisition"]
+        table["geometry"] = {key: settings[key] for key in ("camera", "grid")}
+        table["geometry_of_run"] = {key: trained[key] for key in ("camera", "grid")}
+        run_folder.write_results(folder, table)
+    return table
+
+
+def merged(run: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """A run's settings with the test scene, the acquisition, the camera, the grid, the data options
+    and the compared methods that an evaluation gives.
+
+    A camera with a name takes the place of the run's; without, its options change those of the
+    run's. Cases are of one rig.
+    """
+    data = over(run["data"], options["data"] or {})
+    scene = options["test_scene"] or run["test_scene"]
+    camera, grid = options["camera"] or {}, options["grid"] or {}
+    sizes = {"size", "shape"} if {"size", "shape"} & set(grid) else set()
+    kept = {key: value for key, value in run["grid"].items() if key not in sizes}
+    return {
+        **run,
+        "name": f"{run['name']} ({options['name']})",
+        "test_scene": scene,
+        "acquisition": {**run["acquisition"], **(options["acquisition"] or {})},
+        "camera": camera if "name" in camera else over(run["camera"], camera),
+        "grid": {**kept, **grid},
+        "data": {**data, "rigs": 0},
+        "compare": {**run["compare"], **options["compare"]},
+    }
+
+
+def over(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Settings with changes, mapping by mapping."""
+    inner = {
+        key: over(settings[key], value)
+        for key, value in changes.items()
+        if isinstance(value, dict) and isinstance(settings.get(key), dict)
+    }
+    return {**settings, **changes, **inner}
+
+
+def task(config: DictConfig) -> None:
+    """One run of the app; returns nothing that a sweeper could choose by: these are test scenes."""
+    settings = to_plain(config)
+    folder_of_run(of_weights(settings["checkpoint"]))  # before torch is imported, which takes long
+    from mvrecon.training.report import show
+    from mvrecon.training.run_folder import anchored
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    table = evaluate(anchored(settings), folder)
+    show(table, folder)
+
+
+def main() -> None:
+    """Entry point of `mvrecon-eval`."""
+    launch(task, "eval")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""`mvrecon-list`: every part by name in a line each; of one kind also its options, and where it
+comes from.
+
+Sources are read, not imported, so the answer comes at once and a broken plugin disturbs nobody;
+`--check` imports.
+"""
+
+import argparse
+import keyword
+from collections.abc import Sequence
+from pathlib import Path
+
+from mvrecon.core.parts import LISTED
+from mvrecon.core.signatures import SECTIONS, Option, Part, describe, describe_section
+
+#: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
+#: nothing takes them for mvrecon's own.
+TEMPLATE = Path(__file__).parents[1] / "template"
+STAND_IN = "my_plugin"
+
+
+def new_plugin(name: str, parent: Path) -> list[Path]:
+    """Write a pip-installable project into the new folder `parent / name`; returns its files.
+
+    Raises:
+        ValueError: a name that is none for a package of Python's, or is mvrecon's.
+        FileExistsError: the folder is there already.
+    """
+    if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
+        raise ValueError(
+            f"Expected the name of a Python package, as in my_parts (a-z, 0-9, _), got {name!r}"
+        )
+    if name.partition("_")[0] == "mvrecon":
+        raise ValueError(f"Expected a name that does not begin with mvrecon, got {name!r}")
+    folder = parent / name
+    folder.mkdir(parents=True)
+    written = []
+    for file in sorted(TEMPLATE.rglob("*.txt")):
+        place = str(file.relative_to(TEMPLATE)).removesuffix(".txt").replace(STAND_IN, name)
+        path = folder / place
+        path.parent.mkdir(parents=True, exist_ok=True)
+        text = file.read_text(encoding="utf-8").replace(STAND_IN, name)
+        path.write_text(text, encoding="utf-8")
+        written.append(path)
+    return written
+
+
+SETTING = "setting"
+
+
+def listed(kind: str | None = None, check: bool = False) -> list[Part]:
+    """Describe the parts of one kind, or of all with the settings that are no parts; with `check`
+    parts are imported. A kind that is a setting, too, such as the loss, has its own options last.
+    """
+    kinds = [kind] if kind else [*LISTED, SETTING]
+    names = ((k, name) for k in kinds if k != SETTING for name in LISTED[k].names())
+    parts = [describe(k, name, check) for k, name in names]
+    if not check:
+        parts += [describe_section(s) for s in SECTIONS if kind in (None, SETTING, s)]
+    return parts
+
+
+def overview(parts: Sequence[Part]) -> None:
+    """Write one line for each part to the console, as wide as that is, under their kinds."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console, width, kind = Console(highlight=False), max(len(part.name) for part in parts), ""
+    for part in parts:
+        if part.kind != kind:
+            kind = part.kind
+            console.print(Text(kind, style="bold"))
+        what = (f"broken: {part.error}", "red") if part.error else part.summary
+        line = Text.assemble((f"  {part.name:<{width}}  ", "cyan"), what)
+        console.print(line, no_wrap=True, overflow="ellipsis")
+    console.print("mvrecon-list KIND shows the options of one kind, and where its parts come from.")
+
+
+def show(parts: Sequence[Part]) -> None:
+    """Write the parts to the console, one block each under their kind."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console, table, kind = Console(highlight=False), Table.grid(padding=(0, 2)), ""
+    for part in parts:
+        if part.kind != kind:
+            kind = part.kind
+            table.add_row(Text(f"\n{kind}", style="bold"))
+        rest = Text(part.summary)
+        if part.error:
+            rest.append(f"broken: {part.error}", style="red")
+        for option, what in part.options.items():
+            rest.append(f"\n{_line(option, what)}", style="dim")
+        rest.append(f"\n{part.origin}" if part.origin else "", style="dim")
+        table.add_row(Text(f"  {part.name}", style="cyan"), rest)
+    console.print(table)
+
+
+def report(parts: Sequence[Part]) -> int:
+    """Write one line for each part that was imported; the exit status, 1 where one is broken."""
+    from rich.console import Console
+
+    lines = [
+        f"{part.kind:<15} {part.name:<22} {f'broken: {part.error}' if part.error else part.origin}"
+        for part in parts
+    ]
+    broken = sum(bool(part.error) for part in parts)
+    lines.append(f"{len(parts)} parts imported, {broken} of them broken")
+    Console(markup=False, highlight=False).print("\n".join(lines), soft_wrap=True)
+    return int(broken > 0)
+
+
+def _line(name: str, option: Option) -> str:
+    """An option with its default, its type where it has none, and its text, with the unit."""
+    from mvrecon.apps.config.typed import in_words  # Hydra's import takes longer than all the rest
+
+    value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
+    return f"  {name}{value}  {option.text}".rstrip()
+
+
+def start_project(name: str, parser: argparse.ArgumentParser) -> int:
+    """Write the project of a new plugin into the current folder, and say what comes next."""
+    from rich.console import Console
+
+    try:
+        files = new_plugin(name, Path.cwd())
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    Console(markup=False, highlight=False).print(
+        f"{len(files)} files in {name}; next: pip install -e {name}; pytest {name}", soft_wrap=True
+    )
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The console script; its exit status is 1 if a part that was checked is broken."""
+    parser = argparse.ArgumentParser(
+        prog="mvrecon-list", description="Lists the parts that a configuration can name."
+    )
+    parser.add_argument(
+        "kind",
+        nargs="?",
+        choices=sorted({*LISTED, SETTING}),
+        help="only this kind of part, with options",
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="import every part, and say which are broken and why"
+    )
+    parser.add_argument(
+        "--new-plugin",
+        metavar="NAME",
+        help="write a project with a part of every kind into the new folder NAME",
+    )
+    options = parser.parse_args(arguments)
+    if options.new_plugin:
+        return start_project(options.new_plugin, parser)
+    parts = listed(options.kind, options.check)
+    if options.check:
+        return report(parts)
+    if not parts:
+        parser.exit(message=f"No {options.kind} has a name here; a plugin may bring one.\n")
+    (show if options.kind else overview)(parts)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

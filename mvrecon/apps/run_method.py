@@ -1,0 +1,235 @@
+"""One reconstruction of a measured scan: the method, its progress, its time and memory."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from inspect import signature
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from torch import Tensor
+
+from mvrecon.apps.scan import Scan
+from mvrecon.core.files.memory import peak
+from mvrecon.core.parts import METHODS, STREAMED
+from mvrecon.methods.classical.held_out import Choice, held_out, left_out_residual
+from mvrecon.methods.classical.problem import Iterate
+from mvrecon.methods.classical.stopping import Curve, combined, discrepancy
+from mvrecon.methods.method import build_method
+
+#: Views whose residual is computed at a time.
+BLOCK = 32
+
+
+@dataclass
+class Outcome:
+    """A reconstruction.
+
+    Args:
+        volume: in the unit of the views per mm.
+        seconds: of the method.
+        peak_bytes: most memory of the process so far; None where the system does not tell.
+        residuals: |y - A x| after each iteration, in the unit of the views; empty where the
+            method does not iterate.
+        chosen: iterations and weight that views which were left out have chosen.
+        view_nrmse: |y - A x| / |y| over the measured pixels; NaN for views of zero.
+        sigma: standard deviation of each voxel's error, where the method expects one.
+        camera_weights: how much each camera counts, sum one; empty where they are not weighed.
+    """
+
+    volume: Float[Tensor, "d h w"]
+    seconds: float
+    peak_bytes: int | None
+    view_nrmse: float
+    residuals: list[float] = field(default_factory=list)
+    chosen: dict[str, Any] = field(default_factory=dict)
+    sigma: Float[Tensor, "d h w"] | None = None
+    camera_weights: list[float] = field(default_factory=list)
+
+    def row(self) -> dict[str, Any]:
+        """All but volumes, for `results.json`."""
+        volumes = ("volume", "sigma")
+        return {name: value for name, value in vars(self).items() if name not in volumes}
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """Check the settings `method`, `stop` and `choose` before any view is read.
+
+    Raises:
+        LookupError, TypeError: no such method, or no such option of it.
+        ValueError: a rule to stop or to choose for a method that does not iterate.
+    """
+    name = settings["method"]["name"]
+    METHODS.check(settings["method"])
+    ruled = settings["choose"] or settings["stop"]["sigma"] is not None
+    if ruled and not _iterates(name):
+        raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")
+
+
+def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outcome:
+    """The volume of a scan by the method that the settings `method`, `stop` and `choose`
+    describe.
+
+    Raises:
+        ValueError: what the method raises.
+    """
+    name, options = settings["method"]["name"], dict(settings["method"])
+    del options["name"]
+    start = time.perf_counter()
+    if name in STREAMED.names():
+        run = _streamed(scan, name, options)
+    elif _iterates(name):
+        run = _iterated(scan, settings, options, device)
+    else:
+        run = _direct(scan, settings["method"], device)
+    seconds = time.perf_counter() - start
+    volume = run.volume[0, 0].cpu()
+    sigma = None if run.sigma is None else run.sigma[0, 0].cpu()
+    return Outcome(
+        volume,
+        seconds,
+        peak(),
+        view_nrmse=run.misfit(),
+        residuals=run.residuals,
+        chosen=run.chosen,
+        sigma=sigma,
+        camera_weights=run.camera_weights,
+    )
+
+
+class _Run(NamedTuple):
+    """What a method gave.
+
+    Args:
+        volume: in the unit of the views per mm.
+        misfit: |y - A x| / |y|, computed without the method's time.
+        residuals, chosen, sigma, camera_weights: as of `Outcome`.
+    """
+
+    volume: Float[Tensor, "1 1 d h w"]
+    misfit: Callable[[], float]
+    residuals: list[float] = []
+    chosen: dict[str, Any] = {}
+    sigma: Float[Tensor, "1 1 d h w"] | None = None
+    camera_weights: list[float] = []
+
+
+class _Runs:
+    """A monitor of one run after the other: moves the bar, and has the curve of the last."""
+
+    def __init__(self, advance: Callable[[int], None], iterations: int | None):
+        self.curve, self._advance = Curve(), advance
+        self._length, self._before = iterations or 0, -(iterations or 0)
+
+    def __call__(self, iterate: Iterate) -> bool:
+        if iterate.number == 1:
+            self.curve, self._before = Curve(), self._before + self._length
+        self._advance(self._before + iterate.number)
+        return self.curve(iterate)
+
+
+def left_out(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> list[float]:
+    """The relative error of each view as the method predicts it from the others."""
+    method = build_method(settings["method"]).to(device)
+    views = scan.measured.whole().views[None, None].to(device)
+    return left_out_residual(lambda A, y: method(y, A).volume, scan.operator().to(device), views)[
+        0
+    ].tolist()
+
+
+def _iterated(
+    scan: Scan, settings: Mapping[str, Any], options: dict[str, Any], device: str
+) -> _Run:
+    name, rule = settings["method"]["name"], settings["choose"]
+    A, views = scan.posed(device)
+    parameters = signature(METHODS.get(name)).parameters
+    most, chosen = options.get("iterations", parameters["iterations"].default), {}
+    trials = 0 if not rule else len(rule.get("weights") or [None])
+    with bar(name, most and most * (1 + trials)) as advance:
+        runs = _Runs(advance, most)
+        if rule:
+            options["monitor"] = runs
+            choice = held_out(METHODS.get(name), A, views, options=options, **rule)
+            volume, chosen = choice.volume, _choice_row(choice)
+        else:
+            sigma = settings["stop"]["sigma"]
+            monitor = runs if sigma is None else combined(runs, discrepancy(sigma))
+            volume = METHODS.build(name, A, views, monitor=monitor, **options)
+    residuals, size = runs.curve.residuals, views.norm().item()
+    last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
+    return _Run(volume, lambda: _share(last, size), residuals, chosen)
+
+
+def _choice_row(choice: Choice) -> dict[str, Any]:
+    """The choice of the one sample that a scan is."""
+    trials = [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials]
+    weight = choice.weights[0] if choice.weights else None
+    return {"iterations": choice.iterations[0], "weight": weight, "trials": trials}
+
+
+def _direct(scan: Scan, method: Mapping[str, Any], device: str) -> _Run:
+    """A method that does not iterate, with all views in memory."""
+    whole = scan.measured.whole()
+    A, views = scan.operator().to(device), whole.views[None, None].to(device)
+    with torch.no_grad():
+        out = build_method(method).to(device)(views, A)
+    mask = whole.mask.to(device)
+
+    def misfit() -> float:
+        rest = (views - A(out.volume))[0, 0]
+        return _share(rest[mask].norm().item(), views[0, 0][mask].norm().item())
+
+    weights = [] if out.camera_weights is None else out.camera_weights[0].tolist()
+    return _Run(out.volume, misfit, sigma=out.sigma, camera_weights=weights)
+
+
+def _share(rest: float, whole: float) -> float:
+    return rest / whole if whole else float("nan")
+
+
+def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> _Run:
+    """A method that reads the views block by block, once for the volume and once for the misfit."""
+    saturated = floored = 0
+    with bar(name, len(scan.cameras)) as advance:
+
+        def read(first: int, last: int) -> Tensor:
+            nonlocal saturated, floored
+            part = scan.measured.read(first, last)
+            saturated, floored = saturated + part.saturated, floored + part.floored
+            advance(last)
+            return part.views
+
+        volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
+    scan.measured.warn_of_values(saturated, floored)
+    return _Run(volume, lambda: _residual(scan, volume[0, 0]))
+
+
+def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
+    """|y - A x| / |y| over the measured pixels, views read in blocks."""
+    squares, total = 0.0, 0.0
+    for first in range(0, len(scan.cameras), BLOCK):
+        last = min(first + BLOCK, len(scan.cameras))
+        part = scan.measured.read(first, last)
+        rest = part.views - scan.operator(slice(first, last))(volume[None, None])[0, 0]
+        squares += (rest[part.mask].double()).square().sum().item()
+        total += (part.views[part.mask].double()).square().sum().item()
+    return _share(squares**0.5, total**0.5)
+
+
+def _iterates(name: str) -> bool:
+    """Whether a method shows its iterates to a monitor."""
+    return getattr(METHODS.get(name), "iterates", False)
+
+
+@contextmanager
+def bar(name: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Context with a progress bar on stderr; gives the function that moves it."""
+    columns = (TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn())
+    bars = Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)
+    with bars:
+        task = bars.add_task(name, total=total)
+        yield lambda done: bars.update(task, completed=done)

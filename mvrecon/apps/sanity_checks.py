@@ -1,0 +1,196 @@
+"""What speaks against a reconstruction although nothing failed: views that are mirrored or have
+their axes exchanged, counts taken for line integrals, a volume that does not explain its views.
+"""
+
+import math
+from contextlib import suppress
+from typing import NamedTuple, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.apps.scan import Scan
+from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.data.projections.region import Region
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import resolution
+from mvrecon.geometry.grid import coarse
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.operators.operator import Projector, sees_integrals
+from mvrecon.report.metrics import nrmse
+
+#: Voxels along the grid's longest side, views, and iterations of SIRT that tell mirrored views.
+VOXELS, VIEWS, ITERATIONS = 32, 40, 8
+#: Views in another orientation are told where they leave less than this part of the residual.
+BETTER = 0.75
+#: View NRMSE above which a volume does not explain its views.
+POOR = 0.25
+#: View NRMSE of counts above which a volume does not explain them, by that of their noise.
+ABOVE_NOISE = 1.25
+#: Line integral that no X-ray comes through: 2e-9 of it does.
+OPAQUE = 20.0
+#: What is asked of views that fit better in another orientation than in the stored one.
+CURES = {
+    "columns reversed": "does the rig turn the other way (camera.clockwise, the sign of the "
+    "angles), or are the images mirrored (views.flip_columns=true)? The two volumes are mirror "
+    "images",
+    "rows reversed": "do the rows of the views run upwards (views.flip_rows=true)?",
+    "axes exchanged": "are the images stored as [u, v]? Expected [v, u], a row of the detector "
+    "after the other; exchange the axes of the file (numpy: swapaxes(1, 2))",
+    "axes exchanged and columns reversed": "are the images turned by a quarter? Turn them back, or "
+    "exchange the axes of the file (numpy: swapaxes(1, 2)) and give views.flip_columns=true",
+}
+STORED, COLUMNS, ROWS, EXCHANGED, TURNED = "stored", *CURES
+
+
+def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> list[str]:
+    """What speaks against a scan's reconstruction, in words, without a unit; empty for most.
+
+    A projector whose `pixel_integral` says nothing, and one of weighted integrals, have doubts of
+    their volume's residual alone; a method declares its views, `declares`.
+
+    Args:
+        scan: that was reconstructed.
+        method: name of the method.
+        view_nrmse: |y - A x| / |y| of its volume.
+        device: for the comparison.
+    """
+    words: list[str] = []
+    limit = POOR
+    orders, kind = _orders(scan), getattr(METHODS.get(method), "views", "integrals")
+    if sees_integrals(orders[0].A):
+        first, views = _read(scan, orders)
+        if kind == "integrals":
+            words += _of_counts(first)
+        figures = _nrmse(orders, views, device)
+        best = min(figures, key=lambda name: figures[name])
+        if figures[best] < BETTER * figures[STORED]:
+            words.append(
+                f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
+                f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
+            )
+    elif kind == "counts":
+        noise = _noise_of_counts(scan.measured.read(0, 1).views)
+        limit = max(POOR, ABOVE_NOISE * (noise or 0))
+        if noise is None and view_nrmse > POOR:
+            words.append(
+                f"expected counts, got numbers that are not whole, which the volume does not "
+                f"explain (view NRMSE {view_nrmse:.2g}); projector=drr is for line integrals"
+            )
+    if view_nrmse > limit and not words:
+        words.append(
+            f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); look at "
+            f"rig.png, and whether lengths are mm, the views whole, the grid large enough, and a "
+            f"network was trained for such views"
+        )
+    return words
+
+
+def oriented_nrmse(scan: Scan, device: str = "cpu") -> dict[str, float]:
+    """The view NRMSE of a coarse volume by SIRT, of the views as they are stored and in the
+    orientations of `CURES`.
+
+    A rig whose sense of rotation is wrong has the views of a mirrored object. Reversed rows of a
+    circular scan are those of a mirrored object, and fit as well. Exchanged axes of a body of
+    revolution, such as a ball at the centre, fit as well.
+    """
+    orders = _orders(scan)
+    return _nrmse(orders, _read(scan, orders)[1], device)
+
+
+def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
+    """The doubt of a view whose values are whole numbers that no line integral reaches."""
+    if view.max() <= OPAQUE or not _whole(view):
+        return []
+    return [
+        f"expected line integrals, got whole numbers up to {view.max().item():g}; grey values want "
+        f"views.kind=intensities and views.flat, counts of emission osem"
+    ]
+
+
+def _noise_of_counts(view: Float[Tensor, "1 v u"]) -> float | None:
+    """NRMSE of a view's Poisson noise, where it holds counts, or counts times a factor, the least
+    value above zero, as simulated views of an activity of one do; none where it holds no counts.
+    """
+    if not (view > 0).any():
+        return 0.0
+    counts = view.double() / (1 if _whole(view) else view[view > 0].min())
+    if not torch.allclose(counts, counts.round(), rtol=1e-4, atol=0):
+        return None
+    return (counts.sum().sqrt() / counts.norm()).item()
+
+
+def _whole(view: Float[Tensor, "1 v u"]) -> bool:
+    """Whether all values are whole numbers."""
+    return view.equal(view.round())
+
+
+class _Order(NamedTuple):
+    """Some views with their axes in one order.
+
+    Args:
+        names: of the orientations: as they are, with reversed columns, with reversed rows.
+        A: their operator on a coarse grid.
+        region: the pixels that are joined to one of the operator's.
+    """
+
+    names: tuple[str, ...]
+    A: Projector
+    region: Region
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], scan: Scan, cameras: Cameras) -> Self:
+        """Of a scan's projector; raises what that does."""
+        grid = coarse(scan.grid, VOXELS)
+        size = max(1, int(max(grid.spacing) / resolution(cameras, grid.centre)))
+        rows, columns = cameras.shape
+        joined = (min(size, rows), min(size, columns))
+        kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])
+        region = Region.of((rows, columns), kept[0], kept[1], joined)
+        rig = region.seen_by(cameras[torch.tensor(_numbers(scan))])
+        return cls(names, PROJECTORS.from_config(scan.projector, grid=grid, cameras=rig), region)
+
+    def oriented(self, view: Float[Tensor, "1 v u"]) -> Float[Tensor, "n i j"]:
+        """A view in the orientations, binned."""
+        views = [view, view.flip(-1), view.flip(-2)][: len(self.names)]
+        return self.region.binned(self.region.cropped(torch.cat(views)))
+
+
+def _orders(scan: Scan) -> list[_Order]:
+    """The axes as they are stored, and exchanged unless the projector refuses such cameras.
+
+    Of exchanged axes those with reversed rows are left out: of a circular scan they fit as well.
+    """
+    orders = [_Order.of((STORED, COLUMNS, ROWS), scan, scan.cameras)]
+    with suppress(ValueError):
+        orders.append(_Order.of((EXCHANGED, TURNED), scan, scan.cameras.transposed()))
+    return orders
+
+
+def _read(scan: Scan, orders: list[_Order]) -> tuple[Float[Tensor, "1 v u"], list[Tensor]]:
+    """The first view as it is stored, and some views in every orientation [n 1 m i j], each read
+    once.
+    """
+    first, seen = torch.empty(0), [[] for _ in orders]
+    for number in _numbers(scan):
+        view = scan.measured.read(number, number + 1).views
+        first = first if number else view
+        for order, views, kept in zip(orders, (view, view.mT), seen, strict=False):
+            kept.append(order.oriented(views))
+    return first, [torch.stack(views, dim=1)[:, None] for views in seen]
+
+
+def _nrmse(orders: list[_Order], views: list[Tensor], device: str) -> dict[str, float]:
+    """The view NRMSE of a volume by SIRT in every orientation, by its name."""
+    figures = {}
+    for order, y in zip(orders, (y.to(device) for y in views), strict=True):
+        A = order.A.to(device)
+        with torch.no_grad():
+            again = A(sirt(A, y, ITERATIONS, momentum=True))
+        figures |= {name: nrmse(a, b) for name, a, b in zip(order.names, again, y, strict=True)}
+    return figures
+
+
+def _numbers(scan: Scan) -> range:
+    return range(0, len(scan.cameras), math.ceil(len(scan.cameras) / VIEWS))

@@ -1,0 +1,233 @@
+"""A measured scan: its views on disk, its rig, and the grid that is reconstructed."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.memory import check_memory
+from mvrecon.core.parts import CAMERAS, PROJECTORS
+from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.views import Corrected, MeasuredViews
+from mvrecon.data.volume_files import read_volume
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.detector import Detector
+from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees
+from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
+from mvrecon.geometry.cameras.formats.text import flips_rows
+from mvrecon.geometry.grid import Grid
+from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_integrals
+from mvrecon.training.trained_method import grid_of_training
+
+#: Volumes of the grid's size that a reconstruction holds at least, in float32.
+VOLUMES = 3
+#: Pixels by which a detector's offset may differ from the one by the views' file, for rounding.
+OFFSET = 0.01
+#: Of the grid's diagonal: as much a line integral of ones reaches in any view, and counts behind a
+#: pinhole, or a grey value, never.
+LINE = 0.02
+#: Unit of a volume whose views are line integrals, and of one that emits, where no file tells it.
+ATTENUATION, EMISSION = "1/mm", "activity"
+
+
+class Views(Protocol):
+    """Views of a scan, whole or a few at a time."""
+
+    def read(self, first: int, last: int) -> Corrected:
+        """Views `first` to `last - 1` as line integrals."""
+        ...
+
+    def whole(self) -> Corrected:
+        """All views."""
+        ...
+
+    def divided_by(self, gains: Float[Tensor, " m"]) -> "Views":
+        """The same views with each one's integrals divided by its gain."""
+        ...
+
+    def warn_of_values(self, saturated: int, floored: int) -> None:
+        """Warn how many pixels were saturated or at the floor, where any was."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Measured views with the geometry that they were measured in.
+
+    Args:
+        measured: views, read from disk when they are asked for.
+        cameras: one for each view.
+        grid: voxels that are reconstructed.
+        projector: name and options of the operator.
+        unit: of the volume.
+    """
+
+    measured: Views
+    cameras: Cameras
+    grid: Grid
+    projector: Mapping[str, Any]
+    unit: str = ATTENUATION
+
+    def operator(self, views: slice = slice(None)) -> Projector:
+        """The operator of all views, or of some that follow one another."""
+        cameras = self.cameras[views]
+        return PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
+
+    def posed(self, device: str) -> tuple[LinearOperator, Float[Tensor, "1 1 m v u"]]:
+        """Operator and views without the pixels that were not measured: their rows are zero."""
+        whole = self.measured.whole()
+        A = self.operator().to(device)
+        views, mask = whole.views[None, None].to(device), whole.mask.to(device)
+        if mask.all():
+            return A, views
+        return Scaled(A, pixels=mask.to(views)), views * mask
+
+
+def open_scan(settings: Mapping[str, Any]) -> Scan:
+    """The scan that the settings `views`, `camera`, `grid` and `projector` describe.
+
+    Args:
+        settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
+            counts them from the other end (`flip_rows`); what a camera's detector leaves open
+            (None) is that of the views on disk, see `_detector`; `grid` has size, spacing and
+            centre, or like; without any of them it is that of a trained network's training, or
+            `auto_grid`'s.
+
+    Raises:
+        ValueError: another number of cameras than of views, a detector that contradicts spacing or
+            origin of the views' file, a rig that does not see the grid, a grid that does not fit
+            into memory; what the parts raise.
+    """
+    flipped = settings["views"]["flip_rows"] or flips_rows(settings["camera"])
+    views = {**settings["views"], "flip_rows": flipped}
+    measured = MeasuredViews.of(Measured(**views))
+    known = _detector(measured)
+    _check_offset(settings["camera"], known, measured)
+    rig = CAMERAS.from_config(_completed(settings["camera"], known))
+    cameras = measured.cameras(rig)
+    grid = _grid(settings["grid"], settings["method"], cameras)
+    seeing = int(check_rig_sees(cameras, grid).nonzero()[0, 0])
+    bytes_needed = 4 * VOLUMES * math.prod(grid.shape)
+    check_memory(bytes_needed, f"A reconstruction of {grid.shape} voxels")
+    scan = Scan(measured, cameras, grid, settings["projector"])
+    unit = measured.stack.unit
+    if unit is not None:
+        check_unit(unit, scan, seeing)
+        return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
+    A, largest = _coarse(scan, seeing)
+    emits = not sees_integrals(A) and 0 < largest < LINE
+    return replace(scan, unit=EMISSION) if emits else scan
+
+
+def check_unit(unit: str, scan: Scan, view: int) -> None:
+    """Check that views are what the projector makes: line integrals or not.
+
+    Args:
+        unit: of the views as their file has it: "... * mm" of line integrals, "<projector> of ..."
+            of others.
+        scan: that they are of.
+        view: one that sees the grid.
+
+    Raises:
+        Refused: line integrals for a projector of counts, or counts for one of line integrals.
+    """
+    share, name = _coarse(scan, view)[1], scan.projector["name"]
+    if unit.endswith("* mm") and 0 < share < LINE:
+        raise Refused(
+            f"expected views in the unit of the projector {name!r}, got line integrals in {unit}; "
+            f"projector=drr is for those"
+        )
+    if " of " in unit and share >= LINE:
+        raise Refused(
+            f"expected line integrals for the projector {name!r}, got views in the unit {unit!r}; "
+            f"the projector that made them is {unit.partition(' of ')[0]!r}"
+        )
+
+
+def _coarse(scan: Scan, view: int) -> tuple[Projector, float]:
+    """The operator of a view of two voxels along each axis of the same box, and the greatest value
+    that ones have in that view, relative to the grid's diagonal.
+    """
+    affine = scan.grid.affine.clone()
+    affine[:3, :3] *= torch.tensor(scan.grid.shape[::-1], dtype=affine.dtype) / 2
+    affine[:3, 3] = scan.grid.centre - affine[:3, :3].sum(dim=1) / 2
+    blocks = Grid((2, 2, 2), affine)  # the same box
+    A = PROJECTORS.from_config(scan.projector, grid=blocks, cameras=scan.cameras[view : view + 1])
+    most = A(torch.ones(1, 1, *blocks.shape)).max().item()
+    return A, most / (affine[:3, :3].sum(dim=1) * 2).norm().item()
+
+
+def _detector(measured: MeasuredViews) -> dict[str, Any]:
+    """Options of `Detector` that the views on disk state: `pixels`, and `pixel_mm` and `offset_mm`
+    where their file gives a spacing and an origin.
+    """
+    affine, (rows, columns) = measured.stack.affine, measured.stack.shape
+    if affine is None:
+        return {"pixels": (rows, columns)}
+    spacing = np.linalg.norm(affine[:3, :2], axis=0)
+    if not np.allclose(affine[:3, :2], np.eye(3, 2) * spacing, atol=1e-6 * spacing.min()):
+        raise Refused(
+            f"{measured.options.path}: expected views with columns along x and rows along y, got "
+            f"the direction {(affine[:3, :2] / spacing).T.round(6).tolist()}"
+        )
+    known = detector_of_image((columns, rows), spacing.tolist(), affine[:2, 3].tolist())
+    (v, u), options = known["offset_mm"], measured.options
+    offset = (v if options.flip_rows else -v, -u if options.flip_columns else u)
+    return {**known, "offset_mm": offset}
+
+
+def _check_offset(
+    camera: Mapping[str, Any], known: Mapping[str, Any], views: MeasuredViews
+) -> None:
+    """Refuse a detector's offset that contradicts the origin of the views' file."""
+    detector, affine = camera.get("detector"), views.stack.affine
+    given = detector.get("offset_mm") if isinstance(detector, Mapping) else None
+    if given is None or affine is None or not affine[:2, 3].any():  # 0: where none was set
+        return
+    expected = Detector.of(known)
+    got = Detector.of({**known, "offset_mm": given}).offset_mm
+    if any(
+        abs(a - b) > OFFSET * pixel
+        for a, b, pixel in zip(got, expected.offset_mm, expected.pixel_mm, strict=True)
+    ):
+        down, right = expected.offset_mm
+        raise Refused(
+            f"{views.options.path}: expected the detector's offset_mm [{down:g}, {right:g}] (v, u) "
+            f"by the file's origin, got [{got[0]:g}, {got[1]:g}]"
+        )
+
+
+def _completed(camera: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
+    """A camera's settings with what is known of the detector in the place of None."""
+    filled = {**camera}
+    if isinstance(detector := camera.get("detector"), Mapping):
+        filled["detector"] = _completed(detector, known)
+    return filled | {name: known[name] for name in known if camera.get(name, known) is None}
+
+
+def _grid(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Cameras) -> Grid:
+    like, size, spacing = options["like"], options["size"], options["spacing"]
+    if like is not None and (size is not None or spacing is not None):
+        raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")
+    if any(options["centre"]) and size is None:
+        raise ValueError(
+            f"Expected grid.size and grid.spacing with grid.centre={options['centre']}, got neither"
+        )
+    if like is not None:
+        return read_volume(like)[1]
+    if size is None and spacing is None:
+        if method["name"] == "trained":  # the voxels that the network knows
+            return grid_of_training(method["checkpoint"], method.get("method"))
+        return auto_grid(cameras)
+    if size is None or spacing is None:
+        raise ValueError(
+            f"Expected grid.size (voxels) and grid.spacing (mm) together, got size "
+            f"{size} and spacing {spacing}"
+        )
+    return Grid.centred(size=size, spacing=spacing, centre=options["centre"])

@@ -1,0 +1,135 @@
+"""`mvrecon-train`: train a method and those it is compared with, then print the table of unseen
+scenes.
+
+Torch is imported inside the task, so that `--help` and typing mistakes are answered at once.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from mvrecon.apps.config import labelled, launch, to_plain
+from mvrecon.core.files.rank import rank
+from mvrecon.core.files.runs import RESULTS, folder_of_run, read_results
+from mvrecon.core.plugins import import_plugins
+from mvrecon.core.quiet import silence_libraries
+
+#: The one setting that a resumed run takes.
+STEPS = "trainer.max_steps"
+
+
+def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Train every method of `settings` in a run folder, or resume its training; returns the
+    results.
+
+    On several devices the first process alone writes and judges; the others return nothing. The
+    folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
+    `checkpoints/`, `review/` and `results.json`.
+
+    Args:
+        settings: plain.
+        folder: of the run.
+        overrides: what the command line changed, for the board.
+
+    Raises:
+        RuntimeError: another process is at work in the folder.
+        ValueError: an unknown accelerator; the folder's run has other settings, another rig or
+            other data.
+    """
+    silence_libraries()  # again: a sweep's run may be in a process of its own
+    import_plugins(settings["plugins"])
+    from mvrecon.core.device import device_of
+    from mvrecon.training import evaluation, fit, processes, run_folder
+    from mvrecon.training import tensorboard_summary as board
+
+    device = device_of(settings["trainer"].get("accelerator", "auto"))
+    data = fit.build_data(settings)
+    if rank() > 0:
+        fit.fit_all(settings, data, folder)
+        return {}
+    with run_folder.taken(folder, settings):
+        run_folder.keep_measurement(folder, data)
+        with processes.started(folder, settings["trainer"]):
+            fit.fit_all(settings, data, folder)
+        slices = board.Slices(folder, settings, data.grid, data.data_range, data.unit)
+        table = evaluation.results(settings, folder, data, device, slices)
+        table["validation_psnr"] = evaluation.validation_psnr(settings, folder, data, device)
+        board.close(folder, settings, table, overrides)
+        run_folder.write_results(folder, table)
+    return table
+
+
+def resumed(
+    folder: str, others: Sequence[str], steps: int | None = None
+) -> tuple[dict[str, Any], Path]:
+    """Settings and folder of a run to resume.
+
+    Args:
+        folder: of the run, or a checkpoint in it.
+        others: further options of the command line.
+        steps: trainer.max_steps from now on, more than before; None: as before.
+
+    Raises:
+        ValueError: other options were given, which a resumed run could not honour, or fewer steps
+            than the run has.
+        FileNotFoundError: no run folder is there.
+        RuntimeError: a run with more steps from now on, in which another process is at work.
+    """
+    from mvrecon.training import run_folder
+    from mvrecon.training.extend_training import lengthened
+
+    if others:
+        raise ValueError(
+            f"resume goes on with the run's own settings, with {STEPS}=... for more steps; but got "
+            f"also {' '.join(others)}"
+        )
+    run = folder_of_run(folder)
+    settings = run_folder.read_settings(run)
+    return settings if steps is None else lengthened(settings, run, steps), run
+
+
+def task(config: DictConfig) -> float:
+    """One run of the app; returns the main method's PSNR on the validation's scenes in dB, for
+    sweepers: to choose by the test's scenes would spoil the test.
+    """
+    from mvrecon.training import run_folder
+    from mvrecon.training.progress import tell
+    from mvrecon.training.report import show
+
+    runtime = HydraConfig.get().runtime
+    settings = run_folder.anchored(labelled(to_plain(config), runtime.choices))
+    folder = Path(runtime.output_dir)
+    if settings["resume"]:
+        import_plugins(settings["plugins"])
+        lines = HydraConfig.get().overrides.task
+        keys = {line: line.lstrip("+").partition("=")[0] for line in lines}
+        others = [line for line in lines if keys[line] not in ("resume", "plugins", STEPS)]
+        steps = settings["trainer"]["max_steps"] if STEPS in keys.values() else None
+        settings, folder = resumed(settings["resume"], others, steps)
+    run_folder.check(folder, settings)
+    finished = (folder / RESULTS).is_file()
+    if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
+        tell(f"{folder.name}: its results are there already")
+        return _score(read_results(folder))
+    if table := train(settings, folder, HydraConfig.get().overrides.task):
+        show(table, folder)
+    return _score(table)
+
+
+def _score(table: dict[str, Any]) -> float:
+    score = table.get("validation_psnr")
+    return math.nan if score is None else float(score)
+
+
+def main() -> None:
+    """Entry point of `mvrecon-train`."""
+    launch(task, "train")
+
+
+if __name__ == "__main__":
+    main()

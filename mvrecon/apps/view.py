@@ -1,0 +1,75 @@
+"""`mvrecon-view`: a volume and its rig as one HTML file that any browser opens, without a
+network.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mvrecon.core.files.atomic import written_whole
+
+#: What can be seen first; `viz.page` makes all of them.
+PICTURES = ("slices", "mip", "volume")
+
+
+def view(
+    volume: str | Path,
+    cameras: str | Path | None = None,
+    out: str | Path | None = None,
+    window: tuple[float, float] | None = None,
+    first: str = "slices",
+) -> Path:
+    """Write the page of a volume, and return its path.
+
+    Args:
+        volume: a file that `mvrecon.read_volume` reads, or the folder of a DICOM series.
+        cameras: a rig in a file of mvrecon's, such as `rig.json` of a run.
+        out: the page; by default the volume's name with .html, in the working folder.
+        window: values that are black and white, in the volume's unit.
+        first: what is seen first, one of `PICTURES`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ImportError: a library of the extras `view` or `io` is not installed.
+        ValueError: a file that cannot be read, or see `mvrecon.report.viz.page.page`.
+    """
+    from mvrecon.data.volume_files import name_of, read_volume
+    from mvrecon.geometry.cameras.files import from_file
+    from mvrecon.report.viz.page import page
+
+    path = Path(volume).expanduser()
+    place = Path(out).expanduser() if out else Path(f"{name_of(path)}.html")
+    rig = None if cameras is None else from_file(Path(cameras).expanduser())
+    values, grid = read_volume(path)
+    text = page(values, grid, rig, window, first, name_of(path))
+    with written_whole(place) as part:
+        part.write_text(text, encoding="utf-8")
+    return place
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line of `mvrecon-view`."""
+    made = argparse.ArgumentParser(prog="mvrecon-view", description=__doc__)
+    made.add_argument("volume", help="NIfTI, MHA, MHD, NRRD, or the folder of a DICOM series")
+    made.add_argument("cameras", nargs="?", help="the rig, as rig.json of a run")
+    made.add_argument("--out", help="the page; else the volume's name with .html")
+    black_white = "values that are black and white, in the volume's unit"
+    made.add_argument("--window", nargs=2, type=float, metavar=("LOW", "HIGH"), help=black_white)
+    made.add_argument("--first", choices=PICTURES, default="slices", help="what is seen first")
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `mvrecon-view`."""
+    options = parser().parse_args(arguments)
+    window = None if options.window is None else (options.window[0], options.window[1])
+    try:
+        place = view(options.volume, options.cameras, options.out, window, options.first)
+    except (OSError, ValueError, ImportError) as error:
+        sys.exit(f"mvrecon-view: {error}")
+    sys.stdout.write(f"{place}, {place.stat().st_size / 2**20:.1f} MiB: open it in a browser\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Registries, parts, files: no tensors of the field."""

@@ -1,0 +1,119 @@
+"""mvrecon's own parts, as strings, so that listing them imports nothing."""
+
+from mvrecon.core.registry import Registry
+
+SCENES = Registry(
+    "scene",
+    ellipsoids="mvrecon.data.scenes.ellipsoids:RandomEllipsoids",
+    derenzo="mvrecon.data.scenes.derenzo:RandomDerenzo",
+    defrise="mvrecon.data.scenes.defrise:Defrise",
+    shepp_logan="mvrecon.data.scenes.shepp_logan:SheppLogan",
+    mixture="mvrecon.data.scenes.mixture:Mixture",
+    hdf5="mvrecon.data.volumes:Hdf5Volumes",
+    nifti="mvrecon.data.volumes:NiftiVolume",
+    volumes="mvrecon.data.volume_scene:Volumes",
+)
+CAMERAS = Registry(
+    "camera",
+    circular="mvrecon.geometry.cameras.rigs:circular",
+    arc="mvrecon.geometry.cameras.rigs:arc",
+    dome="mvrecon.geometry.cameras.rigs:dome",
+    random="mvrecon.geometry.cameras.random_rigs:random_rig",
+    parallel="mvrecon.geometry.cameras.rigs:parallel",
+    from_file="mvrecon.geometry.cameras.files:from_file",
+    dcspect80="mvrecon.geometry.cameras.dcspect80:dcspect80",
+    rtk_xml="mvrecon.geometry.cameras.formats.rtk_xml:read",
+    tigre="mvrecon.geometry.cameras.formats.tigre:read",
+    astra="mvrecon.geometry.cameras.formats.astra:read",
+    angles="mvrecon.geometry.cameras.formats.angles:read",
+    matrices="mvrecon.geometry.cameras.formats.matrices:read",
+)
+PROJECTORS = Registry(
+    "projector",
+    drr="mvrecon.operators.drr:Drr",
+    radon="mvrecon.operators.radon:Radon",
+)
+HEADS = Registry(
+    "head",
+    softmax_depth="mvrecon.methods.learned.heads:SoftmaxDepth",
+    density="mvrecon.methods.learned.heads:Density",
+)
+NETWORKS = Registry(
+    "network",
+    unet="mvrecon.methods.learned.network:UNet3d",
+)
+#: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
+#: return a volume; see `models/method.py`.
+METHODS = Registry(
+    "method",
+    cross_view="mvrecon.methods.learned.cross_view:CrossView",
+    world_unet="mvrecon.methods.learned.world_unet:WorldUNet",
+    mean_fusion="mvrecon.methods.learned.mean_fusion:MeanFusion",
+    geometry_free="mvrecon.methods.learned.geometry_free:GeometryFree",
+    aligned="mvrecon.methods.calibration.aligned:Aligned",
+    uncertain="mvrecon.methods.learned.uncertain:Uncertain",
+    backprojection="mvrecon.methods.classical.iterative:backprojection",
+    fbp="mvrecon.methods.classical.filtered.fdk:fbp",
+    fdk="mvrecon.methods.classical.filtered.fdk:fdk",
+    trained="mvrecon.training.trained_method:TrainedMethod",
+    sirt="mvrecon.methods.classical.iterative:sirt",
+    os_sart="mvrecon.methods.classical.os_sart:os_sart",
+    cgls="mvrecon.methods.classical.cgls:cgls",
+    tikhonov="mvrecon.methods.classical.tikhonov:tikhonov",
+    fista_tv="mvrecon.methods.classical.fista_tv:fista_tv",
+    pdhg_tv="mvrecon.methods.classical.pdhg_tv:pdhg_tv",
+    mlem="mvrecon.methods.classical.mlem:mlem",
+    osem="mvrecon.methods.classical.mlem:osem",
+    bsrem="mvrecon.methods.classical.bsrem:bsrem",
+    tv_map="mvrecon.methods.classical.tv_map:tv_map",
+    finer="mvrecon.methods.classical.finer:finer",
+)
+#: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
+STREAMED = Registry(
+    "streamed reconstructor",
+    fdk="mvrecon.methods.classical.filtered.streaming:fdk_streamed",
+)
+#: Files of views that are read as one array, by their endings: f(path) -> ProjectionStack.
+VIEW_FILES = Registry(
+    "views",
+    h5="mvrecon.data.projections.arrays:Hdf5Views",
+    hdf5="mvrecon.data.projections.arrays:Hdf5Views",
+    npy="mvrecon.data.projections.arrays:NpyViews",
+    mha="mvrecon.data.projections.arrays:ItkViews",
+    mhd="mvrecon.data.projections.arrays:ItkViews",
+    nrrd="mvrecon.data.projections.arrays:ItkViews",
+)
+#: What corrects views before they are reconstructed: f(A, views, **options) -> CorrectedViews.
+CORRECTIONS = Registry(
+    "correct",
+    align="mvrecon.methods.calibration.self_alignment:self_aligned",
+)
+#: What a training takes by name besides its parts; of callbacks and loggers mvrecon's own and
+#: Lightning's are named by `_target_`.
+OPTIMIZERS = Registry(
+    "optimizer", adamw="torch.optim:AdamW", adam="torch.optim:Adam", sgd="torch.optim:SGD"
+)
+CALLBACKS = Registry("callback")
+LOGGERS = Registry("logger")
+#: Terms of the loss: f(out, batch, data_range) -> a scalar, by the name of their weight.
+LOSSES = Registry("loss")
+#: Figures of merit: f(volume, truth, inside, data_range) -> a number, of all that are there.
+METRICS = Registry("metric")
+
+REGISTRIES = {
+    r.kind: r
+    for r in (
+        SCENES,
+        CAMERAS,
+        PROJECTORS,
+        HEADS,
+        NETWORKS,
+        METHODS,
+        CORRECTIONS,
+    )
+}
+#: All that `mvrecon-list` shows: besides the parts that a configuration names by `name`, what a
+#: training takes by name, and readers of views.
+LISTED = REGISTRIES | {
+    r.kind: r for r in (OPTIMIZERS, CALLBACKS, LOGGERS, LOSSES, METRICS, STREAMED, VIEW_FILES)
+}

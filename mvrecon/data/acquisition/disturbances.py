@@ -1,0 +1,126 @@
+"""Views that are wrong in a way that nobody knows: options, and the draws of one case."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.core.registry import check_options
+from mvrecon.data.acquisition.rig_errors import RigErrors
+from mvrecon.geometry.cameras.camera import Cameras
+
+#: Options that count views, with the least number of each.
+COUNTS = {"views": 1, "lost": 0}
+#: Options that must stay below a number; of the others only that they are finite is asked.
+BELOW = {"gain": 1.0, "tilt_deg": 45.0, "saturated": 1.0, "truncated": 1.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbance:
+    """Errors of each case, unknown to whoever reconstructs: some views' detectors are shifted by
+    pixels and tilted by degrees, the object moved by mm, values are wrong, cut off or lost.
+
+    Args:
+        views: so many of a case's views, drawn for each case, have all errors but `lost`.
+        shift_px: of the detector along columns and along rows, uniform between minus and plus this.
+        gain: of the views' values, 1 + a number uniform between minus and plus this.
+        tilt_deg: of the detector about its centre, turns about the directions of its columns and
+            rows and about its normal, each uniform between minus and plus this.
+        motion_mm: of the object when the view was taken, along x, y and z, each uniform between
+            minus and plus this.
+        saturated: of a view's greatest value, the least that its overexposed detector can tell.
+        truncated: share of a detector's columns, at its left or its right end, that read zero.
+        lost: so many views, drawn apart, read zero everywhere.
+        probability: with which each of the drawn views is wrong, or lost; at 1 all are.
+
+    Raises:
+        TypeError: an option that is no number.
+        ValueError: numbers below 0, not finite or too large; numbers of views that are not whole.
+    """
+
+    views: int = 1
+    shift_px: float = 0.0
+    gain: float = 0.0
+    tilt_deg: float = 0.0
+    motion_mm: float = 0.0
+    saturated: float = 0.0
+    truncated: float = 0.0
+    lost: int = 0
+    probability: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not isinstance(value, int | float) or isinstance(value, bool):
+                raise TypeError(f"Expected disturbed.{name} as a number, got {value!r}")
+            if name in COUNTS:
+                expected = f"a whole number of at least {COUNTS[name]}"
+                fits = COUNTS[name] <= value < math.inf and value == int(value)
+            elif name == "probability":
+                expected, fits = "a number from 0 to 1", 0 <= value <= 1
+            elif name in BELOW:
+                expected = f"a number from 0 to below {BELOW[name]:g}"
+                fits = 0 <= value < BELOW[name]
+            else:
+                expected, fits = "a number of at least 0", 0 <= value < math.inf
+            if not fits:
+                raise ValueError(f"Expected disturbed.{name} as {expected}, got {value}")
+
+    @classmethod
+    def of(cls, options: Any) -> "Disturbance":
+        """The disturbance that a mapping describes.
+
+        Raises:
+            TypeError: not a mapping, or an unknown option; the message gives the nearest.
+        """
+        known = [field.name for field in fields(cls)]
+        if not isinstance(options, Mapping):
+            raise TypeError(f"disturbed is a mapping of {', '.join(known)}, got {options!r}")
+        check_options("disturbed", options, known)
+        return cls(**options)
+
+
+def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> RigErrors:
+    """The errors of one case, drawn at random: shifts in pixels, tilts in degrees, motions in mm,
+    gains and shares without a unit.
+
+    Raises:
+        ValueError: more views than cameras, or explicit rays, which have no detector.
+    """
+    if not isinstance(cameras, Cameras):
+        raise ValueError(f"Expected cameras to disturb, got {type(cameras).__name__}")
+    m = len(cameras)
+    for name in COUNTS:
+        if (count := getattr(disturbance, name)) > m:
+            raise ValueError(
+                f"Expected disturbed.{name} of at most the rig's {m} cameras, got {count}"
+            )
+    chosen = _drawn(m, disturbance.views, rng)
+    # shifts and gains before all else, so that cases of older runs keep theirs
+    offset, gain = _uniform(m, 3, rng).split((2, 1), dim=1)
+    tilt, motion, side = _uniform(m, 7, rng).split((3, 3, 1), dim=1)
+    lost = _drawn(m, disturbance.lost, rng)
+    wrong, missing = (torch.rand(2, m, 1, generator=rng) < disturbance.probability).double()
+    chosen, lost = chosen * wrong, lost * missing
+    return RigErrors(
+        shift_px=disturbance.shift_px * chosen * offset,
+        gain=((1 + disturbance.gain * chosen * gain) * (1 - lost))[:, 0],
+        tilt_deg=disturbance.tilt_deg * chosen * tilt,
+        motion_mm=disturbance.motion_mm * chosen * motion,
+        saturated=(disturbance.saturated * chosen)[:, 0],
+        truncated=(disturbance.truncated * chosen * torch.where(side < 0, -1, 1))[:, 0],
+    )
+
+
+def _drawn(m: int, count: float, rng: torch.Generator) -> Float[Tensor, "m 1"]:
+    """1 for so many of m cameras, drawn at random, 0 for the others."""
+    chosen = torch.zeros(m, 1, dtype=torch.float64)
+    chosen[torch.randperm(m, generator=rng)[: int(count)]] = 1.0
+    return chosen
+
+
+def _uniform(m: int, count: int, rng: torch.Generator) -> Float[Tensor, "m count"]:
+    return 2 * torch.rand(m, count, generator=rng, dtype=torch.float64) - 1

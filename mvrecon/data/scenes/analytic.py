@@ -1,0 +1,123 @@
+"""Scenes of analytic phantoms: exact views, supersampled truth, and random numbers that depend on
+the case alone.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.core.quantities import PositiveFloat
+from mvrecon.core.random_numbers import generator
+from mvrecon.data.scenes.sample import Rays, Sample
+from mvrecon.data.scenes.solids import Phantom
+from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.geometry.grid import Grid
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnalyticScene(ABC):
+    """Cases of one kind of phantom.
+
+    Args:
+        field: radius of the sphere about the grid's centre that holds the object, as a fraction of
+            the grid's shortest edge.
+        value: the greatest value; all lie between 0 and it.
+        unit: of the value.
+
+    Raises:
+        ValueError: a field that is not in (0, 0.5], or a value that is not positive.
+    """
+
+    field: PositiveFloat = 0.42
+    value: PositiveFloat = 1.0
+    unit: str = "1/mm"
+
+    kind: ClassVar[str]
+    length: ClassVar[int | None] = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.field <= 0.5:
+            raise ValueError(
+                f"The field must be a fraction in (0, 0.5] of the grid's shortest edge, got "
+                f"{self.field}"
+            )
+        if not self.value > 0:
+            raise ValueError(f"The greatest value of a scene must be positive, got {self.value}")
+
+    @property
+    def data_range(self) -> float:
+        """The fixed range of values that PSNR and SSIM refer to."""
+        return self.value
+
+    @abstractmethod
+    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """A phantom in the field of `grid`."""
+
+    def radius(self, grid: Grid) -> float:
+        """Radius of the field in mm."""
+        return self.field * min(
+            n * step for n, step in zip(grid.shape[::-1], grid.spacing, strict=True)
+        )
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
+        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`.
+
+        Raises:
+            IndexError: the scene has no such case.
+        """
+        phantom = self._phantom_of(index, seed, grid)
+        return render(phantom, grid, cameras, f"{self.kind}-{seed}-{index}")
+
+    def _phantom_of(self, index: int, seed: int, grid: Grid) -> Phantom:
+        if self.length is not None and not index < self.length:
+            raise IndexError(
+                f"The scene {self.kind!r} has {self.length} case(s), got index {index}"
+            )
+        return self.phantom(generator(seed, index), grid)
+
+    def finer(
+        self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
+    ) -> Float[Tensor, "1 d h w"]:
+        """The case's values on `grid.refined(factor)`, the mean over at least 2^3 points of each
+        voxel.
+        """
+        phantom = self.phantom(generator(seed, index), grid)
+        return voxelise(phantom, grid.refined(factor), max(2, -(-4 // factor)))[None]
+
+    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
+        """The case without views [1 0 0 0], its truth on `grid` the mean of what `finer` gave.
+
+        Raises:
+            IndexError: the scene has no such case.
+        """
+        phantom = self._phantom_of(index, seed, grid)
+        factor = fine.shape[-1] // grid.shape[-1]
+        volume = torch.nn.functional.avg_pool3d(fine[None], factor)[0]
+        inside = touched(phantom, volume[0], grid, max(4, 2 * factor))
+        name = f"{self.kind}-{seed}-{index}"
+        return Sample(volume.new_zeros(1, 0, 0, 0), volume, inside[None], name)
+
+
+def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int = 4) -> Sample:
+    """Exact views of a phantom, and its truth as the mean over factor^3 points of each voxel."""
+    start, end = cameras.rays()
+    views = phantom.integrals(start.detach().cpu(), end.detach().cpu(), cameras.ray_extent)
+    volume = voxelise(phantom, grid, factor)
+    inside = touched(phantom, volume, grid, factor)
+    return Sample(views[None].to(torch.float32), volume[None], inside[None], name)
+
+
+def touched(
+    phantom: Phantom, volume: Float[Tensor, "d h w"], grid: Grid, factor: int
+) -> Bool[Tensor, "d h w"]:
+    """The voxels that a phantom touches, whose values on the grid are `volume`."""
+    inside = volume > 0
+    if any(
+        (part.values < 0).any() for part in phantom.parts
+    ):  # values may cancel inside the object
+        inside |= voxelise(phantom.support(), grid, factor) > 0
+    return inside

@@ -1,0 +1,296 @@
+"""The record in the terms of other fields and libraries: K R t, 3x4 and 4x4 matrices, ASTRA,
+kornia, PyTorch3D.
+
+All are pure functions of tensors in float64; lengths are mm and pixel centres are integers unless a
+Convention says otherwise. A pinhole with its detector behind it equals a camera whose detector is
+mirrored through the pinhole, and so becomes an ordinary camera, turned by 180 degrees about its
+axis, where a description has no detector of its own.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.cameras.camera import Cameras, Extent
+from mvrecon.geometry.cameras.detector import detector_centre
+from mvrecon.geometry.frustum import homography_jacobian
+from mvrecon.geometry.rigid import check_rotation, unit
+
+
+class KRt(NamedTuple):
+    """Intrinsics and pose of cameras, as of `to_krt`."""
+
+    K: Float[Tensor, "m 3 3"]
+    R: Float[Tensor, "m 3 3"]
+    t: Float[Tensor, "m 3"]
+
+
+class KorniaCameras(NamedTuple):
+    """What kornia's `PinholeCamera` is made from, in its order."""
+
+    intrinsics: Float[Tensor, "m 4 4"]
+    extrinsics: Float[Tensor, "m 4 4"]
+    height: Float[Tensor, " m"]
+    width: Float[Tensor, " m"]
+
+
+class PyTorch3DCameras(NamedTuple):
+    """What PyTorch3D's `PerspectiveCameras` is made from, in NDC."""
+
+    R: Float[Tensor, "m 3 3"]
+    T: Float[Tensor, "m 3"]
+    focal_length: Float[Tensor, "m 2"]
+    principal_point: Float[Tensor, "m 2"]
+
+
+def to_krt(cameras: Cameras) -> KRt:
+    """K, R and t with pixels z (u, v, 1) = K (R X + t), z > 0 in mm on the object's side.
+
+    Convention: OpenCV; K is upper triangular with positive focal lengths and K[2, 2] = 1, R is a
+    rotation whose rows are the camera's axes right, down, forward. K holds a skew where u and v are
+    not at right angles.
+
+    Raises:
+        ValueError: parallel beams, which have no source.
+    """
+    _check_central(cameras, "K, R, t")
+    frame = cameras.frame * (-1 if cameras.extent == "behind" else 1)
+    right = unit(frame[..., 0])
+    forward = unit(torch.linalg.cross(frame[..., 0], frame[..., 1]))
+    R = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-2)
+    K = torch.linalg.inv((R @ frame).triu()) * cameras.distance[:, None, None]
+    return KRt(K, R, -(R @ cameras.source[..., None])[..., 0])
+
+
+def from_krt(
+    K: Float[Tensor, "m 3 3"],
+    R: Float[Tensor, "m 3 3"],
+    t: Float[Tensor, "m 3"],
+    shape: tuple[int, int],
+    distance: float | Float[Tensor, " m"],
+    extent: Extent = "ahead",
+) -> Cameras:
+    """The record of cameras given as K, R and t; the inverse of `to_krt`.
+
+    Args:
+        K, R, t: as `to_krt` gives them.
+        shape: detector pixels (rows, columns).
+        distance: mm from the source or pinhole to the detector, fx times the pixel pitch. K, R, t
+            do not hold it; a vision camera may take any.
+        extent: the part of a ray that counts.
+
+    Convention: OpenCV, as `to_krt`.
+
+    Raises:
+        ValueError: wrong shapes, values not finite, K without the last row (0, 0, 1), R not a
+            rotation.
+    """
+    K, R, t = _checked("K", K, 3, 3), _checked("R", R, 3, 3), _checked("t", t, 3)
+    if not torch.allclose(K[:, 2], K.new_tensor([0, 0, 1]).expand(len(K), 3)):
+        raise ValueError(f"K must have the last row (0, 0, 1), got {K[:, 2].tolist()}")
+    check_rotation(R)
+    frame = R.mT @ torch.linalg.inv(K) * _distances(distance, K)
+    source = -(R.mT @ t[..., None])[..., 0]
+    return _from_frame(source, -frame if extent == "behind" else frame, shape, extent)
+
+
+def from_matrix(
+    P: Float[Tensor, "m 3 4"],
+    shape: tuple[int, int],
+    distance: float | Float[Tensor, " m"],
+    extent: Extent = "segment",
+) -> Cameras:
+    """The record of central cameras given as 3x4 matrices of any positive scale; the inverse of
+    `Cameras.matrix`.
+
+    Convention: P (X, 1) = w (u, v, 1) with w > 0 on the detector's side of the source, as
+    `Cameras.matrix`. Turn the sign of P first where w < 0 there (RTK).
+
+    Raises:
+        ValueError: wrong shapes, values not finite, a singular left 3x3 (parallel beams), a
+            distance not positive.
+    """
+    P = _checked("P", P, 3, 4)
+    left = P[:, :, :3]
+    if not (torch.linalg.det(unit(left)).abs() > 1e-12).all():
+        raise ValueError(
+            "P must have a left 3x3 that can be inverted; parallel beams have no source to find"
+        )
+    frame = torch.linalg.inv(left)
+    source = -(frame @ P[:, :, 3:])[..., 0]
+    unscaled = 1 / left[:, 2].norm(
+        dim=-1
+    )  # the frame's own distance: the last row of its inverse is n / distance
+    return _from_frame(
+        source, frame * _distances(distance, P) / unscaled[:, None, None], shape, extent
+    )
+
+
+def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
+    """The frustum's homography H: X in mm to (u, v, k) with k = f / z; for parallel beams, to (u,
+    v, z).
+
+    Convention: H = [P1; P2; (0, 0, 0, f); P3] with P scaled so that w = z in mm, signed as in
+    `Cameras.project`; rows 3 and 4 stand as in PyTorch3D's K. For parallel beams H = [P1; P2;
+    depth; (0, 0, 0, 1)].
+    """
+    central = replace(cameras, parallel=False).matrix * cameras.distance[:, None, None]
+    unit = central.new_tensor([0, 0, 0, 1]).expand(len(cameras), 4)
+    if cameras.parallel:
+        P = cameras.matrix
+        return torch.stack([P[:, 0], P[:, 1], central[:, 2], unit], dim=1)
+    return torch.stack([central[:, 0], central[:, 1], f * unit, central[:, 2]], dim=1)
+
+
+def frustum_jacobian(
+    cameras: Cameras, xyz: Float[Tensor, "*n 3"], f: float = 1.0
+) -> Float[Tensor, "m *n"]:
+    """Volume in (u, v, k) per mm^3 at world points, |det H| / w^4; a density that keeps its counts
+    is divided by it.
+    """
+    H = to_frustum(cameras, f)
+    w = H[:, 3, :3] @ xyz.reshape(-1, 3).to(H).T + H[:, 3, 3:]
+    return homography_jacobian(H[:, None], w).reshape(len(cameras), *xyz.shape[:-1])
+
+
+def to_astra(cameras: Cameras) -> Float[Tensor, "m 12"]:
+    """Rows for ASTRA's "cone_vec" (or "parallel3d_vec"): source (or ray), detector centre, u, v.
+
+    Convention: ASTRA's world is our (x, y, z) in mm if its volume's window is given in mm; a ray is
+    not normalised.
+    """
+    centre = detector_centre(cameras)
+    first = cameras.origin - cameras.source if cameras.parallel else cameras.source
+    return torch.cat([first, centre, cameras.u, cameras.v], dim=-1)
+
+
+def from_astra(
+    vectors: Float[Tensor, "m 12"],
+    shape: tuple[int, int],
+    parallel: bool = False,
+    extent: Extent | None = None,
+    flip_rows: bool = False,
+) -> Cameras:
+    """The record of ASTRA's "cone_vec" rows, or with `parallel` of its "parallel3d_vec" rows.
+
+    Args:
+        vectors: rows as `to_astra` gives them.
+        shape: detector pixels (rows, columns).
+        parallel: the first three numbers are a ray's direction, and its length the record's depth.
+        extent: by default "segment", and "line" for parallel beams.
+        flip_rows: count rows from the other end; the views' rows must be reversed with it.
+
+    Convention: ASTRA's own circular geometries have v upwards (left-handed here): they need
+    `flip_rows`.
+
+    Raises:
+        ValueError: wrong shapes, values not finite, left-handed cameras.
+    """
+    first, centre, u, v = _checked("ASTRA vectors", vectors, 12).split(3, dim=-1)
+    v = -v if flip_rows else v
+    origin = centre - u * (shape[1] - 1) / 2 - v * (shape[0] - 1) / 2
+    source = origin - first if parallel else first
+    return Cameras(
+        source, origin, u, v, shape, parallel, extent or ("line" if parallel else "segment")
+    )
+
+
+def to_kornia(cameras: Cameras) -> KorniaCameras:
+    """Intrinsics, extrinsics, height and width for kornia's `PinholeCamera`.
+
+    Convention: kornia, which is OpenCV's: extrinsics take the world to the camera, pixel centres
+    are integers.
+
+    Raises:
+        ValueError: parallel beams.
+    """
+    K, R, t = to_krt(cameras)
+    intrinsics = torch.eye(4).to(K).repeat(len(K), 1, 1)
+    extrinsics = intrinsics.clone()
+    intrinsics[:, :3, :3] = K
+    extrinsics[:, :3, :3], extrinsics[:, :3, 3] = R, t
+    height, width = (K.new_full((len(K),), n) for n in cameras.shape)
+    return KorniaCameras(intrinsics, extrinsics, height, width)
+
+
+def from_kornia(
+    intrinsics: Float[Tensor, "m 4 4"],
+    extrinsics: Float[Tensor, "m 4 4"],
+    shape: tuple[int, int],
+    distance: float | Float[Tensor, " m"],
+    extent: Extent = "ahead",
+) -> Cameras:
+    """The record of kornia's cameras; arguments and errors as `from_krt`, the inverse of
+    `to_kornia`.
+
+    Raises:
+        ValueError: intrinsics that shift by a fourth column, which kornia would apply, too.
+    """
+    K, E = _checked("intrinsics", intrinsics, 4, 4), _checked("extrinsics", extrinsics, 4, 4)
+    if K[:, :3, 3].any():
+        raise ValueError(
+            f"Intrinsics must have zeros in the fourth column, got {K[:, :3, 3].tolist()}"
+        )
+    return from_krt(K[:, :3, :3], E[:, :3, :3], E[:, :3, 3], shape, distance, extent)
+
+
+def to_pytorch3d(cameras: Cameras) -> PyTorch3DCameras:
+    """R, T, focal_length and principal_point for PyTorch3D's `PerspectiveCameras` in NDC.
+
+    Convention: PyTorch3D: row vectors X R + T, axes left, up, forward; NDC spans [-1, 1] over the
+    shorter side, +1 left and top; pixels have edges at integers, so the principal point moves by
+    half a pixel.
+
+    Raises:
+        ValueError: parallel beams, or a skew, which PyTorch3D cannot hold.
+    """
+    K, R, t = to_krt(cameras)
+    if not (K[:, 0, 1].abs() < 1e-9 * K[:, 0, 0]).all():
+        raise ValueError(
+            f"PyTorch3D has no skew, but u and v are not at right angles: skew "
+            f"{K[:, 0, 1].tolist()} px"
+        )
+    half = min(cameras.shape) / 2
+    turned = K.new_tensor([-1, -1, 1])
+    focal = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=-1) / half
+    centre = K.new_tensor(cameras.shape[::-1]) / 2
+    point = (centre - K[:, :2, 2] - 0.5) / half
+    return PyTorch3DCameras(R.mT * turned, t * turned, focal, point)
+
+
+def _from_frame(
+    source: Float[Tensor, "m 3"],
+    frame: Float[Tensor, "m 3 3"],
+    shape: tuple[int, int],
+    extent: Extent,
+) -> Cameras:
+    u, v, ray = frame.unbind(dim=-1)
+    return Cameras(source, source + ray, u, v, shape, extent=extent)
+
+
+def _distances(distance: float | Tensor, like: Tensor) -> Float[Tensor, "m 1 1"]:
+    distances = torch.as_tensor(distance).to(like).expand(len(like))
+    if not ((distances > 0) & distances.isfinite()).all():
+        raise ValueError(
+            f"The distance from source to detector must be positive mm, got {distance}"
+        )
+    return distances[:, None, None]
+
+
+def _checked(name: str, values: Tensor, *shape: int) -> Tensor:
+    tensor = torch.as_tensor(values, dtype=torch.float64)
+    if tensor.ndim != len(shape) + 1 or tensor.shape[1:] != shape:
+        raise ValueError(
+            f"{name} must be [m {' '.join(map(str, shape))}], got {list(tensor.shape)}"
+        )
+    if not tensor.isfinite().all():
+        raise ValueError(f"{name} must be finite, got {tensor.tolist()}")
+    return tensor
+
+
+def _check_central(cameras: Cameras, what: str) -> None:
+    if cameras.parallel:
+        raise ValueError(f"Parallel beams have no {what}; use to_frustum or to_astra")

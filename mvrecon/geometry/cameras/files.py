@@ -1,0 +1,102 @@
+"""Rigs in files: the canonical record as JSON, in mm, one camera a line."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import Refused, check_file, shown, text_of
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+
+FORMAT = "mvrecon.cameras"
+VERSION = 1
+#: The most rows or columns that a detector in a file may have.
+PIXELS = 2**16
+
+
+def save(cameras: Cameras, path: str | Path) -> None:
+    """Write a rig as JSON, whole or not at all; `from_file` gives back the very same numbers."""
+    vectors = {name: getattr(cameras, name).tolist() for name in VECTORS}
+    lines = [json.dumps({name: vectors[name][m] for name in VECTORS}) for m in range(len(cameras))]
+    head = {
+        "format": FORMAT,
+        "version": VERSION,
+        "unit": "mm",
+        "shape": list(cameras.shape),
+        "parallel": cameras.parallel,
+        "extent": cameras.extent,
+        "cameras": [],
+    }
+    text = json.dumps(head, indent=1).replace("[]", "[\n  " + ",\n  ".join(lines) + "\n ]")
+    with written_whole(path) as part:
+        part.write_text(text + "\n", encoding="utf-8")
+
+
+def from_file(path: str | Path) -> Cameras:
+    """A rig from a JSON file that `mvrecon.geometry.cameras.files.save` wrote, or that follows its
+    layout.
+
+    Layout: {"format": "mvrecon.cameras", "version": 1, "unit": "mm", "shape": [rows, columns],
+    "parallel": false, "extent": "segment", "cameras": [{"source": [x, y, z], "origin": [..], "u":
+    [..], "v": [..]}, ..]}; the meanings are those of `Cameras`.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: truncated, too large or not such a file, entries missing or not finite, or a rig
+            that `Cameras` refuses.
+    """
+    path = Path(path)
+    check_file(path, "JSON as mvrecon.geometry.cameras.files.save writes it")
+    try:
+        record = json.loads(text_of(path))
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # too large, not UTF-8, not JSON, or brackets without end
+        raise Refused(f"The camera file {path} is truncated or not JSON: {error}") from error
+    try:
+        return _cameras(record)
+    except (ValueError, OverflowError) as error:
+        raise Refused(f"The camera file {path} is not valid: {error}") from error
+
+
+def _cameras(record: Any) -> Cameras:
+    layout = record.get("format") if isinstance(record, dict) else type(record).__name__
+    if layout != FORMAT:
+        raise ValueError(f"expected the format {FORMAT!r}, got {shown(layout)}")
+    for key, value in {"version": VERSION, "unit": "mm"}.items():
+        if record.get(key) != value:
+            raise ValueError(f"expected the {key} {value!r}, got {shown(record.get(key))}")
+    shape, parallel, extent, rows = (
+        record.get(key) for key in ("shape", "parallel", "extent", "cameras")
+    )
+    if not (isinstance(shape, list) and all(type(n) is int and n <= PIXELS for n in shape)):
+        raise ValueError(
+            f"expected 'shape' as [rows, columns], both up to {PIXELS}, got {shown(shape)}"
+        )
+    if not isinstance(extent, str):
+        raise ValueError(f"expected 'extent' as text, got {shown(extent)}")
+    if not isinstance(parallel, bool):
+        raise ValueError(f"expected 'parallel' as true or false, got {shown(parallel)}")
+    if not isinstance(rows, list) or not rows:
+        raise ValueError(f"expected 'cameras' as a list of at least one, got {shown(rows)}")
+    vectors = {name: [_vector(row, name, m) for m, row in enumerate(rows)] for name in VECTORS}
+    return Cameras(**vectors, shape=tuple(shape), parallel=parallel, extent=extent)  # type: ignore[arg-type]
+
+
+def _vector(row: Any, name: str, m: int) -> list[float]:
+    vector = row.get(name) if isinstance(row, dict) else None
+    if (
+        isinstance(vector, list)
+        and len(vector) == 3
+        and all(type(x) in (int, float) for x in vector)
+    ):
+        if all(
+            abs(x) <= sys.float_info.max for x in vector
+        ):  # not so for nan, inf, and integers past them
+            return vector
+    raise ValueError(f"expected {name!r} of camera {m} as three finite mm, got {shown(vector)}")

@@ -1,0 +1,154 @@
+"""Rigs about the z axis as a table: CSV with an angle, distances, offsets and tilts a view."""
+
+import csv
+from collections.abc import Mapping
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.core.files.checks import blaming, text_of
+from mvrecon.core.registry import hint
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.detector import Detector, detector_centre
+from mvrecon.geometry.cameras.formats.text import (
+    VIEWS,
+    check_degrees,
+    check_distances,
+    number,
+    save_lines,
+    square_pixels,
+)
+from mvrecon.geometry.rigid import euler_rotation, look_at, unit
+
+#: The table's columns, and what stands for one that is absent; None: it must be there, or be an
+#: option.
+COLUMNS: dict[str, float | None] = {
+    "angle_degrees": None,
+    "sid_mm": None,
+    "sdd_mm": None,
+    "offset_u_mm": 0.0,
+    "offset_v_mm": 0.0,
+    "tilt_degrees": 0.0,
+    "swivel_degrees": 0.0,
+    "slant_degrees": 0.0,
+    "height_mm": 0.0,
+}
+
+
+def read(
+    path: str | Path,
+    detector: Mapping[str, Any],
+    sid_mm: float | None = None,
+    sdd_mm: float | None = None,
+    clockwise: bool = False,
+    small_arc: bool = False,
+    flip_rows: bool = False,
+) -> Cameras:
+    """Cone-beam rig in mm from a CSV table of angles in degrees, distances, offsets and tilts.
+
+    The first line names the columns. `angle_degrees` must be there; `sid_mm` and `sdd_mm` there or
+    as options; `offset_u_mm`, `offset_v_mm` (shift of the detector to the right and downwards, as
+    the source sees it, added to the detector's own), `tilt_degrees`, `swivel_degrees`,
+    `slant_degrees` (turns of the detector about its middle: about the beam, u towards v; about v;
+    about u) and `height_mm` (source and detector along z) are zero where absent.
+
+    Args:
+        path: of the CSV.
+        detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
+        sid_mm: mm from the source to the axis, where the table has no such column.
+        sdd_mm: mm from the source to the detector's middle, likewise.
+        clockwise: angles count clockwise as seen from +z.
+        small_arc: the angles are degrees although they look like radians.
+        flip_rows: the views' first row is the lowest one; reverse the rows of the views.
+
+    Convention: as `rigs.circular`: the source at (sid cos a, sid sin a, height); detector axes are
+    R_z(tilt) R_y(swivel) R_x(slant) of (right, down, forward).
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: not such a table, values that are not finite, angles in radians, SID > SDD.
+    """
+    with blaming(path, "is not a table of angles"):
+        table = _table(text_of(path), {"sid_mm": sid_mm, "sdd_mm": sdd_mm})
+        check_degrees(table["angle_degrees"].tolist(), small_arc, "angle_degrees")
+        for sid, sdd in zip(table["sid_mm"].tolist(), table["sdd_mm"].tolist(), strict=True):
+            check_distances(sid, sdd)
+        return _cameras(table, Detector.of(detector), -1 if clockwise else 1)
+
+
+def _cameras(table: dict[str, Tensor], detector: Detector, turn: int) -> Cameras:
+    a = torch.deg2rad(turn * table["angle_degrees"])
+    outwards = torch.stack([a.cos(), a.sin(), torch.zeros_like(a)], dim=-1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    source = table["sid_mm"][:, None] * outwards
+    R = look_at(source, torch.zeros_like(source))
+    lift = table["height_mm"][:, None] * up
+    shift = table["offset_u_mm"][:, None] * R[:, 0] + table["offset_v_mm"][:, None] * R[:, 1]
+    centre = source - table["sdd_mm"][:, None] * outwards + shift + lift
+    turns = [table[f"{name}_degrees"] for name in ("tilt", "swivel", "slant")]
+    E = euler_rotation(torch.stack(turns, dim=-1), "zyx")
+    return detector.carried(source + lift, centre, E.mT @ R)
+
+
+def _table(text: str, options: Mapping[str, float | None]) -> dict[str, Float[Tensor, " m"]]:
+    """All columns of `COLUMNS`, as many values each as the table has views."""
+    lines = list(csv.reader(StringIO(text), strict=True, skipinitialspace=True))
+    lines = [[word.strip() for word in line] for line in lines if any(map(str.strip, line))]
+    names, *rows = lines or [[]]
+    for name in names:
+        if name not in COLUMNS:
+            raise ValueError(f"expected known columns, got {name!r}{hint(name, COLUMNS)}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"expected every column once, got {names}")
+    if not 0 < len(rows) <= VIEWS or any(len(row) != len(names) for row in rows):
+        raise ValueError(f"expected 1 to {VIEWS} lines of {len(names)} numbers below the names")
+    table = {}
+    for name, absent in COLUMNS.items():
+        value = options.get(name)
+        if name in names and value is not None:
+            raise ValueError(f"expected {name} in the table or as an option, got it in both")
+        if name not in names and value is None and absent is None:
+            raise ValueError(f"expected {name}, a column of the table or an option, got {names}")
+        column = (
+            [number(row[names.index(name)], f"{name} of view {m}") for m, row in enumerate(rows)]
+            if name in names
+            else [absent if value is None else float(value)] * len(rows)
+        )
+        table[name] = torch.tensor(column, dtype=torch.float64)
+    return table
+
+
+def write(cameras: Cameras, path: str | Path) -> None:
+    """Write a cone-beam rig as a table of angles in degrees and lengths in mm, which `read` reads.
+
+    All offsets are in the table: `read` it with a detector whose offset_mm is 0.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: parallel beams, pinholes, detectors that are not rectangular or differ, a source
+            on the axis.
+    """
+    if cameras.parallel or cameras.extent != "segment":
+        raise ValueError("expected X-ray cone beams for a table of angles, got another rig")
+    square_pixels(cameras, "A table of angles")
+    source, forward = cameras.source, unit(torch.linalg.cross(cameras.u, cameras.v))
+    flat = source * source.new_tensor([1, 1, 0])
+    R = look_at(flat, torch.zeros_like(flat))
+    right, down, depth = (
+        (R * (detector_centre(cameras) - source)[:, None]).sum(dim=-1).unbind(dim=-1)
+    )
+    axes = torch.stack([unit(cameras.u), unit(cameras.v), forward], dim=1)
+    E = R @ axes.mT
+    turns = (
+        torch.atan2(E[:, 1, 0], E[:, 0, 0]),
+        torch.asin((-E[:, 2, 0]).clamp(-1, 1)),
+        torch.atan2(E[:, 2, 1], E[:, 2, 2]),
+    )
+    angle = torch.atan2(source[:, 1], source[:, 0])
+    degrees = [torch.rad2deg(turn) for turn in (angle, *turns)]
+    columns = [degrees[0], flat.norm(dim=-1), depth, right, down, *degrees[1:], source[:, 2]]
+    save_lines(path, ",".join(COLUMNS), torch.stack(columns, dim=-1).tolist(), ",")

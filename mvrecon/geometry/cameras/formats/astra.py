@@ -1,0 +1,92 @@
+"""ASTRA's vector geometries ("cone_vec", "parallel3d_vec"), as text or .npy."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.convert import from_astra, to_astra
+from mvrecon.geometry.cameras.detector import Detector
+from mvrecon.geometry.cameras.formats.text import VIEWS, number_lines, rows_of, save_lines
+from mvrecon.geometry.cameras.formats.world import from_world, into_world
+
+
+def read(
+    path: str | Path,
+    pixels: Any,
+    parallel: bool = False,
+    unit_mm: float = 1.0,
+    world: str = "RAS",
+    flip_rows: bool = True,
+) -> Cameras:
+    """Rig in mm from ASTRA's twelve numbers a view: source (or ray), detector's centre, u, v.
+
+    Args:
+        path: text, twelve numbers a line, or a .npy of [views 12].
+        pixels: rows and columns of the detector.
+        parallel: "parallel3d_vec": the first three numbers are the ray's direction.
+        unit_mm: length of ASTRA's unit in mm.
+        world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
+        flip_rows: v runs upwards, as in ASTRA's own circular geometries; reverse the rows of the
+            views.
+
+    Convention: ASTRA's data are [rows views columns]: views [m v u] are their transpose.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: not such a file, values that are not finite, or left-handed cameras: v runs the
+            other way than `flip_rows` says.
+    """
+    shape = Detector(pixels, 1.0).pixels  # type: ignore[arg-type]
+    vectors = (
+        _npy(Path(path)) if str(path).endswith(".npy") else rows_of(path, number_lines(path), 12)
+    )
+    with blaming(path, "is no rig", f"it was read with flip_rows={str(flip_rows).lower()}"):
+        if not 0 < unit_mm < float("inf"):
+            raise ValueError(f"expected unit_mm as positive mm, got {unit_mm}")
+        cameras = from_astra(vectors * unit_mm, shape, parallel, flip_rows=flip_rows)
+        return from_world(cameras, world)
+
+
+def _npy(path: Path) -> torch.Tensor:
+    """Vectors of a .npy file; its size is checked before any memory is asked for."""
+    with blaming(path, "is not a .npy file of vectors"), path.open("rb") as file:
+        version = np.lib.format.read_magic(file)
+        reader = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, fortran, kind = reader(file)
+        if len(shape) != 2 or shape[1] != 12 or not 0 < shape[0] <= VIEWS or kind.kind != "f":
+            raise Refused(f"{path}: expected floating [views 12], got {kind} {shape}")
+        raw = file.read(shape[0] * 12 * kind.itemsize + 1)
+        if len(raw) != shape[0] * 12 * kind.itemsize:
+            raise Refused(f"{path}: expected {shape[0]} views, got a file of another length")
+        array = np.frombuffer(raw, kind).reshape(shape, order="F" if fortran else "C")
+        return torch.from_numpy(array.astype(np.float64))
+
+
+def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: bool = True) -> None:
+    """Write a rig as text, twelve numbers in mm a view, which `read` reads with the same options.
+
+    Args:
+        cameras: cone beams ("cone_vec") or parallel beams ("parallel3d_vec").
+        path: of the text.
+        world: axes of the file.
+        flip_rows: v upwards; the rows of the views must be reversed for ASTRA.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: pinholes, whose rays ASTRA would begin at the detector's other side.
+    """
+    if cameras.extent not in ("segment", "line"):
+        raise ValueError(f"expected X-ray or parallel beams for ASTRA, got {cameras.extent!r}")
+    vectors = to_astra(into_world(cameras, world))
+    if flip_rows:
+        vectors = torch.cat([vectors[:, :9], -vectors[:, 9:]], dim=1)
+    rows, columns = cameras.shape
+    head = f"# ASTRA {'parallel3d_vec' if cameras.parallel else 'cone_vec'}, mm ({world}), "
+    save_lines(path, f"{head}{rows} rows, {columns} columns", vectors.tolist(), " ")

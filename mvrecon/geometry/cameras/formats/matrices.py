@@ -1,0 +1,90 @@
+"""Rigs as 3x4 projection matrices in a text file, one a view."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.convert import from_matrix
+from mvrecon.geometry.cameras.detector import Detector
+from mvrecon.geometry.cameras.formats.text import number_lines, rows_of, save_lines
+from mvrecon.geometry.cameras.formats.world import from_world, into_world
+
+
+def read(
+    path: str | Path,
+    detector: Mapping[str, Any],
+    first_pixel: float = 0.0,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    world: str = "RAS",
+    flip_rows: bool = False,
+) -> Cameras:
+    """Cone-beam rig in mm from 3x4 matrices P with P (X, 1) ~ (u, v, 1), u and v in pixels.
+
+    Args:
+        path: of the text: twelve numbers a line, or three lines of four a view; # begins a comment.
+        detector: options of `Detector`: pixels and pixel_mm, each (v, u); an offset is P's.
+        first_pixel: what P calls the centre of the first pixel: 0, 0.5 (corners are integers), or 1
+            (MATLAB).
+        centre: a point of the object, in mm in the file's axes, between source and detector; it
+            decides P's sign.
+        world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
+        flip_rows: rows count upwards in P; reverse the rows of the views.
+
+    Convention: the scale of P does not matter; a matrix tells the detector's distance through
+    pixel_mm alone.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: not such a file, values that are not finite, matrices of parallel beams, or
+            left-handed ones: rows that run the other way than `flip_rows` says.
+    """
+    lines, plate = number_lines(path), Detector.of(detector)
+    if any(plate.offset_mm):
+        raise ValueError(f"expected a detector without offset_mm, which P has, got {plate}")
+    if lines and {len(line) for line in lines} == {4} and len(lines) % 3 == 0:
+        lines = [sum(lines[row : row + 3], []) for row in range(0, len(lines), 3)]
+    P = rows_of(path, lines, 12).unflatten(1, (3, 4))
+    with blaming(path, "holds no matrices of a cone beam", "are units and pixels as expected?"):
+        P = _facing(_from_zero(P, first_pixel), torch.tensor([*centre, 1.0], dtype=torch.float64))
+        if flip_rows:
+            P = torch.stack([P[:, 0], (plate.pixels[0] - 1) * P[:, 2] - P[:, 1], P[:, 2]], dim=1)
+        if (torch.linalg.det(P[:, :, :3]) <= 0).any():
+            raise Refused(
+                f"{path}: the rows of its matrices run the other way round; expected "
+                f"flip_rows={'false' if flip_rows else 'true'} (and the rows of the views with it)"
+            )
+        pitch = from_matrix(P, plate.pixels, 1.0).u.norm(dim=-1)
+        return from_world(from_matrix(P, plate.pixels, plate.pixel_mm[1] / pitch), world)
+
+
+def _from_zero(P: Float[Tensor, "m 3 4"], first_pixel: float) -> Float[Tensor, "m 3 4"]:
+    across = P[:, :2] - first_pixel * P[:, 2:]
+    return torch.cat([across, P[:, 2:]], dim=1)
+
+
+def _facing(P: Float[Tensor, "m 3 4"], point: Float[Tensor, "4"]) -> Float[Tensor, "m 3 4"]:
+    """P with the sign that puts a point on the detector's side of the source, and unit scale."""
+    depth = P[:, 2] @ point
+    if not (depth != 0).all():
+        raise ValueError("expected a centre that no source's plane goes through")
+    return P * depth.sign()[:, None, None] / P[:, 2:, :3].norm(dim=-1, keepdim=True)
+
+
+def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
+    """Write the 3x4 matrices of a rig, twelve numbers a view, which `read` reads.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: parallel beams or pinholes, which `read` does not take.
+    """
+    if cameras.parallel or cameras.extent != "segment":
+        raise ValueError("expected X-ray cone beams for 3x4 matrices, got another rig")
+    rows, columns = cameras.shape
+    head = f"# 3x4 matrices, row by row: mm ({world}) to pixels, {rows} rows, {columns} columns"
+    save_lines(path, head, into_world(cameras, world).matrix.flatten(1).tolist(), " ")

@@ -1,0 +1,166 @@
+"""TIGRE's geometry and angles as JSON, in TIGRE's own words (Biguri and others, Biomed. Phys. Eng.
+Express 2, 2016).
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import Refused, blaming, shown, text_of
+from mvrecon.core.registry import hint
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.detector import Detector, detector_centre
+from mvrecon.geometry.cameras.formats.text import VIEWS, check_distances, square_pixels
+from mvrecon.geometry.cameras.formats.world import from_world, into_world
+from mvrecon.geometry.rigid import euler_rotation, unit
+
+#: Radians: an angle beyond is taken for degrees.
+TURNS = 8 * math.pi
+#: What each entry holds for one view, and what stands for one that is absent.
+PER_VIEW = {"DSD": 1, "DSO": 1, "offOrigin": 3, "offDetector": 2, "rotDetector": 3, "COR": 1}
+KNOWN = {"mode", "angles", "nDetector", "dDetector", *PER_VIEW}
+#: Entries of TIGRE's that say nothing about the rig.
+IGNORED = {"nVoxel", "sVoxel", "dVoxel", "sDetector", "accuracy", "n_proj", "filter"}
+
+
+def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Cameras:
+    """Rig in mm from a JSON file of TIGRE's geometry, with its angles in radians.
+
+    Entries, in the order of TIGRE's Python: `DSD`, `DSO` (mm), `nDetector`, `dDetector` (v, u),
+    `angles` (radians [views] or Euler angles zyz [views 3]); and, one for all or one a view,
+    `offDetector` (v, u) mm, `offOrigin` (z, y, x) mm, `rotDetector` (yaw about the beam, pitch
+    about u, roll about v) radians, `COR` mm; `mode` "cone" or "parallel".
+
+    Args:
+        path: of the JSON.
+        world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
+        flip_rows: must be true: TIGRE's first row is the lowest; reverse the rows of the views.
+
+    Convention: TIGRE: the source at R(DSO, 0, 0), u along R(0, 1, 0), v along R(0, 0, 1), upwards.
+    The world's origin is the middle of TIGRE's image: offOrigin moves the cameras instead.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: not such a file, values that are not finite, angles in degrees, DSO > DSD,
+            `flip_rows` false.
+    """
+    if not flip_rows:
+        raise Refused(f"{path}: TIGRE's rows run upwards; expected flip_rows=true, got false")
+    with blaming(path, "is not a geometry of TIGRE's"):
+        return from_world(_cameras(_checked(json.loads(text_of(path)))), world)
+
+
+def _checked(record: Any) -> dict[str, Any]:
+    if not isinstance(record, dict):
+        raise ValueError(f"expected a JSON object, got {shown(record)}")
+    for name in record:
+        if name not in KNOWN | IGNORED:
+            raise ValueError(f"expected known entries, got {name!r}{hint(name, KNOWN)}")
+    for name in ("angles", "nDetector", "dDetector", "DSD", "DSO"):
+        if name not in record:
+            raise ValueError(f"expected the entry {name!r}, got {sorted(record)}")
+    if record.get("mode", "cone") not in ("cone", "parallel"):
+        raise ValueError(f"expected the mode cone or parallel, got {shown(record['mode'])}")
+    return record
+
+
+def _numbers(record: dict[str, Any], name: str) -> Float[Tensor, "*n"]:
+    """An entry as a tensor; JSON's texts, truths and uneven lists are refused by torch."""
+    values = record.get(name, [0.0] * PER_VIEW.get(name, 1))
+    if isinstance(values, str) or len(json.dumps(values)) > VIEWS * 100:
+        raise ValueError(f"expected numbers for {name}, got {shown(values)}")
+    tensor = torch.tensor(values, dtype=torch.float64)
+    if not tensor.isfinite().all() or not tensor.numel():
+        raise ValueError(f"expected finite numbers for {name}, got {shown(values)}")
+    return tensor
+
+
+def _per_view(record: dict[str, Any], name: str, views: int) -> Float[Tensor, "m k"]:
+    """An entry's values for each view."""
+    values, width = _numbers(record, name), PER_VIEW[name]
+    fits = {(width,), (views, width)} | ({(), (views,), (1,)} if width == 1 else set())
+    if tuple(values.shape) not in fits:
+        raise ValueError(
+            f"expected {name} as {width} numbers, one for all or one for each of {views} views, "
+            f"got {list(values.shape)}"
+        )
+    return values.reshape(-1, width).expand(views, width)
+
+
+def _cameras(record: dict[str, Any]) -> Cameras:
+    angles = _numbers(record, "angles")
+    if angles.ndim == 1:
+        angles = torch.stack([angles, *[torch.zeros_like(angles)] * 2], dim=-1)
+    if angles.ndim != 2 or angles.shape[1] != 3 or len(angles) > VIEWS:
+        raise ValueError(f"expected angles [views] or [views 3], got {list(angles.shape)}")
+    if (most := angles.abs().max().item()) > TURNS:
+        raise ValueError(f"expected TIGRE's angles in radians, got {most:.4g}; are they degrees?")
+    views, parallel = len(angles), record.get("mode") == "parallel"
+    DSD, DSO, COR = (_per_view(record, name, views) for name in ("DSD", "DSO", "COR"))
+    for near, far in zip(DSO.flatten().tolist(), DSD.flatten().tolist(), strict=True):
+        check_distances(near, far)
+    R = euler_rotation(torch.rad2deg(angles), "zyz")
+    yaw_pitch_roll = torch.rad2deg(_per_view(record, "rotDetector", views))
+    turn = euler_rotation(yaw_pitch_roll.flip(-1), "zyx")  # roll about z comes last
+    across, zero = _per_view(record, "offDetector", views), torch.zeros_like(DSD)
+    if parallel and (across.any() or yaw_pitch_roll.any()):
+        raise ValueError("expected parallel beams without offDetector and rotDetector, got some")
+    centre = torch.cat([DSO - DSD, across.flip(-1)], dim=-1)
+    start = torch.cat([DSO, zero, zero], dim=-1)
+    alpha = angles[:, 0]
+    shift = COR * torch.stack([-alpha.sin(), alpha.cos(), 0 * alpha], dim=-1)
+    shift = shift - _per_view(record, "offOrigin", views).flip(-1)
+    centre, start = ((R @ point[..., None])[..., 0] + shift for point in (centre, start))
+    axes = R @ turn
+    looking = torch.stack([axes[..., 1], -axes[..., 2], -axes[..., 0]], dim=1)
+    plate = Detector(record["nDetector"], record["dDetector"])
+    return plate.carried(start, centre, looking, parallel)
+
+
+def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
+    """Write a cone-beam rig as JSON in TIGRE's words (mm, radians), which `read` reads.
+
+    Convention: as `read`; the rows of the views must be reversed for TIGRE. Every view has angles
+    zyz and offsets of its own, and no rotDetector.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: parallel beams, pinholes, detectors that are not rectangular or differ.
+    """
+    if cameras.parallel or cameras.extent != "segment":
+        raise ValueError("expected X-ray cone beams for TIGRE, got another rig")
+    dDetector = square_pixels(cameras, "TIGRE")
+    rig = into_world(cameras, world)
+    u, up = unit(rig.u), -unit(rig.v)
+    R = torch.stack([torch.linalg.cross(u, up), u, up], dim=-1)
+    source, centre = (
+        (R.mT @ point[..., None])[..., 0] for point in (rig.source, detector_centre(rig))
+    )
+    aside = source * source.new_tensor([0, 1, 1])
+    across = centre - aside
+    record = {
+        "mode": "cone",
+        "DSO": source[:, 0].tolist(),
+        "DSD": (source - centre)[:, 0].tolist(),
+        "nDetector": list(rig.shape),
+        "dDetector": list(dDetector),
+        "offDetector": across[:, 1:].flip(-1).tolist(),
+        "offOrigin": (-(R @ aside[..., None])[..., 0]).flip(-1).tolist(),
+        "angles": [_zyz(axes) for axes in R.tolist()],
+    }
+    with written_whole(path) as part:
+        part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def _zyz(R: list[list[float]]) -> list[float]:
+    """Euler angles zyz of a rotation in radians; without a tilt the last is zero."""
+    theta = math.atan2(math.hypot(R[0][2], R[1][2]), R[2][2])
+    if math.sin(theta) < 1e-9:
+        return [math.atan2(R[1][0], R[0][0] if R[2][2] > 0 else -R[0][0]), theta, 0.0]
+    return [math.atan2(R[1][2], R[0][2]), theta, math.atan2(R[2][1], -R[2][0])]

@@ -1,0 +1,107 @@
+"""Rigs drawn at random, for networks that shall work on any."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.core.quantities import NonNegativeInt, Pair, PositiveFloat, PositiveInt
+from mvrecon.core.random_numbers import generator, uniform
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.detector import Detector
+from mvrecon.geometry.cameras.rigs import arc, circular, dome
+from mvrecon.geometry.rigid import look_at
+
+#: Kinds of rig: a full circle, an arc, a dome about +z, directions at random.
+PATHS = ("circle", "arc", "dome", "scattered")
+#: Degrees of an arc, full opening of a dome, greatest elevation of scattered cameras.
+ARC, APERTURE, ELEVATION = (90.0, 200.0), (90.0, 180.0), 45.0
+#: By which share a scattered camera's distance is off the rig's, at most.
+UNEVEN = 0.2
+
+
+def random_rig(
+    n_views: Pair[PositiveInt],
+    sid: Pair[PositiveFloat],
+    magnification: Pair[PositiveFloat],
+    pixels: Pair[PositiveInt],
+    field_mm: Pair[PositiveFloat],
+    paths: Sequence[str] = PATHS,
+    seed: NonNegativeInt = 0,
+) -> Cameras:
+    """Cone beam cameras about the origin of the world in mm, on a path, at distances and with a
+    detector that are drawn at random.
+
+    Each pair is the least and the greatest of a uniform draw.
+
+    Args:
+        n_views: number of cameras.
+        sid: mm from the source to the origin.
+        magnification: distance from source to detector, relative to `sid`.
+        pixels: of rows and of columns, one draw for each.
+        field_mm: (v, u), what a detector covers in a plane through the origin.
+        paths: kinds of rig, of `PATHS`: cameras on a full "circle" about z, on an "arc" of 90 to
+            200 degrees, on a "dome" about +z that opens 90 to 180 degrees, or "scattered" over all
+            azimuths and up to 45 degrees above and below the plane of the circle, at distances that
+            differ by up to a fifth.
+        seed: of the draws; another one is another rig.
+
+    Raises:
+        ValueError: a pair out of order or not positive, no path or an unknown one.
+    """
+    _check(n_views=n_views, sid=sid, pixels=pixels, field_mm=(min(field_mm), max(field_mm)))
+    _check(magnification=magnification)
+    if not 1 < magnification[0]:
+        raise ValueError(f"Expected a magnification above 1, got {list(magnification)}")
+    if not paths or not set(paths) <= set(PATHS):
+        raise ValueError(f"Expected paths of {', '.join(PATHS)}, got {list(paths)}")
+    rng = generator(seed, 0)
+    count, rows, columns = (_whole(rng, pair) for pair in (n_views, pixels, pixels))
+    path = paths[_whole(rng, (0, len(paths) - 1))]
+    distance, ratio = uniform(rng, *sid), uniform(rng, *magnification)
+    pitch = [size * ratio / n for size, n in zip(field_mm, (rows, columns), strict=True)]
+    detector = {"pixels": [rows, columns], "pixel_mm": pitch}
+    start = uniform(rng, 0.0, 360.0)
+    if path == "circle":
+        return circular(count, distance, distance * ratio, detector, start_degrees=start)
+    if path == "arc":
+        span = uniform(rng, *ARC)
+        return arc(count, distance, distance * ratio, detector, span, start_degrees=start)
+    if path == "dome":
+        aperture, focal = uniform(rng, *APERTURE), distance * ratio
+        return dome(count, distance, focal, aperture, detector, extent="segment")
+    return _scattered(rng, count, distance, ratio, Detector.of(detector))
+
+
+def _scattered(
+    rng: torch.Generator, count: int, distance: float, ratio: float, detector: Detector
+) -> Cameras:
+    """Cameras at random azimuths, elevations and distances, all aimed at the origin."""
+    outwards = _directions(rng, count)
+    off = torch.rand(count, 1, generator=rng, dtype=torch.float64)
+    source = distance * (1 + UNEVEN * (2 * off - 1)) * outwards
+    R = look_at(source, torch.zeros_like(source))
+    return detector.carried(source, (1 - ratio) * source, R)
+
+
+def _directions(rng: torch.Generator, count: int) -> Float[Tensor, "m 3"]:
+    """Unit vectors, uniform over the zone of the sphere between the elevations."""
+    azimuth, share = torch.rand(2, count, generator=rng, dtype=torch.float64)
+    height = (2 * share - 1) * torch.deg2rad(torch.tensor(ELEVATION, dtype=torch.float64)).sin()
+    across = (1 - height**2).sqrt()
+    azimuth = 2 * torch.pi * azimuth
+    return torch.stack([across * azimuth.cos(), across * azimuth.sin(), height], dim=-1)
+
+
+def _whole(rng: torch.Generator, pair: Sequence[int]) -> int:
+    """A whole number from the first to the second, both included."""
+    return int(torch.randint(pair[0], pair[1] + 1, (), generator=rng))
+
+
+def _check(**pairs: Sequence[float]) -> None:
+    for name, pair in pairs.items():
+        if len(pair) != 2 or not 0 < pair[0] <= pair[1] < float("inf"):
+            raise ValueError(
+                f"Expected {name} as a pair (least, greatest) of positive numbers, got {list(pair)}"
+            )

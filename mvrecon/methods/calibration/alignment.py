@@ -1,0 +1,244 @@
+"""Alignment of measured views with expected ones: what shift and what gain each camera has wrong.
+
+A detector that is shifted by s pixels, with a gain g, measures y(p) = g e(p + s) of the view e that
+it should see. Least squares by Gauss-Newton steps finds both (Lucas & Kanade, IJCAI 1981), with
+weights that keep out what the expected view does not explain (Huber, Ann. Math. Stat. 35, 1964),
+and a prior towards a camera as it should be.
+
+Convention: shifts are those of `Misalignment.offset_px`: of the detector, along (u, v).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.methods.calibration.blur import blurred
+
+#: Pixels of each side that count in `translated`, and the longest shift in pixels.
+REACH = LONGEST = 4
+
+
+def translated(
+    views: Float[Tensor, "b c m v u"], shift_px: Float[Tensor, "#b #m 2"]
+) -> Float[Tensor, "b c m v u"]:
+    """Views as detectors shifted by up to `LONGEST` pixels measure them, y(p) = x(p + s), in their
+    unit; beyond the edge the edge's values go on.
+
+    By a windowed sinc along columns and along rows (Lanczos, 8 pixels).
+    """
+    along_u, along_v = (
+        _interpolation(shift_px[..., axis].to(views.dtype), views.shape[size])[:, None]
+        for axis, size in ((0, -1), (1, -2))
+    )
+    return along_v @ views @ along_u.mT
+
+
+def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "#b #m n n"]:
+    """Weights of pixels for values at their places plus a shift."""
+    beyond = REACH + LONGEST
+    places = torch.arange(count, dtype=shift.dtype, device=shift.device)
+    pixels = torch.arange(-beyond, count + beyond, device=shift.device)
+    apart = places[:, None] + shift[..., None, None] - pixels
+    kernel = torch.sinc(apart) * torch.sinc(apart / REACH) * (apart.abs() < REACH)
+    edge = torch.eye(count, dtype=shift.dtype, device=shift.device)[pixels.clamp(0, count - 1)]
+    return kernel @ edge / kernel.sum(dim=-1, keepdim=True)
+
+
+#: Huber's threshold in standard deviations, the factor from a median to these, fits by weights.
+HUBER, DEVIATION, REWEIGHTED = 1.345, 1.4826, 3
+#: Standard deviation in pixels of the blur under which views are compared.
+BLUR = 1.0
+#: Pixels among which errors of an expected view are alike.
+ALIKE = 64.0
+#: Of the greatest value: pixels below see no object; scales of residuals below are rounding.
+EMPTY, ROUNDING = 1e-3, 1e-6
+
+
+class Prior(NamedTuple):
+    """Standard deviations of a camera's errors that are to be expected.
+
+    Args:
+        shift_px: along each axis, in pixels.
+        gain: relative.
+    """
+
+    shift_px: float = 1.0
+    gain: float = 0.05
+
+    def precision(self, like: Tensor) -> Float[Tensor, " 3"]:
+        """Inverse variances of both shifts and of the gain, as a tensor on the device of another,
+        which is not waited for.
+        """
+        shifts, gain = like.new_full((2,), self.shift_px), like.new_full((1,), self.gain)
+        return torch.cat([shifts, gain]).pow(-2)
+
+
+#: A pixel and 5 %.
+USUAL = Prior()
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """What is wrong with each view, and how well it is known.
+
+    Args:
+        shift_px: of the detector along its columns' and its rows' direction (u, v), in pixels.
+        gain: factor of the view's values.
+        shift_error: standard error of the shifts, in pixels.
+        gain_error: standard error of the gains.
+    """
+
+    shift_px: Float[Tensor, "b m 2"]
+    gain: Float[Tensor, "b m"]
+    shift_error: Float[Tensor, "b m 2"]
+    gain_error: Float[Tensor, "b m"]
+
+    @classmethod
+    def none(cls, views: Float[Tensor, "b 1 m v u"]) -> "Alignment":
+        """Cameras as they should be, without an error."""
+        zero = views.new_zeros(len(views), views.shape[2])
+        pair = zero[..., None].expand(-1, -1, 2)
+        return cls(pair, zero + 1, pair, zero)
+
+    @classmethod
+    def joined(cls, parts: Sequence["Alignment"]) -> "Alignment":
+        """The alignments of batches, one behind the other."""
+        columns = zip(*(one.tensors() for one in parts), strict=True)
+        return cls(*(torch.cat(same) for same in columns))
+
+    def split(self) -> list["Alignment"]:
+        """The alignment of each sample of the batch."""
+        columns = (value.split(1) for value in self.tensors())
+        return [Alignment(*parts) for parts in zip(*columns, strict=True)]
+
+    def to(self, *where: Any) -> "Alignment":
+        """On another device, or in another type."""
+        return Alignment(*(value.to(*where) for value in self.tensors()))
+
+    def tensors(self) -> list[Tensor]:
+        """Shifts, gains, and the errors of both."""
+        return [getattr(self, field.name) for field in fields(self)]
+
+    def deviation(self, prior: Prior = USUAL) -> Float[Tensor, "b m"]:
+        """How wrong each camera is, without a unit: shift and gain relative to what is to be
+        expected.
+        """
+        shift = (self.shift_px / prior.shift_px).square().sum(dim=-1)
+        return (shift + ((self.gain - 1) / prior.gain).square()).sqrt()
+
+
+class CorrectedViews(NamedTuple):
+    """Views after a correction.
+
+    Args:
+        views: in the unit of the measured ones.
+        alignment: what was wrong with the cameras, where the correction tells.
+    """
+
+    views: Float[Tensor, "b 1 m v u"]
+    alignment: Alignment | None = None
+
+
+def alignment(
+    views: Float[Tensor, "b 1 m v u"],
+    expected: Float[Tensor, "b 1 m v u"],
+    weight: Float[Tensor, "#b 1 #m #v #u"] | None = None,
+    start: Alignment | None = None,
+    steps: int = 2,
+    prior: Prior = USUAL,
+) -> Alignment:
+    """Least-squares shift in pixels and gain of every view, such that the expected view, moved and
+    multiplied, is the measured one.
+
+    Differentiable in both, for the weights that pixels then have. The errors are those of the fit
+    alone: an expected view that was made from the measured ones has part of their errors itself.
+
+    Args:
+        views: measured.
+        expected: A x, in the same unit.
+        weight: of pixels, at least 0; by default all count.
+        start: where Gauss-Newton begins; by default at cameras as they should be.
+        steps: of Gauss-Newton.
+        prior: of the errors.
+
+    Raises:
+        ValueError: views of different shapes, or no step.
+    """
+    if views.shape != expected.shape or views.ndim != 5 or steps < 1:
+        raise ValueError(
+            f"expected measured and expected views of one shape [b 1 m v u] and at least one step, "
+            f"got {tuple(views.shape)}, {tuple(expected.shape)} and {steps}"
+        )
+    one = start or Alignment.none(views)
+    smooth = blurred(expected, BLUR)
+    peak = smooth.detach().abs().amax((1, 2, 3, 4), keepdim=True)
+    unit = torch.where(peak > 0, peak, 1.0)  # no object is expected: then nothing is known
+    counts = (smooth.detach().abs() > EMPTY * peak) * (1 if weight is None else weight)
+    fit = _Fit(
+        _columns(smooth).div(unit[:, 0]),
+        counts.to(views.dtype)[:, 0].flatten(2),
+        prior.precision(views),
+    )
+    for _ in range(steps):
+        rest = (blurred(aligned(views, one), BLUR) - smooth) / unit
+        one = fit.step(rest[:, 0].flatten(2), one)
+    return one
+
+
+class _Fit(NamedTuple):
+    """Least squares of every view by its own three numbers.
+
+    Args:
+        columns: what a pixel more of either shift, and a gain of one more, would add.
+        weight: of pixels.
+        precision: of the prior, 1 / variance.
+    """
+
+    columns: Float[Tensor, "b m n 3"]
+    weight: Float[Tensor, "b m n"]
+    precision: Float[Tensor, " 3"]
+
+    def step(self, rest: Float[Tensor, "b m n"], at: Alignment) -> Alignment:
+        """One Gauss-Newton step, reweighted by what it leaves."""
+        present = torch.cat([at.shift_px, (at.gain - 1)[..., None]], dim=-1)
+        change = torch.zeros_like(present)
+        inverse = torch.zeros_like(present[..., None])
+        for _ in range(REWEIGHTED):
+            left = (rest - (self.columns @ change[..., None])[..., 0]).detach()
+            scale = self._scale(left)
+            weight = self.weight * (HUBER * scale / left.abs().clamp_min(ROUNDING)).clamp_max(1)
+            weighted = self.columns * (weight / (ALIKE * scale**2))[..., None]
+            # the prior keeps it from being singular, so that nobody has to wait for a check
+            inverse = torch.linalg.inv_ex(weighted.mT @ self.columns + self.precision.diag())[0]
+            slope = (weighted.mT @ rest[..., None])[..., 0] - self.precision * present
+            change = (inverse @ slope[..., None])[..., 0]
+        error = inverse.diagonal(dim1=-2, dim2=-1).sqrt()
+        shift = (at.shift_px + change[..., :2]).clamp(-LONGEST, LONGEST)
+        gain = at.gain * (1 + change[..., 2].clamp(-0.5, 0.5))
+        return Alignment(shift, gain, error[..., :2], error[..., 2])
+
+    def _scale(self, left: Float[Tensor, "b m n"]) -> Float[Tensor, "b m 1"]:
+        """Standard deviation of what is left, from the median over the pixels that count."""
+        median = left.abs().masked_fill(self.weight == 0, torch.nan).nanmedian(-1, True).values
+        return (DEVIATION * median).nan_to_num(1.0).clamp_min(ROUNDING)
+
+
+def aligned(views: Float[Tensor, "b 1 m v u"], by: Alignment) -> Float[Tensor, "b 1 m v u"]:
+    """Views as cameras without these errors would have measured them, in their unit; differentiable
+    in views and errors.
+    """
+    return translated(views, -by.shift_px) / by.gain[:, None, :, None, None]
+
+
+def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
+    """Derivatives by the two shifts (difference quotients of half a pixel to each side) and by the
+    gain.
+    """
+    halves = 0.5 * torch.eye(2, dtype=smooth.dtype, device=smooth.device)[:, None, None]
+    ahead, behind = ([translated(smooth, side * half) for half in halves] for side in (1, -1))
+    moved = [one - other for one, other in zip(ahead, behind, strict=True)]
+    return torch.stack([*moved, smooth], dim=-1)[:, 0].flatten(2, 3)

@@ -1,0 +1,328 @@
+"""Calibration from the measured views alone: the misalignment that makes them consistent with one
+volume.
+
+A rig that is wrong leaves a residual that no volume explains. Rig and volume are fitted together by
+Gauss-Newton steps on |S y - A(rig) G x|, with the views blurred by S and the volume made of
+Gaussian blobs, G: with voxels alone a volume has so many freedoms that it explains a tilted axis,
+too (of a sharp object wrongly by 0.4 degrees). In each step the rig's unknowns are eliminated
+exactly and the volume's change comes from conjugate gradients (separable least squares: Golub &
+Pereyra, SIAM J. Numer. Anal. 10, 1973; blobs: Lewitt, J. Opt. Soc. Am. A 7, 1990).
+
+No grid holds an object exactly, and that error pulls at every number that is free. A turn of all
+detectors about u, say, is on a circle nearly a stretched object, which voxels may resolve better:
+such a fit runs away, and even views that it left out fit better. A number is therefore fitted only
+where the volume explains its effect on the views far worse than the views themselves.
+"""
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import resolution
+from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
+from mvrecon.geometry.cameras.views import check_finite
+from mvrecon.methods.calibration.blur import Blur, blurred
+from mvrecon.methods.calibration.unknowns import Unknowns, unknowns
+from mvrecon.methods.classical.cgls import cgls
+from mvrecon.operators.operator import LinearOperator, Projector, Scaled
+
+#: Pixels (degrees, or a hundredth of a gain's logarithm) to both sides of a difference quotient.
+STEP = 0.1
+
+
+def derivatives(
+    views_at: Callable[[Tensor], Tensor], values: Float[Tensor, "m k"]
+) -> Float[Tensor, "k m v u"]:
+    """Derivatives of each view by its own numbers: central difference quotients.
+
+    All views move at once, as none depends on another's numbers. Along blurred volumes the
+    quotient is the derivative to the second order of its step; the kernels have a derivative by the
+    pose backwards alone, and the reference's forwards takes some sixty times as long.
+
+    Args:
+        views_at: the views [1 1 m v u] of a volume, of the numbers.
+        values: the numbers.
+    """
+    columns = []
+    for direction in STEP * torch.eye(values.shape[1], dtype=values.dtype):
+        ahead, behind = (views_at(values + side * direction) for side in (1, -1))
+        columns.append((ahead - behind)[0, 0] / (2 * STEP))
+    return torch.stack(columns)
+
+
+class Complement(LinearOperator):
+    """The part of views that no change of the rig's unknowns explains, an orthogonal projection.
+
+    Args:
+        columns: derivatives of each view by its own numbers.
+        unknowns: the numbers that are free.
+    """
+
+    def __init__(self, columns: Float[Tensor, "k m v u"], unknowns: Unknowns):
+        self.columns, basis = columns, unknowns.basis
+        self.domain_shape = self.range_shape = tuple(columns.shape[1:])
+        flat = columns.flatten(2).double()
+        gram = torch.einsum("kmp,lmp->mkl", flat, flat).to(basis)
+        normal = torch.einsum("mkn,mkl,mlo->no", basis, gram, basis)
+        self._solution = basis @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
+        self._basis = basis
+
+    @property
+    def device(self) -> torch.device:
+        return self.columns.device
+
+    def change(self, views: Float[Tensor, "1 1 m v u"]) -> Float[Tensor, "m k"]:
+        """The change of the numbers that explains views best (least squares)."""
+        products = torch.einsum("kmvu,mvu->mk", self.columns, views[0, 0]).to(self._basis)
+        return self._solution @ torch.einsum("mkn,mk->n", self._basis, products)
+
+    def forward(self, x: Float[Tensor, "1 1 m v u"]) -> Float[Tensor, "1 1 m v u"]:
+        explained = torch.einsum("kmvu,mk->mvu", self.columns, self.change(x).to(self.columns))
+        return x - explained
+
+    def adjoint(self, y: Float[Tensor, "1 1 m v u"]) -> Float[Tensor, "1 1 m v u"]:
+        return self.forward(y)
+
+
+OperatorOf = Callable[[Cameras], Projector]
+
+#: Standard deviation of a blob in voxels, and of the views' blur in voxels' images.
+BLOB, VIEW_BLUR = 1.0, 2.0
+#: The fit ends where no number changes by so much of its longest change.
+CLOSE = 2e-3
+#: The views determine a number where, of its effect, the ratio of what the volume leaves to what it
+#: explains is so many times that of the views.
+DETERMINED = 10.0
+#: Parts of the views, each predicted from the others.
+PARTS = 2
+
+
+class Round(NamedTuple):
+    """A round of the fit, as a monitor sees it.
+
+    Args:
+        number: from 1, and again from 1 without the numbers that the views do not determine.
+        residual: |S y - A x| / |S y| of the blurred views at its end.
+    """
+
+    number: int
+    residual: float
+
+
+class Estimate(NamedTuple):
+    """A calibrated rig.
+
+    Args:
+        cameras: the rig.
+        misalignment: what was wrong with each view of the rig that was given, in pixels and
+            degrees.
+        gains: factor of each view's integrals, their geometric mean 1; to be divided by.
+        residual: |S y - A x| / |S y| of the blurred views, of the rig that was given and after
+            each round.
+        kept: names out of `free` whose nominal values were kept.
+        left_out: |S y - A x| / |S y| with x from other views than those that are compared, of the
+            rig that was given and of the fitted one.
+        settled: whether the fit ended by itself before the last round.
+    """
+
+    cameras: Cameras
+    misalignment: Misalignment
+    gains: Float[Tensor, " m"]
+    residual: list[float]
+    kept: list[str]
+    left_out: tuple[float, float]
+    settled: bool
+
+
+class _Fit(NamedTuple):
+    """The rig's numbers and the volume, the residuals of all rounds, and whether it settled."""
+
+    values: Float[Tensor, "m k"]
+    x: Float[Tensor, "1 1 d h w"]
+    residual: list[float]
+    settled: bool
+
+
+class _Problem(NamedTuple):
+    """Blurred views, and what explains them: a volume of blobs, and the rig's unknowns."""
+
+    operator_of: OperatorOf
+    cameras: Cameras
+    unknowns: Unknowns
+    blobs: Blur
+    views: Float[Tensor, "1 1 m v u"]
+
+    def rig(self, values: Float[Tensor, "m k"]) -> Cameras:
+        return misaligned(self.cameras, self.unknowns.misalignment(values))
+
+    def operator(self, values: Float[Tensor, "m k"]) -> LinearOperator:
+        """From a volume's coefficients to its views."""
+        A = self.operator_of(self.rig(values))
+        if "gain" in self.unknowns.kinds:
+            A = Scaled(A, pixels=self.unknowns.gains(values)[:, None, None].to(A.device))
+        return A @ self.blobs
+
+    def residual(self, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"]) -> Tensor:
+        return self.views - self.operator(values)(x)
+
+    def relative(self, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"]) -> float:
+        return (self.residual(values, x).norm() / self.views.norm()).item()
+
+    def left_out(self, values: Float[Tensor, "m k"], iterations: int) -> float:
+        """The relative error of views as the volume of the other views predicts them."""
+        rig = self.rig(values)
+        views = self.views / self.unknowns.gains(values)[:, None, None].to(self.views)
+        part, squares = torch.arange(len(rig)) % PARTS, 0.0
+        for judge in range(PARTS):
+            out, others = part == judge, part != judge
+            x = cgls(self.operator_of(rig[others]) @ self.blobs, views[:, :, others], iterations)
+            rest = views[:, :, out] - (self.operator_of(rig[out]) @ self.blobs)(x)
+            squares += rest.square().sum().item()
+        return squares**0.5 / views.norm().item()
+
+
+@torch.no_grad()
+def calibrated(
+    operator_of: OperatorOf,
+    cameras: Cameras,
+    views: Float[Tensor, "1 1 m v u"],
+    free: Sequence[str] = ("offset_u", "tilt"),
+    iterations: int = 15,
+    rounds: int = 12,
+    monitor: Callable[[Round], object] | None = None,
+) -> Estimate:
+    """Rig fitted to the measured views alone, in pixels and degrees; numbers that the views do not
+    determine keep their nominal values, and so does a rig that predicts left-out views best.
+
+    Blobs and blur go with the grid's voxel. Voxels may be coarse, which is fast and robust: edges
+    need not be resolved, but there should be about as many views as voxels across. The object must
+    be inside the grid and inside all views.
+
+    Args:
+        operator_of: the operator of a rig, such as `partial(Drr, grid)`.
+        cameras: the rig as it should be.
+        views: measured integrals.
+        free: what is fitted. One number for all views: "offset_u", "offset_v" (pixels), "tilt"
+            (about the beam, which is the tilt of the axis), "slant" (about u), "swivel" (about v;
+            degrees). A number for each view: "shifts" (u and v, pixels), "gains" (factors). On a
+            circle an offset_v is nearly a shift of the object, a slant nearly a stretch of it.
+        iterations: of conjugate gradients in each round.
+        rounds: of Gauss-Newton at most; it ends before where nothing changes any more.
+        monitor: called after each round.
+
+    Warns:
+        UserWarning: nominal values are kept; the rig still changed in the last round.
+
+    Raises:
+        ValueError: names that `unknowns` refuses; views that are zero, not finite, or of another
+            shape than the operator's; parallel beams, which `misaligned` refuses.
+    """
+    numbers = unknowns(cameras, free)
+    nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
+    A = operator_of(misaligned(cameras, numbers.misalignment(nominal)))
+    _check(views, A)
+    blobs = Blur(A.domain_shape, [BLOB] * 3, A.device)
+    problem = _Problem(operator_of, cameras, numbers, blobs, blurred(views, _view_blur(A)))
+    kept: list[str] = []
+    while True:
+        fit = _fitted(problem, iterations, rounds, monitor)
+        lost = _undetermined(problem, fit, [name for name in free if name not in kept], iterations)
+        if not lost:
+            break
+        kept += lost
+        problem = problem._replace(unknowns=problem.unknowns.without(lost))
+    if kept:
+        warnings.warn(
+            f"The views do not determine {', '.join(kept)}: kept at the nominal value",
+            stacklevel=3,
+        )
+    if not fit.settled:
+        warnings.warn(f"The rig still changed in the last of {rounds} rounds", stacklevel=3)
+    values = fit.values
+    left_out = (problem.left_out(nominal, iterations), problem.left_out(values, iterations))
+    if left_out[1] > left_out[0]:
+        warnings.warn(
+            f"The nominal rig predicts left-out views with an error of {left_out[0]:.5g}, the "
+            f"fitted one with {left_out[1]:.5g}: the nominal rig is kept",
+            stacklevel=3,
+        )
+        values, kept = nominal, list(free)
+    by, gains = numbers.misalignment(values), numbers.gains(values)
+    return Estimate(problem.rig(values), by, gains, fit.residual, kept, left_out, fit.settled)
+
+
+def _fitted(
+    problem: _Problem,
+    iterations: int,
+    rounds: int,
+    monitor: Callable[[Round], object] | None,
+) -> _Fit:
+    """The fit of rig and volume, from the nominal rig."""
+    values = problem.unknowns.basis.new_zeros(problem.unknowns.basis.shape[:2])
+    x = cgls(problem.operator(values), problem.views, iterations)
+    history = [problem.relative(values, x)]
+    for number in range(1, rounds + 1):
+        last = values
+        values, x = _improved(problem, values, x, iterations)
+        history.append(problem.relative(values, x))
+        if monitor is not None:
+            monitor(Round(number, history[-1]))
+        if ((values - last).abs() < CLOSE * problem.unknowns.longest).all():
+            return _Fit(values, x, history, True)
+    return _Fit(values, x, history, False)
+
+
+def _undetermined(problem: _Problem, fit: _Fit, names: Sequence[str], iterations: int) -> list[str]:
+    """The names of numbers for all views whose effect the volume explains about as well as it
+    explains the views.
+    """
+    A, r = problem.operator(fit.values), problem.residual(fit.values, fit.x)
+    columns = derivatives(lambda moved: problem.operator(moved)(fit.x), fit.values)
+    effects = dict(zip(problem.unknowns.kinds, columns[:, None, None], strict=True))
+    least, lost = DETERMINED * _unexplained(r, problem.views), []
+    for name in names:
+        if name in effects:
+            rest = effects[name] - A(cgls(A, effects[name], iterations))
+            if not _unexplained(rest, effects[name]) >= least:
+                lost.append(name)
+    return lost
+
+
+def _unexplained(rest: Tensor, whole: Tensor) -> float:
+    """What a volume leaves of views, relative to what it explains."""
+    return (rest.norm() / (whole - rest).norm()).item()
+
+
+def _improved(
+    problem: _Problem, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"], iterations: int
+) -> tuple[Float[Tensor, "m k"], Float[Tensor, "1 1 d h w"]]:
+    """The rig's numbers and the volume after a Gauss-Newton step for both."""
+    A, r = problem.operator(values), problem.residual(values, x)
+    columns = derivatives(lambda moved: problem.operator(moved)(x), values)
+    rest = Complement(columns, problem.unknowns)
+    change = cgls(rest @ A, rest(r), iterations)
+    longest = problem.unknowns.longest
+    step = rest.change(r - A(change)).clamp(-longest, longest)
+    return values + step, x + change
+
+
+def _check(views: Float[Tensor, "1 1 m v u"], A: Projector) -> None:
+    if tuple(views.shape) != (1, 1, *A.range_shape):
+        raise ValueError(
+            f"expected views [1 1 m v u] {(1, 1, *A.range_shape)} of the operator, got "
+            f"{tuple(views.shape)}"
+        )
+    check_finite(views)
+    if not views.any():
+        raise ValueError("expected views of an object to calibrate from, got zeros alone")
+
+
+def _view_blur(A: Projector) -> float:
+    """Blur of the views in pixels."""
+    pixel = resolution(A.cameras.to("cpu"), A.grid.centre)
+    return VIEW_BLUR * max(A.grid.spacing) / pixel

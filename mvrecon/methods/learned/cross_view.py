@@ -1,0 +1,359 @@
+"""The cross-view model: per-view estimates from a depth network in each camera's frustum, compared
+by re-projection into the other cameras' frames, fused by a weighting network.
+
+`docs/model.md` has the steps of `CrossView.forward` as a table.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from mvrecon.core.parts import HEADS
+from mvrecon.core.registry import check_choice
+from mvrecon.geometry.box import Box, bounds, placed
+from mvrecon.methods.learned.consistency import Consistency, Steps
+from mvrecon.methods.learned.geometry import Geometry, geometry_of, validated
+from mvrecon.methods.learned.start import ClassicalStart, Start, normalised
+from mvrecon.methods.learned.unet import PlainUNet, Precision
+from mvrecon.methods.learned.view_frames import (
+    ViewFrames,
+    coarsened,
+    deviation,
+    fuse,
+    images,
+    leave_one_out,
+    pooled,
+)
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
+from mvrecon.operators.visual_hull.support import KINDS
+
+#: Factor on residuals, which are small beside the views, at the entry of a network.
+GAIN = 8.0
+#: Density of an empty voxel in the mean along a ray, relative to the content's scale.
+FAINT = 0.01
+#: Factor on the learning rate of the strength of the rays' weights, one number that should have
+#: converged within the first tenth of a training.
+FASTER = 10.0
+#: Voxels around the box of a support that the volume network sees, and whose multiples its bounds
+#: are, so that coarse voxels keep their places.
+MARGIN, ALIGNED = 4, 8
+
+
+class CrossView(nn.Module):
+    """Cross-view reconstruction, in the unit of (views / mm).
+
+    Everything is divided by the scale of the content, f(a y) = a f(y). The weights hold no
+    geometry: any rig, any grid, any operator.
+
+    Args:
+        widths: channels of each scale of the volume network, the finest first.
+        depth_widths: likewise, of the depth network in the frusta.
+        weight_widths: likewise, of the weighting network.
+        features: channels that the depth network hands to the volume network.
+        scale: halvings of the grid at which per-view estimates are computed.
+        depths: bins along each ray.
+        binning: pixels of a frustum's cell along each axis.
+        head: name, or name and options, of the head that turns logits of depth into densities.
+        fusion: weighted by the weighting network, or the mean over the cameras.
+        depth: logits and prior as learned, or uniform along each ray.
+        shared: one depth network for all cameras, or one for each.
+        n_cameras: number of cameras where the depth network is not shared.
+        weigh_rays: whether a ray's residual counts by its camera's weights along it.
+        start: iterations of SIRT with momentum at the start, or name and options of a classical
+            method.
+        consistency: number of data-consistency steps at the end, or options of `Consistency`; for
+            counts `{steps: 3, noise: poisson, rule: em}`.
+        support: where the density may differ from zero, by the views: the visual "hull", its "box",
+            "auto" or "none".
+        noise: of the views, for the support, as of `support_from_views`.
+        crop: whether the volume network is confined to the box around the support.
+        precision: of the convolutions.
+
+    Raises:
+        ValueError: an unknown choice, networks that are not shared without `n_cameras`, or a crop
+            without a support.
+    """
+
+    def __init__(
+        self,
+        widths: Sequence[int] = (16, 32, 64),
+        depth_widths: Sequence[int] = (16, 32),
+        weight_widths: Sequence[int] = (8,),
+        features: int = 4,
+        scale: int = 2,
+        depths: int = 16,
+        binning: int = 3,
+        head: str | Mapping[str, Any] = "softmax_depth",
+        fusion: Literal["weighted", "mean"] = "weighted",
+        depth: Literal["learned", "uniform"] = "learned",
+        shared: bool = True,
+        n_cameras: int | None = None,
+        weigh_rays: bool = True,
+        start: Start = 12,
+        consistency: Steps = 2,
+        support: str = "none",
+        noise: Mapping[str, Any] | None = None,
+        crop: bool = False,
+        precision: Precision = "auto",
+    ):
+        super().__init__()
+        check_choice("fusion", fusion, ("weighted", "mean"))
+        check_choice("support", support, KINDS)
+        if not 0 <= scale < len(widths):
+            raise ValueError(f"Expected scale below the {len(widths)} of widths, got {scale}")
+        if crop and support == "none":
+            raise ValueError("Expected a support to crop to, got crop=True and support='none'")
+        self.estimates = PerViewEstimates(
+            depth_widths, features, scale, depths, binning, head, depth,
+            None if shared else n_cameras or 0, precision,
+        )  # fmt: skip
+        self.weight_net = None
+        if fusion == "weighted":
+            inputs = 5 + self.estimates.confidences
+            self.weight_net = PlainUNet(3, inputs, 1, weight_widths, zero=1, precision=precision)
+            self.weight_net.last.bias = None  # a constant for all cameras has no effect
+        self.scale = scale
+        self.entry = nn.Conv3d(2 + features, widths[scale], 1, bias=False)
+        nn.init.zeros_(self.entry.weight)  # before training: SIRT
+        self.volume_net = PlainUNet(3, 3, 1, widths, zero=1, precision=precision)
+        self.step = nn.Parameter(torch.ones(()))
+        unequal = weigh_rays and fusion == "weighted"
+        self.log_strength = nn.Parameter(torch.zeros(())) if unequal else None
+        self.consistency = Consistency(consistency)
+        self.start = ClassicalStart(start, counts=self.consistency.poisson)
+        self.support, self.noise, self.crop = support, noise, crop
+
+    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+        y = validated(views, A, self.step)
+        g = geometry_of(y, A, self.support, self.noise)
+        frames = self.estimates.frames(g)
+        y, start, scale = normalised(g, y, self.start, self.training)
+
+        projected = A(start)
+        r = y - projected
+        d = g.direction(r)
+        change, confidence, features, missed = self.estimates(frames, g, y, r, start, d)
+        others, variance, _ = leave_one_out(change, frames.visible)
+        predicted = frames.project(frames.to_frames(others))  # re-projection
+
+        x = coarsened(start, self.scale)
+        unexplained = frames.spread(missed - predicted).detach()
+        compared = [change, others, deviation(variance), frames.to_volume(unexplained)]
+        logits = self.weight_logits(torch.cat(compared, 2), x, confidence)
+        fused, weights = fuse(torch.cat([change, features], 2), logits, frames.visible)
+        ray_weights = self.ray_weights(frames, x, weights, y)
+
+        d = g.direction(r, ray_weights)
+        _, spread = pooled(change, frames.visible)
+        fused = [GAIN * fused[:, :1], GAIN * deviation(spread)[:, 0], fused[:, 1:]]
+        x = start + g.within(self.learned_change(g, start, d, torch.cat(fused, 1)) + self.step * d)
+        entry = x
+        if not self.consistency.poisson:
+            g = replace(g, row=g.row * ray_weights)
+        x = self.consistency(g, x, y).clamp_min(0)
+        return Reconstruction(
+            x * scale,
+            per_view=(coarsened(start, self.scale)[:, None] + change) * scale[:, None],
+            visible=frames.visible,
+            weights=weights,
+            predictions=(frames.views(predicted + frames.integrals(projected))) * scale,
+            support=g.support,
+            start=start * scale,
+            entry=entry * scale if self.consistency.em else None,
+        )
+
+    def weight_logits(
+        self,
+        compared: Float[Tensor, "b m 4 e i x"],
+        x: Float[Tensor, "b 1 e i x"],
+        confidence: Float[Tensor, "b m 1 e i x"],
+    ) -> Float[Tensor, "b m 1 e i x"]:
+        """A logit for each camera and cell; zeros without a weighting network."""
+        if self.weight_net is None:
+            return torch.zeros_like(confidence)
+        volumes = x[:, None].expand_as(confidence)
+        inputs = torch.cat([GAIN * compared, volumes, confidence], dim=2)
+        logits = self.weight_net(inputs.flatten(0, 1)).unflatten(0, inputs.shape[:2])
+        return logits + confidence
+
+    def ray_weights(
+        self,
+        frames: ViewFrames,
+        x: Float[Tensor, "b 1 e i x"],
+        weights: Float[Tensor, "b m 1 e i x"],
+        like: Float[Tensor, "b 1 m v u"],
+    ) -> Float[Tensor, "b 1 m v u"] | float:
+        """The mean along each ray of its camera's weight relative to equal weights, with a learned
+        strength.
+        """
+        if self.log_strength is None:
+            return 1.0
+        density = (x.detach().clamp_min(0) + FAINT)[:, None] * frames.visible
+        relative = weights * frames.visible.sum(dim=0)
+        ratio = frames.mean_along_rays(relative, density, like)
+        return (1 + (FASTER * self.log_strength).exp() * (ratio - 1)).clamp_min(0)
+
+    def learned_change(
+        self,
+        g: Geometry,
+        x: Float[Tensor, "b 1 d h w"],
+        d: Float[Tensor, "b 1 d h w"],
+        fused: Float[Tensor, "b k e i x"],
+    ) -> Float[Tensor, "b 1 d h w"]:
+        """The volume network's change of x; with `crop`, computed in the box around the support of
+        each sample.
+        """
+        hull = torch.ones_like(x) if g.support is None else g.support.to(x)
+        inputs, coarse = torch.cat([x, GAIN * d, hull], 1), self.entry(fused)
+        if not self.crop or g.support is None:
+            return self.volume_net(inputs, {self.scale: coarse})
+        changes = []
+        for i, box in enumerate(boxes_of(g.support)):
+            edge = 2**self.scale
+            cells = [slice(s.start // edge, -(-s.stop // edge)) for s in box.slices]
+            part = {self.scale: coarse[i : i + 1, :, *cells]}
+            change = self.volume_net(inputs[i : i + 1, :, *box.slices], part)
+            changes.append(placed(change, box, x.shape[2:]))
+        return torch.cat(changes)
+
+
+class PerViewEstimates(nn.Module):
+    """Depth network and head: each camera's own change of a volume, from its view alone.
+
+    Args:
+        widths, features, scale, depths, binning, head, depth, precision: as of `CrossView`.
+        n_cameras: a network for each of so many cameras; None: one for all.
+
+    Raises:
+        ValueError: an unknown `depth`, or no number of cameras.
+    """
+
+    confidences = 1
+
+    def __init__(
+        self,
+        widths: Sequence[int],
+        features: int,
+        scale: int,
+        depths: int,
+        binning: int,
+        head: str | Mapping[str, Any],
+        depth: str = "learned",
+        n_cameras: int | None = None,
+        precision: Precision = "auto",
+    ):
+        super().__init__()
+        check_choice("depth", depth, ("learned", "uniform"))
+        if n_cameras is not None and n_cameras < 1:
+            raise ValueError("Expected n_cameras for networks that are not shared, got none")
+        self.cut, self.n_cameras = (scale, binning, depths), n_cameras
+        self.binning, self.uniform = binning, depth == "uniform"
+        self.sizes = [1, self.confidences + features]
+        self.head = HEADS.from_config({"name": head} if isinstance(head, str) else head)
+
+        def image() -> nn.Module:
+            return nn.Conv2d(3 * binning**2, widths[0], 1)
+
+        def unet() -> nn.Module:
+            inputs, outputs = widths[0] + 4, sum(self.sizes)
+            return PlainUNet(3, inputs, outputs, widths, zero=2, precision=precision)
+
+        self.image, self.unet = for_cameras(n_cameras, image), for_cameras(n_cameras, unet)
+
+    def frames(self, g: Geometry) -> ViewFrames:
+        """The frames of an operator's cameras, of these bins and cells.
+
+        Raises:
+            ValueError: a number of cameras other than that of the networks.
+        """
+        if self.n_cameras not in (None, len(g.A.cameras)):
+            raise ValueError(f"Expected {self.n_cameras} cameras, got {len(g.A.cameras)}")
+        return ViewFrames.of(g, *self.cut)
+
+    def forward(
+        self,
+        frames: ViewFrames,
+        g: Geometry,
+        y: Float[Tensor, "b 1 m v u"],
+        r: Float[Tensor, "b 1 m v u"],
+        x: Float[Tensor, "b 1 d h w"],
+        d: Float[Tensor, "b 1 d h w"],
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Change of the volume, logits of confidence and features of each camera [b m c e i x], and
+        its residual as integrals [b 1 m r s].
+
+        Args:
+            frames: of the cameras.
+            g: the operator and SIRT's weights.
+            y, r: views and residual views.
+            x, d: volume and SIRT's direction.
+        """
+        frusta = frames.frusta
+        volumes = coarsened(torch.cat([x, GAIN * d], 1), frames.scale)
+        along = frusta.to_frusta(volumes[:, None])
+        logits, rest = self._logits(frames, g.row * y, g.row * r, along).split(self.sizes, 2)
+        prior = frames.to_frames(volumes[:, :1])
+        missed = frames.integrals(r.detach())
+        shape, logits = (torch.ones_like(prior), 0 * logits) if self.uniform else (prior, logits)
+        density = self.head(logits, shape, frames.project(prior) + missed, frusta)
+        # the change is carried to the volume: two warps of the density would blur it
+        carried = frames.to_volume(torch.cat([frames.emitted(density - prior), rest], 2))
+        features = carried.shape[2] - 1 - self.confidences
+        return *carried.split([1, self.confidences, features], 2), missed
+
+    def _logits(
+        self,
+        frames: ViewFrames,
+        measured: Float[Tensor, "b 1 m v u"],
+        residual: Float[Tensor, "b 1 m v u"],
+        along: Float[Tensor, "b m 2 D r s"],
+    ) -> Float[Tensor, "b m k D r s"]:
+        """The depth network's answer: logits of depth, logits of confidence, features."""
+        frusta, (b, m) = frames.frusta, along.shape[:2]
+        smooth = F.avg_pool2d(measured[:, 0], 3, stride=1, padding=1, count_include_pad=False)
+        sharp = measured - smooth[:, None]
+        seen = torch.cat([GAIN * residual, measured, GAIN * sharp], dim=1)
+        cells = images(seen, frames.binning)
+        missing = self.binning**2 * 3 - cells.shape[2]  # on a detector smaller than a cell
+        cells = F.pad(cells, (0, 0, 0, 0, 0, missing)).flatten(0, 1)
+        image = self.image(cells)[:, :, None].expand(-1, -1, frusta.shape[0], -1, -1)
+        occupied = frusta.occupied.to(along)
+        where = torch.cat([occupied, occupied * frusta.depths(occupied)], 1)
+        inputs = torch.cat([along, where.expand(b, -1, -1, -1, -1, -1)], 2).flatten(0, 1)
+        return self.unet(torch.cat([image, inputs], 1)).unflatten(0, (b, m))
+
+
+class OneEach(nn.Module):
+    """A network for each camera, called on the images or volumes of all cameras, camera by camera
+    within each sample.
+    """
+
+    def __init__(self, count: int, make: Callable[[], nn.Module]):
+        super().__init__()
+        self.networks = nn.ModuleList(make() for _ in range(count))
+
+    def forward(self, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
+        parts = x.unflatten(0, (-1, len(self.networks))).unbind(1)
+        pairs = zip(self.networks, parts, strict=True)
+        return torch.stack([network(part) for network, part in pairs], dim=1).flatten(0, 1)
+
+
+def for_cameras(count: int | None, make: Callable[[], nn.Module]) -> nn.Module:
+    """One network for all cameras, or one for each of so many."""
+    return make() if count is None else OneEach(count, make)
+
+
+def boxes_of(support: Bool[Tensor, "b 1 d h w"]) -> list[Box]:
+    """The box around each sample's support, with a margin and bounds that the networks divide; of
+    an empty support, the whole grid.
+    """
+    shape = support.shape[2:]
+    boxes = [Box.of(numbers) for numbers in bounds(support[:, 0]).tolist()]
+    boxes = [box.grown(MARGIN, shape).aligned(ALIGNED, shape) for box in boxes]
+    return [box if box.size else Box.whole(shape) for box in boxes]

@@ -1,0 +1,190 @@
+"""What networks begin with: a classical volume, and the scale by which they divide everything."""
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool3d
+
+from mvrecon.core.parts import METHODS
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.finer import check_factor, on_finer_grid
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.learned.geometry import Geometry
+
+
+def fingerprints(views: Float[Tensor, "b 1 m v u"]) -> list[bytes]:
+    """A name for each sample's views, the same where all bits are; a GPU is waited for once."""
+    return [hashlib.sha256(case.numpy().tobytes()).digest() for case in views.detach().cpu()]
+
+
+#: Iterations of SIRT with momentum, or a classical method: its name and options, and on how many
+#: times finer a grid.
+Start = int | Mapping[str, Any]
+#: The key of that number in the mapping.
+FINER = "finer_grid"
+#: Bytes of volumes and views that a training keeps at most.
+ROOM = 2 << 30
+
+
+class Beginning(NamedTuple):
+    """What networks begin with.
+
+    Args:
+        volume: a classical reconstruction, in the unit of (views / mm).
+        missed: the views of it on a finer grid less those of `volume`: what the grid's operator
+            misses of the views, in their unit; none without a finer grid.
+    """
+
+    volume: Float[Tensor, "b 1 d h w"]
+    missed: Float[Tensor, "b 1 m v u"] | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes of memory."""
+        return sum(part.nbytes for part in self if part is not None)
+
+    def to(self, other: Tensor) -> "Beginning":
+        """The same with the device and the dtype of another tensor."""
+        missed = None if self.missed is None else self.missed.to(other)
+        return Beginning(self.volume.to(other), missed)
+
+
+class ClassicalStart:
+    """The volume that a network begins with, by SIRT with momentum or another method, in the
+    unit of (views / mm).
+
+    It is not differentiated. In training another method's volume of a case is computed once
+    and kept, as long as there is room: views of a training case are the same in every epoch.
+
+    On a grid n times finer, with n x n rays a pixel, that method finds x_f, and the network
+    begins with its mean x over each voxel. Under a grid of few voxels the truth itself misses its
+    views by some percent, and every step towards the data pulls there. A_f x_f - A x tells most of
+    that (it takes half of it away in study 12), so networks get the views without it.
+
+    Args:
+        start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`,
+            with `finer_grid: n` on a grid n times finer.
+        counts: whether the views are counts, which a difference of views is not.
+
+    Raises:
+        LookupError: an unknown name.
+        TypeError: an option that the method does not have, or a mapping without a name.
+        ValueError: a finer grid that is no whole number above 0, or of counts.
+    """
+
+    def __init__(self, start: Start, counts: bool = False):
+        self.start, self.finer_grid = start, 1
+        if isinstance(start, Mapping):
+            self.start = {key: value for key, value in start.items() if key != FINER}
+            self.finer_grid = start.get(FINER, 1)
+            METHODS.check(self.start)
+        check_factor(f"{FINER} of a start", self.finer_grid)
+        if counts and self.finer_grid > 1:
+            raise ValueError(
+                f"Expected line integrals for a start with {FINER}: {self.finer_grid}, got counts "
+                f"(consistency with the noise poisson)"
+            )
+        self._known: dict[bytes, Beginning] = {}
+        self._room = ROOM
+
+    @torch.no_grad()
+    def __call__(
+        self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
+    ) -> Beginning:
+        """The volumes of views within each sample's support, and what their grid misses."""
+        if not isinstance(self.start, Mapping):
+            A, weights = geometry.A, geometry.weights
+            return Beginning(sirt(A, views, self.start, weights=weights, momentum=True))
+        samples = range(len(views))
+        if not training:
+            return _batch([self._made(geometry, views, sample) for sample in samples])
+        names, cases = fingerprints(views), []
+        for sample, name in zip(samples, names, strict=True):
+            case = self._known.get(name)
+            if case is None:
+                case = self._made(geometry, views, sample)
+                self._keep(name, case)
+            cases.append(case.to(views))
+        return _batch(cases)
+
+    def _keep(self, name: bytes, case: Beginning) -> None:
+        if case.nbytes <= self._room:
+            self._room -= case.nbytes
+            self._known[name] = case.to(torch.empty((), dtype=case.volume.dtype))
+
+    def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Beginning:
+        """The method's volume of a sample's views, scaled to a mean density of the rays of
+        about one before, so that a weight of its options is relative to the content.
+        """
+        assert isinstance(self.start, Mapping)
+        case, A, fine = views[sample : sample + 1], geometry.A.of_sample(sample), self.finer_grid
+        level = content_scale(case) / typical_chord(A.grid)
+        mask = None if geometry.support is None else geometry.support[sample, 0]
+        if fine == 1:
+            within = {} if mask is None else {"support": mask}
+            return Beginning(METHODS.from_config(self.start, A, case / level, **within) * level)
+        B, x = on_finer_grid(A, case / level, fine, self.start, mask)
+        mean = avg_pool3d(x * level, fine)
+        return Beginning(mean, B(x * level) - A(mean))
+
+
+def _batch(cases: list[Beginning]) -> Beginning:
+    """One case after the other, of a batch."""
+    volumes, missed = zip(*cases, strict=True)
+    return Beginning(torch.cat(volumes), None if missed[0] is None else torch.cat(missed))
+
+
+def normalised(
+    geometry: Geometry,
+    views: Float[Tensor, "b 1 m v u"],
+    start: ClassicalStart,
+    training: bool = False,
+) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
+    """Views and their classical start, both divided by the content's scale, and that scale.
+
+    The views are without what the grid misses of them, where a finer one told it. The scale of
+    views of nothing is zero.
+    """
+    x, missed = start(geometry, views, training)
+    scale = content_scale(x)
+    y = views if missed is None else views - missed
+    return y / scale, x / scale, scale * nonzero(views)
+
+
+def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:
+    """The value of what is there, sum x^2 / sum |x|: v for any object of one value v, however
+    small.
+
+    Dividing by it makes a network's answer scale with its input: f(a y) = a f(y). One for an empty
+    volume. Relative to the largest value, whose square may be no number of the dtype.
+    """
+    peak = volume.abs().amax(dim=(1, 2, 3, 4), keepdim=True)
+    peak = torch.where(peak > 0, peak, 1.0)
+    part = (volume / peak).abs()
+    scale = part.square().sum(dim=(1, 2, 3, 4), keepdim=True) / part.sum(
+        dim=(1, 2, 3, 4), keepdim=True
+    ).clamp_min(1)
+    return torch.where(scale > 0, scale * peak, 1.0)
+
+
+def typical_chord(grid: Grid) -> float:
+    """The length in mm by which a network's views are divided, so that it sees densities and no
+    unit of length.
+
+    Of the whole grid, since a crop's would change with the crop.
+    """
+    return max(grid.shape) * min(grid.spacing)
+
+
+def nonzero(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:
+    """One for views with any non-zero value, zero for others, so that f(0) = 0; NaN where a value
+    is not finite, which is not checked on a GPU.
+    """
+    values = views.flatten(1)
+    shown = values.any(dim=1).to(views.dtype)
+    finite = values.isfinite().all(dim=1)
+    return torch.where(finite, shown, torch.nan).reshape(-1, 1, 1, 1, 1)

@@ -1,0 +1,71 @@
+"""What a method returns."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d
+
+from mvrecon.core.division import divided
+from mvrecon.methods.calibration.alignment import Alignment
+
+
+@dataclass
+class Reconstruction:
+    """A reconstructed volume, and what else its method reports.
+
+    Per-view quantities have the resolution of the method's frusta, in cells of voxels or pixels.
+
+    Args:
+        volume: in the unit of (views / mm).
+        per_view: each camera's own estimate of the volume.
+        visible: voxels inside each camera's frustum.
+        weights: of each camera at each voxel; they sum to one over the cameras that see it.
+        predictions: what the estimates of all other cameras predict of each camera's view, in the
+            unit of the views.
+        sigma: standard deviation of the error of each voxel, in the unit of the volume.
+        support: voxels that may differ from zero; None: all.
+        start: the classical reconstruction that a network began with.
+        entry: the volume that enters expectation maximisation, which hides its scale and its
+            negative values.
+        alignment: shift and gain of each camera, of views that were aligned before.
+    """
+
+    volume: Float[Tensor, "b 1 d h w"]
+    per_view: Float[Tensor, "b m 1 d h w"] | None = None
+    visible: Bool[Tensor, "m 1 d h w"] | None = None
+    weights: Float[Tensor, "b m 1 d h w"] | None = None
+    predictions: Float[Tensor, "b 1 m v u"] | None = None
+    sigma: Float[Tensor, "b 1 d h w"] | None = None
+    support: Bool[Tensor, "b 1 d h w"] | None = None
+    start: Float[Tensor, "b 1 d h w"] | None = None
+    entry: Float[Tensor, "b 1 d h w"] | None = None
+    alignment: Alignment | None = None
+
+    def split(self) -> list[Self]:
+        """The reconstruction of each case of the batch."""
+        count = len(self.volume)
+
+        def case(value: Any, i: int) -> Any:
+            if isinstance(value, Alignment):
+                return value.split()[i]
+            return value[i : i + 1] if isinstance(value, Tensor) and len(value) == count else value
+
+        own = [field.name for field in fields(self) if field.name != "visible"]  # of all cases
+        return [
+            replace(self, **{name: case(getattr(self, name), i) for name in own})
+            for i in range(count)
+        ]
+
+    @property
+    def camera_weights(self) -> Float[Tensor, "b m"] | None:
+        """The density-weighted mean of each camera's weights over the volume; they sum to one. None
+        without weights.
+        """
+        if self.weights is None:
+            return None
+        d, h, w = self.weights.shape[-3:]
+        density = adaptive_avg_pool3d(self.volume.clamp_min(0), (d, h, w))
+        sums = (self.weights * density[:, None]).flatten(2).sum(dim=2)
+        return divided(sums, sums.sum(dim=1, keepdim=True))

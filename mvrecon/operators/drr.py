@@ -1,0 +1,28 @@
+"""Central projection: X-ray cone beams, pinholes, and rays given one by one."""
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.operators.ray_transform import RayTransform
+
+
+class Drr(RayTransform):
+    """Digitally reconstructed radiographs: integrals along the rays through each camera's point;
+    see `RayTransform`.
+
+    Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth volumes, "siddon"
+    one.
+
+    Args:
+        cameras: a rig of central cameras, or explicit rays.
+        grid, method, backend, rays_per_pixel, skip, support: as in `RayTransform`.
+
+    Raises:
+        ValueError: a parallel rig, or as `RayTransform`.
+    """
+
+    @staticmethod
+    def check_rig(cameras: Cameras | ExplicitRays) -> None:
+        if cameras.parallel:
+            raise ValueError(
+                "The projector 'drr' needs central cameras, got a parallel rig; use projector=radon"
+            )

@@ -1,0 +1,425 @@
+"""Linear operators y = A x: the adjoint, products, weights, and parts of an operator.
+
+A subclass of `LinearOperator` gives the shapes, A x and A^T y. Its parts (`subset`, `cropped`,
+`with_support`) always work: by default the whole operator is computed.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, overload
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from mvrecon.geometry.box import Box, placed
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.symmetry import Mirror, same_weights
+from mvrecon.geometry.grid import Grid, subdivided
+
+
+@dataclass(frozen=True, eq=False)
+class PixelIntegral:
+    """A pixel's value is a weight times the mean integral along lines through it, in (unit of the
+    volume) * mm times the weight's unit.
+
+    Args:
+        weight: of each pixel, broadcasts to [m v u]; one: the integral itself.
+        rays: lines each way over which a pixel is the mean, spread evenly; 1: the line through its
+            centre.
+    """
+
+    weight: Tensor
+    rays: int = 1
+
+    @classmethod
+    def plain(cls, rays: int = 1) -> "PixelIntegral":
+        """The line integral itself."""
+        return cls(torch.ones((), dtype=torch.float64), rays)
+
+    def weighted(self, factors: Tensor | None) -> "PixelIntegral":
+        """The same lines with further factors of the pixels."""
+        return self if factors is None else replace(self, weight=self.weight * factors)
+
+
+def sees_integrals(A: "SaysPixelIntegral") -> bool:
+    """Whether an operator says that its pixels are line integrals themselves, without weight."""
+    pixel = A.pixel_integral()
+    return pixel is not None and bool((pixel.weight == 1).all())
+
+
+class SaysPixelIntegral:
+    """An operator that may say how its pixels are made of line integrals.
+
+    A subclass that computes something else in `forward` says nothing, unless it says it anew.
+    """
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        if "forward" in vars(cls) and "pixel_integral" not in vars(cls):
+            cls.pixel_integral = SaysPixelIntegral.pixel_integral
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """How a pixel is made of integrals along lines; None: otherwise, or not known."""
+        return None
+
+    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+        """What attenuates emission along a pixel's lines, in 1/mm on the grid; None: nothing, or
+        not known.
+        """
+        return None
+
+
+class Refinable:
+    """An operator that may be had on a finer grid, which it says by the capability "refine"."""
+
+    def refined(self, factor: int) -> Any:
+        """A on a grid `factor` times finer, a pixel the mean over `factor` times as many rays each
+        way: a projector whose views have the same shape.
+
+        Raises:
+            ValueError: an operator that is not known on another grid.
+        """
+        raise ValueError(
+            f"Expected an operator that can be had on a grid {factor} times finer, such as drr or "
+            f"radon, got {type(self).__name__}"
+        )
+
+
+Weight = Tensor | Callable[[], Tensor] | None
+
+
+class LinearOperator(SaysPixelIntegral, Refinable):
+    """A linear map y = A x from tensors [b c *domain_shape] to [b c *range_shape], and its adjoint.
+
+    SIRT, MLEM, likelihoods and models need no more. What an operator can do at less than the cost
+    of the whole it names in `capabilities`, which an algorithm asks before it relies on the saving.
+    """
+
+    domain_shape: tuple[int, ...]
+    range_shape: tuple[int, ...]
+    #: The parts that cost less than the whole: "subset", "crop", "support".
+    capabilities: frozenset[str] = frozenset()
+
+    def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
+        """y = A x."""
+        raise NotImplementedError
+
+    def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
+        """x = A^T y: the transpose of `forward`, <A x, y> = <x, A^T y>."""
+        raise NotImplementedError
+
+    def __call__(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
+        return self.forward(x)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the operator computes."""
+        return torch.device("cpu")
+
+    @property
+    def pose_gradient(self) -> bool:
+        """Whether a gradient by the cameras' pose is asked for: nothing of theirs may be kept."""
+        return False
+
+    @property
+    def T(self) -> "LinearOperator":
+        """The adjoint as an operator; its own adjoint is this operator."""
+        return Transposed(self)
+
+    @overload
+    def __matmul__(self, other: "LinearOperator") -> "LinearOperator": ...
+    @overload
+    def __matmul__(self, other: Tensor) -> Tensor: ...
+    def __matmul__(self, other: Any) -> Any:
+        """A @ B is the operator A B; A @ x is A x."""
+        return Composed(self, other) if isinstance(other, LinearOperator) else self(other)
+
+    def __rmul__(self, factor: float) -> "LinearOperator":
+        """factor * A."""
+        return Scaled(self, pixels=torch.tensor(float(factor), dtype=torch.float64))
+
+    def subset(self, selection: "LinearOperator") -> "LinearOperator":
+        """S A, the chosen entries of A x; the selection S is one of `projectors/selection.py`."""
+        return Composed(selection, self)
+
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> "Projector":
+        """A for volumes that are zero outside a box of the grid, and for some cameras."""
+        return Cropped(self, box, views)
+
+    def with_support(self, support: Bool[Tensor, "d h w"] | None) -> "LinearOperator":
+        """A diag(support): voxels outside the mask are neither read nor written."""
+        return self if support is None else Scaled(self, voxels=support)
+
+    def mirror(self) -> Mirror | None:
+        """A plane of symmetry, A(F x) = G(A x); None where none is known."""
+        return None
+
+    #: Whether each sample of a batch has an operator of its own.
+    per_sample = False
+
+    def of_sample(self, index: int) -> "LinearOperator":
+        """The operator of one sample of a batch."""
+        return self
+
+    #: Whether `for_case` gives an operator of each case's own.
+    per_case = False
+
+    def for_case(self, case: Mapping[str, Any]) -> "LinearOperator":
+        """The operator of the cases of a batch, where it depends on a case, as with an attenuation
+        map; by default the operator itself.
+
+        Args:
+            case: a batch of the data set, by name.
+        """
+        return self
+
+
+class Projector(nn.Module, LinearOperator):
+    """A linear operator between a grid's volumes [b c d h w] and a rig's views [b c m v u]."""
+
+    grid: Grid
+    cameras: Cameras
+
+
+class Derived(LinearOperator):
+    """An operator made of another one, A: on its device, and with a gradient by its cameras."""
+
+    A: Any
+
+    @property
+    def device(self) -> torch.device:
+        return self.A.device
+
+    @property
+    def pose_gradient(self) -> bool:
+        return self.A.pose_gradient
+
+
+class Transposed(Derived):
+    """The adjoint of an operator as an operator."""
+
+    def __init__(self, A: LinearOperator):
+        self.A = A
+        self.domain_shape, self.range_shape = A.range_shape, A.domain_shape
+
+    @property
+    def T(self) -> LinearOperator:
+        return self.A
+
+    def forward(self, x: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
+        return self.A.adjoint(x)
+
+    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
+        return self.A(y)
+
+
+class Composed(nn.Module, LinearOperator):
+    """The product A B of two operators, x -> A (B x).
+
+    Raises:
+        ValueError: shapes that do not agree.
+    """
+
+    def __init__(self, A: LinearOperator, B: LinearOperator):
+        super().__init__()
+        if A.domain_shape != B.range_shape:
+            shapes = f"{A.domain_shape} and {B.range_shape}"
+            raise ValueError(f"A B needs A's domain to be B's range, got {shapes}")
+        self.A, self.B = A, B
+        self.domain_shape, self.range_shape = B.domain_shape, A.range_shape
+
+    @property
+    def device(self) -> torch.device:
+        return self.B.device
+
+    @property
+    def pose_gradient(self) -> bool:
+        return self.A.pose_gradient or self.B.pose_gradient
+
+    def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
+        return self.A(self.B(x))
+
+    def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
+        return self.B.adjoint(self.A.adjoint(y))
+
+
+class Wrapped(Derived, Projector):
+    """A projector made of another operator: with its shapes, device, grid and cameras."""
+
+    def __init__(self, A: LinearOperator):
+        super().__init__()
+        self.A = A
+        self.domain_shape, self.range_shape = A.domain_shape, A.range_shape
+
+    @property
+    def grid(self) -> Grid:
+        return self.A.grid
+
+    @property
+    def cameras(self) -> Cameras:
+        return self.A.cameras
+
+
+class Scaled(Wrapped):
+    """An operator with a weight for each pixel and voxel, y = p * A (v * x).
+
+    Subsets, crops and supports are those of A, with the weights that belong to them.
+
+    Args:
+        A: the operator.
+        pixels: factors p that broadcast to [*range_shape], or a function that gives them, called at
+            every use where the cameras want a gradient. None: one.
+        voxels: factors v or a mask [*domain_shape]; a mask leaves out what is not finite, too.
+            None: one.
+    """
+
+    voxels: Tensor | None
+    fixed_factors: Tensor | None
+
+    def __init__(self, A: LinearOperator, pixels: Weight = None, voxels: Tensor | None = None):
+        super().__init__(A)
+        self.capabilities = A.capabilities
+        self.factors = pixels if callable(pixels) else None
+        fixed = pixels() if callable(pixels) else pixels
+        self.register_buffer("fixed_factors", fixed, persistent=False)
+        self.register_buffer("voxels", voxels, persistent=False)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Scaled":
+        exact = self.fixed_factors, self.voxels
+        super()._apply(fn, recurse)  # moves them; their digits stay
+        self.fixed_factors, self.voxels = (None if w is None else w.to(self.device) for w in exact)
+        return self
+
+    @property
+    def pixels(self) -> Tensor | None:
+        """The pixels' factors."""
+        return self.factors() if self.factors and self.pose_gradient else self.fixed_factors
+
+    def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
+        y, factors = self.A(self._weighted(x)), self.pixels
+        return y if factors is None else y * factors.to(y)
+
+    def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
+        if (factors := self.pixels) is not None:
+            # in the wider of the two precisions: a half would round small factors to zero
+            y = y * factors.to(y.device, torch.promote_types(y.dtype, torch.float32))
+        return self._weighted(self.A.adjoint(y))
+
+    def _weighted(self, x: Tensor) -> Tensor:
+        if self.voxels is None:
+            return x
+        mask = self.voxels.dtype == torch.bool
+        return torch.where(self.voxels, x, 0) if mask else x * self.voxels.to(x)
+
+    def subset(self, selection: LinearOperator) -> LinearOperator:
+        def chosen(factors: Tensor) -> Tensor:
+            return selection(factors.expand(self.range_shape)[None, None])[0, 0]
+
+        return Scaled(self.A.subset(selection), self._changed(chosen), self.voxels)
+
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
+        keep = list(range(self.range_shape[0]) if views is None else views)
+        pixels = self._changed(lambda factors: factors.expand(self.range_shape)[keep])
+        voxels = None if self.voxels is None else self.voxels[box.slices]
+        return Scaled(self.A.cropped(box, views), pixels, voxels)
+
+    def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
+        return Scaled(self.A.with_support(support), self.factors or self.fixed_factors, self.voxels)
+
+    def refined(self, factor: int) -> Projector:
+        voxels = None if self.voxels is None else subdivided(self.voxels, factor)
+        return Scaled(self.A.refined(factor), self.factors or self.fixed_factors, voxels)
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """A's own, times the pixels' factors."""
+        own = self.A.pixel_integral()
+        return own.weighted(self.pixels) if own and self.voxels is None else None
+
+    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+        """A's own."""
+        return self.A.attenuation()
+
+    def mirror(self) -> Mirror | None:
+        """A's own, where it mirrors the weights into themselves, too."""
+        mirror, p, v = self.A.mirror(), self.pixels, self.voxels
+        if mirror is None:
+            return None
+        kept = p is None or same_weights(mirror.views(p.expand(self.range_shape)), p)
+        return mirror if kept and (v is None or same_weights(mirror.volume(v), v)) else None
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> Weight:
+        """The pixels' factors after a change, as a function where they were one."""
+        if (factors := self.factors) is not None:
+            return lambda: change(factors())
+        return None if self.fixed_factors is None else change(self.fixed_factors)
+
+
+class Cropped(Wrapped):
+    """A for volumes that are zero outside a box, and for some cameras, by the whole operator.
+
+    Args:
+        A: of the whole grid.
+        box: the voxels of the crop.
+        views: indices of the cameras; None: all.
+    """
+
+    def __init__(self, A: LinearOperator, box: Box, views: Sequence[int] | None = None):
+        super().__init__(A)
+        count, *pixels = A.range_shape
+        self.box, self.views = box, [int(v) for v in (range(count) if views is None else views)]
+        self.domain_shape, self.range_shape = box.shape, (len(self.views), *pixels)
+
+    @property
+    def grid(self) -> Grid:
+        return self.A.grid.cropped(self.box)
+
+    @property
+    def cameras(self) -> Cameras:
+        return self.A.cameras[torch.tensor(self.views)]
+
+    def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
+        return self.A(placed(x, self.box, self.A.domain_shape))[:, :, self.views]
+
+    def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
+        index = torch.tensor(self.views, device=y.device)
+        whole = y.new_zeros(*y.shape[:2], *self.A.range_shape).index_copy(2, index, y)
+        return self.A.adjoint(whole)[..., *self.box.slices]
+
+
+class PerSample(Wrapped):
+    """A batch of operators of the same shapes, one for each sample.
+
+    A single volume or view is taken by all of them.
+
+    Args:
+        operators: of the samples.
+    """
+
+    per_sample = True
+
+    def __init__(self, operators: Sequence[Any]):
+        super().__init__(operators[0])
+        self.operators = nn.ModuleList(operators)
+
+    def of_sample(self, index: int) -> Any:
+        return self.operators[index]
+
+    def forward(self, x: Float[Tensor, "#b c *n"]) -> Float[Tensor, "b c *m"]:
+        return self._each(x, lambda A, one: A(one))
+
+    def adjoint(self, y: Float[Tensor, "#b c *m"]) -> Float[Tensor, "b c *n"]:
+        return self._each(y, lambda A, one: A.T(one))
+
+    def _each(self, values: Tensor, apply: Callable[[Any, Tensor], Tensor]) -> Tensor:
+        samples = values.expand(len(self.operators), *values.shape[1:]).split(1)
+        return torch.cat([apply(A, one) for A, one in zip(self.operators, samples, strict=True)])
+
+    def attenuation(self) -> Float[Tensor, "b d h w"] | None:
+        """The maps of the samples."""
+        maps = [A.attenuation() for A in self.operators]
+        return None if any(mu is None for mu in maps) else torch.stack(maps)
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """That of the first sample, which attenuation does not change."""
+        return self.A.pixel_integral()

@@ -1,0 +1,210 @@
+"""Footprints: the rectangles of pixels onto which bricks of voxels project, and sums of views over
+them in constant time.
+
+A brick is convex, so where all of it lies on one side of a camera's source its image lies between
+those of its corners. Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH
+1984).
+
+Convention: bounds are half-open: of voxels (z, y, x) as in `Box`, of pixels (u, v) = (column, row).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.cuda.bricks import Prints
+from mvrecon.kernels.rays.lines import beside
+
+#: Part of a pixel by which rounding to float32 may shift a ray.
+ROUNDING = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Bricks:
+    """N boxes of voxels, all cubes of one edge but where the grid ends.
+
+    Args:
+        low: first voxel of every brick along (z, y, x).
+        high: one behind the last.
+    """
+
+    low: Int[Tensor, "n 3"]
+    high: Int[Tensor, "n 3"]
+
+    @classmethod
+    def at(cls, places: Int[Tensor, "n 3"], edge: int, shape: Sequence[int]) -> "Bricks":
+        """The bricks at indices (z, y, x) of the lattice of bricks with that edge in voxels; the
+        grid's end cuts the last.
+        """
+        low = places * edge
+        return cls(low, torch.minimum(low + edge, low.new_tensor(list(shape))))
+
+    def __len__(self) -> int:
+        return len(self.low)
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """The footprint of every brick in every view: the pixels whose rays may meet the brick.
+
+    Args:
+        low: first column and row (u, v), within the detector.
+        high: one behind the last; equal to `low` where the camera does not see the brick.
+        whole: the camera sees all of the brick: its footprint, grown by a diagonal of a pixel at
+            most, ends within the detector, and it lies in the part of the rays that counts.
+    """
+
+    low: Int[Tensor, "2 m n"]
+    high: Int[Tensor, "2 m n"]
+    whole: Bool[Tensor, "m n"]
+
+
+def footprints(
+    cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5, gaps: float = 0.0
+) -> Footprints:
+    """The footprints of bricks in all views, in float64.
+
+    Args:
+        cameras: the rig.
+        grid: whose voxels the bricks hold.
+        bricks: N of them; all cameras' corners are held at once, 500 bytes a brick and camera.
+        reach: voxels by which interpolation carries a value beyond the faces of its voxel: 0.5 for
+            joseph and trilinear (a voxel from its centre), 0 for siddon.
+        gaps: from 1 on, grow them by what may lie between rays, too: by half a pixel and half of so
+            many diagonals of one. The thin rays of a brick's own footprint may all miss the bit of
+            a body that is in it. With 1, where every point of the body lies in a ball of it as wide
+            as a pixel's diagonal magnified to there (`ray_gap`), a ray of the grown footprint meets
+            that ball; the further it is grown, the more it meets of thinner bodies.
+    """
+    return footprints_of(prints_of(cameras, grid, gaps), cameras.shape, grid.shape, bricks, reach)
+
+
+def footprints_of(
+    prints: Prints, detector: Sequence[int], shape: Sequence[int], bricks: Bricks, reach: float
+) -> Footprints:
+    """The footprints of bricks of a grid of `shape`, on detectors of (rows, columns)."""
+    numbers, (first, last) = prints.numbers, prints.window
+    margin, more = (numbers[:, part].T[..., None] for part in (slice(12, 14), slice(15, 17)))
+    slack = numbers[:, 14:15]
+    images, w = _images(prints, shape, bricks, reach)
+    near, far = w.amin(dim=1), w.amax(dim=1)
+    across = (near <= 0) & (far >= 0) & (not prints.parallel)  # its image may be anywhere
+    unseen = (far <= first) | (near >= last)
+    low, high = images.amin(dim=2) - margin - ROUNDING, images.amax(dim=2) + margin + ROUNDING
+    size = low.new_tensor(detector[::-1]).reshape(2, 1, 1)
+    whole = (
+        ((low > -1) & (high < size)).all(dim=0)
+        & (near >= first + slack)
+        & (far <= last - slack)
+        & ~across
+    )
+    low = torch.where(across, 0, (low - more).ceil()).clamp(min=0).minimum(size)
+    high = torch.where(across, size, (high + more).floor() + 1).minimum(size)
+    return Footprints(low.long(), torch.where(unseen, low, torch.maximum(low, high)).long(), whole)
+
+
+def prints_of(cameras: Cameras, grid: Grid, gaps: float) -> Prints:
+    """What the footprints of a rig's views are told from, on the cameras' device; `gaps` as of
+    `footprints`.
+    """
+    margin, slack = _gaps(cameras)
+    if not gaps:
+        margin, slack = torch.zeros_like(margin), torch.zeros_like(slack)
+    more = max(0.0, gaps - 1) * (margin - 0.5)
+    maps = _maps(cameras, grid).flatten(1)
+    numbers = torch.cat([maps, margin[..., 0].T, slack, more[..., 0].T], dim=1)
+    return Prints(numbers, cameras.ray_extent, cameras.parallel)
+
+
+def _maps(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 3 4"]:
+    """From voxels about the grid's centre to pixels (u w, v w, w), of parallel beams (u, v, w)."""
+    # a rig has no flat camera, and whether there is an inverse is not waited for
+    inverse = torch.linalg.inv_ex(cameras.frame.detach()).inverse
+    turn = inverse @ beside(grid.affine[:3, :3], inverse)
+    shift = inverse @ (beside(grid.centre, inverse) - cameras.source.detach())[..., None]
+    return torch.cat([turn, shift], dim=-1)
+
+
+def _images(
+    prints: Prints, shape: Sequence[int], bricks: Bricks, reach: float
+) -> tuple[Float[Tensor, "2 m 8 n"], Float[Tensor, "m 8 n"]]:
+    """Pixels (u, v) of the corners of bricks grown by `reach`, not finite where w = 0; and their
+    fraction w.
+    """
+    maps = prints.numbers[:, :12].unflatten(1, (3, 4))
+    sides = [(bricks.low.to(maps), -reach), (bricks.high.to(maps), reach)]
+    faces = [
+        [index[:, 2 - axis] - shape[2 - axis] / 2 + by for axis in range(3)] for index, by in sides
+    ]
+    one = torch.ones_like(faces[0][0])
+    corners = [
+        torch.stack([faces[i][0], faces[j][1], faces[k][2], one])
+        for i, j, k in product((0, 1), repeat=3)
+    ]
+    q = (maps.transpose(0, 1).reshape(-1, 4) @ torch.cat(corners, dim=1)).reshape(
+        3, len(maps), 8, -1
+    )
+    return (q[:2] if prints.parallel else q[:2] / q[2]), q[2]
+
+
+def ray_gap(cameras: Cameras, grid: Grid) -> float:
+    """The widest diagonal of a pixel, magnified to where in the grid its rays count, in mm: a ball
+    of that diameter cannot pass between the rays of any view; 0 where no view's rays pass the
+    grid."""
+    diagonal = _diagonals(cameras)
+    if cameras.parallel:
+        return diagonal.amax().item()
+    w = cameras.depth_range(grid).detach() / cameras.distance.detach()[:, None]
+    first, last = cameras.ray_extent
+    return (diagonal * w.clamp(first, last).abs().amax(dim=-1)).amax().item()
+
+
+def _diagonals(cameras: Cameras) -> Float[Tensor, " m"]:
+    """The longer diagonal of each camera's pixels in mm."""
+    u, v = cameras.u.detach(), cameras.v.detach()
+    return torch.maximum((u + v).norm(dim=-1), (u - v).norm(dim=-1))
+
+
+def _gaps(cameras: Cameras) -> tuple[Float[Tensor, "2 m 1"], Float[Tensor, "m 1"]]:
+    """How far from the image of a point the nearest ray is through any ball that holds it and is a
+    pixel's diagonal wide: (u, v) in pixels; and that diagonal as a fraction of the way from source
+    to detector.
+
+    The ball's centre is half a diagonal away at most, and half a pixel along each axis from a ray.
+    """
+    u, v, diagonal = cameras.u.detach(), cameras.v.detach(), _diagonals(cameras)
+    area = torch.linalg.cross(u, v).norm(dim=-1)
+    pitch = torch.stack(
+        [area / v.norm(dim=-1), area / u.norm(dim=-1)]
+    )  # between columns, between rows
+    return 0.5 + (diagonal / (2 * pitch))[..., None], (diagonal / cameras.distance.detach())[
+        :, None
+    ]
+
+
+def summed_area_tables(images: Shaped[Tensor, "*n v u"]) -> Int[Tensor, "*n v1 u1"]:
+    """The summed-area tables of images of whole numbers: at every pixel corner the sum of all
+    pixels above and to the left; exact.
+    """
+    dtype = torch.int32 if images.dtype == torch.bool else torch.int64
+    sums = images.cumsum(dim=-1, dtype=dtype).cumsum(dim=-2, dtype=dtype)
+    return torch.nn.functional.pad(sums, (1, 0, 1, 0))
+
+
+def footprint_sums(table: Int[Tensor, "*b m v1 u1"], prints: Footprints) -> Int[Tensor, "*b m n"]:
+    """Sums of views over every footprint, from the views' summed-area tables."""
+    width = table.shape[-1]
+    flat = table.flatten(-2)
+    (u0, v0), (u1, v1) = prints.low, prints.high
+
+    def corner(v: Tensor, u: Tensor) -> Tensor:
+        index = v * width + u
+        return flat.gather(-1, index.expand(*flat.shape[:-1], -1))
+
+    return corner(v1, u1) - corner(v0, u1) - corner(v1, u0) + corner(v0, u0)

@@ -1,0 +1,227 @@
+"""The visual hull: the bricks of voxels that may be non-zero, computed from the background pixels
+of the views (Laurentini, IEEE PAMI 16, 1994).
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mvrecon.geometry.box import bricks_along
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.cameras.views import check_finite
+from mvrecon.geometry.grid import Grid
+from mvrecon.kernels import self_test
+from mvrecon.kernels.cuda import bricks
+from mvrecon.kernels.cuda.bricks import Prints, Rule
+from mvrecon.kernels.device_cache import device_cached, grid_key
+from mvrecon.operators.visual_hull.footprints import (
+    Bricks,
+    footprints,
+    prints_of,
+    summed_area_tables,
+)
+from mvrecon.operators.visual_hull.judging import AT_ONCE, judged, proofs
+
+#: Views at a time, of all items of a batch: a brick that some of them prove empty is skipped in
+#: the next.
+VIEWS = 8
+#: Diagonals of a pixel by which footprints are grown: 1 proves bodies absent that are nowhere
+#: thinner than that, and 2 takes in twice the length of what is half as wide, which so covers as
+#: much of the detector.
+GAPS = 2.0
+#: One view in so many must see a brick to be empty, where bodies may be thinner than rays are
+#: apart.
+SHARE = 10
+#: Bricks of so many times the edge are tried first; an empty one of them has only empty bricks in
+#: it.
+COARSER = 4
+#: Voxels by which interpolation carries a value beyond the faces of its voxel.
+REACH = 0.5
+
+
+def visual_hull(
+    views: Float[Tensor, "b 1 m v u"],
+    cameras: Cameras,
+    grid: Grid,
+    brick: int,
+    threshold: float | Float[Tensor, "b 1 m v u"] = 0.0,
+    witnesses: int = 1,
+    keep_unseen: bool = True,
+) -> Bool[Tensor, "b z y x"]:
+    """The visual hull: the bricks of a non-negative volume that may hold non-zero voxels.
+
+    A brick is empty where at least `witnesses` views that see all of it have no pixel above the
+    background threshold in its footprint. A brick seen in part only, or not at all, stays. With
+    exact views,
+    threshold 0 and one witness no occupied brick is lost, as long as the object is nowhere thinner
+    than `ray_gap`; else see `thin_witnesses`.
+
+    Args:
+        views: line integrals, one a ray, finite; what is not finite on a GPU, which is not asked,
+            is no background: it makes no brick empty.
+        cameras: the rig.
+        grid, brick: where the voxels lie, and how many make a brick's edge; the last bricks may be
+            cut.
+        threshold: pixels up to it are background; one number, or one a pixel.
+        witnesses: how many views must agree that a brick is empty.
+        keep_unseen: False also drops the bricks that no view sees whole and that have no pixel
+            above the threshold in any view. The data know nothing of them: with threshold 0, MLEM
+            and non-negative SIRT make them zero themselves.
+
+    Raises:
+        ValueError: views of another size than the rig's or not finite, a NaN threshold, an edge or
+            witnesses below one.
+    """
+    check_measured(views, cameras, on_gpu=False)
+    if brick < 1 or witnesses < 1:
+        raise ValueError(
+            f"Need a brick's edge and witnesses of at least 1, got {brick} and {witnesses}"
+        )
+    rule = Rule(brick, REACH, witnesses, keep_unseen)
+    foreground = _foreground(views, threshold)
+    if views.is_cuda and not self_test.failure(views.device, "hull", torch.float64, _self_test):
+        return at_once(foreground, cameras, grid, rule)
+    return refined(foreground, cameras.to(views.device), grid, rule)
+
+
+def at_once(
+    foreground: Bool[Tensor, "b m v u"],
+    cameras: Cameras,
+    grid: Grid,
+    rule: Rule,
+    judge: Callable[..., Tensor] = judged,
+) -> Bool[Tensor, "b z y x"]:
+    """The bricks that stay, all of them and all views at once."""
+
+    def moved() -> Prints:
+        prints = prints_of(cameras, grid, GAPS)
+        return prints._replace(numbers=prints.numbers.to(foreground.device))
+
+    prints = device_cached(cameras, ("footprints", grid_key(grid)), foreground, moved)
+    return judge(summed_area_tables(foreground), prints, rule, grid.shape)
+
+
+def refined(
+    foreground: Bool[Tensor, "b m v u"], cameras: Cameras, grid: Grid, rule: Rule
+) -> Bool[Tensor, "b z y x"]:
+    """The bricks that stay, from coarse to fine ones, some views at a time."""
+    brick, _, witnesses, keep_unseen = rule
+    kept = foreground.new_ones((len(foreground), 1, 1, 1))
+    for edge in _edges(brick, grid.shape):
+        counts = bricks_along(grid.shape, edge)
+        kept = _repeated(kept, COARSER, counts) if kept[0].numel() > 1 else kept.expand(-1, *counts)
+        places = kept.any(dim=0).nonzero()
+        empty, dark = _witnesses(foreground, cameras, grid, places, edge, witnesses)
+        kept = kept.clone()
+        kept[:, *places.T] &= (empty < witnesses) & (~dark | keep_unseen)
+    return kept
+
+
+def thin_witnesses(n_views: int) -> int:
+    """How many of a rig's views must agree that a brick is empty, so that bodies thinner than the
+    gap between rays are not lost: a tenth.
+
+    If a view misses such a body with probability q, a rig of enough views has any fixed number that
+    all miss it. That a share of the views above q all miss it is improbable, the more so the more
+    views there are.
+    """
+    return max(1, n_views // SHARE)
+
+
+def expand(
+    bricks: Bool[Tensor, "b z y x"], brick: int, shape: Sequence[int]
+) -> Bool[Tensor, "b 1 d h w"]:
+    """The mask of voxels, of a volume of `shape`, that lie in the true bricks."""
+    return _repeated(bricks, brick, shape)[:, None]
+
+
+def check_measured(
+    views: Float[Tensor, "b 1 m v u"], cameras: Cameras, on_gpu: bool = True
+) -> None:
+    """Refuse views from which no hull can be computed; `on_gpu` as of `check_finite`.
+
+    Raises:
+        ValueError: a wrong rank or size, or values that are not finite.
+    """
+    expected = (1, len(cameras), *cameras.shape)
+    if views.ndim != 5 or tuple(views.shape[1:]) != expected:
+        raise ValueError(
+            f"Expected views [b 1 m v u] with last sizes {expected}, got {tuple(views.shape)}"
+        )
+    check_finite(views, on_gpu)
+
+
+def _foreground(
+    views: Float[Tensor, "b 1 m v u"], threshold: float | Float[Tensor, "b 1 m v u"]
+) -> Bool[Tensor, "b m v u"]:
+    # a number is checked on the host, since a tensor of one would have to be copied to a GPU
+    several = isinstance(threshold, Tensor)
+    limits = threshold.to(views).expand_as(views) if several else float(threshold)
+    asked = not isinstance(limits, Tensor) or limits.is_cpu
+    bad = int(torch.as_tensor(limits).isnan().sum()) if asked else 0
+    if bad:
+        raise ValueError(f"Expected a threshold, got {bad} values that are NaN")
+    # what is not finite, which nobody waits for on a GPU, proves nothing empty
+    return (~(views <= limits) | views.isinf())[:, 0]
+
+
+def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Errors:
+    """A hull in one launch, of three views of a box of bright pixels."""
+    detector = {"pixels": [40, 44], "pixel_mm": 1.0}
+    cameras, grid = circular(3, 40.0, 70.0, detector), Grid.centred(size=(13, 12, 10), spacing=1.5)
+    bright = torch.zeros(1, 3, *cameras.shape, dtype=torch.bool, device=device)
+    bright[..., 18:23, 20:24] = True
+    rule = Rule(2, REACH, 1, True)
+    expected = refined(bright, cameras.to(torch.device(device)), grid, rule)
+    stays = at_once(bright, cameras, grid, rule, bricks.judge)
+    yield "hull", self_test.error_of(stays.float(), expected.float())
+
+
+def _edges(brick: int, shape: Sequence[int]) -> Iterator[int]:
+    """Edges of bricks from coarse to fine, as long as a coarse one is a small part of the grid."""
+    if brick * COARSER**2 <= max(shape):
+        yield from _edges(brick * COARSER, shape)
+    yield brick
+
+
+def _repeated(
+    kept: Bool[Tensor, "b z y x"], times: int, shape: Sequence[int]
+) -> Bool[Tensor, "b d h w"]:
+    for axis, count in enumerate(shape, start=1):
+        kept = kept.repeat_interleave(times, dim=axis).narrow(axis, 0, int(count))
+    return kept
+
+
+def _witnesses(
+    foreground: Bool[Tensor, "b m v u"],
+    cameras: Cameras,
+    grid: Grid,
+    places: Int[Tensor, "n 3"],
+    edge: int,
+    enough: int,
+) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
+    """The number of views that prove a brick empty, counted up to `enough`; and whether no view
+    looked at has a foreground pixel in the brick's footprint.
+    """
+    batch, device = len(foreground), foreground.device
+    empty = torch.zeros(batch, len(places), dtype=torch.int32, device=device)
+    dark = torch.ones_like(empty, dtype=torch.bool)
+    undecided = torch.arange(len(places), device=device)
+    rounds = -(-len(cameras) // max(1, VIEWS // batch))
+    for turn in range(rounds):
+        chosen = list(
+            range(turn, len(cameras), rounds)
+        )  # far apart on most rigs, so that they differ in what they see
+        table = summed_area_tables(foreground[:, chosen])
+        for some in undecided.split(max(1, AT_ONCE // (batch * len(chosen)))):
+            prints = footprints(
+                cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), REACH, GAPS
+            )
+            proved, unlit = proofs(table, prints)
+            empty[:, some] += proved
+            dark[:, some] &= unlit
+        undecided = undecided[(empty[:, undecided] < enough).any(dim=0)]
+    return empty, dark

@@ -1,0 +1,184 @@
+"""A volume and its rig as one page of HTML that needs no network: slices, maximum-intensity
+projection and volume rendering by K3D (MIT), whose program is written into the page.
+
+Convention: the page's axes are the world's x, y, z in mm, for a patient R, A and H (RAS, as in
+NIfTI).
+"""
+
+import math
+import re
+from html import escape
+from itertools import count
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool3d, max_pool3d
+
+from mvrecon.geometry.box import Box, three
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.report.viz.planes import LETTERS
+from mvrecon.report.viz.rig_mesh import COLOURS, Segments, box, segments
+
+#: The pictures on a page, and the most voxels of each: of more, blocks are joined into their mean,
+#: of the projection into their maximum.
+VOXELS = {"slices": 2**24, "mip": 2**21, "volume": 2**21}
+#: Magnitudes that are kept as 16-bit floating-point numbers, to three digits.
+HALF = (1e-2, 6e4)
+TITLE = re.compile("<title>.*?</title>")
+#: Colour behind all.
+BACKGROUND = 0x202024
+#: What the page may do: run its own program; nothing is loaded from elsewhere.
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:"
+)
+
+
+def page(
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    cameras: Cameras | None = None,
+    window: tuple[float, float] | None = None,
+    first: str = "slices",
+    title: str = "mvrecon",
+) -> str:
+    """HTML of a volume in the world, in mm, with the rig around it.
+
+    Args:
+        volume: values in any unit.
+        grid: where its voxels lie.
+        cameras: the rig; none by default.
+        window: values that are black and white; by default the 1st and the 99.9th percentile.
+        first: what is seen first, one of `VOXELS`.
+        title: of the page.
+
+    Raises:
+        ImportError: k3d is not installed.
+        ValueError: a picture that is not known, a window whose ends are not in order, a volume that
+            is not the grid's, or values that are not finite.
+    """
+    if first not in VOXELS:
+        raise ValueError(f"Expected one of {', '.join(VOXELS)} to be seen first, got {first!r}")
+    if tuple(volume.shape) != grid.shape:
+        raise ValueError(f"Expected one volume of {grid.shape} voxels, got {tuple(volume.shape)}")
+    if bad := int((~volume.isfinite()).sum()):
+        raise ValueError(f"Expected finite values, got {bad} that are not")
+    low, high = usual_window(volume) if window is None else window
+    if not low < high:
+        raise ValueError(f"Expected a window from a lower to a higher value, got {low} to {high}")
+    k3d = _k3d()
+    plot = k3d.plot(grid_visible=False, camera_auto_fit=False, background_color=BACKGROUND)
+    parts = {"grid": box(grid)} if cameras is None else segments(cameras, grid)
+    plot.camera = _camera(torch.cat(list(parts.values())).flatten(0, 1), grid)
+    _add_lines(plot, k3d, parts)
+    _add_letters(plot, k3d, grid)
+    for name, make in {"slices": k3d.volume_slice, "mip": k3d.mip, "volume": k3d.volume}.items():
+        values, coarse = reduced(volume, grid, VOXELS[name], most=name == "mip")
+        z, y, x = (n // 2 for n in values.shape)
+        at = {"slice_x": x, "slice_y": y, "slice_z": z} if name == "slices" else {}
+        plot += make(
+            _halved(values),
+            name=name,
+            visible=name == first,
+            color_map=k3d.matplotlib_color_maps.gray,
+            color_range=[low, high],
+            model_matrix=box_matrix(coarse),
+            compression_level=6,
+            **at,
+        )
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+    written = TITLE.sub(lambda _: f"<title>{escape(title)}</title>", plot.get_snapshot(6), count=1)
+    return written.replace("<head>", f"<head>\n    {policy}", 1)
+
+
+def reduced(
+    volume: Float[Tensor, "d h w"], grid: Grid, voxels: int, most: bool = False
+) -> tuple[Float[Tensor, "z y x"], Grid]:
+    """A volume of at most so many voxels on a grid to match: blocks are joined into their mean, or
+    into their maximum.
+
+    Voxels at the far ends that make no whole block are left out.
+    """
+    factor = next(k for k in count(1) if math.prod(n // min(k, n) for n in volume.shape) <= voxels)
+    if factor == 1:
+        return volume, grid
+    blocks = [min(factor, n) for n in volume.shape]
+    whole = three(n - n % block for n, block in zip(volume.shape, blocks, strict=True))
+    pooled = (max_pool3d if most else avg_pool3d)(volume[None, None].float(), blocks)[0, 0]
+    return pooled, grid.cropped(Box((0, 0, 0), whole)).coarsened(factor)
+
+
+def _halved(volume: Float[Tensor, "d h w"]) -> np.ndarray:
+    """Values as 16-bit numbers where these hold them."""
+    values = volume.detach().cpu().float().numpy()
+    return values.astype(np.float16) if HALF[0] <= np.abs(values).max() < HALF[1] else values
+
+
+def usual_window(volume: Float[Tensor, "d h w"]) -> tuple[float, float]:
+    """The 1st and the 99.9th percentile of the values, of at most a million of them; of a constant
+    volume, its value and one more.
+    """
+    values = volume.detach().cpu().float().flatten()
+    sample = values[:: max(1, values.numel() // 10**6)].numpy()
+    low, high = (float(v) for v in np.percentile(sample, (1.0, 99.9)))
+    return (low, high) if low < high else (low, low + 1.0)
+
+
+def box_matrix(grid: Grid) -> Float[np.ndarray, "4 4"]:
+    """The affine map from K3D's unit cube about the origin to the grid's box in world mm.
+
+    K3D's voxels (x, y, z) of n along an axis are centred at (index + 1/2) / n - 1/2.
+    """
+    size = torch.tensor(grid.size, dtype=torch.float64)
+    to_index = torch.eye(4, dtype=torch.float64)
+    to_index[:3, :3] = torch.diag(size)
+    to_index[:3, 3] = (size - 1) / 2
+    return (grid.affine @ to_index).numpy()
+
+
+def _camera(points: Float[Tensor, "n 3"], grid: Grid) -> list[float]:
+    """Where the page looks from (front, right, above), what at (the grid's middle), and what is
+    up.
+    """
+    reach = 2.2 * (points - grid.centre).norm(dim=1).max()
+    eye = grid.centre + reach * torch.tensor([0.45, 0.8, 0.4], dtype=torch.float64)
+    return [*eye.tolist(), *grid.centre.tolist(), 0.0, 0.0, 1.0]
+
+
+def _add_lines(plot: Any, k3d: Any, parts: dict[str, Segments]) -> None:
+    for name, lines in parts.items():
+        red, green, blue = COLOURS[name]
+        plot += k3d.lines(
+            lines.flatten(0, 1).numpy().astype(np.float32),
+            np.arange(2 * len(lines), dtype=np.uint32).reshape(-1, 2),
+            indices_type="segment",
+            shader="simple",
+            color=red << 16 | green << 8 | blue,
+            name=name,
+        )
+
+
+def _add_letters(plot: Any, k3d: Any, grid: Grid) -> None:
+    """Letters of the patient's directions beside the grid's box, along the world's axes."""
+    corners = grid.corners()
+    low, high = corners.amin(dim=0), corners.amax(dim=0)
+    reach = 0.08 * (high - low).max()
+    for axis, (first, last) in enumerate(LETTERS):
+        for letter, end, step in ((first, low, -reach), (last, high, reach)):
+            place = (low + high) / 2
+            place[axis] = end[axis] + step
+            plot += k3d.texture_text(
+                letter, position=place.tolist(), color=0xFFD200, size=reach.item(), name=letter
+            )
+
+
+def _k3d() -> Any:
+    try:
+        import k3d
+    except ImportError as error:
+        raise ImportError("A page needs K3D: pip install 'mvrecon[view]'") from error
+    return k3d

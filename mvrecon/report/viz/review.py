@@ -1,0 +1,390 @@
+"""The sheets of a review: planes, projections, slices, views, per-view estimates and weights of
+cameras, with fixed scales of values.
+
+Convention: [d h w] = (z, y, x); letters at the edges say where the patient's right (R), left (L),
+front (A), back (P), head (H) and feet (F) are.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
+from mvrecon.report.viz.planes import Edges, Image, brightest, grey, letters, middle_planes, signed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Pixels: a sheet's width, strip of the rows' names, gap between tiles, a line of text, the strip
+#: of the colour bars, and the size of letters.
+WIDTH, STRIP, GAP, LINE, BARS, TEXT = 700, 24, 4, 22, 66, 17
+#: The most tiles in a row, and a tile's greatest height by its width.
+ACROSS, TALL = 5, 1.5
+DPI, BLACK, WHITE = 100, "#101010", "white"
+
+
+class Scale(NamedTuple):
+    """Values that an image's colours stand for: grey from low to high, or, where low = -high, blue,
+    white and red.
+
+    Args:
+        low, high: ends, in the unit that the name tells.
+        name: what is shown, with its unit.
+    """
+
+    low: float
+    high: float
+    name: str
+
+    def painted(self, pixels: Float[Tensor, "r c"]) -> Image:
+        """Colours of values."""
+        if self.low == -self.high:
+            return signed(pixels, self.high)
+        return grey(pixels, (self.low, self.high))
+
+
+class Panel(NamedTuple):
+    """One image, its colours, and the letters at its edges."""
+
+    pixels: Float[Tensor, "r c"]
+    scale: Scale
+    edges: Edges | None = None
+
+
+class Column(NamedTuple):
+    """Images below one another (None: left out) under a name of one line or more."""
+
+    name: str
+    panels: Sequence[Panel | None]
+
+
+class Tile(NamedTuple):
+    """Where a panel lies on the sheet, in pixels from the upper left."""
+
+    panel: Panel
+    left: float
+    top: float
+    width: float
+    height: float
+
+
+class Text(NamedTuple):
+    """Words on the sheet: middle of their line's left end, centre, or, upright, their middle."""
+
+    words: str
+    x: float
+    y: float
+    at: str = "center"
+    upright: bool = False
+
+
+class Layout(NamedTuple):
+    """All that is on a sheet, and the sheet's height in pixels, with the colour bars at its end."""
+
+    tiles: list[Tile]
+    texts: list[Text]
+    height: int
+
+
+def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layout:
+    """The places of panels and words: columns side by side, at most `ACROSS`, then below; letters
+    stay at the first of a row.
+
+    Raises:
+        ValueError: no column, or columns that have not the rows' number of panels.
+    """
+    lengths = [len(column.panels) for column in columns]
+    if not columns or set(lengths) != {len(rows)}:
+        raise ValueError(f"A sheet of {len(rows)} rows needs columns of as many, got {lengths}")
+    lines = math.ceil(len(columns) / ACROSS)
+    across = max(2, math.ceil(len(columns) / lines))
+    wide = (WIDTH - STRIP) / across - GAP
+    shapes = [p.pixels.shape for column in columns for p in column.panels if p is not None]
+    zoom = min(wide / max(s[1] for s in shapes), TALL * wide / max(s[0] for s in shapes))
+    tiles, texts, top = [], [Text(title, GAP, LINE / 2, "left")], float(LINE)
+    for first in range(0, len(columns), across):
+        block = columns[first : first + across]
+        lefts = [STRIP + k * (wide + GAP) for k in range(len(block))]
+        names = [column.name.splitlines() for column in block]
+        for left, words in zip(lefts, names, strict=True):
+            texts += [
+                Text(line, left + wide / 2, top + (k + 0.5) * LINE) for k, line in enumerate(words)
+            ]
+        top += LINE * max(map(len, names))
+        for k, row in enumerate(rows):
+            panels = [column.panels[k] for column in block]
+            height = zoom * max((p.pixels.shape[0] for p in panels if p is not None), default=0)
+            texts.append(Text(row, STRIP / 2, top + height / 2, upright=True))
+            for left, panel in zip(lefts, panels, strict=True):
+                if panel is not None:
+                    tall, width = (zoom * n for n in panel.pixels.shape)
+                    shown = panel if left == lefts[0] else panel._replace(edges=None)
+                    tiles.append(Tile(shown, left + (wide - width) / 2, top, width, tall))
+            top += height + GAP
+    return Layout(tiles, texts, round(top) + BARS)
+
+
+def sheet(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Image:
+    """Image of the panels with their names above, letters of directions at the edges of the first
+    column, and a colour bar for every scale.
+
+    Args:
+        title: a line above all.
+        columns: one for each method or camera.
+        rows: what is below one another.
+
+    Raises:
+        ValueError: see `laid_out`.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    layout = laid_out(title, columns, rows)
+    figure = Figure((WIDTH / DPI, layout.height / DPI), dpi=DPI, facecolor=BLACK)
+    canvas, axes = FigureCanvasAgg(figure), figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(0, WIDTH), ylim=(layout.height, 0), autoscale_on=False)
+    axes.axis("off")
+    size = TEXT * 72 / DPI
+    for tile in layout.tiles:
+        right, bottom = tile.left + tile.width, tile.top + tile.height
+        axes.imshow(
+            tile.panel.scale.painted(tile.panel.pixels),
+            extent=(tile.left, right, bottom, tile.top),
+            aspect="auto",
+        )
+    for text in layout.texts:
+        axes.text(
+            *(text.x, text.y, text.words),
+            color=WHITE,
+            fontsize=size,
+            ha=text.at,
+            va="center",
+            rotation=90 if text.upright else 0,
+        )
+    for tile in layout.tiles:
+        if tile.panel.edges is not None:
+            _letters(axes, tile, tile.panel.edges, size)
+    scales = list(dict.fromkeys(tile.panel.scale for tile in layout.tiles))
+    for k, scale in enumerate(scales):
+        _bar(figure, scale, (k / len(scales), 1 / len(scales)), layout.height)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _letters(axes: "Axes", tile: Tile, edges: Edges, size: float) -> None:
+    middle = tile.left + tile.width / 2, tile.top + tile.height / 2
+    right, bottom = tile.left + tile.width - 2, tile.top + tile.height - 2
+    places = (
+        (edges.left, tile.left + 2, middle[1], "left", "center"),
+        (edges.right, right, middle[1], "right", "center"),
+        (edges.top, middle[0], tile.top + 2, "center", "top"),
+        (edges.bottom, middle[0], bottom, "center", "bottom"),
+    )
+    for letter, x, y, ha, va in places:
+        axes.text(x, y, letter, color="#f0a000", fontsize=size, ha=ha, va=va)
+
+
+def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int) -> None:
+    """A colour bar at the sheet's lower end, from a fraction of its width on."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    first, share = place
+    box = (first + 0.08 * share, 46 / height, 0.84 * share, 12 / height)
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(scale.low, scale.high), "bwr" if scale.low < 0 else "gray"),
+        cax=figure.add_axes(box),
+        orientation="horizontal",
+        ticks=[scale.low, (scale.low + scale.high) / 2, scale.high],
+        format="%.3g",
+    )
+    size = 0.9 * TEXT * 72 / DPI
+    bar.ax.tick_params(colors=WHITE, labelsize=size, length=3, pad=1)
+    least, _, most = bar.ax.get_xticklabels()  # long numbers stay between the bar's ends
+    least.set_horizontalalignment("left")
+    most.set_horizontalalignment("right")
+    bar.set_label(scale.name, color=WHITE, fontsize=size, labelpad=0)
+    bar.outline.set_edgecolor(WHITE)  # pyright: ignore[reportCallIssue]
+
+
+PLANES, ALONG = ("across z", "across y", "across x"), ("along z", "along y", "along x")
+#: The most cameras on a sheet.
+CAMERAS = 8
+Volumes = Mapping[str, Float[Tensor, "d h w"]]
+
+
+class Case(NamedTuple):
+    """What a sheet of a case is headed with, and how its values are shown.
+
+    Args:
+        name: of the case.
+        grid: of its volumes; its letters hold for coarser volumes of the same box.
+        data_range: values of volumes go from 0 to it.
+        unit: of the volumes.
+        unit_of_views: of the views.
+    """
+
+    name: str
+    grid: Grid
+    data_range: float
+    unit: str = ""
+    unit_of_views: str = ""
+
+    def value(self, share: float = 1.0, name: str = "value") -> Scale:
+        """Scale of values from 0 to a share of the range."""
+        return Scale(0.0, share * self.data_range, _named(name, self.unit))
+
+    def error(self, share: float, name: str = "error") -> Scale:
+        """Scale of signed values up to a share of the range."""
+        return Scale(-share * self.data_range, share * self.data_range, _named(name, self.unit))
+
+    def panels(self, volume: Float[Tensor, "d h w"], scale: Scale) -> list[Panel]:
+        """The three middle planes."""
+        return self._panels(middle_planes(volume, self.grid.spacing), scale)
+
+    def _panels(self, pixels: Sequence[Tensor], scale: Scale) -> list[Panel]:
+        edges = letters(self.grid)
+        return [Panel(p, scale, e) for p, e in zip(pixels, edges, strict=True)]
+
+
+def planes(
+    case: Case,
+    truth: Float[Tensor, "d h w"],
+    volumes: Volumes,
+    marked: Float[Tensor, "d h w"] | None = None,
+) -> Image:
+    """Three middle planes of the truth and of every volume, each above its error, to scale.
+
+    Values from 0 to the case's range; errors, volume - truth, to a fourth of it.
+
+    Args:
+        case: its grid and range.
+        truth: the values that were to be reconstructed.
+        volumes: by name; further lines of a name, such as figures, are shown below it.
+        marked: the truth with a support's outline, shown in its place.
+    """
+    value, error = case.value(), case.error(0.25, "error, volume - truth")
+    first = case.panels(truth if marked is None else marked, value)
+    columns = [Column("truth", _spread(first, [None] * 3))]
+    for name, volume in volumes.items():
+        columns.append(
+            Column(name, _spread(case.panels(volume, value), case.panels(volume - truth, error)))
+        )
+    return sheet(case.name, columns, _spread(PLANES, ("error",) * 3))
+
+
+def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) -> Image:
+    """One plane across z of the truth and of every volume above its error, to scale; see
+    `planes`.
+    """
+    value, error = case.value(), case.error(0.25, "error, volume - truth")
+    at = slice(z, z + 1)
+    columns = [Column("truth", [case.panels(truth[at], value)[0], None])]
+    for name, volume in volumes.items():
+        both = case.panels(volume[at], value)[0], case.panels((volume - truth)[at], error)[0]
+        columns.append(Column(name, both))
+    return sheet(f"{case.name}, slice {z + 1} of {len(truth)}", columns, ("across z", "error"))
+
+
+def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> Image:
+    """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
+    columns = [
+        Column(name, case._panels(brightest(volume, case.grid.spacing), case.value(name="maximum")))
+        for name, volume in {"truth": truth, **volumes}.items()
+    ]
+    return sheet(case.name, columns, ALONG)
+
+
+def scan(case: Case, volume: Float[Tensor, "d h w"]) -> Image:
+    """The three middle planes of a volume side by side, to scale, from 0 or its least value to its
+    greatest.
+    """
+    low, high = min(0.0, volume.min().item()), volume.max().item()
+    high = max(high, low + torch.finfo(torch.float32).tiny)
+    panels = case.panels(volume, Scale(low, high, _named("value", case.unit)))
+    columns = [Column(name, [panel]) for name, panel in zip(PLANES, panels, strict=True)]
+    return sheet(case.name, columns, ("",))
+
+
+def views(
+    measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"], name: str = "", unit=""
+) -> Image:
+    """Measured and predicted views of the cameras and their difference, with its NRMSE; of many
+    cameras, `CAMERAS` at equal steps.
+
+    Values from 0 to the greatest measured value; the difference to a tenth of it.
+    """
+    top = max(measured.amax().item(), torch.finfo(torch.float32).tiny)
+    value = Scale(0.0, top, _named("view", unit))
+    apart = Scale(-top / 10, top / 10, _named("difference", unit))
+    columns = []
+    for m in _chosen(len(measured)):
+        y, p = measured[m], predicted[m]
+        error = ((p - y).norm() / y.norm().clamp(min=torch.finfo(torch.float32).tiny)).item()
+        panels = [Panel(y, value), Panel(p, value), Panel(p - y, apart)]
+        columns.append(Column(f"camera {m}\n{error:.3f}", panels))
+    title = f"{name}: NRMSE of views{_left_out(len(columns), len(measured))}"
+    return sheet(title, columns, ("measured", "predicted", "difference"))
+
+
+def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
+    """Three middle planes of the mean of the cameras' volumes, and of how each camera's own differs
+    from it, to scale.
+
+    The mean from 0 to the range; a difference to an eighth of it, blue to red.
+    """
+    mean, apart = volumes.mean(dim=0), case.error(1 / 8, "estimate - mean")
+    columns = [Column("mean", case.panels(mean, case.value(name="mean")))]
+    for m in _chosen(len(volumes), CAMERAS - 1):
+        columns.append(Column(f"camera {m}", case.panels(volumes[m] - mean, apart)))
+    return sheet(
+        f"{case.name}: per-view estimates{_left_out(len(columns) - 1, len(volumes))}",
+        columns,
+        PLANES,
+    )
+
+
+def uncertainty(case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]) -> Image:
+    """Three middle planes of the size of a volume's error and of its expected standard deviation,
+    to scale, both from 0 to an eighth of the range.
+    """
+    scale = case.value(1 / 8, "|error| and sigma")
+    shown = {"|error|": error.abs(), "sigma": sigma}
+    columns = [Column(name, case.panels(volume, scale)) for name, volume in shown.items()]
+    return sheet(case.name, columns, PLANES)
+
+
+def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
+    """Three middle planes of every camera's weight, to scale.
+
+    Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
+    """
+    scale = Scale(0.0, 3 / len(volumes), "weight (one third: equal)")
+    columns = [Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))]
+    title = f"{case.name}: weights of cameras{_left_out(len(columns), len(volumes))}"
+    return sheet(title, columns, PLANES)
+
+
+def _chosen(count: int, most: int = CAMERAS) -> list[int]:
+    """At most so many of the cameras, at equal steps."""
+    shown = min(count, most)
+    return [k * count // shown for k in range(shown)]
+
+
+def _left_out(shown: int, count: int) -> str:
+    """What a title adds where a sheet has not all cameras."""
+    return f", {shown} of {count} cameras" if shown < count else ""
+
+
+def _spread(first: Sequence, second: Sequence) -> list:
+    return [item for pair in zip(first, second, strict=True) for item in pair]
+
+
+def _named(name: str, unit: str) -> str:
+    return f"{name} ({unit})" if unit else name

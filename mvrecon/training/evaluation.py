@@ -1,0 +1,234 @@
+"""The result table: figures of merit of every method on the same test scenes, and which of these
+scenes were used in training.
+"""
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from mvrecon.core.files.memory import peak_since, restarted_peak
+from mvrecon.core.parts import METRICS
+from mvrecon.data import digests
+from mvrecon.data.dataset import single_cases
+from mvrecon.data.module import SceneData
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
+from mvrecon.report.metrics import UNITS, case_metrics, mean_and_spread
+from mvrecon.training.checkpoints import Trained, finished, load
+from mvrecon.training.fit import build_module, trainable
+from mvrecon.training.module import Settings, build_projector
+from mvrecon.training.module import methods as methods_of
+from mvrecon.training.quality import quality_of, quality_row
+from mvrecon.training.wrong_cameras import camera_row, cameras_of
+
+Scores = dict[str, list[dict[str, Any]]]
+#: Units of what a method costs.
+COSTS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
+
+See = Callable[[dict[str, Any], dict[str, Tensor]], None]
+
+
+@torch.inference_mode()
+def evaluate(
+    methods: Mapping[str, nn.Module],
+    batches: Iterable[dict[str, Any]],
+    A: Projector,
+    data_range: float,
+    device: str = "cpu",
+    see: See | None = None,
+    assumed: Mapping[str, Projector] | None = None,
+) -> Scores:
+    """Figures of merit, milliseconds and memory of one reconstruction ("ms"; "bytes", None where it
+    is not known), what a method reports of its own error ("quality") and of the cameras
+    ("cameras", where it does), of each method on each scene. Figures of merit are nan where a
+    volume has failed: `case_metrics`.
+
+    Args:
+        methods: by label.
+        batches: test scenes, in batches of any size; the methods get them one by one.
+        A: the operator that made the views.
+        data_range: for PSNR and SSIM.
+        device: where the methods run.
+        see: called with every scene and its reconstructions by label.
+        assumed: operators of methods that reconstruct by another one than A, by label.
+    """
+    A, others = A.to(device), {k: B.to(device) for k, B in (assumed or {}).items()}
+    ready = {label: method.to(device).eval() for label, method in methods.items()}
+    scores: Scores = {label: [] for label in methods}
+    for case in chain.from_iterable(map(single_cases, batches)):
+        scene = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
+        volumes, of_case = {}, A.for_case(scene)
+        for label, method in ready.items():
+            B = others[label].for_case(scene) if label in others else of_case
+            if not scores[label]:
+                method(scene["views"], B)  # the first call compiles and fills caches
+            milliseconds, needed, out = _measured(method, scene["views"], B)
+            volume = out.volume
+            figures = case_metrics(volume[0], of_case(volume)[0], scene, data_range)
+            costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
+            scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
+            volumes[label] = volume
+        if see is not None:
+            see(scene, volumes)
+    return scores
+
+
+def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[str, Trained]:
+    """Every method of a run: from its checkpoint, or built anew if it has no weights to learn.
+
+    Raises:
+        FileNotFoundError: a method whose training has not ended.
+    """
+    trained: dict[str, Trained] = {}
+    for label, model in methods_of(settings).items():
+        path = finished(folder, label)
+        fresh = None if path.exists() else build_module(settings, model, data_range)
+        trained[label] = load(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
+    return trained
+
+
+def results(
+    settings: Settings,
+    folder: Path,
+    data: SceneData,
+    device: str = "cpu",
+    see: See | None = None,
+    elsewhere: bool = False,
+) -> dict[str, Any]:
+    """The result table of a run: its checkpoints evaluated on the test scenes of `data`.
+
+    Args:
+        settings: of the run, or of an evaluation.
+        folder: of the run.
+        data: with the test scenes.
+        device: where the models run.
+        see: called with every scene and its reconstructions by label.
+        elsewhere: on the rig and the grid of `settings`, which may be others than in training.
+
+    Raises:
+        FileNotFoundError: a method whose training has not ended.
+        ValueError: weights that do not fit the rig or the grid.
+        Refused: a method that was trained with another rig, which is no `elsewhere`, or with other
+            contents of a file.
+    """
+    trained = load_methods(settings, folder, data.data_range)
+    for label, method in trained.items():
+        known = data.digests("test", rig=not elsewhere)
+        digests.compare(known, method.digests, finished(folder, label))
+    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    methods, assumed = {}, {}
+    for label, one in trained.items():
+        methods[label] = one.module.method
+        projector = one.module.hparams["geometry"]["projector"]
+        if projector != settings["projector"]:
+            assumed[label] = build_projector(settings["grid"], settings["camera"], projector)
+    names: list[str] = []
+    truths: list[str] = []
+
+    def watch(scene: dict[str, Any], volumes: dict[str, Tensor]) -> None:
+        names.extend(scene["name"])
+        truths.extend(digests.of_volume(truth) for truth in scene["volume"])
+        if see is not None:
+            see(scene, volumes)
+
+    data.setup("test")
+    batches = data.test_dataloader()
+    scores = evaluate(methods, batches, A, data.data_range, device, watch, assumed)
+    return {
+        "name": settings["name"],
+        "seed": settings["seed"],
+        "scenes": names,
+        "seen_in_training": seen_in_training(trained.values(), names, truths),
+        "overlap": data.overlap and data.scenes["test"].length is not None,
+        "projector": settings["projector"],
+        "acquisition": asdict(data.acquisition),
+        "data_range": data.data_range,
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "brought": METRICS.names(),
+        "units": {**UNITS, **COSTS, "data_range": data.unit},
+        "methods": {label: _row(method, scores[label], names) for label, method in trained.items()},
+    }
+
+
+def validation_psnr(
+    settings: Settings, folder: Path, data: SceneData, device: str = "cpu"
+) -> float:
+    """Mean PSNR of a run's main method on the validation scenes in dB, nan without any, and minus
+    infinity where a volume has failed: what settings may be chosen by.
+    """
+    data.setup("validate")
+    label, model = next(iter(methods_of(settings).items()))
+    path = finished(folder, label)
+    module = load(path).module if path.exists() else build_module(settings, model, data.data_range)
+    batches = DataLoader(data.sets["val"])
+    methods = {label: module.method}
+    scores = evaluate(methods, batches, module.projector, data.data_range, device)
+    values = [score["psnr"] for score in scores[label]]
+    return -math.inf if any(map(math.isnan, values)) else mean_and_spread(values)["mean"]
+
+
+def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) -> dict[str, Any]:
+    failed = [n for n, score in zip(names, scores, strict=True) if math.isnan(score["nrmse"])]
+    needed = [score["bytes"] for score in scores if score["bytes"] is not None]
+    return {
+        "parameters": sum(p.numel() for p in method.module.method.parameters() if p.requires_grad),
+        "train_steps": method.steps,
+        "train_seconds": method.seconds,
+        "ms_per_volume": statistics.median([score["ms"] for score in scores]),
+        "peak_mb": max(needed) / 2**20 if needed else None,
+        "failed": failed,
+        **{
+            name: mean_and_spread([score[name] for score in scores], bool(failed))
+            for name in (*METRICS.names(), *UNITS)
+        },
+        **quality_row(scores),
+        **camera_row(scores),
+    }
+
+
+def seen_in_training(
+    methods: Iterable[Trained], names: Sequence[str], truths: Sequence[str] = ()
+) -> list[str] | None:
+    """Names of the scenes that any method was trained on; None if a checkpoint does not store its
+    training cases.
+
+    Args:
+        methods: of the run.
+        names: of the scenes.
+        truths: digests of their volumes, by which a training case is known under any name.
+    """
+    trained = [method for method in methods if method.steps]
+    if any(method.cases is None for method in trained):
+        return None
+    cases = {case for method in trained for case in method.cases or ()}
+    volumes = {volume for method in trained for volume in method.volumes}
+    known = truths or [""] * len(names)
+    pairs = zip(names, known, strict=True)
+    return [name for name, truth in pairs if name in cases or truth in volumes]
+
+
+def _measured(
+    method: nn.Module, views: Tensor, A: Projector
+) -> tuple[float, int | None, Reconstruction]:
+    """Milliseconds and bytes of one reconstruction, above those in use before, and its result."""
+    before = torch.cuda.memory_allocated() if views.is_cuda else restarted_peak()
+    if views.is_cuda:
+        torch.cuda.reset_peak_memory_stats()
+    start = time.perf_counter()
+    out = method(views, A)
+    if views.is_cuda:
+        torch.cuda.synchronize()
+    milliseconds = 1e3 * (time.perf_counter() - start)
+    if views.is_cuda:
+        return milliseconds, torch.cuda.max_memory_allocated() - (before or 0), out
+    return milliseconds, peak_since(before), out

@@ -1,0 +1,134 @@
+"""A case as files: volumes as NIfTI, views and planes as images, measured views as HDF5."""
+
+import json
+import re
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import h5py
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.data.attenuation import hounsfield
+from mvrecon.data.nifti import save_nifti
+from mvrecon.data.projections.writing import Exposure, write_projections
+from mvrecon.geometry.grid import Grid
+from mvrecon.report.viz import montage, review
+from mvrecon.report.viz.planes import Image
+
+#: Line integral of which one grey value of 16 bits is left.
+OPAQUE = 10.0
+
+
+def save_case(
+    folder: Path,
+    scene: Mapping[str, Any],
+    volumes: Mapping[str, Tensor],
+    grid: Grid,
+    data_range: float,
+) -> Path:
+    """Write one scene: `views.png`, `planes.png`, and with nibabel `truth.nii.gz` and one for each
+    method.
+
+    Returns the scene's own folder in `folder`.
+    """
+    case = folder / file_name(scene["name"][0])
+    truth = scene["volume"][0, 0]
+    shown = {label: volume[0, 0] for label, volume in volumes.items()}
+    save_png(case / "views.png", montage.gallery(scene["views"][0, 0]))
+    heading = review.Case(scene["name"][0], grid, data_range)
+    save_png(case / "planes.png", review.planes(heading, truth, shown))
+    if find_spec("nibabel"):
+        for label, volume in {"truth": truth, **shown}.items():
+            save_nifti(case / f"{label}.nii.gz", volume, grid)
+    return case
+
+
+def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str) -> Path:
+    """Write the views of one case: `view_<camera>.png` as radiographs, black at 0, and the numbers
+    as `views.h5`.
+
+    `views.h5` holds `views` [m v u], float32, with the attributes `axes` and `unit`, and the case's
+    `name`.
+
+    Args:
+        folder: of all cases.
+        name: of the case, and of its own folder in `folder`, which is returned.
+        views: line integrals, or what another projector makes.
+        unit: of the views.
+    """
+    case = folder / file_name(name)
+    for m, image in enumerate(montage.radiographs(views)):
+        save_png(case / f"view_{m:03d}.png", image)
+    with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
+        file.attrs["name"] = name
+        values = views.detach().cpu().float().numpy()
+        dataset = file.create_dataset("views", data=values, compression="gzip", shuffle=True)
+        dataset.attrs.update(axes="camera, v, u", unit=unit)
+    return case
+
+
+def save_truth(
+    folder: Path, name: str, volume: Float[Tensor, "d h w"], grid: Grid, unit: str
+) -> Path:
+    """Write the truth of one case as `truth.nii.gz`, in the rig's world in mm; returns the file.
+
+    A scene in 1/mm is written in Hounsfield units, which the scenes of files read; with their
+    option `crop: none` it comes back where it was. Other units are written as they are.
+
+    Raises:
+        ImportError: nibabel is not installed.
+    """
+    path = folder / file_name(name) / "truth.nii.gz"
+    save_nifti(path, hounsfield(volume) if unit == "1/mm" else volume, grid)
+    return path
+
+
+def save_placement(folder: Path, name: str, placement: Float[Tensor, "4 4"]) -> Path:
+    """Write where a case came from as `placement.json`: the affine map in mm from the file's world
+    to the rig's, and its last column, the shift.
+    """
+    path = folder / file_name(name) / "placement.json"
+    record = {"file_to_rig": placement.tolist(), "shift_mm": placement[:3, 3].tolist()}
+    with written_whole(path) as part:
+        part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
+    """Write the views of one case as a detector's grey values in `projections`: 16-bit TIFF with
+    dark and flat field.
+
+    Convention: RTK's; the first row is the lowest one, against the rows of `views`.
+
+    Args:
+        folder: of all cases.
+        name: of the case.
+        views: line integrals of attenuation.
+
+    Raises:
+        ValueError: integrals that 16 bits cannot hold, as of another unit than 1/mm.
+    """
+    if not (top := views.max().item()) < OPAQUE:
+        raise ValueError(
+            f"Expected line integrals of attenuation below {OPAQUE:g} for 16-bit images, got "
+            f"{top:.3g}; scene.value=0.02 is near water, in 1/mm"
+        )
+    case = folder / file_name(name)
+    return write_projections(case / "projections", views.flip(-2), Exposure(photons=None))
+
+
+def save_png(path: Path, image: Image) -> None:
+    """Write an image; a file of that name is replaced whole or not at all."""
+    from PIL import Image as Pillow
+
+    with written_whole(path) as part:
+        Pillow.fromarray(image).save(part, format="PNG")
+
+
+def file_name(name: str) -> str:
+    """The name of a case as that of a folder."""
+    return re.sub(r"[^\w.-]+", "_", name)

@@ -1,0 +1,220 @@
+"""Training losses, relative to the volumes' value range, so that the same weights serve every unit.
+
+The weights of a training run are those of `conf/train.yaml`.
+"""
+
+from dataclasses import asdict, dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, avg_pool3d
+
+from mvrecon.core.parts import LOSSES
+from mvrecon.core.registry import check_options
+from mvrecon.methods.reconstruction import Reconstruction
+
+#: Share of the truth's power added to the error of the start, with which per-view estimates are
+#: compared.
+LEAST = 1e-6
+#: The least variance that a voxel may have, relative to the square of the value range.
+VARIANCE = 1e-12
+
+
+def edge_difference(
+    a: Float[Tensor, "b 1 d h w"],
+    b: Float[Tensor, "b 1 d h w"],
+    support: Bool[Tensor, "b 1 d h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """Mean squared difference of the first differences along the three axes: edges count, offsets
+    do not.
+
+    With a support only differences between two of its voxels count.
+    """
+    error, terms = a - b, []
+    for axis in (2, 3, 4):
+        pairs = None if support is None else _neighbours(support, axis)
+        terms.append(mean_where(error.diff(dim=axis).square(), pairs))
+    return torch.stack(terms).mean()
+
+
+def mean_where(values: Float[Tensor, "*n"], where: Bool[Tensor, "*n"] | None) -> Float[Tensor, ""]:
+    """Mean of the values where the mask is true; zero if it is true nowhere."""
+    if where is None:
+        return values.mean()
+    where = where.expand_as(values)
+    return (values * where).sum() / where.sum().clamp_min(1)
+
+
+def _neighbours(support: Bool[Tensor, "b 1 d h w"], axis: int) -> Tensor:
+    count = support.shape[axis] - 1
+    return support.narrow(axis, 0, count) & support.narrow(axis, 1, count)
+
+
+def at_cells(volume: Float[Tensor, "b c d h w"], like: Tensor) -> Float[Tensor, "b c e i x"]:
+    """Means of a volume in the cells of a coarser one, in the volume's unit."""
+    edges = [-(-n // k) for n, k in zip(volume.shape[-3:], like.shape[-3:], strict=True)]
+    return volume if max(edges) == 1 else avg_pool3d(volume, edges, ceil_mode=True)
+
+
+def binned_like(
+    views: Float[Tensor, "b 1 m v u"], like: Float[Tensor, "b k m r s"]
+) -> Float[Tensor, "b 1 m r s"]:
+    """Means of views over the cells of pixels that other views have, in the views' unit."""
+    edge = -(-views.shape[-1] // like.shape[-1])
+    pooled = avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
+    return pooled.unflatten(0, views.shape[:3])
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the terms of a training loss; 0 leaves a term out.
+
+    Args:
+        volume: of the mean squared error.
+        common_field: of the mean squared error of the voxels that all cameras see, where more is
+            seen than what a rig is built for.
+        edges: of the squared error of first differences.
+        per_view: of the mean squared error of the per-view estimates, where their cameras see.
+        per_view_gain: of the squared error of each per-view estimate relative to that of the start
+            where its camera sees, the mean over the cameras, and the same of the weighted estimate;
+            both are 1 where every estimate is the start.
+        cross_view: of the squared error of each view as the other cameras' estimates predict it,
+            relative to the views.
+        entry: of the mean squared error of the volume that enters expectation maximisation. What
+            that hides, a scale and what is negative, has no other error: networks drift there until
+            all is zero. Small, since what enters need not be the best volume.
+        uncertainty: of the mean negative log-likelihood of the volume's error under the standard
+            deviations that the method expects, Gaussian (Nix & Weigend, IEEE ICNN 1994); it is no
+            term where the method expects none, and has no gradient in the volume.
+    """
+
+    volume: float = 1.0
+    common_field: float = 0.0
+    edges: float = 0.0
+    per_view: float = 0.0
+    per_view_gain: float = 0.0
+    cross_view: float = 0.0
+    entry: float = 0.0
+    uncertainty: float = 0.0
+
+
+#: Names of the terms that are mvrecon's own.
+TERMS = tuple(field.name for field in fields(Weights))
+
+
+class ReconstructionLoss(nn.Module):
+    """Weighted sum of the errors of the volume, of the per-view estimates, and of the views that
+    these predict for the other cameras.
+
+    Where a method has a support, the means of the volumes' errors are over its voxels: all
+    others are 0 by definition, and have no gradient. The figures of merit cover the whole grid.
+
+    Args:
+        data_range: value range of the volumes, in their unit.
+        weights: of `Weights`, and of the terms that plugins bring, by their names.
+
+    Raises:
+        TypeError: a term that is not known.
+    """
+
+    def __init__(self, data_range: float, **weights: float):
+        super().__init__()
+        if not data_range > 0:
+            raise ValueError(f"data_range must be positive, got {data_range}")
+        self.data_range = data_range
+        check_options("The loss", weights, [*TERMS, *LOSSES.names()])
+        brought = {name: weight for name, weight in weights.items() if name not in TERMS}
+        self.brought = {name: LOSSES.get(name) for name, weight in brought.items() if weight}
+        own = {name: weight for name, weight in weights.items() if name in TERMS}
+        self.weights = asdict(Weights(**own)) | brought
+
+    def forward(
+        self, out: Reconstruction, batch: dict[str, Tensor]
+    ) -> dict[str, Float[Tensor, ""]]:
+        """Each term unweighted, and their weighted sum as "total".
+
+        Args:
+            out: of the method.
+            batch: "volume" and "views"; where it has a weight "common_field" [1 d h w], the voxels
+                that all cameras see.
+        """
+        truth, views = batch["volume"] / self.data_range, batch["views"]
+        volume = out.volume / self.data_range
+        error = (volume - truth).square()
+        terms = {"volume": mean_where(error, out.support)}
+        if self.weights["common_field"]:
+            field = batch["common_field"].to(error.device)
+            within = field if out.support is None else out.support & field
+            terms["common_field"] = mean_where(error, within)
+        if self.weights["edges"]:
+            terms["edges"] = edge_difference(volume, truth, out.support)
+        terms |= self._of_cameras(out, truth, views)
+        if out.entry is not None and self.weights["entry"]:
+            entry = out.entry / self.data_range
+            terms["entry"] = mean_where((entry - truth).square(), out.support)
+        if out.sigma is not None and self.weights["uncertainty"]:
+            terms["uncertainty"] = self._uncertainty(out, volume, truth)
+        terms |= {name: term(out, batch, self.data_range) for name, term in self.brought.items()}
+        total = sum(self.weights[name] * value for name, value in terms.items())
+        return {**terms, "total": torch.as_tensor(total)}
+
+    def _uncertainty(self, out: Reconstruction, volume: Tensor, truth: Tensor) -> Float[Tensor, ""]:
+        assert out.sigma is not None
+        variance = (out.sigma / self.data_range).square()
+        if out.support is not None:  # outside it all is zero by definition, the error's size too
+            variance = torch.where(out.support, variance, 1.0)
+        # not torch's own loss, which asks whether a variance is negative, and waits for the answer;
+        # as there, the least variance has the gradient of the one that it stands for
+        variance = variance + (variance.clamp_min(VARIANCE) - variance).detach()
+        error = volume.detach() - truth
+        return mean_where((variance.log() + error.square() / variance) / 2, out.support)
+
+    def _of_cameras(
+        self, out: Reconstruction, truth: Tensor, views: Float[Tensor, "b 1 m v u"]
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The terms of the per-view estimates, at their resolution."""
+        terms = {}
+        if out.per_view is not None and out.visible is not None:
+            estimates, support = out.per_view / self.data_range, out.support
+            if support is not None:
+                support = at_cells(support.to(truth.dtype), estimates) > 0
+            truth = at_cells(truth, estimates)
+            error = (estimates - truth[:, None]).square()
+            if self.weights["per_view"]:
+                terms["per_view"] = self._per_view(error, out.visible, support)
+            if self.weights["per_view_gain"]:
+                terms["per_view_gain"] = self._gain(out, error, truth, support)
+        if out.predictions is not None and self.weights["cross_view"]:
+            views = binned_like(views, out.predictions)
+            power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
+            terms["cross_view"] = (out.predictions - views).square().mean() / power
+        return terms
+
+    @staticmethod
+    def _per_view(error: Tensor, visible: Tensor, support: Tensor | None) -> Float[Tensor, ""]:
+        if support is None:
+            return (error * visible).mean() / visible.float().mean()
+        return mean_where(error, visible & support[:, None])
+
+    def _gain(
+        self, out: Reconstruction, error: Tensor, truth: Tensor, support: Tensor | None
+    ) -> Float[Tensor, ""]:
+        assert out.per_view is not None and out.visible is not None
+        visible = out.visible if support is None else out.visible & support[:, None]
+        start = 0 * truth if out.start is None else at_cells(out.start / self.data_range, truth)
+        before = (start - truth).square()[:, None]
+        least = LEAST * truth.square()[:, None] + torch.finfo(truth.dtype).tiny
+
+        def relative(error: Tensor, where: Tensor) -> Float[Tensor, ""]:
+            axes = tuple(range(2, 6))
+            whole = ((before + least) * where).sum(dim=axes)
+            gain = (error * where).sum(dim=axes) / whole.clamp_min(torch.finfo(whole.dtype).tiny)
+            return gain.mean()
+
+        gain = relative(error, visible)
+        if out.weights is None:
+            return gain
+        anywhere = visible.any(dim=-5, keepdim=True)
+        fused = (out.weights * out.per_view).sum(dim=1, keepdim=True) / self.data_range
+        return gain + relative((fused - truth[:, None]).square(), anywhere)

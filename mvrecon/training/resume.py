@@ -1,0 +1,167 @@
+"""Callbacks for a training that resumes exactly after an interruption, and the error message that
+names its last checkpoint.
+"""
+
+import random
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Checkpoint, EMAWeightAveraging
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+from mvrecon.training.storage import previous
+
+
+class KeepLast(Checkpoint):
+    """Writes the checkpoint for resuming: after every validation, after every epoch if there is no
+    validation, and at SIGTERM (not with several processes, of which each gets its own SIGTERM at
+    another step: there the training stops at once).
+
+    Args:
+        path: of the checkpoint; the one before stays beside it.
+    """
+
+    of_every_run = True
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Replace Lightning's handler of SIGTERM, whose broadcast would wait for processes that are
+        in another one.
+        """
+        if trainer.world_size > 1 and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, _stop)
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Save."""
+        if not trainer.sanity_checking:
+            self._save(trainer)
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        """Save where nothing is ever validated, and before Lightning breaks off."""
+        unjudged = trainer.is_last_batch and not sum(trainer.num_val_batches)
+        if unjudged or trainer.received_sigterm:
+            self._save(trainer)
+
+    def _save(self, trainer: L.Trainer) -> None:
+        for logger in (
+            trainer.loggers
+        ):  # or what they hold back is lost, though the training does not come by again
+            logger.save()
+        trainer.save_checkpoint(self.path)
+
+
+class AveragedWeights(EMAWeightAveraging):
+    """Lightning's exponential moving average of the weights; also stores the last epoch that it
+    averaged.
+
+    A checkpoint of an epoch's last step is from before that epoch's end, which Lightning does not
+    come back to.
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the averages."""
+        return super().state_dict() | {"latest_update_epoch": self._latest_update_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        super().load_state_dict(state_dict)
+        self._latest_update_epoch = state_dict["latest_update_epoch"]
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Average the weights of an epoch whose end was interrupted."""
+        last = trainer.current_epoch - 1
+        if last > self._latest_update_epoch and self.should_update(epoch_idx=last):
+            assert self._average_model is not None
+            self._average_model.update_parameters(pl_module)
+            self._latest_update_epoch = last
+
+
+class RandomNumbers(L.Callback):
+    """Stores the states of the global random generators of Python, NumPy and torch in checkpoints,
+    for layers that use them.
+
+    Data, its order and its augmentation do not: they are pure functions of seed, epoch and index.
+    """
+
+    of_every_run = True
+
+    def __init__(self) -> None:
+        self._loaded: dict[str, Any] | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """States of the random generators."""
+        version, words, gauss = random.getstate()
+        kind, keys, place, has, cached = np.random.get_state(legacy=True)
+        return {
+            "python": [version, torch.tensor(words), gauss],
+            "numpy": [
+                kind,
+                torch.tensor(np.asarray(keys, np.int64)),
+                int(place),
+                int(has),
+                float(cached),
+            ],
+            "torch": torch.get_rng_state(),
+            "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Keep the states until the training starts, since the setup may draw random numbers."""
+        self._loaded = state_dict
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Restore the states of the interrupted run."""
+        if self._loaded is None:
+            return
+        state, self._loaded = self._loaded, None
+        version, words, gauss = state["python"]
+        random.setstate((version, tuple(words.tolist()), gauss))
+        kind, keys, *rest = state["numpy"]
+        np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
+        torch.set_rng_state(state["torch"])
+        if len(state["cuda"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state["cuda"])
+
+
+@contextmanager
+def remembered(last: Path) -> Iterator[None]:
+    """Context that adds the path of the last good checkpoint to the error of an interrupted
+    training; SIGTERM and Ctrl-C become errors too.
+
+    Raises:
+        SystemExit: SIGTERM or Ctrl-C came. Lightning's own would end the process as if all had gone
+            well, or without a word.
+    """
+    try:
+        yield
+    except SIGTERMException as stop:
+        raise SystemExit(f"Stopped by SIGTERM. {_kept(last)}") from stop
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning ends the process itself
+            raise SystemExit(f"Stopped by Ctrl-C. {_kept(last)}") from stop
+        raise
+    except Exception as error:
+        if last.exists() or previous(last).exists():
+            error.add_note(_kept(last))
+        raise
+
+
+def _stop(*_: Any) -> None:
+    raise SIGTERMException
+
+
+def _kept(last: Path) -> str:
+    run = last.parents[2]
+    checkpoint = next((path for path in (last, previous(last)) if path.exists()), None)
+    if checkpoint is None:
+        return f"There is no checkpoint yet: mvrecon-train resume={run} begins again"
+    return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} goes on from it"

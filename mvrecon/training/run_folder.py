@@ -1,0 +1,222 @@
+"""The folder of one run: its lock, settings, versions, measurement and results; every file is
+written whole or not at all.
+"""
+
+import json
+import math
+import platform
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mvrecon import __version__
+from mvrecon.core.files.atomic import claimed, written_whole
+from mvrecon.core.files.checks import Refused, blaming, shown, text_of, yaml_of
+from mvrecon.core.files.places import of_weights
+from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
+from mvrecon.data import digests
+from mvrecon.data.module import SceneData
+from mvrecon.geometry.cameras import files
+
+PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
+#: Settings whose text is a file or a folder.
+PLACES = ("path", "dark", "flat", "like", "out", "checkpoint", "init_from")
+DIGESTS, RIG = "digests.json", "rig.json"
+#: Results of a run; a folder that has one of them but no file of settings is refused.
+WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
+
+
+@contextmanager
+def taken(
+    folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
+) -> Iterator[None]:
+    """Context that locks a run folder, new or started with the same settings, and writes the
+    settings into it.
+
+    Args:
+        folder: of the run.
+        settings: plain.
+        file: of the settings.
+        products: files that a run which fails takes away with it, if they were not there before.
+
+    Raises:
+        RuntimeError: another process is at work in the folder.
+        ValueError, FileExistsError: it is another run's; see `check`.
+    """
+    with claimed(folder):
+        check(folder, settings, file)
+        with _cleared_on_failure(folder, products):
+            start(folder, dict(settings), file)
+            yield
+
+
+def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
+    """Compare settings with those that the folder's run was started with, without writing anything.
+
+    Raises:
+        ValueError: they differ; the message names each that does.
+        FileExistsError: the folder has results but no file of settings.
+    """
+    remedy = "choose another folder by hydra.run.dir=..."
+    if not (folder / file).is_file():
+        if work := [name for name in WORK if (folder / name).exists()]:
+            raise FileExistsError(
+                f"{folder} holds {', '.join(work)} of another run without its {file}; {remedy}"
+            )
+        return
+    expected = yaml_of(folder / file)
+    plain = yaml.safe_load(yaml.safe_dump(dict(settings)))
+    if changed := differences(plain, expected):
+        raise ValueError(
+            f"{folder} is the folder of a run with other settings: {'; '.join(changed)}; {remedy}"
+        )
+
+
+def differences(got: Any, expected: Any, key: str = "") -> list[str]:
+    """The settings that differ, by their full names, each with what was got and what was expected.
+
+    One that is missing is as one that is null.
+    """
+    if isinstance(got, Mapping) and isinstance(expected, Mapping):
+        names = {f"{key}.{name}".lstrip("."): name for name in (*got, *expected)}
+        return [
+            line
+            for full, name in names.items()
+            for line in differences(got.get(name), expected.get(name), full)
+        ]
+    return [] if got == expected else [f"got {key}={shown(got)}, expected {shown(expected)}"]
+
+
+def keep_measurement(folder: Path, data: SceneData) -> None:
+    """Write a run's rig, and the digests of its rig and its data files; a resumed run compares them
+    instead.
+
+    Raises:
+        Refused: the rig or a file is not what the run began with.
+    """
+    if (folder / DIGESTS).is_file():
+        compare_measurement(folder, data.digests("train", "test"))
+        return
+    files.save(data.cameras, folder / RIG)
+    write(folder / DIGESTS, json.dumps(data.digests("train", "test"), indent=1) + "\n")
+
+
+def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
+    """Compare digests with those in a run folder, if it has any.
+
+    Raises:
+        Refused: the rig or a file differs, or the file of digests is none.
+    """
+    path = folder / DIGESTS
+    if not path.is_file():
+        return
+    with blaming(path, "is not JSON"):
+        expected = json.loads(text_of(path))
+    if not isinstance(expected, dict):
+        raise Refused(f"{path}: expected digests by name, got {shown(expected)}")
+    digests.compare(got, expected, f"{path} (its rig is kept as {RIG})")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, of mvrecon and of what its numbers depend on.
+
+    Torch's is its own, which tells the build (2.13.0+cu130) that the package index leaves out
+    (2.13.0).
+    """
+    import torch
+
+    packages = {
+        "mvrecon": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+    packages["torch"] = str(torch.__version__)
+    for name in PACKAGES:
+        try:
+            packages[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            packages[name] = "not installed"
+    return packages
+
+
+def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
+    """Write down a run's settings, plain and resolved, and the versions it runs with."""
+    write(folder / file, yaml.safe_dump(settings, sort_keys=False))
+    write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """The settings that a run was started with.
+
+    Raises:
+        FileNotFoundError: the folder is no run folder.
+        Refused: the run is of version 0.1.0.
+    """
+    path = folder / SETTINGS
+    if not path.is_file():
+        raise FileNotFoundError(f"Expected a run folder with {SETTINGS} in it, got {folder}")
+    settings = yaml_of(path)
+    if isinstance(settings, dict) and ("model" in settings or "reconstructor" in settings):
+        raise Refused(f"{path}: was written by mvrecon 0.1.0; v0.1.0 reads it")
+    return settings
+
+
+def anchored(value: Any) -> Any:
+    """Settings with every file and folder in them (`PLACES`) made absolute, so that they mean the
+    same from any other folder.
+    """
+    if isinstance(value, dict):
+        return {
+            key: _absolute(key, item) if key in PLACES else anchored(item)
+            for key, item in value.items()
+        }
+    return [anchored(item) for item in value] if isinstance(value, list) else value
+
+
+def write_results(folder: Path, results: dict[str, Any]) -> None:
+    """Write `results.json` with the command and the versions; nan becomes null, and infinity the
+    text "inf" or "-inf", which `float` reads.
+    """
+    whole = {**results, "command": sys.argv, "versions": versions()}
+    write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file; one of that name is replaced whole or not at all."""
+    with written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def _cleared_on_failure(folder: Path, names: Sequence[str]) -> Iterator[None]:
+    new = [folder / name for name in names if not (folder / name).exists()]
+    try:
+        yield
+    except BaseException:
+        for path in new:
+            path.unlink(missing_ok=True)
+        raise
+
+
+def _absolute(key: str, path: Any) -> Any:
+    if isinstance(path, dict | list):
+        return anchored(path)
+    if not isinstance(path, str):
+        return path
+    trained = key in ("checkpoint", "init_from")
+    return str(of_weights(path) if trained else Path(path).expanduser().absolute())
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value
