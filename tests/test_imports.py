@@ -13,8 +13,8 @@ COMMANDS = {
     "train --help": "train",
     "eval --help": "eval",
     "simulate --help": "simulate",
-    "list": "listing",
-    "list --help": "listing",
+    "list": "list",
+    "list --help": "list",
     "train --cfg job": "train",
     "train projectr=drr": "train",
     "train camera.n_views=abc": "train",
@@ -25,7 +25,7 @@ COMMANDS = {
 def test_a_quick_answer_imports_nothing_heavy(run_python, command: str):
     argv = [f"mvrecon-{command.split()[0]}", *command.split()[1:]]
     code = (
-        f"{REPORT} sys.argv = {argv!r}; from mvrecon.{COMMANDS[command]} import main; "
+        f"{REPORT} sys.argv = {argv!r}; from mvrecon.apps.{COMMANDS[command]} import main; "
         "sys.exit(main())"
     )
     done = run_python("-c", code)
@@ -36,7 +36,8 @@ def test_a_quick_answer_imports_nothing_heavy(run_python, command: str):
 
 
 def test_importing_says_nothing_and_imports_nothing_heavy(run_python):
-    names = ("registry", "parts", "config", "train", "eval", "simulate", "listing")
+    names = ("core.registry", "core.parts", "apps.config")
+    names += ("apps.train", "apps.eval", "apps.simulate", "apps.list")
     modules = ", ".join(["mvrecon", *(f"mvrecon.{name}" for name in names)])
     done = run_python("-W", "error", "-c", f"{REPORT} import {modules}")
     assert done.returncode == 0, done.stderr

@@ -156,9 +156,15 @@ class Registry:
     def _accepting(self, name: str, options: Iterable[str]) -> Callable[..., Any]:
         """One part, if it has these options."""
         part = self.get(name)
-        parameters = inspect.signature(part).parameters
-        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-            check_options(f"The {self.kind} {name!r}", options, parameters)
+        known: list[str] = []
+        for parameter in inspect.signature(part).parameters.values():
+            if parameter.kind is not parameter.VAR_KEYWORD:
+                known.append(parameter.name)
+            elif shared := getattr(parameter.annotation, "__args__", ()):  # Unpack[TypedDict]
+                known += shared[0].__annotations__
+            else:
+                return part
+        check_options(f"The {self.kind} {name!r}", options, known)
         return part
 
     def takes(self, name: str, option: str) -> bool:

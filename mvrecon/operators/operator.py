@@ -140,7 +140,7 @@ class LinearOperator(SaysPixelIntegral, Refinable):
         return Scaled(self, pixels=torch.tensor(float(factor), dtype=torch.float64))
 
     def subset(self, selection: "LinearOperator") -> "LinearOperator":
-        """S A, the chosen entries of A x; the selection S is one of `projectors/selection.py`."""
+        """S A, the chosen entries of A x; the selection S is one of `operators/selection.py`."""
         return Composed(selection, self)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> "Projector":

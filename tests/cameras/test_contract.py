@@ -19,7 +19,9 @@ BUILTIN = sorted(["from_file", *OPTIONS, *FORMATS])
 
 def test_every_built_in_camera_is_tested_here():
     builtin = [
-        name for name in CAMERAS.names() if CAMERAS.origin(name).startswith("mvrecon.cameras")
+        name
+        for name in CAMERAS.names()
+        if CAMERAS.origin(name).startswith("mvrecon.geometry.cameras")
     ]
     assert builtin == BUILTIN
 

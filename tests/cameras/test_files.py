@@ -76,8 +76,8 @@ def with_camera(record, **changes):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: [1, 2], "expected the format 'mvrecon.geometry.cameras', got 'list'"),
-        (lambda r: {"poses": []}, "expected the format 'mvrecon.geometry.cameras', got None"),
+        (lambda r: [1, 2], "expected the format 'mvrecon.cameras', got 'list'"),
+        (lambda r: {"poses": []}, "expected the format 'mvrecon.cameras', got None"),
         (lambda r: changed(r, version=2), "expected the version 1, got 2"),
         (lambda r: changed(r, unit="cm"), "expected the unit 'mm', got 'cm'"),
         (lambda r: changed(r, shape=[7]), r"\(rows, columns\)"),

@@ -195,7 +195,7 @@ def test_a_place_that_a_default_leads_to_is_looked_at(
 
 
 @pytest.mark.parametrize(
-    "name", ["survival.KeepLast", "survival.RandomNumbers", "callbacks.Clock", "callbacks.Confined"]
+    "name", ["resume.KeepLast", "resume.RandomNumbers", "callbacks.Clock", "callbacks.Confined"]
 )
 def test_what_every_run_has_is_no_target(name: str, tmp_path: Path):
     """The callbacks that every run has, such as the one that keeps its last checkpoint, cannot be
