@@ -56,7 +56,7 @@ def test_a_mistyped_name_names_the_nearest():
 
 
 def test_submodules_are_not_in_the_way():
-    from mvrecon import losses  # noqa: F401
+    from mvrecon import methods  # noqa: F401
 
 
 @pytest.mark.parametrize("ending", [".nii", ".nii.gz", ".NII.GZ", ".mha", ".nrrd"])

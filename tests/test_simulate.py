@@ -178,7 +178,7 @@ def test_the_rig_for_rtk_turns_about_the_axis_that_rtk_s_fdk_takes_its_angles_ab
         (["scene=nifti", "scene.path=nowhere.nii"], "nowhere.nii: no such file"),
         (["cases=[-1]"], "at least 0, got seed 0, index -1"),
         (["cases=3"], "cases"),
-        (["method=sirt"], "model"),
+        (["method=sirt"], "method"),
         (["scene.unti=1"], "unti"),
     ],
 )

@@ -86,8 +86,9 @@ def definition(module: str, name: str) -> tuple[str, Definition]:
         ImportError: there is no such module, or no such name in it.
     """
     with suppress(SyntaxError):  # a string whose lines begin at the margin; the module then tells
-        if node := ast.parse(_lines(module).get(name, "")).body:
-            return module, node[0]
+        body = ast.parse(_lines(module).get(name, "")).body
+        if body and isinstance(body[0], Definition):
+            return module, body[0]
     for node in _tree(module).body:  # ten times as slow as its lines alone
         if isinstance(node, Definition) and node.name == name:
             return module, node

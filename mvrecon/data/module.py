@@ -115,7 +115,7 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
                     f"{path}: expected {name} as {kind}, got {dataset.shape}, {dataset.dtype}"
                 )
             values[name] = torch.from_numpy(dataset[()])
-        held = {name: values.pop(name) for name in maps}
+        held = {str(name): values.pop(name) for name in maps}
         return Sample(**values, name=str(file.attrs["name"]), maps=held)
 
 

@@ -49,7 +49,7 @@ def build_method(config: Mapping[str, Any]) -> nn.Module:
     """
     METHODS.check(config)
     name, options = config["name"], {k: v for k, v in config.items() if k != "name"}
-    part = METHODS.get(name)
+    part: Any = METHODS.get(name)
     return part(**options) if inspect.isclass(part) else Solver(part, options)
 
 

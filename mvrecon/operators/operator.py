@@ -158,14 +158,14 @@ class LinearOperator(SaysPixelIntegral, Refinable):
     #: Whether each sample of a batch has an operator of its own.
     per_sample = False
 
-    def of_sample(self, index: int) -> "LinearOperator":
+    def of_sample(self, index: int) -> Any:
         """The operator of one sample of a batch."""
         return self
 
     #: Whether `for_case` gives an operator of each case's own.
     per_case = False
 
-    def for_case(self, case: Mapping[str, Any]) -> "LinearOperator":
+    def for_case(self, case: Mapping[str, Any]) -> Any:
         """The operator of the cases of a batch, where it depends on a case, as with an attenuation
         map; by default the operator itself.
 
@@ -417,7 +417,8 @@ class PerSample(Wrapped):
 
     def attenuation(self) -> Float[Tensor, "b d h w"] | None:
         """The maps of the samples."""
-        maps = [A.attenuation() for A in self.operators]
+        operators: Any = self.operators
+        maps = [A.attenuation() for A in operators]
         return None if any(mu is None for mu in maps) else torch.stack(maps)
 
     def pixel_integral(self) -> PixelIntegral | None:

@@ -29,7 +29,7 @@ def openkbp(root):
     ("script", "choice"),
     [
         ("prepare_openkbp.py", "experiment=open_kbp"),
-        ("prepare_openkbp.py", "experiment=open_kbp_cross_view"),
+        ("prepare_openkbp.py", "experiment=open_kbp"),
         ("fetch_chest_ct.py", "scene@test_scene=chest_ct"),
     ],
 )

@@ -305,7 +305,8 @@ class PerViewEstimates(nn.Module):
         # the change is carried to the volume: two warps of the density would blur it
         carried = frames.to_volume(torch.cat([frames.emitted(density - prior), rest], 2))
         features = carried.shape[2] - 1 - self.confidences
-        return *carried.split([1, self.confidences, features], 2), missed
+        change, confidence, rest = carried.split([1, self.confidences, features], 2)
+        return change, confidence, rest, missed
 
     def _logits(
         self,

@@ -81,7 +81,9 @@ class Spect(Scaled):
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
         attenuation, build = CaseAttenuation.of(mu), partial(type(self), **edge, **options)
-        matter, beyond = (None, None) if mu is None or attenuation else attenuation_on(grid, mu)
+        matter = beyond = None
+        if mu is not None and attenuation is None:
+            matter, beyond = attenuation_on(grid, mu)  # pyright: ignore[reportArgumentType]
         optics = Optics(hole, float(intrinsic_mm), beyond)
         if blur and blurs(grid, cameras, optics):
             A, weight = BlurredPinholes(grid, cameras, matter, optics, **options), None

@@ -118,7 +118,7 @@ class Skip:
         return groups
 
     def _modes(self, task: str) -> list[str]:
-        return [*DENSE, *self.learned["modes"]] if task == CROSS_VIEW else self.modes
+        return [*DENSE, *(self.learned or {})["modes"]] if task == CROSS_VIEW else self.modes
 
     def label(self, row: Row) -> str:
         """A row's case and mode, short."""

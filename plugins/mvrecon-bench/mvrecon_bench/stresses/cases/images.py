@@ -107,7 +107,7 @@ def source_in_the_volume(subject: CameraSubject) -> float:
     ).to(rig.source.device)
     views = torch.ones(1, 1, len(rig), *rig.shape, device=rig.source.device, requires_grad=True)
     lifted = frusta.spread(views)
-    world = frusta.to_world(lifted)
+    world = frusta.to_volume(lifted)
     back = frusta.to_frusta(world)
     (slope,) = torch.autograd.grad(back.sum(), views)
     return float(sum((~tensor.isfinite()).sum() for tensor in (lifted, world, back, slope)))

@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,7 +53,7 @@ def one_camera(subject: MethodSubject) -> float:
     return bad_numbers(*answers(out), *slopes(method, out).values())
 
 
-def slopes(method: torch.nn.Module, out: Reconstruction) -> dict[str, Tensor | None]:
+def slopes(method: Any, out: Reconstruction) -> dict[str, Tensor | None]:
     """Gradients of all trained parameters, by the sum of squares of the volume and of sigma."""
     named = {name: weight for name, weight in method.named_parameters() if weight.requires_grad}
     if not named:
