@@ -102,9 +102,9 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     assert "hp_metric" not in tags["scalars"]
     data = test.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     session = HParamsPluginData.FromString(data).session_start_info.hparams
-    names = {key: session[key].string_value for key in ("method", "method.name", "scene.name")}
+    names = {key: session[key].string_value for key in ("label", "method.name", "scene.name")}
     assert names == {
-        "method": "cross_view_small",
+        "label": "cross_view_small",
         "method.name": "cross_view",
         "scene.name": "ellipsoids",
     }

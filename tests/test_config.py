@@ -238,7 +238,7 @@ def test_the_app_answers_help_itself(
 def test_plugin_modules_are_imported_and_a_broken_one_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "good_plugin_module.py").write_text("from mvrecon import parts\nmade = 1\n")
+    (tmp_path / "good_plugin_module.py").write_text("from mvrecon.core import parts\nmade = 1\n")
     (tmp_path / "bad_plugin_module.py").write_text("import mvrecon\n1 / 0\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     import_plugins(["good_plugin_module"])

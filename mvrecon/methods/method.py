@@ -50,7 +50,9 @@ def build_method(config: Mapping[str, Any]) -> nn.Module:
     METHODS.check(config)
     name, options = config["name"], {k: v for k, v in config.items() if k != "name"}
     part: Any = METHODS.get(name)
-    return part(**options) if inspect.isclass(part) else Solver(part, options)
+    if inspect.isclass(part):
+        return part(**options)
+    return Solver(part, options)
 
 
 def reconstruct(

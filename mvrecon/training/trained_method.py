@@ -7,7 +7,6 @@ from torch import Tensor, nn
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.training.checkpoints import warn_of_geometry, warn_of_values
 
 
 class TrainedMethod(nn.Module):
@@ -34,7 +33,9 @@ class TrainedMethod(nn.Module):
 
     @torch.no_grad()
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
-        from mvrecon.training.trained import load  # Lightning's import takes seconds
+        # here, since Lightning's import takes seconds
+        from mvrecon.training.checkpoints import warn_of_geometry, warn_of_values
+        from mvrecon.training.trained import load
 
         module = load(self.checkpoint, self.label).module.to(A.device)
         warn_of_geometry(A, module, self.checkpoint)

@@ -17,6 +17,7 @@ def run(tmp_path_factory):
         f"camera.path={rig_file(place)}",
         f"hydra.run.dir={place}/run",
         "seed=3",
+        "method.n_cameras=3",
     ]
     assert call(mvrecon.apps.train, *options) == 0
     return place / "run", options

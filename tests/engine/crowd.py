@@ -112,7 +112,7 @@ def app(name: str, *options: str) -> Callable[[], str]:
     def task() -> str:
         hydra.core.utils.datetime = Noon
         sys.argv = [f"mvrecon-{name}", *options, "hydra/job_logging=none"]
-        import_module(f"mvrecon.{name}").main()
+        import_module(f"mvrecon.apps.{name}").main()
         return ""
 
     return task
@@ -126,7 +126,7 @@ def apps(folder: Path) -> list[tuple[int, str]]:
 
     warmed(*OPTIONS)
     for name in ("train", "eval", "simulate"):
-        import_module(f"mvrecon.{name}")
+        import_module(f"mvrecon.apps.{name}")
     os.chdir(folder)
     run = "checkpoint=outputs/train/2026-01-01_12-00-00"
     simulation = [*(o for o in OPTIONS if o.startswith(("grid", "camera"))), "cases=[0]"]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-import mvrecon as mv
+from mvrecon.geometry.cameras.field import common_field
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.training.losses import ReconstructionLoss
 from mvrecon.training.module import ReconstructionModule
@@ -24,7 +24,7 @@ def module():
 
 def test_the_term_is_the_mean_square_of_what_all_cameras_see(module):
     cameras, grid = module.projector.cameras, module.projector.grid
-    field = mv.cameras.field.common_field(cameras, grid)
+    field = common_field(cameras, grid)
     assert 0 < field.float().mean() < 0.5
     truth = torch.rand(2, 1, *grid.shape, generator=torch.Generator().manual_seed(0))
     batch = {"volume": truth, "views": module.projector(truth)}

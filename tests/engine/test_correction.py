@@ -118,7 +118,7 @@ def test_the_table_has_the_figures_where_the_truth_is_known(case):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """One step of a method that estimates its uncertainty."""
-    small = "method@compare.uncertain.method=cross_view_small"
+    small = "method@method.method=cross_view_small"
     return trained_for_a_step(tmp_path_factory.mktemp("run"), "uncertain", options=(small,))
 
 
