@@ -50,9 +50,8 @@ def build_method(config: Mapping[str, Any]) -> nn.Module:
     METHODS.check(config)
     name, options = config["name"], {k: v for k, v in config.items() if k != "name"}
     part: Any = METHODS.get(name)
-    if inspect.isclass(part):
-        return part(**options)
-    return Solver(part, options)
+    method: Any = part(**options) if inspect.isclass(part) else Solver(part, options)
+    return method
 
 
 def reconstruct(
