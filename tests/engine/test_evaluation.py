@@ -26,9 +26,6 @@ SHAPE = (8, 8, 8)
 class Shadow(Projector):
     """The sum along z, seen by two equal cameras."""
 
-    def for_case(self, case):
-        return self
-
     def forward(self, volume):
         return volume.sum(dim=2)[:, :, None].expand(-1, -1, 2, -1, -1)
 

@@ -12,6 +12,7 @@ from mvrecon.core.files import places
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.methods.method import build_method
+from mvrecon.operators.operator import Projector
 from mvrecon.training import fit, run_folder
 from mvrecon.training.trained_method import TrainedMethod
 from tests.cameras.rigs import OPTIONS
@@ -75,6 +76,57 @@ def test_a_step_on_one_rig_is_a_step_of_the_weights_on_all():
     after = method(B(truth), B).volume
     assert torch.equal(copy(B(truth), B).volume, after)
     assert not torch.equal(after, before)
+
+
+def module_and_data(*options):
+    settings = compose(*SETTINGS, *options)
+    data = fit.build_data(settings)
+    data.setup("fit")
+    return fit.build_module(settings, settings["method"], data.data_range), data
+
+
+def test_the_operator_of_a_batch_is_that_of_its_rig(monkeypatch):
+    """It is built once for each rig, and sees about the same as the scenes' exact views."""
+    module, data = module_and_data()
+    built, build = [], module._projector
+    monkeypatch.setattr(module, "_projector", lambda rig: built.append(rig) or build(rig))
+    operators = {}
+    for batch in data.train_dataloader():
+        A = module.operator(batch)
+        assert (A(batch["volume"]) - batch["views"]).norm() < 0.35 * batch["views"].norm()
+        operators.setdefault(int(batch["rig"][0]), set()).add(A)
+    assert len(operators) == 3 and all(len(same) == 1 for same in operators.values())
+    assert sorted(built) == sorted(rig for rig in operators if rig)
+    assert not any("projector" in name for name in module.state_dict())
+
+
+class OfCase(Projector):
+    """Twice an operator for every case that is not named "plain"."""
+
+    per_case = True
+
+    def __init__(self, A):
+        super().__init__()
+        self.A, self.grid, self.cameras = A, A.grid, A.cameras
+
+    def for_case(self, case):
+        return self.A if case["name"][0] == "plain" else 2.0 * self.A
+
+
+@torch.no_grad()
+def test_a_case_with_an_operator_of_its_own_is_reconstructed_with_it():
+    """By `for_case`, for a step and a validation alike: the same volume from twice the views."""
+    module, _ = module_and_data("data.rigs=0")
+    module.projector = OfCase(module.eval().projector)
+    truth = torch.rand(1, 1, *module.projector.grid.shape)
+    inside, losses = torch.ones_like(truth, dtype=torch.bool), []
+    for name in ("plain", "doubled"):
+        A = module.operator({"name": [name]})
+        batch = {"volume": truth, "views": A(truth), "inside": inside, "name": [name]}
+        losses.append(module.terms(batch)["volume"].item())
+        out = module.validation_step(batch, 0)["out"]
+        torch.testing.assert_close(out.volume, module(batch["views"], A).volume)
+    assert losses[0] == pytest.approx(losses[1], rel=0.2)
 
 
 def test_networks_for_each_camera_do_not_fit_another_number_of_cameras():

@@ -43,6 +43,8 @@ def test_a_mistyped_option_names_the_nearest_and_all():
         ("cross_view", "suport", "support"),
         ("mean_fusion", "consistancy", "consistency"),
         ("fdk", "cutof", "cutoff"),
+        ("sirt", "nonegative", "nonnegative"),
+        ("osem", "suport", "support"),
     ):
         with pytest.raises(TypeError, match=f"no option '{typed}'; did you mean '{meant}'"):
             stirred(name, **{typed: 1})
