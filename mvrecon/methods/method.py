@@ -34,10 +34,11 @@ class Solver(nn.Module):
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)
-        cases = [(A, views)] if not A.per_sample else [
-            (A.of_sample(i), one) for i, one in enumerate(views.split(1))
-        ]  # fmt: skip
-        return Reconstruction(torch.cat([self.solve(A, y, **self.options) for A, y in cases]))
+        if not A.per_sample:
+            return Reconstruction(self.solve(A, views, **self.options))
+        samples = enumerate(views.split(1))
+        volumes = [self.solve(A.of_sample(i), y, **self.options) for i, y in samples]
+        return Reconstruction(torch.cat(volumes))
 
 
 def build_method(config: Mapping[str, Any]) -> nn.Module:

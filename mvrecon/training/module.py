@@ -223,7 +223,7 @@ class ReconstructionModule(L.LightningModule):
         return self._rig(batch).for_case(batch)
 
     def on_train_start(self) -> None:
-        """Set the learning rate by the schedule: a training that was lengthened goes on with that
+        """Set the learning rate by the schedule: a training that was extended resumes with that
         of its new length, any other with the rate of its checkpoint, to the last bit.
         """
         schedule: Any = self.lr_schedulers()

@@ -115,8 +115,7 @@ class CrossView(nn.Module):
         )  # fmt: skip
         self.weight_net = None
         if fusion == "weighted":
-            inputs = 5 + self.estimates.confidences
-            self.weight_net = PlainUNet(3, inputs, 1, weight_widths, zero=1, precision=precision)
+            self.weight_net = PlainUNet(3, 6, 1, weight_widths, zero=1, precision=precision)
             self.weight_net.last.bias = None  # a constant for all cameras has no effect
         self.scale = scale
         self.entry = nn.Conv3d(2 + features, widths[scale], 1, bias=False)
@@ -142,24 +141,24 @@ class CrossView(nn.Module):
         others, variance, _ = leave_one_out(change, frames.visible)
         predicted = frames.project(frames.to_frames(others))  # re-projection
 
-        x = coarsened(start, self.scale)
+        coarse = coarsened(start, self.scale)
         unexplained = frames.spread(missed - predicted).detach()
         compared = [change, others, deviation(variance), frames.to_volume(unexplained)]
-        logits = self.weight_logits(torch.cat(compared, 2), x, confidence)
+        logits = self.weight_logits(torch.cat(compared, 2), coarse, confidence)
         fused, weights = fuse(torch.cat([change, features], 2), logits, frames.visible)
-        ray_weights = self.ray_weights(frames, x, weights, y)
+        ray_weights = self.ray_weights(frames, coarse, weights, y)
 
         d = g.direction(r, ray_weights)
         _, spread = pooled(change, frames.visible)
         fused = [GAIN * fused[:, :1], GAIN * deviation(spread)[:, 0], fused[:, 1:]]
-        x = start + g.within(self.learned_change(g, start, d, torch.cat(fused, 1)) + self.step * d)
-        entry = x
+        learned = self.learned_change(g, start, d, torch.cat(fused, 1))
+        entry = start + g.within(learned + self.step * d)
         if not self.consistency.poisson:
             g = replace(g, row=g.row * ray_weights)
-        x = self.consistency(g, x, y).clamp_min(0)
+        x = self.consistency(g, entry, y).clamp_min(0)
         return Reconstruction(
             x * scale,
-            per_view=(coarsened(start, self.scale)[:, None] + change) * scale[:, None],
+            per_view=(coarse[:, None] + change) * scale[:, None],
             visible=frames.visible,
             weights=weights,
             predictions=(frames.views(predicted + frames.integrals(projected))) * scale,
@@ -234,8 +233,6 @@ class PerViewEstimates(nn.Module):
         ValueError: an unknown `depth`, or no number of cameras.
     """
 
-    confidences = 1
-
     def __init__(
         self,
         widths: Sequence[int],
@@ -254,14 +251,14 @@ class PerViewEstimates(nn.Module):
             raise ValueError("Expected n_cameras for networks that are not shared, got none")
         self.cut, self.n_cameras = (scale, binning, depths), n_cameras
         self.binning, self.uniform = binning, depth == "uniform"
-        self.sizes = [1, self.confidences + features]
+        self.features = features
         self.head = HEADS.from_config({"name": head} if isinstance(head, str) else head)
 
         def image() -> nn.Module:
             return nn.Conv2d(3 * binning**2, widths[0], 1)
 
         def unet() -> nn.Module:
-            inputs, outputs = widths[0] + 4, sum(self.sizes)
+            inputs, outputs = widths[0] + 4, 2 + features
             return PlainUNet(3, inputs, outputs, widths, zero=2, precision=precision)
 
         self.image, self.unet = for_cameras(n_cameras, image), for_cameras(n_cameras, unet)
@@ -297,16 +294,15 @@ class PerViewEstimates(nn.Module):
         frusta = frames.frusta
         volumes = coarsened(torch.cat([x, GAIN * d], 1), frames.scale)
         along = frusta.to_frusta(volumes[:, None])
-        logits, rest = self._logits(frames, g.row * y, g.row * r, along).split(self.sizes, 2)
+        logits, rest = self._logits(frames, g.row * y, g.row * r, along).tensor_split([1], 2)
         prior = frames.to_frames(volumes[:, :1])
         missed = frames.integrals(r.detach())
         shape, logits = (torch.ones_like(prior), 0 * logits) if self.uniform else (prior, logits)
         density = self.head(logits, shape, frames.project(prior) + missed, frusta)
         # the change is carried to the volume: two warps of the density would blur it
         carried = frames.to_volume(torch.cat([frames.emitted(density - prior), rest], 2))
-        features = carried.shape[2] - 1 - self.confidences
-        change, confidence, rest = carried.split([1, self.confidences, features], 2)
-        return change, confidence, rest, missed
+        change, confidence, features = carried.split([1, 1, self.features], 2)
+        return change, confidence, features, missed
 
     def _logits(
         self,

@@ -2,6 +2,7 @@
 pixels.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -30,7 +31,7 @@ class ViewFrames:
 
     Args:
         frusta: over cells of voxels, with cells of pixels as rows and columns.
-        scale: voxels of a cell along each axis, as a power of two.
+        scale: halvings of the grid, 2^scale voxels of a cell along each axis.
         binning: pixels of a cell along each axis.
         transmission: share of each bin's emission that reaches the detector; None: nothing
             attenuates.
@@ -156,7 +157,7 @@ def coarsened(volume: Float[Tensor, "b c d h w"], scale: int) -> Float[Tensor, "
     return _halvings(volume, scale, halved)
 
 
-def _halvings(volume: Tensor, scale: int, halve) -> Tensor:
+def _halvings(volume: Tensor, scale: int, halve: Callable[[Tensor], Tensor]) -> Tensor:
     for _ in range(scale):
         volume = halve(volume)
     return volume
