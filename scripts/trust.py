@@ -71,7 +71,7 @@ def fuzz(given: argparse.Namespace) -> Any:
 
 def kills(given: argparse.Namespace) -> Any:
     """Trainings that were killed at random and went on."""
-    said = done(sys.executable, "-m", "tests.engine.lives", str(given.kills), str(given.seed))
+    said = done(sys.executable, "-m", "tests.training.lives", str(given.kills), str(given.seed))
     return json.loads(said.splitlines()[-1])
 
 
@@ -188,7 +188,7 @@ def figures(
         (
             "trainings killed at random, and resumed",
             str(kills["kills"]),
-            "`python -m tests.engine.lives`",
+            "`python -m tests.training.lives`",
         ),
         ("of these, with one byte lost or one bit of a weight changed", str(lost), ""),
         (

@@ -6,7 +6,7 @@ import torch
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.module import SceneData
 from mvrecon.data.rigs import camera_of
-from tests.cameras.rigs import OPTIONS
+from tests.geometry.cameras.rigs import OPTIONS
 
 CAMERA = {"name": "random", **OPTIONS["random"], "seed": 5}
 SCENE = {"name": "ellipsoids"}

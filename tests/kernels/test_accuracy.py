@@ -8,7 +8,7 @@ from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from tests.projectors.cases import METHODS, Case
+from tests.operators.cases import METHODS, Case
 
 N = 48
 #: A pixel is as wide as a voxel where the rays pass the centre.

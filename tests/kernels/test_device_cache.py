@@ -10,7 +10,7 @@ import torch
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import device_cache as module
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from tests.projectors.rigs import CONE
+from tests.operators.rigs import CONE
 
 
 @pytest.fixture

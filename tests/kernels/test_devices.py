@@ -7,7 +7,7 @@ import pytest
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.operators.visual_hull.footprints import prints_of
 from tests.kernels.cuda.waits import Waits
-from tests.projectors.rigs import CONE, GRID, PARALLEL
+from tests.operators.rigs import CONE, GRID, PARALLEL
 
 
 @pytest.mark.parametrize("rig", [CONE, PARALLEL], ids=["cone", "parallel"])

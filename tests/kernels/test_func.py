@@ -15,7 +15,7 @@ from mvrecon.geometry.lattice import lifted_maps
 from mvrecon.kernels.warps.warp import warp
 from mvrecon.operators.voxel_driven import backproject
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
-from tests.projectors.cases import DIFFERENTIABLE, METHODS, Case, gap, noise
+from tests.operators.cases import DIFFERENTIABLE, METHODS, Case, gap, noise
 
 Loss = Callable[[Tensor], Tensor]
 CASE = DIFFERENTIABLE["cone"]

@@ -17,7 +17,7 @@ from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room
 from mvrecon.kernels.rays.cpu.rig import Reads, Slabs, Units, rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon_bench.benchmarks.measure import threads, with_memory
-from tests.projectors.cases import CASES, OPTIONS, Case, noise
+from tests.operators.cases import CASES, OPTIONS, Case, noise
 
 PIXELS = {"pixels": [48, 48], "pixel_mm": 1.5}
 ROUND = Case(Grid.centred((48, 48, 48), 1.0), circular(8, 100.0, 150.0, PIXELS, start_degrees=3.0))

@@ -7,7 +7,7 @@ from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cpu.footprint import projection_matrix
 from mvrecon.kernels.rays.lines import lines_of
-from tests.projectors.rigs import CONE, GRID, PARALLEL
+from tests.operators.rigs import CONE, GRID, PARALLEL
 
 BODY = Grid.centred(size=(10, 8, 9), spacing=22.0)
 RIGS = {

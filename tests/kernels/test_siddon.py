@@ -8,8 +8,8 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from tests.projectors.cases import CASES, gap, noise
-from tests.projectors.rigs import GRID, RIGS
+from tests.operators.cases import CASES, gap, noise
+from tests.operators.rigs import GRID, RIGS
 
 
 def slow_sum(

@@ -5,7 +5,7 @@ import torch
 from torch.library import opcheck
 
 from mvrecon.kernels.rays import ops
-from tests.projectors.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, noise
+from tests.operators.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, noise
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from tests.projectors.cases import Case
+from tests.operators.cases import Case
 
 #: Of a voxel: nearer to a face than this a ray is taken to touch it.
 NEAR = 1e-6

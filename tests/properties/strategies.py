@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import EXTENTS, Cameras
 from mvrecon.geometry.grid import Grid
-from tests.projectors.cases import Case
+from tests.operators.cases import Case
 
 METHODS = ("joseph", "siddon", "trilinear")
 DTYPES = (torch.float32, torch.float64)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from tests.projectors.cases import Case
+from tests.operators.cases import Case
 from tests.properties.rays import allowed, course, faded
 from tests.properties.strategies import DTYPES, METHODS, cases, epsilon, volumes
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from tests.projectors.cases import Case
+from tests.operators.cases import Case
 from tests.properties.rays import allowed
 from tests.properties.strategies import (
     CUBE,

@@ -12,7 +12,7 @@ from mvrecon.geometry.lattice import enclosed
 from mvrecon.kernels.warps.reference import normalised_places
 from mvrecon.methods.learned.frusta import Frusta
 from mvrecon.methods.learned.view_frames import fuse, leave_one_out, pooled
-from tests.projectors.cases import Case
+from tests.operators.cases import Case
 from tests.properties.strategies import SEEDS, cases, real, volumes
 
 EPS = torch.finfo(torch.float32).eps

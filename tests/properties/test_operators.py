@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from tests.projectors.cases import Case
+from tests.operators.cases import Case
 from tests.properties.rays import allowed
 from tests.properties.strategies import DTYPES, METHODS, SEEDS, cases, epsilon, real, volumes
 

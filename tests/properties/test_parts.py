@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mvrecon.geometry.box import Box
 from mvrecon.kernels.rays.cpu import skip_policy
 from mvrecon.operators.selection import ray_subset, view_subset
-from tests.projectors.cases import CASES
+from tests.operators.cases import CASES
 from tests.properties.rays import allowed
 from tests.properties.strategies import DTYPES, METHODS, SEEDS, cases, epsilon, volumes
 

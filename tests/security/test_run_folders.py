@@ -19,7 +19,7 @@ from mvrecon.core.targets import instantiate
 from mvrecon.training import fit
 from mvrecon.training.callbacks import Confined
 from mvrecon.training.storage import DurableCheckpoints, previous, remove
-from tests.engine.lives import OPTIONS
+from tests.training.lives import OPTIONS
 
 CALLBACKS, LOGGERS, OWN = (
     "lightning.pytorch.callbacks",

@@ -10,7 +10,7 @@ from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.kernels.rays.occupancy import Occupancy
-from tests.projectors.rigs import AXIAL, CONE, GRID, INSIDE, PARALLEL, PINHOLES
+from tests.operators.rigs import AXIAL, CONE, GRID, INSIDE, PARALLEL, PINHOLES
 
 whole = Occupancy.whole
 SMALL = Grid.centred(size=(6, 4, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))

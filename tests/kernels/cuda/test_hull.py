@@ -15,7 +15,7 @@ from mvrecon.operators.visual_hull import hull, noise
 from mvrecon.operators.visual_hull.footprints import prints_of, summed_area_tables
 from mvrecon.operators.visual_hull.judging import counted, counted_at_once
 from tests.kernels.cuda.waits import Waits
-from tests.visual_hull.cases import KINDS, random_world
+from tests.operators.visual_hull.cases import KINDS, random_world
 
 
 @pytest.mark.parametrize("kind", KINDS)

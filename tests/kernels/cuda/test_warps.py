@@ -12,7 +12,7 @@ from mvrecon.methods.learned.frusta import frusta_lattice
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
 from tests.kernels.warps.scenes import OTHER, RIGS, SMALL, generic, lattices
-from tests.projectors.rigs import CONE, GRID
+from tests.operators.rigs import CONE, GRID
 
 #: More channels than a thread has, and fewer.
 PRECISIONS = [(torch.float64, 3, 1e-11), (torch.float32, 9, 3e-6)]

@@ -25,7 +25,7 @@ from tests.kernels.warps.scenes import (
     index_in_frusta,
     lattices,
 )
-from tests.projectors.rigs import CONE, GRID
+from tests.operators.rigs import CONE, GRID
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])

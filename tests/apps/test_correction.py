@@ -1,0 +1,147 @@
+"""Corrections before a reconstruction: the same for an app, a method and a table."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+import mvrecon as mv
+import mvrecon.apps.reconstruct
+from mvrecon.core.parts import PROJECTORS, SCENES
+from mvrecon.data.attenuation import WATER
+from mvrecon.data.volume_files import read_volume
+from mvrecon.geometry.cameras import files
+from mvrecon.methods.calibration.aligned import Aligned
+from mvrecon.methods.calibration.alignment import translated
+from mvrecon.methods.calibration.self_alignment import self_aligned
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.training.export import save_views
+from mvrecon.training.wrong_cameras import camera_row, cameras_of, sentences
+from tests.methods.learned.rig import small_rig
+from tests.training.runs import call, trained_for_a_step
+
+SHIFT, GAIN = torch.zeros(1, 8, 2), torch.ones(1, 8)
+SHIFT[0, 2], SHIFT[0, 5], GAIN[0, 5] = torch.tensor([0.9, -0.7]), torch.tensor([-0.6, 0.8]), 1.05
+SIRT = "method=sirt", "method.momentum=true", "method.iterations=20"
+WRONG = (SHIFT != 0).any(dim=-1) | (GAIN != 1)
+
+
+@pytest.fixture(scope="module")
+def case():
+    """Operator, truth, and views of which two cameras are wrong."""
+    grid, cameras = small_rig(n_views=8, size=24, pixels=36)
+    sample = SCENES.build("ellipsoids").sample(0, 0, grid, cameras)
+    views = translated(sample.views[None], SHIFT) * GAIN[:, None, :, None, None]
+    return PROJECTORS.build("drr", grid=grid, cameras=cameras), sample.volume[None], views
+
+
+def reconstructed(case, folder, *options: str, method=SIRT) -> tuple[float, dict]:
+    """Relative error of the volume of the app, and its results."""
+    A, truth, views = case
+    stored = save_views(folder, "scan", views[0, 0], "1/mm")
+    files.save(A.cameras, folder / "rig.json")
+    fixed = (
+        f"views.path={stored}/views.h5",
+        f"camera.path={folder}/rig.json",
+        f"grid.size={list(A.grid.size)}",
+        f"grid.spacing={list(A.grid.spacing)}",
+        f"hydra.run.dir={folder}/run",
+        "device=cpu",
+    )
+    assert call(mvrecon.apps.reconstruct, *fixed, *method, *options) == 0
+    volume, _ = read_volume(folder / "run" / "volume.nii.gz")
+    table = json.loads((folder / "run" / "results.json").read_text())
+    return ((volume - truth[0, 0]).norm() / truth.norm()).item(), table
+
+
+def test_the_app_tells_wrong_cameras_and_moves_views_or_cameras(case, tmp_path, capsys):
+    for name in ("plain", "align", "calibrate"):
+        (tmp_path / name).mkdir()
+    plain, results = reconstructed(case, tmp_path / "plain", "left_out=true")
+    assert "cameras" not in results
+    disagreement = torch.tensor(results["left_out"])
+    moved, results = reconstructed(case, tmp_path / "align", "correct=align", "left_out=true")
+    assert "camera 2: shifted by +0." in capsys.readouterr().out
+    assert (torch.tensor(results["left_out"])[[2, 5]] < disagreement[[2, 5]]).all()
+    shift = torch.tensor(results["cameras"]["shift_px"])
+    assert (shift - SHIFT).abs().max() < 0.15
+    calibrated, _ = reconstructed(
+        case, tmp_path / "calibrate", "correct=align", "self_calibrate=true"
+    )
+    rigs = [files.from_file(tmp_path / "calibrate" / at) for at in ("rig.json", "run/rig.json")]
+    offset = (rigs[1].origin - rigs[0].origin)[2].float()
+    pixels = shift[0, 2, 0] * rigs[0].u[2].float() + shift[0, 2, 1] * rigs[0].v[2].float()
+    torch.testing.assert_close(offset, pixels, rtol=1e-3, atol=1e-3)
+    assert max(moved, calibrated) < 0.85 * plain and abs(moved - calibrated) < 0.1 * plain
+
+
+def test_a_method_on_aligned_views_is_the_method_of_these_views(case):
+    A, _, views = case
+    options = {"name": "sirt", "iterations": 5}
+    method = Aligned(options).eval()
+    corrected, by = self_aligned(A, views)
+    out = method(views, A)
+    torch.testing.assert_close(out.volume, sirt(A, corrected, 5))
+    assert out.alignment is not None and torch.equal(out.alignment.gain, by.gain)
+
+
+def test_in_training_a_view_is_aligned_once(case, monkeypatch):
+    A, _, views = case
+    batch = torch.cat([views, views.flip(-1)])
+    method = Aligned({"name": "sirt", "iterations": 2}).train()
+    first = method(batch, A)
+    monkeypatch.setattr(method, "_corrected", None)  # a second computation would fail
+    again = method(batch.flip(0), A)
+    assert torch.equal(again.volume.flip(0), first.volume)
+    fresh = Aligned({"name": "sirt", "iterations": 2}).eval()
+    torch.testing.assert_close(first.volume, fresh(batch, A).volume)
+
+
+def test_the_table_has_the_figures_where_the_truth_is_known(case):
+    A, _, views = case
+    _, by = self_aligned(A, views)
+    row = camera_row([cameras_of(by, {"shift_px": SHIFT, "gain": GAIN, "wrong": WRONG})])["cameras"]
+    assert row["auc"] == 1 and row["shift_rms_px"] < 0.2 * row["true_shift_rms_px"]
+    assert camera_row([cameras_of(by, {})])["cameras"].keys() == {
+        "deviation",
+        "shift_px",
+        "gain",
+        "shift_error",
+        "gain_error",
+    }
+    assert camera_row([cameras_of(None, {})]) == {} and sentences(None) == []
+    still = replace(by, shift_px=0 * by.shift_px, gain=0 * by.gain + 1)
+    assert sentences(camera_row([cameras_of(still, {})])["cameras"]) == []
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """One step of a method that estimates its uncertainty."""
+    small = "method@method.method=cross_view_small"
+    return trained_for_a_step(tmp_path_factory.mktemp("run"), "uncertain", options=(small,))
+
+
+def test_the_app_writes_the_standard_deviation_beside_the_volume(run, tmp_path):
+    """In the volume's unit: 1000 HU are 0.0192/mm where all that may be is less than water."""
+    module = mv.load(run, "uncertain").module.eval()
+    A = module.projector
+    truth = torch.full((1, 1, *A.grid.shape), 0.01)
+    method = "method=trained", f"method.checkpoint={run}", "method.method=uncertain"
+    reconstructed((A, truth, A(truth)), tmp_path, "unit=HU", method=method)
+    saved, grid = read_volume(tmp_path / "run" / "volume.sigma.nii.gz")
+    with torch.inference_mode():
+        out = module(A(truth))
+    light = (out.volume + out.sigma < WATER)[0, 0]
+    assert light.any() and torch.allclose(grid.affine, A.grid.affine)
+    expected = out.sigma[0, 0][light] * 1000 / WATER
+    assert expected.min() > 0 and torch.allclose(saved[light], expected, rtol=1e-3, atol=0.1)
+
+
+def test_a_correction_that_does_not_fit_is_refused(case, tmp_path, capsys):
+    """A calibration without an alignment and an unknown option are refused."""
+    with pytest.raises(TypeError, match="alternations"):
+        Aligned({"name": "sirt"}, correct={"name": "align", "alternation": 2})
+    with pytest.raises(AssertionError):
+        reconstructed(case, tmp_path, "self_calibrate=true")
+    assert "correct=align" in capsys.readouterr().err

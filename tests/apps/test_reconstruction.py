@@ -1,0 +1,337 @@
+"""`mvrecon-reconstruct` as a user calls it: a scan on disk comes back as the volume it was made
+from.
+"""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image as Pillow
+
+import mvrecon.apps.reconstruct
+import mvrecon.apps.simulate
+from mvrecon.apps.scan import Scan, check_unit, open_scan
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.data.attenuation import WATER
+from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.volume_files import WRITTEN, read_volume
+from mvrecon.geometry.cameras import files
+from mvrecon.geometry.cameras.formats import rtk_xml
+from mvrecon.geometry.grid import Grid
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.operator import Scaled
+from tests.training.runs import call
+
+ROOT = Path(__file__).parents[2]
+VALUE = WATER
+SIMULATED = (
+    "scene=ellipsoids",
+    f"scene.value={VALUE}",
+    "grid.size=[24,22,20]",
+    "grid.spacing=8",
+    "camera.n_views=40",
+    "camera.arc_degrees=360",
+    "camera.sid=600",
+    "camera.sdd=900",
+    "camera.detector={pixels: [36, 40], pixel_mm: 9.0, offset_mm: [0.0, 0.0]}",
+    "rtk=true",
+)
+RIG = ("camera=rtk_xml", "camera.detector.pixel_mm=9.0", "camera.world=IEC")
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """A simulated scan: folder of projections, rig as RTK's XML, and the truth."""
+    folder = tmp_path_factory.mktemp("scan")
+    assert call(mvrecon.apps.simulate, *SIMULATED, f"hydra.run.dir={folder}/simulated") == 0
+    case = next((folder / "simulated" / "cases").iterdir())
+    shutil.copytree(case / "projections", folder / "projections")
+    shutil.copy(folder / "simulated" / "geometry.xml", folder / "geometry.xml")
+    for name in ("truth.nii.gz", "views.h5"):
+        shutil.copy(case / name, folder / name)
+    return folder
+
+
+def run(scan, folder, *options, views="projections"):
+    """Exit of the app on the scan, with the truth's grid."""
+    return call(
+        mvrecon.apps.reconstruct,
+        f"views.path={scan / views}",
+        *RIG,
+        f"camera.path={scan}/geometry.xml",
+        f"grid.like={scan}/truth.nii.gz",
+        f"hydra.run.dir={folder}",
+        *options,
+    )
+
+
+def error_of(scan, path):
+    """Relative error of a volume in HU against the truth, which mvrecon-simulate wrote in HU."""
+    (truth, grid), (volume, own) = read_volume(scan / "truth.nii.gz"), read_volume(path)
+    assert torch.allclose(own.affine, grid.affine)
+    return ((volume - truth).norm() / (truth + 1000).norm()).item()
+
+
+@pytest.mark.parametrize(
+    ("method", "limit"),
+    [
+        (("method=fdk", "method.filter=hann"), 0.3),
+        (("method=sirt", "method.momentum=true"), 0.25),
+        (("method=cgls", "choose={every: 8}"), 0.25),
+        (("method=os_sart", "stop.sigma=0.001"), 0.25),
+    ],
+)
+def test_a_scan_as_a_detector_stores_it_comes_back_in_place_and_in_hu(
+    scan, tmp_path, method, limit
+):
+    folder = tmp_path / "run"
+    assert run(scan, folder, *method, f"out={tmp_path}/volume.nii.gz", "unit=HU") == 0
+    assert error_of(scan, tmp_path / "volume.nii.gz") < limit
+    table = json.loads((folder / "results.json").read_text())
+    assert table["view_nrmse"] < 0.15 and table["seconds"] > 0
+    for picture in ("rig.png", "planes.png"):
+        assert np.asarray(Pillow.open(folder / picture)).std() > 0
+
+
+def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
+    """views.h5 has mvrecon's order of rows, the images RTK's; either file knows its own."""
+    stored = (
+        f"views.path={scan}/views.h5",
+        "camera=from_file",
+        f"camera.path={scan}/simulated/rig.json",
+        f"grid.like={scan}/truth.nii.gz",
+        f"out={tmp_path}/stored.nii.gz",
+        f"hydra.run.dir={tmp_path}/stored",
+    )
+    assert call(mvrecon.apps.reconstruct, *stored) == 0
+    assert run(scan, tmp_path / "grey", f"out={tmp_path}/grey.nii.gz") == 0
+    grey, exact = (read_volume(tmp_path / f"{name}.nii.gz")[0] for name in ("grey", "stored"))
+    assert (grey - exact).norm() < 2e-3 * exact.norm()
+
+
+def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
+    """The detector is said to be two pixels of 9 mm aside, and turned by nothing."""
+    options = (
+        f"views.path={scan}/views.h5",
+        "camera=from_file",
+        f"camera.path={tmp_path}/wrong.json",
+        f"grid.like={scan}/truth.nii.gz",
+        "calibrate=[offset_u,tilt]",
+        f"out={tmp_path}/volume.nii.gz",
+        f"hydra.run.dir={tmp_path}/run",
+    )
+    rig = files.from_file(scan / "simulated" / "rig.json")
+    files.save(rig.shifted(torch.tensor([[-2.0, 0.0]])), tmp_path / "wrong.json")
+    assert call(mvrecon.apps.reconstruct, *options) == 0
+    assert re.search(
+        r"offset_u \+(1\.9|2\.0)\d+ pixels, tilt [+-]0\.[0-2]", capsys.readouterr().out
+    )
+    mended = files.from_file(tmp_path / "volume.cameras.json")
+    assert (mended.origin - rig.origin).abs().max() < 9.0 / 4
+    fit = json.loads((tmp_path / "run" / "results.json").read_text())["calibration"]
+    assert fit["residual"][-1] < 0.2 * fit["residual"][0] and fit["free"] == ["offset_u", "tilt"]
+
+
+def test_rigs_of_volumes_whose_names_have_dots_lie_side_by_side(scan, tmp_path):
+    rigs = []
+    for pixel in ("9.0", "8.9"):
+        stored = (
+            f"views.path={scan}/views.h5",
+            f"camera.detector.pixel_mm={pixel}",
+            "camera.detector.pixels=[36,40]",
+            "views.every=4",
+            "calibrate=[offset_u]",
+            f"out={tmp_path}/scan.{pixel}mm.nii.gz",
+        )
+        assert run(scan, tmp_path / pixel, *stored, views="views.h5") == 0
+        rigs.append(files.from_file(tmp_path / f"scan.{pixel}mm.cameras.json").u.norm().item())
+    assert rigs[0] / rigs[1] == pytest.approx(9 / 8.9)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("mine.cameras.json", ("out={}/mine.nii.gz", "calibrate=[offset_u]")),
+        ("rig.json", ("hydra.run.dir={}",)),
+    ],
+)
+def test_a_run_that_would_write_to_its_own_rig_is_refused(scan, tmp_path, name, options, capsys):
+    """A run whose results would replace a file that it reads is refused, and the file stays."""
+    rig = tmp_path / name
+    shutil.copy(scan / "simulated" / "rig.json", rig)
+    before = rig.read_bytes()
+    stored = (
+        f"views.path={scan}/views.h5",
+        "camera=from_file",
+        f"camera.path={rig}",
+        f"grid.like={scan}/truth.nii.gz",
+        f"hydra.run.dir={tmp_path}/run",
+        *(option.format(tmp_path) for option in options),
+    )
+    assert call(mvrecon.apps.reconstruct, *stored) == 1
+    assert f"does not write, got camera.path={rig}" in capsys.readouterr().err
+    assert rig.read_bytes() == before
+
+
+@pytest.mark.parametrize("place", ["file/volume.nii.gz", "folder.nii.gz"])
+def test_a_place_that_cannot_be_written_is_refused_first(
+    scan, tmp_path, place, monkeypatch, capsys
+):
+    """A volume that cannot be written is refused before any view is read."""
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.nii.gz").mkdir()
+    monkeypatch.setattr("mvrecon.apps.scan.open_scan", lambda _: pytest.fail("views are read"))
+    assert run(scan, tmp_path / "run", f"out={tmp_path / place}") == 1
+    assert f"{tmp_path / place}: expected" in capsys.readouterr().err
+
+
+def test_the_endings_that_the_settings_list_for_a_volume_are_written():
+    line = re.search(r"^out:.*", (ROOT / "conf" / "reconstruct.yaml").read_text(), re.MULTILINE)
+    listed = re.findall(r"[(, ](\.\w+(?:\.\w+)?)", line[0])
+    assert set(listed) == set(WRITTEN)
+
+
+@pytest.mark.parametrize("method", ["fdk", "cgls", "os_sart"])
+def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, monkeypatch):
+    """Told from the method's own last residual, or one projection: never from the files anew, which
+    doubts read in part.
+    """
+    reads = []
+    monkeypatch.setattr("mvrecon.apps.sanity_checks.doubts", lambda *_: [])
+    read = MeasuredViews.read
+    monkeypatch.setattr(MeasuredViews, "read", lambda *a: reads.append(a) or read(*a))
+    options = (f"method={method}", "views.every=4", f"out={tmp_path}/volume.nii.gz")
+    assert run(scan, tmp_path / "run", *options) == 0
+    last = {"fdk": 2}.get(method, 1)  # FDK is streamed: its views need not fit into memory
+    assert sum(b - a for _, a, b in reads) == last * 10
+    settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    case = open_scan(settings)
+    A, y = case.posed("cpu")
+    x = read_volume(tmp_path / "volume.nii.gz")[0][None, None]
+    expected = ((y - A(x)).norm() / y.norm()).item()
+    table = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert table["view_nrmse"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
+    scan, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(scan)
+    fields = ("views.dark=projections/dark.tif", "views.flat=projections/flat.tif")
+    (scan / "elsewhere").mkdir(exist_ok=True)
+    options = (*fields, "views.path=projections", "camera.path=geometry.xml", "views.every=4")
+    assert run(scan, tmp_path / "run", *options, "grid.like=truth.nii.gz") == 0
+    first = read_volume(tmp_path / "run" / "volume.nii.gz")[0]
+    settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    monkeypatch.chdir(scan / "elsewhere")
+    again = mvrecon.apps.reconstruct.reconstruct(settings, tmp_path / "again")
+    assert torch.equal(read_volume(again["volume"])[0], first)
+
+
+def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypatch, capsys):
+    """A reconstruction that fails in the middle leaves neither settings nor pictures nor a volume,
+    and another with other settings may have its folder.
+    """
+
+    def fails(*_):
+        raise MemoryError("no room left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mvrecon.apps.run_method.solve", fails)
+        assert run(scan, tmp_path / "run", "views.every=4") == 1
+    assert "no room left" in capsys.readouterr().err
+    assert {file.name for file in (tmp_path / "run").iterdir()} <= {".lock", "reconstruct.log"}
+    assert run(scan, tmp_path / "run", "views.every=5") == 0
+    assert (tmp_path / "run" / "volume.nii.gz").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("views.every=3", "views.rows=[0, 99]"), "rows"),
+        (("out=volume.raw",), "ends in"),
+        (("choose={every: 8}",), "does not iterate"),
+        (("stop.sigma=0.1",), "does not iterate"),
+        (("grid.size=[8, 8, 8]",), "grid.like"),
+        (("grid.centre=[0, 0, 8]",), "grid.size and grid.spacing with grid.centre"),
+        (("camera.detector.pixels=[36, 41]",), "detector"),
+        (("views.flat=50", "views.dark=100"), "flat field"),
+        (("unit=kg",), "unit"),
+        (("calibrate=tilt",), "such as calibrate=[offset_u,tilt]"),
+        (("calibrate=[tild]",), "did you mean 'tilt'"),
+        (("calibrate=[gains]", "views.every=40"), "at least two views"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_and_leave_no_volume(
+    scan, tmp_path, options, message, capsys
+):
+    """Settings that do not fit views, geometry or method are an error, and no volume is written."""
+    assert run(scan, tmp_path / "run", *options) == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.nii.gz"))
+
+
+@pytest.mark.parametrize("method", ["fdk", "sirt"])
+def test_saturated_pixels_are_told_by_every_way_of_reading(scan, tmp_path, method):
+    """A scan with saturated pixels is told with their number, streamed or read as a whole."""
+    with pytest.warns(UserWarning, match="pixels of 40 views are saturated"):
+        assert (
+            run(
+                scan,
+                tmp_path / "run",
+                f"method={method}",
+                "views.saturation=49500",
+                "views.flat=49000",
+            )
+            == 0
+        )
+
+
+def test_fewer_views_than_cameras_are_refused(scan, tmp_path, capsys):
+    """A scan with another number of views than of cameras is an error that gives both."""
+    short = tmp_path / "projections"
+    shutil.copytree(scan / "projections", short)
+    (short / "view_00039.tif").unlink()
+    assert (
+        run(
+            tmp_path,
+            tmp_path / "run",
+            f"camera.path={scan}/geometry.xml",
+            f"grid.like={scan}/truth.nii.gz",
+        )
+        == 1
+    )
+    said = capsys.readouterr().err
+    assert "one camera for each of 39 views" in said and "got 40 cameras; is a view missing" in said
+
+
+def test_a_grid_larger_than_memory_is_refused_with_its_size(scan, tmp_path, capsys):
+    """A grid that does not fit into memory is an error that says how large it is."""
+    options = ("grid.like=null", "grid.size=[40000, 40000, 40000]", "grid.spacing=0.01")
+    assert run(scan, tmp_path / "run", *options) == 1
+    assert "GiB" in capsys.readouterr().err
+
+
+def test_line_integrals_are_no_counts(scan, monkeypatch):
+    """Line integrals given as counts, and counts given as line integrals, are refused."""
+
+    class Counts(Scaled):
+        def __init__(self, grid, cameras):
+            super().__init__(Drr(grid, cameras), pixels=torch.tensor(1e-4))
+
+    monkeypatch.setitem(PROJECTORS._parts, "counts", Counts)
+    cameras = rtk_xml.read(scan / "geometry.xml", {"pixels": [36, 40], "pixel_mm": 9.0}, "IEC")
+    measured = MeasuredViews.of(Measured(path=str(scan / "views.h5")))
+    for name, unit, message in (
+        ("counts", measured.stack.unit, "got line integrals in 1/mm \\* mm"),
+        ("drr", "counts of activity", "made them is 'counts'"),
+    ):
+        case = Scan(measured, cameras, Grid.centred(4, spacing=48.0), {"name": name})
+        with pytest.raises(ValueError, match=message):
+            check_unit(unit, case, 0)

@@ -1,0 +1,68 @@
+"""Sweeps: runs that are named by what is varied, that are not run twice, and that other processes
+run.
+"""
+
+import json
+
+import pytest
+from omegaconf import OmegaConf
+
+import mvrecon.apps.train
+from mvrecon.apps.config import own_folder
+from mvrecon.training import fit
+from tests.training.lives import OPTIONS
+from tests.training.runs import call
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    """A sweep over two seeds, and its command line."""
+    folder = tmp_path_factory.mktemp("sweep") / "runs"
+    options = ["-m", *OPTIONS, "trainer.max_steps=1", "seed=0,1", f"hydra.sweep.dir={folder}"]
+    assert call(mvrecon.apps.train, *options) == 0
+    return folder, options
+
+
+def test_a_sweep_names_its_runs_by_what_it_varies_and_compares_them(sweep):
+    folder, _ = sweep
+    runs = {path.parent.name for path in folder.glob("*/results.json")}
+    assert runs == {"seed=0", "seed=1"}
+    page = (folder / "compare.md").read_text()
+    assert all(f"| {name} | geometry_free |" in page for name in runs)
+
+
+def test_a_sweep_that_is_begun_again_runs_only_what_is_missing(sweep, monkeypatch):
+    """A sweep that is begun again in its folder runs no finished run a second time."""
+    folder, options = sweep
+    before = (folder / "seed=0" / "results.json").read_text()
+    (folder / "seed=1" / "results.json").unlink()
+    seeds = []
+    build = fit.build_data
+    monkeypatch.setattr(fit, "build_data", lambda s: seeds.append(s["seed"]) or build(s))
+    assert call(mvrecon.apps.train, *options) == 0
+    assert seeds == [1] and (folder / "seed=0" / "results.json").read_text() == before
+
+
+def test_sweepers_choose_by_validation_never_by_the_test(sweep):
+    """What the app returns is the PSNR of validation scenes: others than those of the table."""
+    table = json.loads((sweep[0] / "seed=0" / "results.json").read_text())
+    assert mvrecon.apps.train._score(table) == table["validation_psnr"]
+    assert table["validation_psnr"] not in table["methods"]["geometry_free"]["psnr"]["values"]
+
+
+def test_a_sweep_in_other_processes_takes_no_config_from_elsewhere(tmp_path):
+    """A sweep whose jobs run in processes of their own, where configs are not checked, takes none
+    from elsewhere.
+    """
+
+    def config(launcher, *folders):
+        sources = [{"path": str(f), "schema": "file", "provider": "x"} for f in folders]
+        target = {"_target_": launcher}
+        section = {"launcher": target, "runtime": {"config_sources": sources}}
+        return OmegaConf.create({"hydra": section})
+
+    joblib = "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher"
+    own_folder.check_launcher(config(joblib, own_folder.conf_dir()))
+    own_folder.check_launcher(config(own_folder.IN_TURN, tmp_path))
+    with pytest.raises(PermissionError, match="composes its jobs in other processes"):
+        own_folder.check_launcher(config(joblib, tmp_path))

@@ -1,0 +1,235 @@
+import math
+
+import pytest
+import torch
+
+from mvrecon.geometry.cameras.camera import EXTENTS, VECTORS, Cameras
+from mvrecon.geometry.grid import Grid, pixel_centres
+from mvrecon.geometry.rigid import random_rotation
+from tests.geometry.cameras.rigs import random_cameras, same
+
+
+def record(**changes):
+    """Three cameras at (0, 0, -100) looking along +z, which are right-handed as OpenCV's."""
+    vectors = {
+        "source": [0.0, 0, -100],
+        "origin": [-4.0, -3, 100],
+        "u": [2.0, 0, 0],
+        "v": [0.0, 2, 0],
+    }
+    options = {name: torch.tensor([vector] * 3) for name, vector in vectors.items()}
+    return Cameras(**(options | {"shape": (4, 5)} | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"u": torch.tensor([2.0, 0, 0])}, r"u as \[3 3\], one row a camera, got \[3\]"),
+        ({"source": torch.zeros(3)}, r"source as \[m 3\].* got \[3\]"),
+        ({"source": torch.zeros(0, 3)}, r"source as \[0 3\].* got \[0, 3\]"),
+        ({"v": torch.tensor([[0.0, 2, 0]])}, r"v as \[3 3\].* got \[1, 3\]"),
+        ({"v": torch.zeros(2, 3)}, r"v as \[3 3\].* got \[2, 3\]"),
+        ({"origin": torch.zeros(3, 2)}, r"origin as \[3 3\].* got \[3, 2\]"),
+        ({"origin": torch.full((3, 3), math.nan)}, "finite mm, got origin = .*nan"),
+        ({"source": torch.full((3, 3), math.inf)}, "finite mm, got source = .*inf"),
+        ({"shape": (4, 0)}, r"positive integers, got \(4, 0\)"),
+        ({"shape": (4, 5, 6)}, r"\(rows, columns\).* got \(4, 5, 6\)"),
+        ({"shape": (4.5, 5)}, r"positive integers, got \(4.5, 5\)"),
+        ({"extent": "segments"}, "Unknown extent 'segments'. Known: segment, behind, ahead, line"),
+        ({"u": torch.tensor([[-2.0, 0, 0]] * 3)}, "right-handed .* camera 0 is left-handed"),
+        ({"extent": "behind"}, "right-handed .* camera 0 is left-handed"),
+        ({"u": torch.tensor([[2.0, 0, 0]] * 2 + [[-2.0, 0, 0]])}, "camera 2 is left-handed"),
+        ({"v": torch.tensor([[2.0, 0, 0]] * 3)}, "must not be flat, .* camera 0"),
+        ({"u": torch.zeros(3, 3)}, "must not be flat"),
+        (
+            {"origin": torch.tensor([[-4.0, -3, 100]] * 2 + [[-4.0, -3, -100]])},
+            "must not be flat, .* camera 2",
+        ),
+    ],
+)
+def test_bad_records_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        record(**changes)
+
+
+def test_cameras_of_two_devices_are_refused():
+    with pytest.raises(ValueError, match="one device, got v on meta, source on cpu"):
+        record(v=torch.zeros(3, 3, device="meta"))
+
+
+def test_numbers_keep_their_digits_whatever_holds_them():
+    third = 1 / 3
+    lists = Cameras([[0, 0, -third]], [[0, 0, 1]], [[1, 0, 0]], [[0, 1, 0]], (1, 1))  # type: ignore[arg-type]
+    assert lists.source.dtype == torch.float64 and lists.source[0, 2].item() == -third
+
+
+@pytest.mark.parametrize("convert", [lambda x: x, torch.Tensor.numpy])
+def test_a_rig_keeps_its_own_numbers_but_moves_with_what_is_optimised(convert):
+    vectors = [getattr(record(), name).clone() for name in VECTORS]
+    cameras = Cameras(*map(convert, vectors), (4, 5))
+    before = [getattr(cameras, name).clone() for name in VECTORS]
+    for vector in vectors:
+        vector *= 2
+    assert all(torch.equal(getattr(cameras, n), x) for n, x in zip(VECTORS, before, strict=True))
+    source = before[0].requires_grad_()
+    cameras = Cameras(source, *before[1:], (4, 5))
+    with torch.no_grad():
+        source += 1
+    assert torch.equal(cameras.source, source)
+
+
+def test_the_textbook_camera():
+    """At depth 150 of 200, the centre of pixel (u, v) = (4, 0) of a 4 x 5 detector: (4, -3) mm
+    times 150/200.
+    """
+    cameras = record()
+    assert torch.equal(cameras.distance, torch.full((3,), 200.0, dtype=torch.float64))
+    xyz = torch.tensor([4.0 * 0.75, -3.0 * 0.75, 50.0], dtype=torch.float64)
+    uvz = torch.tensor([4.0, 0.0, 150.0], dtype=torch.float64).expand(3, 3)
+    torch.testing.assert_close(cameras.project(xyz), uvz, rtol=1e-14, atol=1e-14)
+    torch.testing.assert_close(cameras.unproject(uvz), xyz.expand(3, 3), rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("extent", EXTENTS)
+def test_the_matrix_agrees_with_project(extent):
+    cameras = random_cameras(extent=extent)
+    xyz = 40 * torch.randn(11, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    ones = torch.ones(11, 1, dtype=torch.float64)
+    homogeneous = torch.cat([xyz, ones], dim=-1) @ cameras.matrix.mT
+    uvz = cameras.project(xyz)
+    torch.testing.assert_close(
+        homogeneous[..., :2] / homogeneous[..., 2:], uvz[..., :2], rtol=1e-10, atol=1e-10
+    )
+    torch.testing.assert_close(
+        homogeneous[..., 2] * cameras.distance[:, None], uvz[..., 2], rtol=1e-10, atol=1e-10
+    )
+
+
+def test_a_detector_mirrored_through_its_pinhole_sees_the_same():
+    behind = random_cameras(extent="behind")
+    ahead = Cameras(
+        behind.source,
+        2 * behind.source - behind.origin,
+        -behind.u,
+        -behind.v,
+        behind.shape,
+        False,
+        "ahead",
+    )
+    xyz = 40 * torch.randn(11, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    a, b = ahead.project(xyz), behind.project(xyz)
+    torch.testing.assert_close(a[..., :2], b[..., :2], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(a[..., 2], -b[..., 2], rtol=1e-9, atol=1e-9)
+
+
+def test_points_keep_their_shape_and_dtype():
+    cameras = random_cameras(3)
+    assert cameras.project(torch.rand(3)).shape == (3, 3)
+    assert cameras.project(torch.rand(2, 4, 5, 3)).shape == (3, 2, 4, 5, 3)
+    assert cameras.project(torch.rand(2, 3)).dtype == torch.float32
+    assert cameras.unproject(torch.rand(3, 2, 4, 3)).shape == (3, 2, 4, 3)
+
+
+def test_projection_is_differentiable_in_points_and_pose():
+    cameras = random_cameras(2)
+    vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
+    xyz = torch.randn(
+        3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    ).requires_grad_()
+
+    def project(xyz, *vectors):
+        return Cameras(*vectors, shape=cameras.shape).project(xyz)
+
+    assert torch.autograd.gradcheck(project, (xyz, *vectors))
+
+
+def test_choosing_cameras():
+    cameras = random_cameras(5)
+    for index in (
+        2,
+        -3,
+        [2],
+        torch.tensor([2]),
+        slice(2, 3),
+        torch.arange(5) == 2,
+        torch.tensor(2),
+    ):
+        one = cameras[index]
+        assert len(one) == 1 and torch.equal(one.source[0], cameras.source[2])
+    assert torch.equal(cameras[[3, 0]].u, cameras.u[[3, 0]])
+    assert len(list(cameras)) == 5
+
+
+def test_rays_lead_from_the_source_to_the_pixels():
+    cameras = random_cameras(3)
+    start, end = cameras.rays()
+    assert start.shape == end.shape == (3, 7, 9, 3)
+    torch.testing.assert_close(
+        start, cameras.source[:, None, None].expand_as(start), rtol=0, atol=0
+    )
+    expected = cameras.origin + 6 * cameras.v + 8 * cameras.u
+    torch.testing.assert_close(end[:, 6, 8], expected, rtol=1e-14, atol=1e-12)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_binned_pixels_are_centred_on_the_pixels_that_they_join(parallel):
+    cameras = record(shape=(4, 6), parallel=parallel)
+    coarse = cameras.binned(2)
+    assert coarse.shape == (2, 3)
+    for fine_ends, ends in zip(cameras.rays(), coarse.rays(), strict=True):
+        mean = fine_ends.reshape(3, 2, 2, 3, 2, 3).mean(dim=(2, 4))
+        torch.testing.assert_close(ends, mean, rtol=1e-12, atol=1e-12)
+    for factor in (0, 4):
+        with pytest.raises(ValueError, match=f"Binning by {factor} needs"):
+            cameras.binned(factor)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_transposed_detectors_stay_where_they_are(parallel):
+    """The middle of the detector stays, and twice transposed is as before."""
+    cameras = record(shape=(5, 8), parallel=parallel)
+    other = cameras.transposed()
+    assert other.shape == (8, 5)
+    middle = cameras.origin + 3.5 * cameras.u + 2 * cameras.v
+    torch.testing.assert_close(other.origin + 2 * other.u + 3.5 * other.v, middle)
+    again = other.transposed()
+    torch.testing.assert_close(again.origin, cameras.origin)
+    torch.testing.assert_close(again.source, cameras.source)
+
+
+def test_moving_the_rig_moves_what_it_sees():
+    cameras, rng = random_cameras(), torch.Generator().manual_seed(4)
+    R, t = random_rotation(rng), torch.randn(3, generator=rng, dtype=torch.float64)
+    xyz = 20 * torch.randn(9, 3, generator=rng, dtype=torch.float64)
+    moved = cameras.moved(R, t)
+    torch.testing.assert_close(
+        moved.project(xyz @ R.T + t), cameras.project(xyz), rtol=1e-9, atol=1e-9
+    )
+    assert same(moved.moved(R.T, -R.T @ t), cameras)
+    with pytest.raises(ValueError, match="left-handed"):
+        cameras.moved(torch.diag(torch.tensor([1.0, 1, -1])), t)
+
+
+def test_the_depth_range_holds_the_grid_tightly():
+    cameras = record()[0]
+    grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 5.0), centre=(1.0, 2.0, 3.0))
+    torch.testing.assert_close(
+        cameras.depth_range(grid), torch.tensor([[93.0, 113.0]], dtype=torch.float64)
+    )
+
+
+def test_the_limits_are_those_of_the_extent():
+    assert record().ray_extent == (0.0, 1.0)
+    assert random_cameras(extent="behind").ray_extent == (-math.inf, 0.0)
+
+
+def test_pixel_centres_of_a_parallel_beam_project_to_themselves_at_any_depth():
+    cameras = record(parallel=True, extent="line")
+    start, end = cameras.rays()
+    for w in (-3.0, 0.0, 2.0):
+        uvz = cameras.project((start + w * (end - start))[0])[0]
+        torch.testing.assert_close(uvz[..., :2], pixel_centres((4, 5)), rtol=0, atol=1e-12)
+        torch.testing.assert_close(uvz[..., 2], torch.full((4, 5), 200 * w, dtype=torch.float64))
+    assert torch.equal(
+        cameras.matrix[:, 2], torch.tensor([[0.0, 0, 0, 1]] * 3, dtype=torch.float64)
+    )

@@ -1,0 +1,103 @@
+"""The field of a rig: isocentre, automatic grid, and a rig that misses its grid."""
+
+import math
+
+import pytest
+import torch
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees, common_field, isocentre, sees
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.rigid import euler_rotation
+from tests.geometry.cameras.rigs import OPTIONS
+
+PLATE = {"pixels": [64, 96], "pixel_mm": 4.0}
+AWAY = torch.tensor([30.0, -20.0, 55.0], dtype=torch.float64)
+
+
+def moved(rig: Cameras) -> Cameras:
+    return rig.moved(torch.eye(3), AWAY)
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        circular(7, 400.0, 800.0, {**PLATE, "offset_mm": [9.0, 40.0]}),
+        parallel(5, PLATE),
+        dome(9, 200.0, 70.0, 120.0, PLATE),
+    ],
+)
+def test_principal_rays_meet_in_the_isocentre_wherever_the_rig_is(rig):
+    turned = rig.moved(euler_rotation([20.0, 30.0, 40.0]), AWAY)
+    assert torch.allclose(isocentre(turned), AWAY, atol=1e-8)
+
+
+def test_the_field_of_a_circle_is_the_cylinder_of_textbooks():
+    """Radius sid sin(atan(half width / sdd)) and half height (half height / sdd) sid."""
+    grid = auto_grid(moved(circular(180, 400.0, 800.0, PLATE)))
+    assert grid.spacing == pytest.approx((2.0, 2.0, 2.0))
+    assert torch.allclose(grid.centre, AWAY, atol=1e-6)
+    radius, height = 400 * math.sin(math.atan(192 / 800)), 64.0
+    assert [n * 2.0 for n in grid.size] == pytest.approx([2 * radius] * 2 + [2 * height], abs=2.0)
+
+
+def test_a_given_size_covers_the_same_field_with_cubes():
+    grid = auto_grid(parallel(30, PLATE), size=(48, 48, 48))
+    assert grid.size == (48, 48, 48) and grid.spacing == pytest.approx((8.0,) * 3)
+
+
+def test_a_detector_aside_doubles_the_field_that_half_of_the_views_see():
+    rig = circular(180, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, 150.0]})
+    assert auto_grid(rig).size[0] < 45 < 150 < auto_grid(rig, seen_by=0.45).size[0]
+
+
+def test_points_of_the_field_are_seen_and_others_are_not():
+    rig = circular(8, 400.0, 800.0, PLATE)
+    points = torch.tensor([[0.0, 0, 0], [0, 0, 63], [0, 0, 65], [-500, 0, 0]]).double()
+    assert sees(rig, points).all(dim=0).tolist() == [True, True, False, False]
+    assert not sees(rig, points)[0, 3]  # in line with the detector, but behind it
+
+
+def test_the_common_field_of_dcspect80_holds_its_ball_and_little_more():
+    """All 80 pinholes see the ball of 78.41 mm; on its surface one detector ends."""
+    grid = Grid.centred(size=(44, 40, 36), spacing=5.0, centre=(3.0, -2.0, 1.0))
+    away = voxel_centres(grid).norm(dim=-1)
+    field = common_field(dcspect80(pixels=[16, 16]), grid)[0]
+    assert field[away < 78.4].all() and not field[away > 125].any()
+    assert not field[(78.4 < away) & (away < 85)].all()
+
+
+def test_the_common_field_of_a_turned_grid_is_what_every_camera_sees():
+    rig = circular(5, 400.0, 800.0, {**PLATE, "offset_mm": [20.0, 30.0]})
+    affine = Grid.centred(24, spacing=6.0).affine.clone()
+    affine[:3] = (
+        torch.cat([euler_rotation([10.0, 20.0, 30.0]).to(affine), AWAY[:, None] / 3], 1) @ affine
+    )
+    grid = Grid((24, 24, 24), affine)
+    seen = sees(rig, voxel_centres(grid).reshape(-1, 3)).all(dim=0).reshape(1, 24, 24, 24)
+    assert seen.any() and not seen.all() and torch.equal(common_field(rig, grid), seen)
+
+
+def test_a_common_field_of_no_voxel_is_refused():
+    """A loss over the voxels that all cameras see is refused where there is none."""
+    rig = circular(8, 400.0, 800.0, PLATE)
+    with pytest.raises(ValueError, match="a voxel that all of 8 cameras see, got none"):
+        common_field(rig, Grid.centred(4, spacing=1.0, centre=(0, 0, 70)))
+
+
+def test_a_rig_that_misses_its_grid_is_refused():
+    """A rig of which no view meets the grid is refused, with where both are in mm."""
+    rig = circular(**OPTIONS["circular"])
+    assert check_rig_sees(rig, Grid.centred(8, spacing=1.0)).all()
+    with pytest.raises(ValueError, match="5 views that all miss it.*z 496 to 504 mm.*meet at"):
+        check_rig_sees(rig, Grid.centred(8, spacing=1.0, centre=(0, 0, 500)))
+
+
+def test_no_grid_is_guessed_where_there_is_no_field():
+    """A grid is not guessed from one view, nor where views see nothing in common."""
+    with pytest.raises(ValueError, match="at least two directions"):
+        auto_grid(circular(1, 400.0, 800.0, PLATE))
+    with pytest.raises(ValueError, match="to see the isocentre"):
+        auto_grid(circular(8, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, 300.0]}))

@@ -1,0 +1,94 @@
+"""Wrong cameras are told from the views alone, and an object that they draw aside stays put."""
+
+import pytest
+import torch
+
+from mvrecon.core.parts import PROJECTORS, SCENES
+from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
+from mvrecon.methods.calibration.alignment import Alignment, translated
+from mvrecon.methods.calibration.self_alignment import (
+    least_deviations,
+    self_aligned,
+    self_alignment,
+    standing_still,
+)
+from mvrecon.methods.calibration.unknowns import motions
+from tests.methods.learned.rig import small_rig
+
+
+@pytest.fixture(scope="module")
+def measurement():
+    """An operator, and views of ellipsoids that are exact."""
+    grid, cameras = small_rig(n_views=8, size=24, pixels=36)
+    scene = SCENES.build("ellipsoids")
+    views = torch.stack([scene.sample(i, 0, grid, cameras).views for i in range(2)])
+    return PROJECTORS.build("drr", grid=grid, cameras=cameras), views
+
+
+@pytest.fixture(scope="module")
+def disturbed(measurement):
+    A, views = measurement
+    rng = torch.Generator().manual_seed(1)
+    disturbance = Disturbance(views=3, shift_px=1.0, gain=0.05)
+    errors = [rig_errors(disturbance, A.cameras, rng) for _ in views]
+    shift = torch.stack([one.shift_px for one in errors]).float()
+    gain = torch.stack([one.gain for one in errors]).float()
+    return translated(views, shift) * gain[:, None, :, None, None], shift, gain
+
+
+def test_three_wrong_cameras_of_eight_are_told_and_righted(measurement, disturbed):
+    (A, exact), (views, shift, gain) = measurement, disturbed
+    corrected, by = self_aligned(A, views)
+    assert by is not None
+    assert (by.shift_px - shift).square().mean().sqrt() < 0.15 * shift.square().mean().sqrt()
+    assert (by.gain - gain).square().mean().sqrt() < 0.5 * (gain - 1).square().mean().sqrt()
+    wrong = shift.abs().sum(dim=-1) > 0
+    assert by.deviation()[wrong].min() > by.deviation()[~wrong].max()
+    assert (corrected - exact).norm() < 0.25 * (views - exact).norm()
+
+
+def test_exact_views_stay_as_they_are(measurement):
+    A, views = measurement
+    by = self_alignment(A, views)
+    assert by.shift_px.abs().max() < 0.06 and (by.gain - 1).abs().max() < 0.02
+
+
+def test_a_motion_of_the_object_and_a_common_gain_are_no_errors_of_cameras(measurement):
+    A, _ = measurement
+    moves = motions(A.cameras, A.grid.centre).float()
+    wrong = torch.zeros(1, 8, 2)
+    wrong[0, [1, 4, 6]] = torch.tensor([[0.7, -0.3], [-0.5, 0.9], [0.8, 0.8]])
+    shift = wrong + moves @ torch.tensor([0.2, -0.3, 0.1])
+    gain = torch.ones(1, 8)
+    gain[0, 1] = 1.05
+    none = Alignment.none(torch.zeros(1, 1, 8, 1, 1))
+    by = Alignment(shift, 1.3 * gain, none.shift_error, none.gain_error)
+    still = standing_still(by, moves)
+    torch.testing.assert_close(still.shift_px, wrong, rtol=0, atol=0.02)
+    torch.testing.assert_close(still.gain, gain, rtol=0, atol=1e-3)
+
+
+def test_a_motion_moves_points_as_the_cameras_see_them(measurement):
+    cameras, centre = measurement[0].cameras, torch.tensor([3.0, -2.0, 4.0]).double()
+    step = torch.tensor([0.2, -0.1, 0.3]).double()
+    places = cameras.project(torch.stack([centre, centre + step]))[..., :2]
+    torch.testing.assert_close(
+        motions(cameras, centre) @ step, places[:, 1] - places[:, 0], rtol=0, atol=2e-3
+    )
+
+
+def test_what_modes_cannot_change_is_left():
+    values = torch.tensor([[[1.0], [1.0], [4.0]]])
+    modes = torch.ones(3, 1, 1)
+    expected = torch.tensor([[[0.0], [0.0], [3.0]]])
+    torch.testing.assert_close(least_deviations(values, modes, 1e-3), expected, rtol=0, atol=1e-3)
+    torch.testing.assert_close(least_deviations(values, 0 * modes, 1e-3), values)
+
+
+def test_views_that_are_not_finite_are_refused(measurement):
+    """Alignment of views by themselves refuses values that are not finite, and no alternation."""
+    A, views = measurement
+    with pytest.raises(ValueError, match="alternation"):
+        self_alignment(A, views, alternations=0)
+    with pytest.raises(ValueError, match="finite"):
+        self_alignment(A, views.index_fill(2, torch.tensor([1]), torch.nan))

@@ -1,0 +1,103 @@
+"""The circle of the sources is worked out of the cameras; rigs that have none are refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.rigid import euler_rotation
+from mvrecon.methods.classical.filtered.fdk import fbp, fdk
+from mvrecon.methods.classical.filtered.orbit import orbit_of
+from mvrecon.methods.classical.filtered.scan_weights import scan_of
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.operator import Scaled
+from mvrecon.operators.radon import Radon
+from tests.methods.classical.filtered.scans import CONES, FAN, FANS, LINE, RAYS, SLICE, VOLUME
+
+
+def test_axis_isocentre_and_radius_are_those_of_the_scanner():
+    turn, shift = euler_rotation([10.0, 30.0, 5.0]), torch.tensor([7.0, 80.0, -9.0]).double()
+    rig = circular(40, 400.0, 600.0, FAN, arc_degrees=200.0).moved(turn, shift)
+    orbit = orbit_of(rig, SLICE)
+    assert orbit.radius == pytest.approx(400.0)
+    assert torch.allclose(orbit.centre, shift)
+    assert (orbit.axis @ turn[:, 2]).abs().item() == pytest.approx(1.0)
+    steps = orbit.angles.diff().remainder(360.0)
+    assert torch.allclose(torch.minimum(steps, 360 - steps), torch.full((39,), 5.0).double())
+
+
+def test_sources_that_shake_a_little_have_the_circle_of_their_mean():
+    torch.manual_seed(0)
+    rig = CONES["full"]
+    shaken = replace(rig, source=rig.source + torch.randn_like(rig.source))
+    orbit = orbit_of(shaken, VOLUME)
+    assert orbit.radius == pytest.approx(400.0, abs=0.5)
+    assert orbit.centre.norm() < 0.5 and orbit.axis[2].abs() > 0.99999
+
+
+def test_steps_of_a_turn_add_up_to_it_and_repeated_views_share_theirs():
+    for kind in ("full", "uneven", "offset"):
+        assert scan_of(FANS[kind], SLICE).steps.sum().item() == pytest.approx(2 * torch.pi)
+    twice = FANS["full"][list(range(240)) * 2]
+    once, both = scan_of(FANS["full"], SLICE, "full"), scan_of(twice, SLICE, "full")
+    assert torch.allclose(both.steps[:240] + both.steps[240:], once.steps)
+    rig = parallel(90, LINE, arc_degrees=360.0, **RAYS)
+    assert scan_of(rig, SLICE).steps.sum().item() == pytest.approx(torch.pi)
+
+
+SPHERE = dome(20, 300.0, 200.0, 180.0, {"pixels": [8, 8], "pixel_mm": 9.0})
+SIDEWAYS = replace(FANS["full"], u=FANS["full"].v, v=-FANS["full"].u, shape=(100, 1))
+REFUSED = {
+    "dome": (fdk, SPHERE, "sources on a circle, .* use sirt"),
+    "80 pinholes": (
+        fdk,
+        dcspect80(pixels=[4, 4]),
+        "sources on a circle, .* 80 sources .* use sirt",
+    ),
+    "two": (fdk, CONES["full"][:2], "at least three sources on a circle, got 2"),
+    "short of fan": (fdk, CONES["full"][:58], "A short scan needs 180 degrees and the fan angle"),
+    "limited": (fbp, parallel(60, LINE, arc_degrees=120.0, **RAYS), "got a gap of 62 degrees"),
+    "two close": (fbp, parallel(2, LINE, arc_degrees=20.0, **RAYS), "got a gap of 170 degrees"),
+    "one": (fbp, parallel(1, LINE, **RAYS), "two directions at least, got 1 views"),
+    "cone": (fbp, CONES["full"], "got a cone beam of 32 rows; use fdk"),
+    "parallel": (fdk, parallel(60, LINE, **RAYS), "got parallel beams; use fbp"),
+    "beside": (
+        fdk,
+        circular(60, 400.0, 600.0, {**FAN, "offset_mm": [0.0, 120.0]}),
+        "the axis of rotation is projected",
+    ),
+    "rows along the axis": (fdk, SIDEWAYS, "exchange rows and columns"),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_a_rig_without_a_turn_about_an_axis_is_refused(kind: str):
+    """A rig that FBP or FDK is not made for is refused with the reason, and with what will do."""
+    method, rig, message = REFUSED[kind]
+    A = (Radon if rig.parallel else Drr)(VOLUME, rig)
+    with pytest.raises(ValueError, match=message):
+        method(A, torch.zeros(1, 1, *A.range_shape))
+
+
+def test_weighted_integrals_views_with_nan_and_unknown_scans_are_refused():
+    """FDK refuses weighted operators, views that are not finite or too few, and unknown scans."""
+    A = Drr(VOLUME, CONES["full"])
+    views = torch.zeros(1, 1, *A.range_shape)
+    spoilt = views.clone()
+    spoilt[0, 0, 5, 1, 2] = torch.nan
+    with pytest.raises(ValueError, match="needs plain line integrals"):
+        fdk(Scaled(A, torch.full(A.range_shape, 2.0)), views)
+    with pytest.raises(ValueError, match="Expected views"):
+        fdk(A, views[:, :, :-1])
+    with pytest.raises(ValueError, match="got 1 of"):
+        fdk(A, spoilt)
+    with pytest.raises(ValueError, match="Known: auto, full, short, offset"):
+        fdk(A, views, scan="half")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="A full scan needs angles all around"):
+        fdk(Drr(VOLUME, CONES["short"]), torch.zeros(1, 1, 90, 32, 100), scan="full")
+    with pytest.raises(ValueError, match="Expected weights_from as a rig of 120 views"):
+        fdk(A, views, weights_from=CONES["short"])
+    with pytest.raises(ValueError, match="of floating point"):
+        fdk(A, views.int())

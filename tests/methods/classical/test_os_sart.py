@@ -1,0 +1,66 @@
+"""Ordered subsets: their order, the metric in which no step goes astray, and the limit."""
+
+import math
+
+import pytest
+import torch
+
+from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.os_sart import os_sart
+from mvrecon.operators.selection import distant_order, ordered_subsets, usual_subsets
+from tests.methods.classical.methods import Dense, gap, projector, truth
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 7, 12, 13, 20, 30, 64])
+def test_an_order_of_subsets_takes_all_and_neighbours_are_far_apart(count):
+    order = distant_order(count)
+    assert sorted(order) == list(range(count)) and 1 <= usual_subsets(count) <= count
+    steps = [(b - a) % count for a, b in zip(order, order[1:], strict=False)]
+    if count > 4:  # on a circle of subsets
+        assert min(min(s, count - s) for s in steps) >= max(2, count // 3 - 1)
+
+
+def test_one_subset_is_sirt():
+    A = projector()
+    y = A(truth(A))
+    assert gap(os_sart(A, y, 5, subsets=1), sirt(A, y, 5)) < 1e-12
+
+
+@pytest.mark.parametrize("relaxation", [0.3, 1.0, 1.9])
+def test_no_iteration_brings_the_volume_farther_from_the_solution(relaxation):
+    """For views that agree, in the norm of C^-1, whatever the subsets and the relaxation."""
+    A = Dense()
+    x = truth(A)
+    rows = A.matrix.reshape(6, 35, 120)
+    sums = torch.stack([rows[list(views)].sum(dim=(0, 1)) for views in ordered_subsets(6, 3)])
+    column = torch.maximum(sums.mean(dim=0), relaxation * sums.amax(dim=0) / 1.9)
+    column, far = column.reshape(A.domain_shape), []
+
+    def monitor(iterate):
+        far.append((column * (iterate.volume - x).square()).sum().item())
+
+    os_sart(A, A(x), 20, subsets=3, relaxation=relaxation, monitor=monitor)
+    assert all(later < earlier for earlier, later in zip(far, far[1:], strict=False))
+
+
+def test_with_a_relaxation_that_falls_noisy_views_end_at_the_least_squares_of_sirt():
+    torch.manual_seed(0)
+    A = Dense()
+    y = A(truth(A)) + torch.randn(1, 1, *A.range_shape, dtype=torch.float64)
+    options = {"subsets": 3, "nonnegative": False}
+    least = sirt(A, y, 3000, nonnegative=False, momentum=True)
+    start = least + 0.01 * least.mean()
+    cycle = os_sart(A, y, 100, **options, start=start)
+    limit = os_sart(A, y, 400, **options, start=start, reduction=0.985)
+    assert gap(limit, least) < 0.4 * gap(cycle, least)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"relaxation": 0.0}, {"relaxation": 2.0}, {"relaxation": math.nan}, {"reduction": 1.1}],
+)
+def test_a_relaxation_that_does_not_converge_is_refused(options):
+    """OS-SART refuses a relaxation or its reduction where no theory lets it converge."""
+    A = Dense()
+    with pytest.raises(ValueError, match="0 < relaxation < 2"):
+        os_sart(A, A(truth(A)), **options)

@@ -1,0 +1,127 @@
+"""Views in MHA and NRRD: their spacing and origin are RTK's detector, and contradict no other."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import torch
+
+from mvrecon.apps.scan import open_scan
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.measured import Measured
+from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.geometry.cameras.formats import rtk_xml
+from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.filtered.fdk import fdk
+from mvrecon.operators.drr import Drr
+from tests.geometry.cameras.rigs import same
+
+PLATE = {"pixels": [30, 36], "pixel_mm": [2.0, 1.5], "offset_mm": [3.0, -4.5]}
+GRID = Grid.centred(12, spacing=3.0)
+PARTS = {
+    "grid": {"like": None, "size": 12, "spacing": 3.0, "centre": [0.0, 0.0, 0.0]},
+    "projector": {"name": "drr"},
+    "method": {"name": "fdk"},
+}
+
+
+def stack(path, views, spacing, origin, direction=(1, 1)):
+    """Views [m v u] as an ITK image, spacing and origin along (x, y)."""
+    image = sitk.GetImageFromArray(views.numpy())
+    image.SetSpacing([*spacing, 1.0])
+    image.SetOrigin([*origin, 0.0])
+    image.SetDirection(np.diag([*direction, 1.0]).flatten().tolist())
+    sitk.WriteImage(image, str(path))
+    return path
+
+
+def settings(path, camera, **views):
+    options = {"path": str(path), "kind": "integrals", "flip_rows": False, **views}
+    return {**PARTS, "views": options, "camera": camera}
+
+
+def rtk(path, **detector):
+    nothing = {"pixels": None, "pixel_mm": None, "offset_mm": None}
+    return {"name": "rtk_xml", "path": str(path), "detector": {**nothing, **detector}}
+
+
+def placed(path, offset):
+    """A stack whose middle lies at an offset (down, right) in mm, for rows that run upwards."""
+    (down, right), rows, columns = offset, 30, 36
+    origin = (right - 1.5 * (columns - 1) / 2, -down - 2.0 * (rows - 1) / 2)
+    return stack(path, torch.ones(4, rows, columns), (1.5, 2.0), origin)
+
+
+@pytest.mark.parametrize("ending", ["mha", "nrrd"])
+def test_spacing_and_origin_of_projections_are_the_detector_of_rtk(ending, tmp_path):
+    """A detector aside and of oblong pixels: the object comes back as from the exact rig."""
+    rig = circular(60, 200.0, 300.0, PLATE)
+    centred = circular(60, 200.0, 300.0, {**PLATE, "offset_mm": [0.0, 0.0]})
+    rtk_xml.write(centred, tmp_path / "rig.xml")
+    truth = torch.zeros(1, 1, 12, 12, 12)
+    truth[..., 3:7, 4:9, 2:6] = 0.02
+    views = Drr(GRID, rig)(truth)[0, 0]
+    origin = (-4.5 - 1.5 * 35 / 2, -3.0 - 2.0 * 29 / 2)
+    path = stack(tmp_path / f"a.{ending}", views.flip(-2), (1.5, 2.0), origin)
+    scan = open_scan(settings(path, rtk(tmp_path / "rig.xml")))
+    assert same(scan.cameras, rig, 1e-6)
+    volume = fdk(scan.operator(), scan.measured.whole().views[None, None])
+    expected = fdk(Drr(GRID, rig), views[None, None])
+    assert (volume - expected).norm() < 1e-4 * expected.norm()
+
+
+@pytest.mark.parametrize("name", ["circular", "rtk_xml"])
+def test_a_spacing_or_an_origin_that_contradicts_the_rig_is_refused(name, tmp_path):
+    """A detector whose pixel_mm or offset_mm is not that of the views' MHA is refused."""
+    rtk_xml.write(circular(4, 200.0, 300.0, PLATE), tmp_path / "rig.xml")
+    path = placed(tmp_path / "a.mha", (3.0, -4.5))
+    known = {
+        "circular": {"name": "circular", "n_views": 4, "sid": 200.0, "sdd": 300.0},
+        "rtk_xml": {"name": "rtk_xml", "path": str(tmp_path / "rig.xml")},
+    }[name]
+    options = settings(path, {**known, "detector": PLATE}, flip_rows=True)
+    open_scan(options)
+    options["camera"]["detector"] = {**PLATE, "pixel_mm": [2.0, 1.6]}
+    with pytest.raises(Refused, match=r"file's pixels of 2 x 1.5 mm \(v, u\), got 2 x 1.6 mm"):
+        open_scan(options)
+    for offset in ([3.0, -3.75], [2.0, -4.5], [0.0, 0.0]):
+        options["camera"]["detector"] = {**PLATE, "offset_mm": offset}
+        with pytest.raises(Refused, match=r"offset_mm \[3, -4.5\] \(v, u\) by .*origin, got"):
+            open_scan(options)
+
+
+def test_reversed_rows_and_columns_take_the_origin_with_them(tmp_path):
+    path = placed(tmp_path / "a.mha", (3.0, -4.5))
+    camera = {"name": "circular", "n_views": 4, "sid": 200.0, "sdd": 300.0}
+    for rows in (True, False):
+        for columns in (True, False):
+            offset = [3.0 if rows else -3.0, 4.5 if columns else -4.5]
+            camera["detector"] = {**PLATE, "offset_mm": offset}
+            open_scan(settings(path, camera, flip_rows=rows, flip_columns=columns))
+
+
+def test_pixels_of_any_rig_are_compared_with_the_file(tmp_path):
+    path = placed(tmp_path / "a.mha", (0.0, 0.0))
+    measured = MeasuredViews.of(Measured(path=str(path), kind="integrals"))
+    measured.cameras(circular(4, 200.0, 300.0, PLATE))
+    with pytest.raises(Refused, match=r"got 2\.01 x 1\.5 mm"):
+        measured.cameras(circular(4, 200.0, 300.0, {**PLATE, "pixel_mm": [2.01, 1.5]}))
+
+
+def test_an_image_that_nobody_placed_states_nothing(tmp_path):
+    """ITK's defaults, as of an array without geometry."""
+    path = stack(tmp_path / "a.mha", torch.ones(4, 30, 36), (1.0, 1.0), (0.0, 0.0))
+    rig = circular(4, 200.0, 300.0, {**PLATE, "offset_mm": [0.0, 0.0]})
+    rtk_xml.write(rig, tmp_path / "rig.xml")
+    scan = open_scan(settings(path, rtk(tmp_path / "rig.xml", pixel_mm=[2.0, 1.5])))
+    assert same(scan.cameras, rig, 1e-6)
+    with pytest.raises(TypeError, match="needs pixel_mm"):
+        open_scan(settings(path, rtk(tmp_path / "rig.xml")))
+
+
+def test_views_whose_file_mirrors_them_are_refused(tmp_path):
+    """Views in an MHA whose direction mirrors rows or columns are refused."""
+    path = stack(tmp_path / "a.mha", torch.ones(4, 30, 36), (1.5, 2.0), (0.0, 0.0), (-1, 1))
+    rtk_xml.write(circular(4, 200.0, 300.0, PLATE), tmp_path / "rig.xml")
+    with pytest.raises(Refused, match="expected views with columns along x and rows along y, got"):
+        open_scan(settings(path, rtk(tmp_path / "rig.xml")))

@@ -1,0 +1,131 @@
+"""Derivatives: confirmed by differences, equal to the oracle's, and computed only where they are
+asked for.
+"""
+
+import pytest
+import torch
+
+from mvrecon.kernels.rays.cpu import operators as cpu
+from mvrecon.kernels.rays.cpu import plan
+from tests.operators.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, Case, gap, noise
+
+
+def leaves(case: Case) -> list[torch.Tensor]:
+    return [vector.clone().requires_grad_() for vector in case.vectors.values()]
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("kind", DIFFERENTIABLE)
+def test_differences_confirm_the_derivatives(kind, option):
+    """Also where a ray's own end lies inside the volume: at a source in it, or before a plane."""
+    case, options = DIFFERENTIABLE[kind], OPTIONS[option]
+    x, y = (each[:1].requires_grad_() for each in noise(case))
+    assert torch.autograd.gradcheck(
+        lambda x, *v: case.moved(*v).build(**options)(x), (x, *leaves(case)), atol=1e-5
+    )
+    assert torch.autograd.gradcheck(
+        lambda y, *v: case.moved(*v).build(**options).T(y), (y, *leaves(case)), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("kind", ["cone", "beams", "explicit"])
+def test_second_derivatives_in_volume_and_views(kind, option):
+    A = DIFFERENTIABLE[kind].build(**OPTIONS[option])
+    x, y = (each[:1].requires_grad_() for each in noise(DIFFERENTIABLE[kind]))
+    assert torch.autograd.gradgradcheck(
+        lambda x, y: (A(x).square() * y).sum() + A.T(y).pow(3).sum(), (x, y)
+    )
+
+
+def changes(case: Case, backend: str, options: dict) -> list[torch.Tensor]:
+    """Derivatives by the rays, through the views and through the adjoint."""
+    x, y = noise(case, channels=2)
+    vectors = leaves(case)
+    A = case.moved(*vectors).build(backend=backend, **options)
+    one = torch.autograd.grad((A(x) * y).sum(), vectors)
+    return [*one, *torch.autograd.grad((A.T(y) * x).sum(), vectors)]
+
+
+# derivatives along an axis-aligned view stand on the kinks between voxels
+@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("kind", [kind for kind in CASES if kind != "axial"])
+def test_derivatives_by_the_rays_equal_the_oracle(kind, option, monkeypatch):
+    case, options = CASES[kind], OPTIONS[option]
+    expected, found = (changes(case, backend, options) for backend in ("reference", "cpu"))
+    monkeypatch.setattr(plan, "BUDGET", 1)
+    pieces = changes(case, "cpu", options)
+    scale = max(each.norm() for each in expected)
+    assert scale > 1
+    for exact, each, piecewise in zip(expected, found, pieces, strict=True):
+        assert (each - exact).norm() < 1e-11 * max(exact.norm(), 1e-3 * scale)
+        assert (piecewise - each).norm() < 1e-12 * scale
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_single_precision_leaves_the_pose_its_digits(method):
+    case = CASES["cone"]
+    x, y = noise(case)
+    found = []
+    for dtype in (torch.float64, torch.float32):
+        vectors = leaves(case)
+        A = case.moved(*vectors).build(method=method)
+        found.append(torch.autograd.grad((A(x.to(dtype)) * y.to(dtype)).sum(), vectors))
+    for exact, single in zip(*found, strict=True):
+        assert single.dtype == torch.float64 and (single - exact).norm() < 1e-4 * exact.norm()
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Counts what the CPU does."""
+    made: list[str] = []
+    works = {name: getattr(cpu, name) for name in ("project", "backproject", "lines_vjp")}
+    for name, work in works.items():
+
+        def counted(*arguments, name=name, work=work):
+            made.append(name)
+            return work(*arguments)
+
+        monkeypatch.setattr(cpu, name, counted)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("of_values", "of_rays", "expected"),
+    [
+        (True, False, ["back"]),
+        (False, True, ["vjp"]),
+        (True, True, ["back", "vjp"]),
+        (False, False, []),
+    ],
+)
+def test_only_what_is_asked_for_is_computed(of_values, of_rays, expected, calls):
+    case = DIFFERENTIABLE["cone"]
+    x, y = (each.requires_grad_(of_values) for each in noise(case))
+    vectors = leaves(case) if of_rays else list(case.vectors.values())
+    A = case.moved(*vectors).build()
+    for result, forward, back in (
+        (A(x), "project", "backproject"),
+        (A.T(y), "backproject", "project"),
+    ):
+        assert result.requires_grad == bool(expected)
+        calls.clear()
+        if expected:
+            result.sum().backward()
+        assert calls == [{"back": back, "vjp": "lines_vjp"}[each] for each in expected], forward
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_second_derivatives_in_the_pose_are_those_of_the_reference(method):
+    case = DIFFERENTIABLE["cone"]
+    x, y = (each[:1] for each in noise(case))
+    for act, values in (("forward", x), ("adjoint", y)):
+        seconds = []
+        for backend in ("cpu", "reference"):
+            vectors = leaves(case)
+            A = case.moved(*vectors).build(backend=backend, method=method)
+            (change,) = torch.autograd.grad(
+                getattr(A, act)(values).square().sum(), vectors[0], create_graph=True
+            )
+            seconds.append(torch.autograd.grad(change.sum(), vectors[0])[0])
+        assert seconds[1].norm() > 0.1 and gap(*seconds) < 1e-10

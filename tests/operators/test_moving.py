@@ -1,0 +1,97 @@
+"""Cameras that move after a projector was built: followed where they want a gradient, refused where
+not.
+"""
+
+import pickle
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mvrecon.operators.selection import ray_subset, view_subset
+from tests.operators.cases import DIFFERENTIABLE, Case, noise
+
+KINDS = ("cone", "beams", "explicit")
+
+
+def own(kind: str, wants: bool) -> Case:
+    """A case with tensors of its own."""
+    case = DIFFERENTIABLE[kind]
+    return case.moved(*(vector.clone().requires_grad_(wants) for vector in case.vectors.values()))
+
+
+def move(case: Case) -> None:
+    """The first source by 2 mm."""
+    with torch.no_grad():
+        case.rays.source[0] += torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_projector_built_without_grad_follows_cameras_that_want_one(kind, backend):
+    case, (x, y) = own(kind, wants=True), noise(DIFFERENTIABLE[kind])
+    with torch.no_grad():
+        A = case.build(backend=backend)
+        subset = view_subset(A, [1])
+        before = A(x)
+        move(case)
+        B = case.build(backend=backend)
+        assert torch.equal(A(x), B(x)) and not torch.allclose(A(x), before)
+        assert torch.equal(A.T(y), B.T(y))
+        assert torch.equal(subset(x), view_subset(B, [1])(x))
+    (change,) = torch.autograd.grad(A(x).square().sum(), case.rays.source)
+    (expected,) = torch.autograd.grad(B(x).square().sum(), case.rays.source)
+    assert torch.equal(change, expected) and change.norm() > 0.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cameras_that_want_a_gradient_later_get_it(kind):
+    case, x = own(kind, wants=False), noise(DIFFERENTIABLE[kind])[0]
+    A = case.build()
+    assert not A(x).requires_grad
+    case.rays.source.requires_grad_()
+    move(case)
+    assert torch.equal(A(x), case.build()(x)) and A(x).requires_grad
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cameras_that_were_changed_in_place_are_refused(kind):
+    case, (x, y) = own(kind, wants=False), noise(DIFFERENTIABLE[kind])
+    A = case.build()
+    mask = torch.zeros(len(case.rays), *case.rays.shape, dtype=torch.bool)
+    mask[0, 0, 0] = True
+    subset, support = (
+        ray_subset(A, mask),
+        A.with_support(torch.ones(case.grid.shape, dtype=torch.bool)),
+    )
+    calls = [
+        lambda: A(x),
+        lambda: A.T(y),
+        lambda: subset(x),
+        lambda: support(x),
+        lambda: A.with_support(None),
+    ]
+    for call in [*calls, lambda: deepcopy(A), lambda: pickle.dumps(A)]:
+        call()
+    move(case)
+    for call in [*calls, lambda: deepcopy(A), lambda: pickle.dumps(A)]:
+        with pytest.raises(RuntimeError, match="changed in place after the projector was built"):
+            call()
+    assert case.build()(x).isfinite().all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_copies_of_a_projector_work_whatever_was_written_before_it_was_built(kind):
+    case, x = own(kind, wants=False), noise(DIFFERENTIABLE[kind])[0]
+    move(case)
+    A = case.build()
+    for copied in (deepcopy(A), pickle.loads(pickle.dumps(A)), A.with_support(None)):
+        assert torch.equal(copied(x), A(x))
+
+
+def test_cameras_made_in_inference_mode_serve():
+    case, x = DIFFERENTIABLE["cone"], noise(DIFFERENTIABLE["cone"])[0]
+    with torch.inference_mode():
+        rays = replace(case.rays, source=case.rays.source * 1)
+        assert torch.equal(replace(case, rays=rays).build()(x), case.build()(x))

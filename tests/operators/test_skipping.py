@@ -1,0 +1,162 @@
+"""Leaving out what is zero changes no bit of views, and no gradient."""
+
+import pytest
+import torch
+
+from mvrecon.geometry.box import Box
+from mvrecon.geometry.rigid import random_rotation
+from mvrecon.kernels.rays.cpu import plan
+from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.operators import integrals
+from tests.operators.cases import Case
+from tests.operators.sparse import CASES, GRID, KINDS, METHODS, WAYS, volumes
+
+pytestmark = pytest.mark.usefixtures("nothing_is_too_little")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", CASES)
+def test_skipping_zeros_changes_no_bit(kind, method):
+    case = CASES[kind]
+    operators = {skip: case.build(method=method, skip=skip) for skip in ["off", *WAYS]}
+    for shape in KINDS:
+        for dtype, count in ((torch.float32, 1), (torch.float64, 1), (torch.float32, 5)):
+            x = volumes(shape, dtype, count)
+            dense = operators["off"](x)
+            assert operators["off"].skipped.mode == "off"
+            for skip in WAYS:
+                assert torch.equal(operators[skip](x), dense), (shape, dtype, count, skip)
+            assert (
+                bool(dense.any())
+                or shape not in ("blob", "checkerboard", "full")
+                or method == "trilinear:7"
+            )
+
+
+@pytest.mark.parametrize("kind", ["cone", "dome"])
+def test_random_rays_agree_to_the_last_bit(kind):
+    """Ten thousand and more rays in random poses of the grid."""
+    rng = torch.Generator().manual_seed(11)
+    for _ in range(6):
+        rig = CASES[kind].rays.moved(
+            random_rotation(rng) if kind == "dome" else torch.eye(3), torch.rand(3) - 0.5
+        )
+        case = Case(GRID, rig.refined(2))
+        for shape in ("blob", "checkerboard"):
+            x = volumes(shape)
+            for method in ("joseph", "siddon"):
+                dense = case.build(method=method, skip="off")(x)
+                assert torch.equal(case.build(method=method, skip="brick")(x), dense)
+
+
+@pytest.mark.parametrize("budget", [1, 4 * 8 * 3000])
+@pytest.mark.parametrize("kind", ["cone", "dome"])
+def test_pieces_and_threads_change_no_bit_either(kind, budget, monkeypatch):
+    monkeypatch.setattr(plan, "BUDGET", budget)
+    monkeypatch.setattr("mvrecon.kernels.threads.LEAST", 1)
+    case, before = CASES[kind], torch.get_num_threads()
+    try:
+        for shape in ("blob", "checkerboard"):
+            x, found = volumes(shape), []
+            for threads in (1, 3):
+                torch.set_num_threads(threads)
+                found += [case.build(skip=skip)(x) for skip in ("off", "box", "brick")]
+            assert all(torch.equal(found[0], other) for other in found[1:])
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf, 1e-42, -0.0])
+@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
+@pytest.mark.parametrize("kind", ["cone", "dome"])
+def test_what_is_not_a_number_is_not_skipped(kind, method, bad):
+    for place in ((8, 8, 8), (7, 16, 23), (18, 25, 32)):
+        x = volumes("blob")
+        x[0, 0][place] = bad
+        dense = CASES[kind].build(method=method, skip="off")(x)
+        for skip in ("box", "brick"):
+            views = CASES[kind].build(method=method, skip=skip)(x)
+            assert torch.equal(views.isnan(), dense.isnan())
+            assert torch.equal(views.nan_to_num(), dense.nan_to_num())
+
+
+def test_halves_are_looked_at_as_they_are():
+    for dtype in (torch.float16, torch.bfloat16):
+        x = volumes("blob", dtype)
+        dense = CASES["cone"].build(skip="off")(x)
+        for skip in ("box", "brick", "verify"):
+            A = CASES["cone"].build(skip=skip)
+            assert torch.equal(A(x), dense) and A.skipped.fractions["voxels"] < 0.1
+
+
+def test_nothing_stale_is_ever_used():
+    """The volume is looked at in every call, so no edit can go unseen, however it is made."""
+    A, dense = (CASES["cone"].build(skip=skip) for skip in ("brick", "off"))
+    x = volumes("blob")
+    A(x)
+    x[0, 0, 2, 3, 4] = 7  # in place
+    assert torch.equal(A(x), dense(x))
+    x.data[0, 0, 17, 20, 30] = 5  # past torch's count of versions
+    assert torch.equal(A(x), dense(x))
+    x.numpy()[0, 0, 1, 24, 2] = 3  # by another library
+    assert torch.equal(A(x), dense(x))
+    x.zero_()
+    x[0, 0, 18, 0, 0] = 1  # another volume at the same address
+    assert torch.equal(A(x), dense(x))
+
+
+def test_verify_finds_a_kernel_that_skips_too_much(monkeypatch):
+    A = CASES["cone"].build(skip="verify")
+    x = volumes("blob")
+    A(x)
+    wrong = Occupancy(Box.whole(GRID.shape).high, Box((6, 12, 9), (7, 14, 12))).encoded()
+    monkeypatch.setattr(integrals.ops, "occupied", lambda *arguments: wrong)
+    with pytest.raises(RuntimeError, match="skip='verify': [0-9]+ of 1190 pixels differ"):
+        A(x)
+
+
+@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
+def test_the_gradient_by_the_volume_is_the_dense_one(method):
+    y = None
+    found = []
+    for skip in ("off", "box", "brick"):
+        A = CASES["dome"].build(method=method, skip=skip)
+        x = volumes("blob").requires_grad_()
+        views = A(x)
+        y = torch.randn(views.shape, generator=torch.Generator().manual_seed(1)) if y is None else y
+        found.append(torch.autograd.grad(views, x, y)[0])
+    assert found[0][0, 0, 0, 0].abs().sum() > 0, "it is not zero where the volume is"
+    assert all(torch.equal(found[0], other) for other in found[1:])
+
+
+@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
+@pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
+def test_the_gradient_by_the_geometry_is_the_dense_one(kind, method):
+    case, found = CASES[kind], []
+    for skip in ("off", "box", "brick"):
+        leaves = [vector.clone().requires_grad_() for vector in case.vectors.values()]
+        views = case.moved(*leaves).build(method=method, skip=skip)(volumes("blob", torch.float64))
+        found.append(torch.autograd.grad(views.square().sum(), leaves))
+    for other in found[1:]:
+        for one, two in zip(found[0], other, strict=True):
+            assert torch.allclose(one, two, rtol=0, atol=1e-12 * one.abs().max().item())
+
+
+def test_views_that_are_zero_are_not_spread():
+    """Zeros add nothing to the adjoint, so leaving their rays out changes no bit of it."""
+    for kind in ("cone", "dome"):
+        A = CASES[kind].build()
+        y = torch.rand(1, 1, 5, 17, 14)
+        y[0, 0, :, 5:, :9] = 0
+        y[0, 0, 2] = 0
+        whole = sum(A.T(torch.where(torch.arange(5)[:, None, None] == m, y, 0)) for m in range(5))
+        assert torch.allclose(A.T(y), whole, rtol=1e-5, atol=1e-5)
+        oracle = CASES[kind].build(backend="reference")
+        assert torch.allclose(A.T(y.double()), oracle.T(y.double()), atol=1e-11)
+
+
+def test_compiled_and_mapped_calls_skip_too():
+    A = CASES["cone"].build(skip="box")
+    x = volumes("blob")
+    compiled = torch.compile(A, backend="eager", fullgraph=True)
+    assert torch.equal(compiled(x), A(x))

@@ -1,0 +1,106 @@
+"""A support is part of the operator and of its adjoint."""
+
+import pytest
+import torch
+
+from mvrecon.geometry.cameras.rigs import dome
+from mvrecon.geometry.grid import Grid
+from tests.operators.cases import Case
+from tests.operators.sparse import CASES, GRID, METHODS, volumes
+
+
+def support() -> torch.Tensor:
+    """A ball, off the centre, that leaves bricks of its box empty."""
+    places = torch.meshgrid(
+        *[torch.arange(n, dtype=torch.float64) for n in GRID.shape], indexing="ij"
+    )
+    return sum((p - c).square() for p, c in zip(places, (9, 14, 18), strict=True)) < 8.4**2
+
+
+@pytest.mark.parametrize("skip", ["off", "auto", "box", "brick"])
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", CASES)
+def test_a_support_is_part_of_operator_and_adjoint(kind, method, skip):
+    """A_M = A diag(M), A_M^T = diag(M) A^T, exactly adjoint, and the same to the last bit as the
+    dense operator's.
+    """
+    M, dense = support(), CASES[kind].build(method=method, skip="off")
+    A = CASES[kind].build(method=method, skip=skip, support=M)
+    for dtype, close in ((torch.float32, 1e-5), (torch.float64, 1e-12)):
+        rng = torch.Generator().manual_seed(2)
+        x = torch.randn(1, 2, *GRID.shape, generator=rng, dtype=dtype)
+        y = torch.randn(1, 2, *dense(x).shape[2:], generator=rng, dtype=dtype)
+        views, volume = A(x), A.T(y)
+        assert torch.equal(views, dense(torch.where(M, x, 0)))
+        assert torch.equal(volume, torch.where(M, dense.T(y), 0)) and volume.abs().max() > 0
+        one, two = (views.double() * y).sum(), (x.double() * volume).sum()
+        assert abs(one - two) < close * views.double().norm() * y.double().norm()
+
+
+@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:9"])
+def test_the_oracle_has_supports_too(method):
+    A, oracle = (
+        CASES["dome"].build(method=method, backend=b, support=support())
+        for b in ("cpu", "reference")
+    )
+    x = torch.randn(1, 1, *GRID.shape, dtype=torch.float64)
+    y = torch.randn(1, 1, 5, 17, 14, dtype=torch.float64)
+    assert torch.allclose(A(x), oracle(x), atol=1e-11) and torch.allclose(
+        A.T(y), oracle.T(y), atol=1e-11
+    )
+    assert oracle.skipped.mode == "off" and A.skipped.mode in ("box", "brick")
+
+
+def test_what_stands_outside_a_support_has_no_say():
+    x = torch.full((1, 1, *GRID.shape), torch.nan)
+    x[0, 0][support()] = 1
+    A = CASES["cone"].build(support=support())
+    assert A(x).isfinite().all()
+    x = torch.rand(1, 1, *GRID.shape, requires_grad=True)
+    A(x).sum().backward()
+    assert (x.grad != 0).logical_and(~support()).sum() == 0 and x.grad.abs().sum() > 0
+
+
+def test_gradients_with_a_support_are_exact():
+    grid = Grid.centred(size=(11, 10, 9), spacing=3.0)
+    mask = torch.zeros(grid.shape, dtype=torch.bool)
+    mask[4:6, 3:5, 8] = mask[5, 7, 1] = True
+    A = Case(grid, dome(2, 45.0, 30.0, 120.0, {"pixels": [3, 2], "pixel_mm": 20.0})).build(
+        support=mask
+    )
+    x, y = (
+        torch.randn(1, 1, *grid.shape, dtype=torch.float64),
+        torch.randn(1, 1, 2, 3, 2, dtype=torch.float64),
+    )
+    places = mask.nonzero().T
+
+    def forward(values):
+        return A(x.index_put((torch.tensor([0]), torch.tensor([0]), *places), values))
+
+    assert torch.autograd.gradcheck(forward, x[0, 0][mask].requires_grad_(), atol=1e-8)
+    assert torch.autograd.gradcheck(A.T, y.requires_grad_(), atol=1e-8)
+    assert torch.autograd.gradgradcheck(A.T, y, atol=1e-8)
+
+
+def test_an_empty_support_gives_nothing():
+    A = CASES["cone"].build(support=torch.zeros(GRID.shape, dtype=torch.bool))
+    y = torch.ones(1, 1, 5, 17, 14)
+    assert (
+        not A(torch.rand(1, 1, *GRID.shape)).any()
+        and not A.T(y).any()
+        and A.T(y).shape[2:] == GRID.shape
+    )
+
+
+def test_a_support_can_be_changed_and_follows_the_module():
+    A = CASES["cone"].build()
+    x = torch.rand(1, 1, *GRID.shape)
+    inside = A.with_support(support())
+    assert A.support is None and torch.equal(inside(x), A(torch.where(support(), x, 0)))
+    assert torch.equal(inside.with_support(None)(x), A(x))
+    assert inside.double().support.dtype == torch.bool
+
+
+def test_compiled_calls_have_supports_too():
+    x, inside = volumes("blob"), CASES["cone"].build(support=support())
+    assert torch.equal(torch.compile(inside, backend="eager", fullgraph=True)(x), inside(x))

@@ -1,0 +1,255 @@
+"""The docs are true: their Python runs, their commands compose, their files, names and tests
+exist.
+"""
+
+import ast
+import importlib
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+
+from mvrecon.apps import compare, view
+from mvrecon.apps.config import compose
+from mvrecon.apps.config.typed import check_parts
+from mvrecon.apps.list import SETTING
+from mvrecon.core.parts import LISTED, PROJECTORS
+from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.iterative import sirt
+from scripts import site_pages
+
+ROOT = Path(__file__).parents[2]
+DOCS = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "scripts").rglob("*.md")]
+    + [*(ROOT / "plugins").glob("*.md"), *(ROOT / "plugins").glob("*/README.md")]
+    + [*(ROOT / "plugins").glob("*/*/gpu/README.md")]
+    + [*(ROOT / "experiments").rglob("README.md"), *(ROOT / "mvrecon").rglob("README.md")]
+)
+#: Files that a reader makes, that an app writes, and other projects' files.
+ELSEWHERE = {"my_parts.py", "compare.md", "api.md", "page.md", "no.md"}
+#: Apps whose command line is not Hydra's.
+PARSERS = {"compare": compare.parser, "view": view.parser}
+#: Words of Lightning's that SECURITY.md forbids, and the pages that say so or that tell the past.
+UNSAFE, HISTORY = "load_from_checkpoint", {"SECURITY.md", "CHANGELOG.md"}
+
+
+def name_of(file: Path) -> str:
+    return str(file.relative_to(ROOT))
+
+
+def blocks(file: Path, language: str) -> list[str]:
+    """The fenced blocks of a page."""
+    return re.findall(rf"^ *```{language}\n(.*?)^ *```", file.read_text(), re.M | re.S)
+
+
+@pytest.fixture
+def registries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test registers is gone after it."""
+    for registry in LISTED.values():
+        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
+
+
+@pytest.mark.parametrize("file", [f for f in DOCS if blocks(f, "python")], ids=name_of)
+def test_the_python_of_a_page_runs(file: Path, registries: None):
+    """All blocks of a page one after the other; tests that they define are called."""
+    space = {"__name__": "page"}
+    for number, block in enumerate(blocks(file, "python"), 1):
+        try:
+            exec(compile(block, f"{name_of(file)}, block {number}", "exec"), space)  # noqa: S102
+        except ImportError as error:
+            if file.parent.name != "mvrecon-peers":  # whose libraries are the reader's choice
+                raise
+            pytest.skip(str(error))
+    for test in [value for name, value in space.items() if name.startswith("test_")]:
+        test()
+
+
+def test_the_projector_that_the_plugins_page_prints_reconstructs(registries: None):
+    detector = {"pixels": [6, 6], "pixel_mm": 1.0}
+    page = "\n".join(blocks(ROOT / "plugins" / "README.md", "python"))
+    exec(page, {"__name__": "page"})  # noqa: S102
+    grid, rig = Grid.centred(6, spacing=1.0), circular(1, 40.0, 70.0, detector)
+    A = PROJECTORS.build("sum_along_y", grid=grid, cameras=rig).to("cpu")
+    x = torch.rand(2, 1, *grid.shape, dtype=torch.float64)
+    y = torch.rand_like(A(x))
+    torch.testing.assert_close((A(x) * y).sum(), (x * A.T(y)).sum())
+    torch.testing.assert_close(A(x)[0, 0, 0], x[0, 0].sum(dim=1))
+    torch.testing.assert_close((2 * A)(sirt(A, y, iterations=2)), 2 * y)
+
+
+def commands() -> Iterator[tuple[str, str]]:
+    """Every command line of ours with the page that shows it, in blocks and inside sentences."""
+    for file in DOCS:
+        text = "\n".join([*blocks(file, "bash"), *blocks(file, "")]).replace("\\\n", " ")
+        spans = re.findall(r"`(mvrecon-[a-z]+ [^`]+)`", file.read_text())
+        for line in [*text.splitlines(), *(" ".join(span.split()) for span in spans)]:
+            for part in re.split(r"&&|;", line):
+                if re.match(r"(\w+=\S+ )*(\.venv/bin/)?mvrecon-[a-z]+( |$)", part.strip()):
+                    yield name_of(file), part.strip()
+
+
+@pytest.mark.parametrize(("page", "command"), sorted(set(commands())))
+def test_a_command_of_a_page_composes(page: str, command: str):
+    words = shlex.split(re.sub(r"<\w+>", "name", command), comments=True)
+    first = next(i for i, word in enumerate(words) if "mvrecon-" in word)
+    app, options = words[first].rpartition("mvrecon-")[2], words[first + 1 :]
+    if app == "list":
+        assert set(options) <= {*LISTED, SETTING, "--check", "--new-plugin", "my_plugin"}, command
+        return
+    if app == "warmup":
+        assert not options, command
+        return
+    if app in PARSERS:
+        PARSERS[app]().parse_args(options)
+        return
+    given = OverridesParser.create().parse_overrides([w for w in options if not w.startswith("-")])
+    for run in {tuple(values(line)[end] for line in given) for end in (0, -1)}:
+        settings = compose(*run, config_name=app)
+        if page not in HISTORY:
+            check_parts(settings)
+
+
+def values(given: Override) -> list[str]:
+    """A setting of a command line; of a sweep, with every value."""
+    if not given.is_sweep_override():
+        return [str(given.input_line)]
+    return [f"{given.get_key_element()}={value}" for value in given.sweep_string_iterator()]
+
+
+def test_pages_show_commands_of_every_app():
+    shown = {re.search(r"mvrecon-([a-z]+)", command)[1] for _, command in commands()}  # type: ignore[index]
+    assert shown >= {"train", "eval", "list", "bench", "stress"}
+
+
+def docstrings(file: Path) -> Iterator[str]:
+    """Every docstring of a module."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield ast.get_docstring(node) or ""
+
+
+def told(folders: tuple[str, ...] = ("mvrecon", "plugins", "scripts", "tests")) -> dict[str, str]:
+    """All that is told to a reader: pages, and the docstrings of each module."""
+    modules = [f for folder in folders for f in sorted((ROOT / folder).rglob("*.py"))]
+    texts = {name_of(f): "\n".join(docstrings(f)) for f in modules}
+    return texts | {name_of(f): f.read_text() for f in DOCS}
+
+
+def test_a_file_that_is_mentioned_is_there():
+    """By the end of its path, as `geometry/grid.py`."""
+    folders = ("mvrecon", "plugins", "scripts", "tests", "docs", "experiments", "conf")
+    files = [*ROOT.glob("*.*"), *(f for folder in folders for f in (ROOT / folder).rglob("*.*"))]
+    paths = [Path("/", f.relative_to(ROOT)).as_posix() for f in files]
+    missing = {
+        f"{page}: {path}"
+        for page, text in told().items()
+        if page != "CHANGELOG.md"
+        for path in re.findall(r"(?<![\w.*<>/-])[\w./-]*\w\.(?:py|md)\b", text)
+        if path not in ELSEWHERE
+        and not any(p.endswith("/" + re.sub(r"^(\.\./|\./|/)*", "", path)) for p in paths)
+    }
+    assert missing == set()
+
+
+def anchors(page: str) -> set[str]:
+    """The anchors of a page's headings: small letters, hyphens for spaces, no other signs."""
+    text = re.sub(r"^ *```.*?^ *```", "", page, flags=re.M | re.S)
+    titles = re.findall(r"^#+ +(.*)", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text), re.M)
+    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def broken(file: Path) -> list[str]:
+    """The links of a page to files, folders and headings of the project that are not there."""
+    links = re.findall(r"\]\(([^)\s#]*)#?([^)\s]*)\)", file.read_text())
+    missing = []
+    for path, anchor in [link for link in links if "://" not in link[0]]:
+        target = file.parent / path if path else file
+        target = target / "README.md" if anchor and target.is_dir() else target
+        if not target.exists() or anchor and anchor not in anchors(target.read_text()):
+            missing.append(f"{path}#{anchor}")
+    return missing
+
+
+@pytest.mark.parametrize("file", DOCS, ids=name_of)
+def test_a_link_leads_somewhere(file: Path):
+    assert broken(file) == []
+
+
+def test_a_broken_link_is_recognised(tmp_path: Path):
+    page = tmp_path / "page.md"
+    page.write_text("# Two words, `code`\n[a](page.md#two-words-code) [b](#no) [c](no.md)\n")
+    assert broken(page) == ["#no", "no.md#"]
+
+
+def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
+    """Laid out by scripts/site_pages.py: no page is forgotten, links still lead somewhere."""
+    site_pages.main(tmp_path, run=False)
+    laid_out = {str(f.relative_to(tmp_path)): f for f in tmp_path.rglob("*.md")}
+    tutorials = {name_of(script.with_suffix(".md")) for script in site_pages.TUTORIALS}
+    assert set(laid_out) == {*map(name_of, DOCS), *tutorials, "api.md"}
+    assert {page: broken(file) for page, file in laid_out.items() if broken(file)} == {}
+    folders = [
+        link
+        for file in laid_out.values()
+        for link in re.findall(r"\]\(([^)\s#:]+)\)", file.read_text())
+        if (file.parent / link).is_dir()
+    ]
+    assert folders == []  # a site has pages, no folders
+
+
+def test_a_module_or_name_that_is_mentioned_is_there():
+    """`mvrecon.operators.drr.Drr`, whole, in a page or a docstring."""
+    missing = {
+        f"{page}: {name}"
+        for page, text in told().items()
+        if page != "CHANGELOG.md"
+        for name in re.findall(r"`(mvrecon(?:_\w+)?(?:\.\w+)+)[`(]", text)
+        if name != "mvrecon.plugins" and not importable(name)  # the group of entry points
+    }
+    assert missing == set()
+
+
+def importable(name: str) -> bool:
+    """Whether a dotted name is a module, or an attribute of one."""
+    module, _, attribute = name.rpartition(".")
+    try:
+        importlib.import_module(name)
+    except ImportError:
+        try:
+            return hasattr(importlib.import_module(module), attribute)
+        except ImportError:
+            return False
+    return True
+
+
+def test_a_test_that_a_page_names_is_there():
+    names = {name for f in DOCS for name in re.findall(r"`(test_\w+)`", f.read_text())}
+    folders = (ROOT / "tests", *ROOT.glob("plugins/*/tests"))
+    code = "\n".join(f.read_text() for folder in folders for f in folder.rglob("test_*.py"))
+    assert len(names) > 20
+    assert [name for name in sorted(names) if f"def {name}(" not in code] == []
+
+
+def test_nobody_is_told_to_load_a_checkpoint_unseen():
+    texts = told(("mvrecon", "plugins", "scripts"))
+    assert [p for p, text in texts.items() if UNSAFE in text and p not in HISTORY] == []
+
+
+def test_the_layers_that_contributors_read_are_those_that_are_checked():
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    layers = next(c["layers"] for c in contracts["contracts"] if c["type"] == "layers")
+    rule = re.search(
+        r"Imports run downward only.*?`core`[^.]*\.",
+        (ROOT / "CONTRIBUTING.md").read_text(),
+        re.S,
+    )
+    assert rule is not None
+    rows = [set(re.findall(r"`(\w+)`", row)) for row in rule[0].split(";")]
+    assert rows == [set(re.split(r" \| ", layer)) for layer in layers]

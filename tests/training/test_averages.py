@@ -1,0 +1,46 @@
+"""Averaged weights over a break: the averages and their counters are those of a run that never
+broke off.
+"""
+
+import pytest
+
+from mvrecon.apps.config import compose
+from mvrecon.training import fit
+from mvrecon.training.module import ReconstructionModule
+from tests.training import lives
+
+#: Every other step, and every epoch.
+AVERAGED = ("+callbacks.ema.update_every_n_steps=2", "+callbacks.ema.update_starting_at_epoch=0")
+CASES = {
+    "judged within epochs": (),
+    "judged at epochs' ends": ("trainer.val_check_interval=5",),
+    "never judged": ("+trainer.limit_val_batches=0",),
+}
+
+
+def trained(folder, options, broken=None):
+    """What a training of five steps an epoch leaves that breaks off at a step, and goes on from its
+    last checkpoint.
+    """
+    settings = compose(*lives.OPTIONS, *AVERAGED, *options)
+    if broken is not None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(ReconstructionModule, "training_step", ReconstructionModule.training_step)
+            lives.counted(
+                ReconstructionModule, "training_step", broken, lives.raising(MemoryError())
+            )
+            with pytest.raises(MemoryError):
+                fit.fit(lives.METHOD, settings, fit.build_data(settings), folder)
+    fit.fit(lives.METHOD, settings, fit.build_data(settings), folder)
+    return lives.state(folder)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_break_changes_no_bit_of_the_averages(case, tmp_path):
+    whole = trained(tmp_path / "whole", CASES[case])
+    assert (
+        whole["averaging_state"]["n_averaged"] == lives.STEPS // 2 + 3
+    )  # of the epochs one is not whole
+    places = lives.different(whole, trained(tmp_path / "broken", CASES[case], 6))
+    # Lightning does not count an epoch as begun that it begins after a break
+    assert [place for place in places if "/fit_loop/epoch_progress/" not in place] == []

@@ -1,0 +1,91 @@
+"""A volume with NaN or infinity is an error of its method: counted, shown, and never the best."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from mvrecon.apps.config import compose
+from mvrecon.core.parts import METRICS
+from mvrecon.methods.classical.iterative import backprojection
+from mvrecon.methods.method import Solver
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.report.comparison.rows import read
+from mvrecon.report.metrics import UNITS
+from mvrecon.training import evaluation, fit, report, run_folder
+from tests.training.test_evaluation import shown
+
+
+@pytest.fixture
+def settings():
+    """Four test scenes, two methods that learn nothing."""
+    return compose("experiment=smoke", "method=backprojection", "data.sizes.test=4")
+
+
+@pytest.fixture
+def spoilt(monkeypatch):
+    """Lets one voxel of backprojection fail in each second scene."""
+    solve, scenes = Solver.forward, []
+
+    def forward(method, views, A):
+        out = solve(method, views, A)
+        if method.solve is not backprojection:
+            return out
+        scene = views.sum().item()
+        scenes.extend([scene] if scene not in scenes else [])
+        volume = out.volume.clone()
+        volume[..., 0, 0, 0] = [0.0, math.nan, 0.0, math.inf][scenes.index(scene)]
+        return Reconstruction(volume, sigma=torch.ones_like(volume))
+
+    monkeypatch.setattr(Solver, "forward", forward)
+
+
+def test_a_failed_volume_is_counted_shown_and_never_averaged_away(settings, spoilt, tmp_path):
+    found = evaluation.results(settings, tmp_path, fit.build_data(settings))
+    first, second = found["methods"].values()
+    assert first["failed"] == found["scenes"][1::2] and second["failed"] == []
+    for name in UNITS:
+        values = [math.isnan(value) for value in first[name]["values"]]
+        assert values == [False, True, False, True] and math.isnan(first[name]["mean"])
+        assert math.isfinite(second[name]["mean"])
+    assert all(math.isnan(q["mean"]) for q in first["quality"].values() if "mean" in q)
+    text = shown(found)
+    assert text.count("2 of 4") == text.count("failed") == len(report.COLUMNS)
+    (line,) = report.remarks(found)
+    assert all(name in line for name in first["failed"])
+
+    run_folder.write(tmp_path / "config.yaml", "{}")
+    run_folder.write_results(tmp_path, found)
+    assert [row.failed for row in read([tmp_path])] == [2, 0]
+
+
+def test_a_failed_validation_is_the_worst_of_a_sweep(settings, spoilt, tmp_path):
+    score = evaluation.validation_psnr(settings, tmp_path, fit.build_data(settings))
+    run_folder.write_results(tmp_path, {"validation_psnr": score})
+    written = json.loads((tmp_path / "results.json").read_text())["validation_psnr"]
+    assert float(written) == -math.inf
+
+
+def test_a_scene_without_an_object_is_no_failure(settings, monkeypatch, tmp_path):
+    data, empty = fit.build_data(settings), evaluation.case_metrics
+
+    def without(volume, views, case, data_range):
+        return empty(volume, views, {**case, "inside": case["inside"] & False}, data_range)
+
+    monkeypatch.setattr(evaluation, "case_metrics", without)
+    found = evaluation.results(settings, tmp_path, data)
+    for row in found["methods"].values():
+        assert row["failed"] == [] and math.isfinite(row["psnr"]["mean"])
+        assert all(map(math.isnan, row["psnr_inside"]["values"]))
+
+
+def test_a_plugins_figure_never_meets_a_failed_volume(settings, spoilt, monkeypatch, tmp_path):
+    def figure(volume, truth, inside, data_range):
+        assert volume.isfinite().all()
+        return 1.0
+
+    monkeypatch.setattr(METRICS, "names", lambda: ["mine"])
+    monkeypatch.setattr(METRICS, "get", lambda name: figure)
+    first, _ = evaluation.results(settings, tmp_path, fit.build_data(settings))["methods"].values()
+    assert first["mine"]["values"][::2] == [1.0, 1.0] and math.isnan(first["mine"]["mean"])

@@ -1,0 +1,90 @@
+"""A run goes on to more steps."""
+
+import json
+import shutil
+
+import pytest
+
+import mvrecon.apps.train
+from mvrecon.apps.config import compose
+from mvrecon.training import checkpoints, storage
+from mvrecon.training.module import share
+from tests.training.lives import METHOD, OPTIONS
+from tests.training.runs import call
+
+#: Steps of the short training, in the middle of the second epoch of five; and of the long one.
+SHORT, LONG = 7, 14
+PLAIN = [option for option in OPTIONS if not option.startswith(("callbacks=", "trainer.max_s"))]
+
+
+def steps(count, schedule):
+    return [f"trainer.max_steps={count}", f"optimizer.schedule={schedule}", "optimizer.warmup=0"]
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A finished run of few steps at a constant rate."""
+    folder = tmp_path_factory.mktemp("short")
+    mvrecon.apps.train.train(compose(*PLAIN, *steps(SHORT, "constant")), folder)
+    return folder
+
+
+def kept(folder):
+    """The weights and the optimiser's moments that a run ended with."""
+    state = storage.read(checkpoints.finished(folder, METHOD))
+    moments = state["optimizer_states"][0]["state"]
+    return state["state_dict"], {k: moments[k]["exp_avg_sq"] for k in moments}
+
+
+def same(a, b):
+    return all((x == y).all() for x, y in zip(a.values(), b.values(), strict=True))
+
+
+def test_a_finished_run_goes_on_to_more_steps_as_if_it_had_never_ended(short, tmp_path, capsys):
+    """A finished run that goes on to more steps ends, at a constant rate, with the same bits as one
+    of so many steps from the start; its table is a new one.
+    """
+    folder, whole = tmp_path / "run", tmp_path / "whole"
+    shutil.copytree(short, folder)
+    assert call(mvrecon.apps.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
+    said = capsys.readouterr().err
+    assert f"{SHORT} steps become {LONG}" in said and f"going on from step {SHORT}" in said
+    mvrecon.apps.train.train(compose(*PLAIN, *steps(LONG, "constant")), whole)
+    assert all(map(same, kept(folder), kept(whole)))
+    rows = [json.loads((f / "results.json").read_text())["methods"] for f in (folder, whole)]
+    assert [row[METHOD]["train_steps"] for row in rows] == [LONG, LONG]
+    assert rows[0][METHOD]["psnr"]["values"] == rows[1][METHOD]["psnr"]["values"]
+
+
+def test_a_run_is_never_shortened_and_takes_nothing_else(short, capsys):
+    """A run that would go on to fewer steps, or with any other setting, is refused, and its table
+    stays.
+    """
+    before = (short / "results.json").read_bytes()
+    for options, message in (
+        ([f"trainer.max_steps={SHORT - 1}"], f"expected more, got {SHORT - 1}"),
+        ([f"trainer.max_steps={LONG}", "seed=1"], "but got also seed=1"),
+    ):
+        assert call(mvrecon.apps.train, f"resume={short}", *options) == 1
+        assert message in capsys.readouterr().err
+    assert (short / "results.json").read_bytes() == before
+
+
+def test_the_rate_of_a_lengthened_training_is_that_of_the_whole_schedule(short):
+    """At step 7 of 14 the cosine is at half of the highest rate, not where it ended at step 7."""
+    folder = short.parent / "cosine"
+    settings = compose(*PLAIN, *steps(SHORT, "cosine"))
+    mvrecon.apps.train.train(settings, folder)
+    rates = []
+    step = mvrecon.training.module.ReconstructionModule.training_step
+    with pytest.MonkeyPatch.context() as patch:
+
+        def watched(module, batch, batch_idx):
+            rates.append(module.optimizers().param_groups[0]["lr"])
+            return step(module, batch, batch_idx)
+
+        patch.setattr(mvrecon.training.module.ReconstructionModule, "training_step", watched)
+        assert call(mvrecon.apps.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
+    highest = settings["optimizer"]["lr"]
+    assert rates == [highest * share("cosine", n, LONG, 0.0) for n in range(SHORT, LONG)]
+    assert rates[0] == pytest.approx(highest / 2)

@@ -1,0 +1,103 @@
+"""A trained method from the path of its checkpoint or of its run."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+import mvrecon as mv
+from mvrecon.apps.config import compose
+from mvrecon.training import checkpoints, fit
+from tests.training.runs import trained_for_a_step
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run of one step; its other method, SIRT, learns nothing and has no checkpoint."""
+    place = tmp_path_factory.mktemp("run")
+    return trained_for_a_step(
+        place, "cross_view_small", options=["callbacks=best", "~callbacks.board"]
+    )
+
+
+def test_a_run_folder_and_its_checkpoint_are_one_method(run: Path):
+    first, second = mv.load(run), mv.load(checkpoints.finished(run, "cross_view_small"))
+    third = mv.load(str(run), "cross_view_small")
+    weights = first.module.state_dict()
+    for other in (second, third):
+        assert all(torch.equal(weights[k], v) for k, v in other.module.state_dict().items())
+    A = first.module.projector
+    assert first.module(torch.zeros(1, 1, *A.range_shape)).volume.shape[2:] == A.domain_shape
+
+
+def test_a_trained_method_is_called_with_views_and_with_another_rig_and_grid(run: Path):
+    """The training's own rig and grid give the same bits; others their own shape."""
+    trained = mv.load(str(run))
+    A = trained.module.projector
+    views = A(torch.rand(1, 1, *A.domain_shape, generator=torch.Generator().manual_seed(0)))
+    expected = trained.module(views).volume
+    assert torch.equal(trained(views), expected) and not trained(views).requires_grad
+    assert torch.equal(trained(views, A.cameras, A.grid), expected)
+    fewer = trained(views[:, :, ::2], A.cameras[::2])
+    assert fewer.shape == expected.shape and fewer.isfinite().all()
+    grid = mv.Grid.centred(size=(12, 14, 16), spacing=9.0)
+    assert trained(views, grid=grid).shape[2:] == grid.shape
+    with pytest.raises(ValueError, match=r"take x\[None, None\]"):
+        trained(views[0, 0])
+
+
+def test_a_method_that_a_run_does_not_have_is_named(run: Path):
+    with pytest.raises(LookupError, match="no method 'unet'. It has cross_view_small"):
+        mv.load(run, "unet")
+    with pytest.raises(FileNotFoundError, match="sirt.*did the training of"):
+        mv.load(run, "sirt")
+    with pytest.raises(FileNotFoundError, match="No checkpoint or run folder"):
+        mv.load(run / "nowhere")
+
+
+def test_a_grid_by_its_shape_is_refused_where_the_order_of_the_axes_matters(run: Path):
+    """A shape (z, y, x) is no size (x, y, z): of a cube, or of cubic voxels, it is clear."""
+    settings = yaml.safe_load((run / "config.yaml").read_text())
+    spacing = [1.0, 2.0, 3.0]
+    settings["grid"] = {"shape": [16, 16, 16], "spacing": spacing}
+    assert fit.build_data(settings).grid.spacing == tuple(spacing)
+    settings["grid"] = {"shape": [4, 6, 8], "spacing": 2.0}
+    assert fit.build_data(settings).grid.shape == (4, 6, 8)
+    settings["grid"] = {"shape": [4, 6, 8], "spacing": spacing}
+    with pytest.raises(ValueError, match=r"expected size=\(8, 6, 4\)"):
+        fit.build_data(settings)
+
+
+def test_a_method_begins_with_the_weights_of_another_on_any_rig(run: Path, tmp_path, monkeypatch):
+    """`init_from`, once; a resumed run keeps its own weights. Those of another method are
+    refused.
+    """
+    options = ("experiment=smoke", "camera.n_views=5", f"init_from={run}", "seed=7")
+    settings, weights = compose(*options), mv.load(run).module.method.state_dict()
+    begun: list[dict[str, torch.Tensor]] = []
+
+    class Trainer:
+        loggers, is_global_zero = (), False
+        save_checkpoint = staticmethod(lambda path: None)
+
+        def fit(self, module, **_):
+            begun.append(module.method.state_dict())
+
+    monkeypatch.setattr(fit, "build_trainer", lambda *_: Trainer())
+    fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
+    assert all(torch.equal(begun[0][name], value) for name, value in weights.items())
+    other = compose(*options, "method=world_unet")
+    with pytest.raises(ValueError, match="weights of the same method.*'world_unet'"):
+        fit.fit("world_unet", other, fit.build_data(other), tmp_path)
+
+
+def test_the_checkpoint_of_the_best_validation_is_kept(run: Path):
+    """By `val/psnr`; of one validation it is the last step's."""
+    best, last = mv.load(run / "best" / "best.ckpt"), mv.load(run)
+    assert best.steps == last.steps == 1
+    weights = last.module.state_dict()
+    assert all(torch.equal(weights[k], v) for k, v in best.module.state_dict().items())
+    state = torch.load(run / "best" / "best.ckpt")["callbacks"]
+    (kept,) = (value for key, value in state.items() if key.startswith("ModelCheckpoint"))
+    assert kept["monitor"] == "val/psnr" and kept["best_model_score"] > 0
