@@ -3,9 +3,8 @@ begun again.
 
 `python -m tests.training.lives PLAN.json` runs a plan's lives and prints, one line of JSON each,
 how they ended. A plan holds `options` (the command line of mvrecon-train) and `runs` (folder ->
-what
-befalls each life; a last one follows that nothing befalls). `python -m tests.training.lives COUNT
-SEED` kills COUNT times at random and compares the weights.
+what befalls each life; a last one follows that nothing befalls). `python -m tests.training.lives
+COUNT SEED` kills COUNT times at random and compares the weights.
 """
 
 import errno
