@@ -28,7 +28,7 @@ from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
 from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.methods.calibration.blur import Blur, blurred
 from mvrecon.methods.calibration.unknowns import Unknowns, unknowns
-from mvrecon.methods.classical.cgls import cgls
+from mvrecon.methods.classical.least_squares import cgls
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled
 
 #: Pixels (degrees, or a hundredth of a gain's logarithm) to both sides of a difference quotient.

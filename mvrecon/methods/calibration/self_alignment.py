@@ -16,7 +16,7 @@ from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.methods.calibration.alignment import Alignment, CorrectedViews, aligned, alignment
 from mvrecon.methods.calibration.unknowns import motions
-from mvrecon.methods.classical.iterative import sirt, sirt_weights
+from mvrecon.methods.classical.sirt import sirt, sirt_weights
 from mvrecon.operators.operator import Projector
 
 #: Shifts in pixels, and gains, below which a camera counts as standing still.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.views import check_finite
-from mvrecon.methods.classical.problem import Iterate, Monitor
+from mvrecon.methods.classical.solver import Iterate, Monitor
 from mvrecon.methods.classical.stopping import combined
 from mvrecon.operators.operator import LinearOperator, Projector
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from mvrecon.kernels.precision import wide
+from mvrecon.methods.classical.solver import spread_background
 from mvrecon.operators.checks import check_measured
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import RaySelection, ViewSelection
@@ -57,7 +58,10 @@ class PoissonLikelihood:
             A,
             ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views),
         )
-        measured, added = wide(self.views(counts)), self.views(_spread(background, counts))
+        measured, added = (
+            wide(self.views(counts)),
+            self.views(spread_background(background, counts)),
+        )
         bins = {"counts": measured, "background": added}
         faults = [(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]
         full = (measured != 0).flatten(0, 1).any(dim=0)[None, None]
@@ -215,20 +219,3 @@ def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
     """y / ybar, and 0 where either is."""
     counted = (counts > 0) & (expected > 0)
     return torch.where(counted, counts / torch.where(counted, expected, 1), 0)
-
-
-def _spread(background: float | Tensor, counts: Tensor) -> Tensor:
-    if not isinstance(background, Tensor | int | float):
-        raise TypeError(f"Expected a background of one number or views, got {background!r}")
-    like = wide(counts[:0])
-    if not isinstance(background, Tensor):
-        return like.new_full((), background).expand(counts.shape)
-    added = background.to(like)
-    try:
-        return added.expand(counts.shape)
-    except RuntimeError as error:
-        raise ValueError(
-            f"Expected a background of one number or views that broadcast to "
-            f"{tuple(counts.shape)}, "
-            f"got {tuple(added.shape)}"
-        ) from error

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.methods.classical.problem import Iterate, Monitor
+from mvrecon.methods.classical.solver import Iterate, Monitor
 
 
 def discrepancy(sigma: float | Float[Tensor, "#b #c #m #v #u"]) -> Monitor:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from mvrecon.core.division import divided
 from mvrecon.core.registry import check_options
-from mvrecon.methods.classical.iterative import inverse_sums
+from mvrecon.methods.classical.sirt import inverse_sums
 from mvrecon.methods.learned.geometry import Geometry
 
 

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool3d
 from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.finer import check_factor, on_finer_grid
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.learned.geometry import Geometry
 
 

@@ -6,7 +6,7 @@ from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.learned import start as starts
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.learned.start import ClassicalStart
