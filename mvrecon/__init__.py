@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     from mvrecon.geometry.grid import Grid as Grid
     from mvrecon.methods.calibration.from_data import calibrated as calibrated
     from mvrecon.methods.calibration.markers import from_markers as from_markers
-    from mvrecon.methods.classical.filtered.fdk import fbp as fbp
-    from mvrecon.methods.classical.filtered.fdk import fdk as fdk
-    from mvrecon.methods.classical.filtered.streaming import fdk_streamed as fdk_streamed
-    from mvrecon.methods.classical.finer import finer as finer
-    from mvrecon.methods.classical.held_out import held_out as held_out
+    from mvrecon.methods.classical.fdk import fbp as fbp
+    from mvrecon.methods.classical.fdk import fdk as fdk
+    from mvrecon.methods.classical.fdk import fdk_streamed as fdk_streamed
     from mvrecon.methods.classical.least_squares import cgls as cgls
     from mvrecon.methods.classical.least_squares import tikhonov as tikhonov
     from mvrecon.methods.classical.mlem import mlem as mlem
     from mvrecon.methods.classical.mlem import osem as osem
     from mvrecon.methods.classical.sirt import os_sart as os_sart
     from mvrecon.methods.classical.sirt import sirt as sirt
+    from mvrecon.methods.classical.stopping import held_out as held_out
     from mvrecon.methods.classical.total_variation import fista_tv as fista_tv
     from mvrecon.methods.classical.total_variation import pdhg_tv as pdhg_tv
     from mvrecon.methods.classical.tv_map import tv_map as tv_map
+    from mvrecon.methods.method import finer as finer
     from mvrecon.methods.method import reconstruct as reconstruct
     from mvrecon.operators.drr import Drr as Drr
     from mvrecon.operators.operator import LinearOperator as LinearOperator
@@ -66,14 +66,14 @@ _DOOR = {
     "dcspect80": "mvrecon.geometry.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.geometry.cameras.rigs:dome",
     "epipolar_line": "mvrecon.geometry.cameras.epipolar:epipolar_line",
-    "finer": "mvrecon.methods.classical.finer:finer",
+    "finer": "mvrecon.methods.method:finer",
     "fista_tv": "mvrecon.methods.classical.total_variation:fista_tv",
-    "fbp": "mvrecon.methods.classical.filtered.fdk:fbp",
-    "fdk": "mvrecon.methods.classical.filtered.fdk:fdk",
-    "fdk_streamed": "mvrecon.methods.classical.filtered.streaming:fdk_streamed",
+    "fbp": "mvrecon.methods.classical.fdk:fbp",
+    "fdk": "mvrecon.methods.classical.fdk:fdk",
+    "fdk_streamed": "mvrecon.methods.classical.fdk:fdk_streamed",
     "from_file": "mvrecon.geometry.cameras.files:from_file",
     "from_markers": "mvrecon.methods.calibration.markers:from_markers",
-    "held_out": "mvrecon.methods.classical.held_out:held_out",
+    "held_out": "mvrecon.methods.classical.stopping:held_out",
     "load": "mvrecon.training.trained:load",
     "mlem": "mvrecon.methods.classical.mlem:mlem",
     "os_sart": "mvrecon.methods.classical.sirt:os_sart",

@@ -40,21 +40,21 @@ HEADS = Registry(
 )
 NETWORKS = Registry(
     "network",
-    unet="mvrecon.methods.learned.network:UNet3d",
+    unet="mvrecon.methods.learned.unet:UNet3d",
 )
 #: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
 #: return a volume; see `models/method.py`.
 METHODS = Registry(
     "method",
     cross_view="mvrecon.methods.learned.cross_view:CrossView",
-    world_unet="mvrecon.methods.learned.world_unet:WorldUNet",
-    mean_fusion="mvrecon.methods.learned.mean_fusion:MeanFusion",
-    geometry_free="mvrecon.methods.learned.geometry_free:GeometryFree",
-    aligned="mvrecon.methods.calibration.aligned:Aligned",
+    world_unet="mvrecon.methods.learned.baselines:WorldUNet",
+    mean_fusion="mvrecon.methods.learned.baselines:MeanFusion",
+    geometry_free="mvrecon.methods.learned.baselines:GeometryFree",
+    aligned="mvrecon.methods.calibration.self_alignment:Aligned",
     uncertain="mvrecon.methods.learned.uncertain:Uncertain",
     backprojection="mvrecon.methods.classical.sirt:backprojection",
-    fbp="mvrecon.methods.classical.filtered.fdk:fbp",
-    fdk="mvrecon.methods.classical.filtered.fdk:fdk",
+    fbp="mvrecon.methods.classical.fdk:fbp",
+    fdk="mvrecon.methods.classical.fdk:fdk",
     trained="mvrecon.training.trained_method:TrainedMethod",
     sirt="mvrecon.methods.classical.sirt:sirt",
     os_sart="mvrecon.methods.classical.sirt:os_sart",
@@ -65,12 +65,12 @@ METHODS = Registry(
     mlem="mvrecon.methods.classical.mlem:mlem",
     osem="mvrecon.methods.classical.mlem:osem",
     tv_map="mvrecon.methods.classical.tv_map:tv_map",
-    finer="mvrecon.methods.classical.finer:finer",
+    finer="mvrecon.methods.method:finer",
 )
 #: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
 STREAMED = Registry(
     "streamed reconstructor",
-    fdk="mvrecon.methods.classical.filtered.streaming:fdk_streamed",
+    fdk="mvrecon.methods.classical.fdk:fdk_streamed",
 )
 #: Files of views that are read as one array, by their endings: f(path) -> ProjectionStack.
 VIEW_FILES = Registry(

@@ -11,9 +11,9 @@ from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.finer import check_factor, on_finer_grid
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.learned.geometry import Geometry
+from mvrecon.methods.method import check_factor, on_finer_grid
 
 
 def fingerprints(views: Float[Tensor, "b 1 m v u"]) -> list[bytes]:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.methods.classical.filtered.fdk import fbp
+from mvrecon.methods.classical.fdk import fbp
 from mvrecon.methods.classical.total_variation import power_norm
 from mvrecon.methods.method import build_method
 from mvrecon_baselines.breast import BreastSlices

@@ -1,4 +1,4 @@
-"""Likelihoods of counts with total variation: the method ends at the minimum, told by other means."""
+"""Likelihoods of counts with total variation: the method ends at the minimum."""
 
 import pytest
 import torch
