@@ -40,7 +40,7 @@ HEADS = Registry(
 )
 NETWORKS = Registry(
     "network",
-    unet="mvrecon.methods.learned.unet:UNet3d",
+    unet="mvrecon.methods.learned.baselines:UNet3d",
 )
 #: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
 #: return a volume; see `models/method.py`.

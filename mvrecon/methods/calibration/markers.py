@@ -1,6 +1,5 @@
 """Calibration from views of known markers: their places on the detector to a fraction of a pixel,
-projection matrices by the direct linear transform, then
-a rig by least squares.
+projection matrices by the direct linear transform, then a rig by least squares.
 """
 
 from typing import NamedTuple

@@ -144,7 +144,8 @@ def proximal_gradient(
             15, 2015, 3.2): an inexact proximal map needs it.
     """
     A, views, x = problem.A, problem.views, problem.first
-    t: float | Tensor = 1.0
+    # each sample has its own restarts
+    t = views.new_ones(*views.shape[:2], 1, 1, 1) if momentum == "restarted" else 1.0
     beta: float | Tensor = 0.0
     ahead, residual = x, problem.residual(problem.start)
     of_volume = residual
@@ -156,7 +157,7 @@ def proximal_gradient(
             if momentum == "restarted":
                 # a step of a sample points against the way from its last volume
                 turns = ((ahead - x) * (x - last)).flatten(2).sum(dim=2) > 0
-                t = torch.where(turns[..., None, None, None], 1.0, t)
+                t = torch.where(turns[..., None, None, None], 1, t)
             root = 1 + 4 * t * t
             root = root.sqrt() if isinstance(root, Tensor) else math.sqrt(root)
             t, before = (1 + root) / 2, t
