@@ -6,7 +6,7 @@ A registered method is a class of modules, which are called as `module(views, A)
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -92,18 +92,6 @@ def reconstruct(
 SIRT = {"name": "sirt", "iterations": 25, "momentum": True}
 
 
-class Fine(NamedTuple):
-    """A reconstruction on a finer grid.
-
-    Args:
-        A: the operator of that grid.
-        volume: its voxels, in the unit of the volume.
-    """
-
-    A: LinearOperator
-    volume: Float[Tensor, "b c e i x"]
-
-
 def finer(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
@@ -130,7 +118,8 @@ def finer(
         LookupError, TypeError: an unknown method, or an option that it does not have.
     """
     check_factor("fine", fine)
-    return avg_pool3d(on_finer_grid(A, views, fine, method or SIRT, support).volume, fine)
+    _, volume = on_finer_grid(A, views, fine, method or SIRT, support)
+    return avg_pool3d(volume, fine)
 
 
 def on_finer_grid(
@@ -139,13 +128,13 @@ def on_finer_grid(
     fine: int,
     method: Mapping[str, Any],
     support: Bool[Tensor, "d h w"] | None = None,
-) -> Fine:
-    """Reconstruct by a method on a grid `fine` times finer, in the unit of the volume; see
-    `finer`.
+) -> tuple[LinearOperator, Float[Tensor, "b c e i x"]]:
+    """The operator of a grid `fine` times finer, and a method's volume there, in the unit of
+    the volume; see `finer`.
     """
     mask = {} if support is None else {"support": subdivided(support, fine)}
     B = A.refined(fine)
-    return Fine(B, METHODS.from_config(method, B, views, **mask))
+    return B, METHODS.from_config(method, B, views, **mask)
 
 
 def check_factor(name: str, factor: Any) -> None:

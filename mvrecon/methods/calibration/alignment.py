@@ -139,13 +139,6 @@ class Prior(NamedTuple):
     shift_px: float = 1.0
     gain: float = 0.05
 
-    def precision(self, like: Tensor) -> Float[Tensor, " 3"]:
-        """Inverse variances of both shifts and of the gain, as a tensor on the device of another,
-        which is not waited for.
-        """
-        shifts, gain = like.new_full((2,), self.shift_px), like.new_full((1,), self.gain)
-        return torch.cat([shifts, gain]).pow(-2)
-
 
 #: A pixel and 5 %.
 USUAL = Prior()
@@ -251,7 +244,7 @@ def alignment(
     fit = _Fit(
         _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
-        prior.precision(views),
+        torch.cat([views.new_full((2,), prior.shift_px), views.new_full((1,), prior.gain)]).pow(-2),
     )
     for _ in range(steps):
         rest = (blurred(aligned(views, one), BLUR) - smooth) / unit

@@ -364,9 +364,17 @@ def calibrated(
     numbers = unknowns(cameras, free)
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
     A = operator_of(misaligned(cameras, numbers.misalignment(nominal)))
-    _check(views, A)
+    if tuple(views.shape) != (1, 1, *A.range_shape):
+        raise ValueError(
+            f"expected views [1 1 m v u] {(1, 1, *A.range_shape)} of the operator, got "
+            f"{tuple(views.shape)}"
+        )
+    check_finite(views)
+    if not views.any():
+        raise ValueError("expected views of an object to calibrate from, got zeros alone")
+    blur_px = VIEW_BLUR * max(A.grid.spacing) / resolution(A.cameras.to("cpu"), A.grid.centre)
     blobs = Blur(A.domain_shape, [BLOB] * 3, A.device)
-    problem = _Problem(operator_of, cameras, numbers, blobs, blurred(views, _view_blur(A)))
+    problem = _Problem(operator_of, cameras, numbers, blobs, blurred(views, blur_px))
     kept: list[str] = []
     while True:
         fit = _fitted(problem, iterations, rounds, monitor)
@@ -448,20 +456,3 @@ def _improved(
     longest = problem.unknowns.longest
     step = rest.change(r - A(change)).clamp(-longest, longest)
     return values + step, x + change
-
-
-def _check(views: Float[Tensor, "1 1 m v u"], A: Projector) -> None:
-    if tuple(views.shape) != (1, 1, *A.range_shape):
-        raise ValueError(
-            f"expected views [1 1 m v u] {(1, 1, *A.range_shape)} of the operator, got "
-            f"{tuple(views.shape)}"
-        )
-    check_finite(views)
-    if not views.any():
-        raise ValueError("expected views of an object to calibrate from, got zeros alone")
-
-
-def _view_blur(A: Projector) -> float:
-    """Blur of the views in pixels."""
-    pixel = resolution(A.cameras.to("cpu"), A.grid.centre)
-    return VIEW_BLUR * max(A.grid.spacing) / pixel

@@ -120,37 +120,22 @@ def pixel_weights(
     tangents, rows, pitch = orbit.tangents, unit(rig.u), rig.u.norm(dim=-1)
     slant = (tangents * rows).sum(dim=-1)
     angle = (scan.steps / pitch).to(dtype)[:, None, None]
-    fan = _fan(rig, scan, u, v)
+    if scan.kind == "full":  # its shares do not depend on fan coordinates: one pixel a view
+        fan = u.new_zeros(len(rig), 1, 1)
+    else:
+        fan = fan_coordinate(rig, orbit, u, v)
     share = redundancy(scan, fan) * angle
     if rig.parallel:
         return share / slant.abs().to(dtype)[:, None, None]
     start = rig.origin - rig.source
     by_row, by_motion = along(start, rig, rows, u, v), along(start, rig, tangents, u, v)
-    square = _squares(rig, u, v)
+    # squared distances of pixels from the source in mm^2
+    normal = unit(torch.linalg.cross(rows, unit(rig.v)))
+    level = along(start, rig, torch.linalg.cross(normal, rows), u, v)
+    square = (start * normal).sum(dim=-1).square().to(u)[:, None, None]
+    square = square + by_row.square() + level.square()
     motion = slant.to(dtype)[:, None, None] * square - by_row * by_motion
     return share * orbit.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
-
-
-def _fan(
-    rig: Cameras, scan: Scan, u: Float[Tensor, " u"], v: Float[Tensor, " v"]
-) -> Float[Tensor, "m v u"]:
-    """Fan coordinates; of one pixel a view where the shares do not depend on them."""
-    if scan.kind == "full":
-        return u.new_zeros(len(rig), 1, 1)
-    return fan_coordinate(rig, scan.orbit, u, v)
-
-
-def _squares(
-    rig: Cameras, u: Float[Tensor, " u"], v: Float[Tensor, " v"]
-) -> Float[Tensor, "m v u"]:
-    """Squared distances of pixels from the source in mm^2."""
-    axis_u, axis_v = unit(rig.u), unit(rig.v)
-    normal = unit(torch.linalg.cross(axis_u, axis_v))
-    start = rig.origin - rig.source
-    level = torch.linalg.cross(normal, axis_u)
-    parts = (along(start, rig, axis, u, v).square() for axis in (axis_u, level))
-    depth = (start * normal).sum(dim=-1).square().to(u)[:, None, None]
-    return sum(parts, start=depth)
 
 
 #: Pixels in memory at a time, weighted and filtered: 8 bytes for each of them.
@@ -211,7 +196,11 @@ class Plan:
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
     rig = cameras if filtering.weights_from is None else filtering.weights_from
     scan = scan_of(rig, grid, filtering.scan)
-    target = _widened(cameras, *scan.columns)
+    # further columns before and behind the rig's own
+    before, behind = scan.columns
+    shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
+    source = cameras.source - shift if cameras.parallel else cameras.source
+    target = replace(cameras, source=source, origin=cameras.origin - shift, shape=shape)
     response = ramp_response(target.shape[1], filtering.filter, filtering.cutoff)
     maps = image_maps(target, grid)
     images = Images(maps, target.ray_extent, grid.shape)
@@ -270,13 +259,6 @@ def filtered_backprojection(
         total = volume if total is None else total.add_(volume)
     assert total is not None  # a rig has at least one camera
     return total
-
-
-def _widened(cameras: Cameras, before: int, behind: int) -> Cameras:
-    """The rig with further columns before and behind its own."""
-    shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
-    source = cameras.source - shift if cameras.parallel else cameras.source
-    return replace(cameras, source=source, origin=cameras.origin - shift, shape=shape)
 
 
 def fdk_streamed(

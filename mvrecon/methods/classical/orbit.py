@@ -208,7 +208,11 @@ def scan_of(cameras: Cameras, grid: Grid, kind: ScanKind = "auto") -> Scan:
     if kind not in KINDS:
         raise ValueError(f"Unknown scan {kind!r}. Known: {', '.join(KINDS)}")
     orbit = orbit_of(cameras, grid)
-    low, high = _limits(cameras, orbit)
+    # the fan coordinates between which every camera's middle row measures
+    rows, columns = cameras.shape
+    ends = torch.tensor([-0.5, columns - 0.5], dtype=torch.float64)
+    fan = fan_coordinate(cameras, orbit, ends, torch.tensor([(rows - 1) / 2]).double())[:, 0]
+    low, high = fan.amin(dim=1).max().item(), fan.amax(dim=1).min().item()
     narrow, wide = min(-low, high), max(-low, high)
     if not narrow > 0:
         raise ValueError(
@@ -242,8 +246,8 @@ def scan_of(cameras: Cameras, grid: Grid, kind: ScanKind = "auto") -> Scan:
     far, near = (wide, narrow) if cameras.parallel else (math.tan(wide), math.tan(narrow))
     empty = math.ceil(cameras.shape[1] * (far - near) / (far + near))
     before = side * (cameras.u[0] @ orbit.tangents[0]).item() > 0
-    columns = (empty, 0) if before else (0, empty)
-    return Scan(orbit, kind, angles, steps, narrow, side, columns)
+    padding = (empty, 0) if before else (0, empty)
+    return Scan(orbit, kind, angles, steps, narrow, side, padding)
 
 
 def _gaps(angles: Float[Tensor, " m"], period: float) -> tuple[Tensor, Tensor]:
@@ -284,14 +288,6 @@ def _short(
     behind = behind.clone()
     behind[last] = 0
     return Scan(orbit, "short", angles, _periodic(order, behind), arc / 2 - math.pi / 2)
-
-
-def _limits(cameras: Cameras, orbit: Orbit) -> tuple[float, float]:
-    """The fan coordinates between which every camera's middle row measures."""
-    rows, columns = cameras.shape
-    ends = torch.tensor([-0.5, columns - 0.5], dtype=torch.float64)
-    fan = fan_coordinate(cameras, orbit, ends, torch.tensor([(rows - 1) / 2]).double())[:, 0]
-    return fan.amin(dim=1).max().item(), fan.amax(dim=1).min().item()
 
 
 def fan_coordinate(

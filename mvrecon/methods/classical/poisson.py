@@ -98,20 +98,16 @@ class PoissonLikelihood:
         want a gradient.
         """
         if self.A.pose_gradient or dtype not in self._sensitivity:
-            self._sensitivity[dtype] = self._summed(dtype)
+            like = self.counts.new_ones((), dtype=dtype)
+            chosen = like.expand(1, 1, *self.selection.range_shape).contiguous()
+            total = self.bins.T(chosen)
+            if self.selection is not self.views:
+                # a list of rays rounds otherwise than whole views, and MLEM divides what a list
+                # explains by this
+                others = like - self.views(self.selection.T(chosen))
+                total = total + self.A.subset(self.views).T(others)
+            self._sensitivity[dtype] = total
         return self._sensitivity[dtype]
-
-    def _summed(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
-        shapes = self.selection.range_shape, self.views.range_shape
-        chosen, ones = (
-            torch.ones(1, 1, *s, dtype=dtype, device=self.counts.device) for s in shapes
-        )
-        if self.selection is self.views:
-            return self.bins.T(chosen)
-        # a list of rays rounds otherwise than whole views, and MLEM divides what a list explains by
-        # this
-        rest = ones - self.views(self.selection.T(chosen))
-        return self.bins.T(chosen) + self.A.subset(self.views).T(rest)
 
     def expected(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
         """ybar, the counts to be expected in the bins that are computed.
@@ -130,7 +126,12 @@ class PoissonLikelihood:
         Raises:
             ValueError: a volume of another batch than the counts.
         """
-        self._check(volume)
+        if volume.shape[:2] != self.counts.shape[:2]:
+            batch = tuple(self.counts.shape[:2])
+            raise ValueError(
+                f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got "
+                f"{tuple(volume.shape)}"
+            )
         return self.bins(volume) + self.background
 
     def impossible(self, expected: Float[Tensor, "b c *n"]) -> Int64[Tensor, ""]:
@@ -169,14 +170,6 @@ class PoissonLikelihood:
         so.
         """
         return self.bins.T(_ratio(self.counts, self.mean(volume)))
-
-    def _check(self, volume: Tensor) -> None:
-        if volume.shape[:2] != self.counts.shape[:2]:
-            batch = tuple(self.counts.shape[:2])
-            raise ValueError(
-                f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got "
-                f"{tuple(volume.shape)}"
-            )
 
 
 def refuse_impossible(bins: int) -> None:

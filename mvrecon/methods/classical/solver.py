@@ -179,7 +179,14 @@ class InverseProblem:
             check_finite(views, on_gpu=False)
         views = wide(views)
         if start is not None:
-            _check_start(A, start, views)
+            # on a GPU, which is not synchronised, results from bad values are not finite either
+            check(start, "start", A.domain_shape, A.device)
+            if start.shape[:2] != views.shape[:2] or (start.is_cpu and not start.isfinite().all()):
+                raise ValueError(
+                    f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
+                    f"{tuple(start.shape)} with {int((~start.isfinite()).sum())} values that are "
+                    f"not finite"
+                )
             start = start.to(views.dtype)
             start = start if support is None else start * support
         if background is None or (isinstance(background, int | float) and background == 0):
@@ -317,16 +324,3 @@ def check_not_negative(**options: float) -> None:
     for name, value in options.items():
         if not 0 <= value < float("inf"):
             raise ValueError(f"Expected {name} of at least 0, got {value}")
-
-
-def _check_start(A: LinearOperator, start: Tensor, views: Tensor) -> None:
-    """Refuse a first volume of another shape, batch or device, or in main memory with values that
-    are not finite; on a GPU, which is not synchronised, results from such values are not finite
-    either.
-    """
-    check(start, "start", A.domain_shape, A.device)
-    if start.shape[:2] != views.shape[:2] or (start.is_cpu and not start.isfinite().all()):
-        raise ValueError(
-            f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
-            f"{tuple(start.shape)} with {int((~start.isfinite()).sum())} values that are not finite"
-        )

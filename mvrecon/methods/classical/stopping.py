@@ -224,7 +224,11 @@ def held_out(
     for weight in [None] if weights is None else weights:
         run = partial(method, taken, explained, **_with(fixed, weight))
         trials.append(Trial(weight, jury.errors(run, fixed.get("monitor"))))
-    picks = [_best(trials, sample) for sample in range(len(views))]
+    picks = []
+    for sample in range(len(views)):
+        best = min(trials, key=lambda trial: min(trial.errors[sample]))  # noqa: B023
+        errors = best.errors[sample]
+        picks.append(_Pick(1 + errors.index(min(errors)), best.weight))
     most = max(pick.iterations for pick in picks)
     if most == fixed.get("iterations"):
         warnings.warn(
@@ -233,8 +237,8 @@ def held_out(
             stacklevel=2,
         )
     volume = _chosen(method, A, views, picks, fixed)
-    best = None if weights is None else [pick.weight for pick in picks if pick.weight is not None]
-    return Choice(volume, [pick.iterations for pick in picks], best, trials)
+    chosen = None if weights is None else [pick.weight for pick in picks if pick.weight is not None]
+    return Choice(volume, [pick.iterations for pick in picks], chosen, trials)
 
 
 class _Pick(NamedTuple):
@@ -270,12 +274,6 @@ class _Jury(NamedTuple):
 
     def _tired(self, errors: list[float]) -> bool:
         return len(errors) - 1 - errors.index(min(errors)) >= self.patience if errors else False
-
-
-def _best(trials: Sequence[Trial], sample: int) -> _Pick:
-    """The iterations and the weight with the least error of a sample."""
-    best = min(trials, key=lambda trial: min(trial.errors[sample]))
-    return _Pick(1 + best.errors[sample].index(min(best.errors[sample])), best.weight)
 
 
 def _chosen(

@@ -107,14 +107,11 @@ class ClassicalStart:
             case = self._known.get(name)
             if case is None:
                 case = self._made(geometry, views, sample)
-                self._keep(name, case)
+                if case.nbytes <= self._room:
+                    self._room -= case.nbytes
+                    self._known[name] = case.to(torch.empty((), dtype=case.volume.dtype))
             cases.append(case.to(views))
         return _batch(cases)
-
-    def _keep(self, name: bytes, case: Beginning) -> None:
-        if case.nbytes <= self._room:
-            self._room -= case.nbytes
-            self._known[name] = case.to(torch.empty((), dtype=case.volume.dtype))
 
     def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Beginning:
         """The method's volume of a sample's views, scaled to a mean density of the rays of

@@ -97,8 +97,13 @@ class Frusta:
             depth: number of depth bins.
         """
         edges = depth_edges(seen_depth_range(cameras, grid), depth)
-        frusta_from_world, world_from_frusta = maps_between(grid, cameras, edges)
-        ahead = frusta_lattice(cameras, grid, edges).ahead[:, None, :, None]
+        world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges)
+        # where voxels lie in frusta, and where bins lie in the grid
+        frusta_from_world, world_from_frusta = (
+            lattice_maps(frusta, world),
+            lattice_maps(world, frusta),
+        )
+        ahead = frusta.ahead[:, None, :, None]
         shape = depth, *cameras.shape
         bins = enclosed(world_from_frusta[0, :, None], grid.shape, shape)
         start, end = cameras.rays()
@@ -172,14 +177,6 @@ class Frusta:
         if volumes.shape[1] == 1:
             return warp(volumes, self.world_from_frusta, self.shape)[:, 0]
         return warp(volumes, self.world_from_frusta.transpose(0, 1), self.shape)[:, :, 0]
-
-
-def maps_between(
-    grid: Grid, cameras: Cameras, edges: Float[Tensor, "m e"]
-) -> tuple[Float[Tensor, "m 1 5 2 3"], Float[Tensor, "1 m 5 2 3"]]:
-    """The maps of the warps: where voxels lie in frusta, and where bins lie in the grid."""
-    world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges)
-    return lattice_maps(frusta, world), lattice_maps(world, frusta)
 
 
 #: A bin whose transmission is below this share counts as one of this share.
@@ -265,7 +262,8 @@ class ViewFrames:
     def to_frames(self, volumes: Float[Tensor, "b *m c e i x"]) -> Float[Tensor, "b m c D r s"]:
         """Volumes in each camera's frustum, attenuated: one for all cameras, or one for each."""
         volumes = volumes[:, None] if volumes.ndim == 5 else volumes
-        return self._transmitted(self.frusta.to_frusta(volumes) * self.frusta.occupied)
+        density = self.frusta.to_frusta(volumes) * self.frusta.occupied
+        return density if self.transmission is None else density * self.transmission
 
     def to_volume(self, density: Float[Tensor, "b m c D r s"]) -> Float[Tensor, "b m c e i x"]:
         """Densities of the frusta at the cells of the volume, zero outside the support."""
@@ -275,9 +273,6 @@ class ViewFrames:
     def emitted(self, density: Float[Tensor, "b m 1 D r s"]) -> Float[Tensor, "b m 1 D r s"]:
         """The density whose attenuated one is given."""
         return density if self.transmission is None else density / self.transmission
-
-    def _transmitted(self, density: Tensor) -> Tensor:
-        return density if self.transmission is None else density * self.transmission
 
     def project(self, density: Float[Tensor, "b m 1 D r s"]) -> Float[Tensor, "b 1 m r s"]:
         """Each camera's view of the density in its own frustum, as integrals."""
