@@ -147,7 +147,7 @@ Method = Callable[..., Tensor]
 
 
 class Trial(NamedTuple):
-    """A run without the views that judge.
+    """A run without the views that are left out.
 
     Args:
         weight: of the penalty; None for a method without.
@@ -197,7 +197,7 @@ def held_out(
         A: the operator.
         views: measured.
         weights: values of the method's option `weight` to compare; None: the method's own value.
-        every: one view in so many judges.
+        every: one view in so many is left out.
         patience: a trial ends where so many iterations have brought nothing better to any sample.
         options: of the method; its `iterations` are the most that are tried, its `monitor` sees the
             iterates of all runs in turn.
@@ -216,14 +216,14 @@ def held_out(
             f"every={every}, weights={weights}"
         )
     check_finite(views)
-    judges = list(range(min(every // 2, count - 1), count, every))
-    rest = [view for view in range(count) if view not in set(judges)]
+    left = list(range(min(every // 2, count - 1), count, every))
+    others = [view for view in range(count) if view not in set(left)]
     grid = Box.whole(A.domain_shape)  # a crop, unlike a subset, knows its voxels' size
-    jury, trials = _Jury(A.cropped(grid, judges), views[:, :, judges], patience), []
-    taken, explained = A.cropped(grid, rest), views[:, :, rest]
+    validation, trials = _Validation(A.cropped(grid, left), views[:, :, left], patience), []
+    taken, explained = A.cropped(grid, others), views[:, :, others]
     for weight in [None] if weights is None else weights:
         run = partial(method, taken, explained, **_with(fixed, weight))
-        trials.append(Trial(weight, jury.errors(run, fixed.get("monitor"))))
+        trials.append(Trial(weight, validation.errors(run, fixed.get("monitor"))))
     picks = []
     for sample in range(len(views)):
         best = min(trials, key=lambda trial: min(trial.errors[sample]))  # noqa: B023
@@ -248,8 +248,8 @@ class _Pick(NamedTuple):
     weight: float | None
 
 
-class _Jury(NamedTuple):
-    """Views that were left out, and how long they wait for something better."""
+class _Validation(NamedTuple):
+    """Views that were left out, and after how many iterations without a lower error a run ends."""
 
     A: LinearOperator
     views: Tensor
@@ -260,19 +260,19 @@ class _Jury(NamedTuple):
         errors: list[list[float]] = [[] for _ in self.views]
         size = self.views.flatten(1).norm(dim=1).clamp_min(torch.finfo(torch.float32).tiny)
 
-        def judge(iterate: Iterate) -> bool:
+        def record(iterate: Iterate) -> bool:
             misfit = (self.views - self.A(iterate.volume)).flatten(1).norm(dim=1) / size
             for curve, error in zip(errors, misfit.tolist(), strict=True):
-                if not self._tired(curve):
+                if not self._stalled(curve):
                     curve.append(error)
-            return all(map(self._tired, errors))
+            return all(map(self._stalled, errors))
 
-        run(monitor=judge if monitor is None else combined(judge, monitor))
+        run(monitor=record if monitor is None else combined(record, monitor))
         if not all(errors):
             raise ValueError("Expected a method that iterates, got one that ended before it began")
         return errors
 
-    def _tired(self, errors: list[float]) -> bool:
+    def _stalled(self, errors: list[float]) -> bool:
         return len(errors) - 1 - errors.index(min(errors)) >= self.patience if errors else False
 
 
