@@ -28,21 +28,20 @@ if TYPE_CHECKING:
     from mvrecon.geometry.grid import Grid as Grid
     from mvrecon.methods.calibration.from_data import calibrated as calibrated
     from mvrecon.methods.calibration.markers import from_markers as from_markers
-    from mvrecon.methods.classical.bsrem import bsrem as bsrem
-    from mvrecon.methods.classical.cgls import cgls as cgls
-    from mvrecon.methods.classical.filtered.fdk import fbp as fbp
-    from mvrecon.methods.classical.filtered.fdk import fdk as fdk
-    from mvrecon.methods.classical.filtered.streaming import fdk_streamed as fdk_streamed
-    from mvrecon.methods.classical.finer import finer as finer
-    from mvrecon.methods.classical.fista_tv import fista_tv as fista_tv
-    from mvrecon.methods.classical.held_out import held_out as held_out
-    from mvrecon.methods.classical.iterative import sirt as sirt
+    from mvrecon.methods.classical.fdk import fbp as fbp
+    from mvrecon.methods.classical.fdk import fdk as fdk
+    from mvrecon.methods.classical.fdk import fdk_streamed as fdk_streamed
+    from mvrecon.methods.classical.least_squares import cgls as cgls
+    from mvrecon.methods.classical.least_squares import tikhonov as tikhonov
     from mvrecon.methods.classical.mlem import mlem as mlem
     from mvrecon.methods.classical.mlem import osem as osem
-    from mvrecon.methods.classical.os_sart import os_sart as os_sart
-    from mvrecon.methods.classical.pdhg_tv import pdhg_tv as pdhg_tv
-    from mvrecon.methods.classical.tikhonov import tikhonov as tikhonov
+    from mvrecon.methods.classical.sirt import os_sart as os_sart
+    from mvrecon.methods.classical.sirt import sirt as sirt
+    from mvrecon.methods.classical.stopping import held_out as held_out
+    from mvrecon.methods.classical.total_variation import fista_tv as fista_tv
+    from mvrecon.methods.classical.total_variation import pdhg_tv as pdhg_tv
     from mvrecon.methods.classical.tv_map import tv_map as tv_map
+    from mvrecon.methods.method import finer as finer
     from mvrecon.methods.method import reconstruct as reconstruct
     from mvrecon.operators.drr import Drr as Drr
     from mvrecon.operators.operator import LinearOperator as LinearOperator
@@ -61,35 +60,34 @@ _DOOR = {
     "LinearOperator": "mvrecon.operators.operator:LinearOperator",
     "Radon": "mvrecon.operators.radon:Radon",
     "arc": "mvrecon.geometry.cameras.rigs:arc",
-    "bsrem": "mvrecon.methods.classical.bsrem:bsrem",
     "calibrated": "mvrecon.methods.calibration.from_data:calibrated",
-    "cgls": "mvrecon.methods.classical.cgls:cgls",
+    "cgls": "mvrecon.methods.classical.least_squares:cgls",
     "circular": "mvrecon.geometry.cameras.rigs:circular",
     "dcspect80": "mvrecon.geometry.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.geometry.cameras.rigs:dome",
     "epipolar_line": "mvrecon.geometry.cameras.epipolar:epipolar_line",
-    "finer": "mvrecon.methods.classical.finer:finer",
-    "fista_tv": "mvrecon.methods.classical.fista_tv:fista_tv",
-    "fbp": "mvrecon.methods.classical.filtered.fdk:fbp",
-    "fdk": "mvrecon.methods.classical.filtered.fdk:fdk",
-    "fdk_streamed": "mvrecon.methods.classical.filtered.streaming:fdk_streamed",
+    "finer": "mvrecon.methods.method:finer",
+    "fista_tv": "mvrecon.methods.classical.total_variation:fista_tv",
+    "fbp": "mvrecon.methods.classical.fdk:fbp",
+    "fdk": "mvrecon.methods.classical.fdk:fdk",
+    "fdk_streamed": "mvrecon.methods.classical.fdk:fdk_streamed",
     "from_file": "mvrecon.geometry.cameras.files:from_file",
     "from_markers": "mvrecon.methods.calibration.markers:from_markers",
-    "held_out": "mvrecon.methods.classical.held_out:held_out",
+    "held_out": "mvrecon.methods.classical.stopping:held_out",
     "load": "mvrecon.training.trained:load",
     "mlem": "mvrecon.methods.classical.mlem:mlem",
-    "os_sart": "mvrecon.methods.classical.os_sart:os_sart",
+    "os_sart": "mvrecon.methods.classical.sirt:os_sart",
     "osem": "mvrecon.methods.classical.mlem:osem",
     "parallel": "mvrecon.geometry.cameras.rigs:parallel",
-    "pdhg_tv": "mvrecon.methods.classical.pdhg_tv:pdhg_tv",
+    "pdhg_tv": "mvrecon.methods.classical.total_variation:pdhg_tv",
     "random_rig": "mvrecon.geometry.cameras.random_rigs:random_rig",
     "read_volume": "mvrecon.data.volume_files:read_volume",
     "reconstruct": "mvrecon.methods.method:reconstruct",
     "save_program": "mvrecon.training.program:save_program",
     "save_volume": "mvrecon.data.volume_files:save_volume",
     "save_weights": "mvrecon.training.trained:save_weights",
-    "sirt": "mvrecon.methods.classical.iterative:sirt",
-    "tikhonov": "mvrecon.methods.classical.tikhonov:tikhonov",
+    "sirt": "mvrecon.methods.classical.sirt:sirt",
+    "tikhonov": "mvrecon.methods.classical.least_squares:tikhonov",
     "tv_map": "mvrecon.methods.classical.tv_map:tv_map",
 }
 

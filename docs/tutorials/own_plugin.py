@@ -14,7 +14,7 @@ import mvrecon as mv
 from mvrecon.apps.list import new_plugin
 from mvrecon.core.parts import HEADS, PROJECTORS
 from mvrecon.methods.learned.cross_view import CrossView
-from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon.operators.operator import Wrapped
 from mvrecon.testing import check_head, check_projector
 

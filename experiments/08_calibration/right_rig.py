@@ -12,7 +12,7 @@ from mvrecon.core.parts import SCENES
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.calibration.from_data import calibrated
-from mvrecon.methods.classical.cgls import cgls
+from mvrecon.methods.classical.least_squares import cgls
 from mvrecon.operators.drr import Drr
 
 EDGE = 96.0  # mm of the grid

@@ -15,10 +15,8 @@ from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned, perturbed
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.methods.calibration.detection import centroids, helix
-from mvrecon.methods.calibration.from_data import calibrated
-from mvrecon.methods.calibration.markers import from_markers
-from mvrecon.methods.calibration.unknowns import without_motion
+from mvrecon.methods.calibration.from_data import calibrated, without_motion
+from mvrecon.methods.calibration.markers import centroids, from_markers, helix
 from mvrecon.operators.drr import Drr
 
 EDGE = 96.0  # mm of the grid

@@ -16,6 +16,7 @@ from mvrecon.core.files.tables import write_rows
 from mvrecon.data.scenes.derenzo import derenzo
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon_spect.bsrem import bsrem
 from mvrecon_spect.metrics.contrast import sphere_recovery
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 from mvrecon_spect.metrics.repeated import repeated
@@ -29,8 +30,8 @@ WELLS = (10, 8, 7, 6, 5, 4)
 METHODS = {
     "mlem": (100, lambda A, y, n, **o: mv.mlem(A, y, n, **o)),
     "osem20": (10, lambda A, y, n, **o: mv.osem(A, y, n, 20, **o)),
-    "bsrem 0.003": (15, lambda A, y, n, **o: mv.bsrem(A, y, n, 0.003, 8, **o)),
-    "bsrem 0.03": (15, lambda A, y, n, **o: mv.bsrem(A, y, n, 0.03, 8, **o)),
+    "bsrem 0.003": (15, lambda A, y, n, **o: bsrem(A, y, n, 0.003, 8, **o)),
+    "bsrem 0.03": (15, lambda A, y, n, **o: bsrem(A, y, n, 0.03, 8, **o)),
     "tv_map 0.1": (100, lambda A, y, n, **o: mv.tv_map(A, y, n, 0.1, background=0.01, **o)),
 }
 

@@ -13,6 +13,7 @@ import torch
 import mvrecon as mv
 from mvrecon.core.files.tables import write_rows
 from mvrecon.geometry.rigid import euler_rotation
+from mvrecon_spect.bsrem import bsrem
 from mvrecon_spect.metrics.contrast import contrast_to_noise, count_bias, defect_contrast
 from mvrecon_spect.metrics.polar_map import LongAxis, polar_map
 from mvrecon_spect.projector import Spect
@@ -26,7 +27,7 @@ METHODS = {
     "osem, no attenuation": (mv.osem, {"iterations": 4, "subsets": 8}, False),
     "osem, 20 subsets": (mv.osem, {"iterations": 3, "subsets": 20}, True),
     "osem, 8 subsets": (mv.osem, {"iterations": 4, "subsets": 8}, True),
-    "bsrem, weight 0.003": (mv.bsrem, {"iterations": 6, "subsets": 8, "weight": 0.003}, True),
+    "bsrem, weight 0.003": (bsrem, {"iterations": 6, "subsets": 8, "weight": 0.003}, True),
 }
 
 

@@ -17,9 +17,8 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.misalignment import misaligned
 from mvrecon.geometry.grid import Grid, coarse
-from mvrecon.methods.calibration.blur import blurred
-from mvrecon.methods.calibration.from_data import Estimate, calibrated
-from mvrecon.methods.calibration.unknowns import KINDS, unknowns
+from mvrecon.methods.calibration.alignment import blurred
+from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
 
 #: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
 COARSE, ROUNDS = 64, 12

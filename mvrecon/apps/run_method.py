@@ -16,9 +16,15 @@ from torch import Tensor
 from mvrecon.apps.scan import Scan
 from mvrecon.core.files.memory import peak
 from mvrecon.core.parts import METHODS, STREAMED
-from mvrecon.methods.classical.held_out import Choice, held_out, left_out_residual
-from mvrecon.methods.classical.problem import Iterate
-from mvrecon.methods.classical.stopping import Curve, combined, discrepancy
+from mvrecon.methods.classical.solver import Iterate
+from mvrecon.methods.classical.stopping import (
+    Choice,
+    Curve,
+    combined,
+    discrepancy,
+    held_out,
+    left_out_residual,
+)
 from mvrecon.methods.method import build_method
 
 #: Views whose residual is computed at a time.

@@ -16,7 +16,7 @@ from mvrecon.data.projections.region import Region
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.grid import coarse
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Projector, sees_integrals
 from mvrecon.report.metrics import nrmse
 
@@ -48,7 +48,7 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
     """What speaks against a scan's reconstruction, in words, without a unit; empty for most.
 
     A projector whose `pixel_integral` says nothing, and one of weighted integrals, have doubts of
-    their volume's residual alone; a method declares its views, `declares`.
+    their volume's residual alone; a method declares its data, `declares`.
 
     Args:
         scan: that was reconstructed.
@@ -58,7 +58,7 @@ def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> l
     """
     words: list[str] = []
     limit = POOR
-    orders, kind = _orders(scan), getattr(METHODS.get(method), "views", "integrals")
+    orders, kind = _orders(scan), getattr(METHODS.get(method), "data_kind", "integrals")
     if sees_integrals(orders[0].A):
         first, views = _read(scan, orders)
         if kind == "integrals":

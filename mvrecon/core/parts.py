@@ -40,38 +40,37 @@ HEADS = Registry(
 )
 NETWORKS = Registry(
     "network",
-    unet="mvrecon.methods.learned.network:UNet3d",
+    unet="mvrecon.methods.learned.baselines:UNet3d",
 )
 #: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
 #: return a volume; see `models/method.py`.
 METHODS = Registry(
     "method",
     cross_view="mvrecon.methods.learned.cross_view:CrossView",
-    world_unet="mvrecon.methods.learned.world_unet:WorldUNet",
-    mean_fusion="mvrecon.methods.learned.mean_fusion:MeanFusion",
-    geometry_free="mvrecon.methods.learned.geometry_free:GeometryFree",
-    aligned="mvrecon.methods.calibration.aligned:Aligned",
+    world_unet="mvrecon.methods.learned.baselines:WorldUNet",
+    mean_fusion="mvrecon.methods.learned.baselines:MeanFusion",
+    geometry_free="mvrecon.methods.learned.baselines:GeometryFree",
+    aligned="mvrecon.methods.calibration.self_alignment:Aligned",
     uncertain="mvrecon.methods.learned.uncertain:Uncertain",
-    backprojection="mvrecon.methods.classical.iterative:backprojection",
-    fbp="mvrecon.methods.classical.filtered.fdk:fbp",
-    fdk="mvrecon.methods.classical.filtered.fdk:fdk",
+    backprojection="mvrecon.methods.classical.sirt:backprojection",
+    fbp="mvrecon.methods.classical.fdk:fbp",
+    fdk="mvrecon.methods.classical.fdk:fdk",
     trained="mvrecon.training.trained_method:TrainedMethod",
-    sirt="mvrecon.methods.classical.iterative:sirt",
-    os_sart="mvrecon.methods.classical.os_sart:os_sart",
-    cgls="mvrecon.methods.classical.cgls:cgls",
-    tikhonov="mvrecon.methods.classical.tikhonov:tikhonov",
-    fista_tv="mvrecon.methods.classical.fista_tv:fista_tv",
-    pdhg_tv="mvrecon.methods.classical.pdhg_tv:pdhg_tv",
+    sirt="mvrecon.methods.classical.sirt:sirt",
+    os_sart="mvrecon.methods.classical.sirt:os_sart",
+    cgls="mvrecon.methods.classical.least_squares:cgls",
+    tikhonov="mvrecon.methods.classical.least_squares:tikhonov",
+    fista_tv="mvrecon.methods.classical.total_variation:fista_tv",
+    pdhg_tv="mvrecon.methods.classical.total_variation:pdhg_tv",
     mlem="mvrecon.methods.classical.mlem:mlem",
     osem="mvrecon.methods.classical.mlem:osem",
-    bsrem="mvrecon.methods.classical.bsrem:bsrem",
     tv_map="mvrecon.methods.classical.tv_map:tv_map",
-    finer="mvrecon.methods.classical.finer:finer",
+    finer="mvrecon.methods.method:finer",
 )
 #: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
 STREAMED = Registry(
     "streamed reconstructor",
-    fdk="mvrecon.methods.classical.filtered.streaming:fdk_streamed",
+    fdk="mvrecon.methods.classical.fdk:fdk_streamed",
 )
 #: Files of views that are read as one array, by their endings: f(path) -> ProjectionStack.
 VIEW_FILES = Registry(

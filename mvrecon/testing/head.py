@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from mvrecon.core.parts import HEADS
-from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.view_frames import Frusta
 
 
 def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None:

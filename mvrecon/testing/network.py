@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from mvrecon.methods.learned.network import network_by_name
+from mvrecon.methods.learned.baselines import network_by_name
 from mvrecon.testing.method import check_gradients
 from mvrecon.testing.projector import close
 

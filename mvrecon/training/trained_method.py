@@ -25,7 +25,7 @@ class TrainedMethod(nn.Module):
         FileNotFoundError, LookupError, Refused: as `load` (at the call).
     """
 
-    views = "trained"
+    data_kind = "trained"
 
     def __init__(self, checkpoint: str, method: str | None = None):
         super().__init__()

@@ -12,10 +12,9 @@ from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras import files
-from mvrecon.methods.calibration.aligned import Aligned
 from mvrecon.methods.calibration.alignment import translated
-from mvrecon.methods.calibration.self_alignment import self_aligned
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.calibration.self_alignment import Aligned, self_aligned
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.training.export import save_views
 from mvrecon.training.wrong_cameras import camera_row, cameras_of, sentences
 from tests.methods.learned.rig import small_rig

@@ -12,7 +12,7 @@ from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.problem import declares
+from mvrecon.methods.classical.solver import declares
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
 
@@ -97,7 +97,7 @@ def test_a_plugins_own_words_decide_what_is_doubted(views, monkeypatch):
     PROJECTORS.register("as_lines")(lambda grid, cameras: Drr(grid, cameras))
     PROJECTORS.register("doubled")(lambda grid, cameras: 2 * Drr(grid, cameras))
     METHODS.register("of_lines")(lambda A, views: views)
-    METHODS.register("of_counts")(declares(views="counts")(lambda A, counts: counts))
+    METHODS.register("of_counts")(declares(data_kind="counts")(lambda A, counts: counts))
     counts = (4e4 * torch.exp(-views)).round()
     assert "whole numbers" in "".join(doubts(scan_of(counts, "as_lines"), "of_lines", 0.1))
     assert "whole numbers" not in "".join(doubts(scan_of(counts, "as_lines"), "of_counts", 0.1))

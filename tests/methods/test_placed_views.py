@@ -12,7 +12,7 @@ from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.filtered.fdk import fdk
+from mvrecon.methods.classical.fdk import fdk
 from mvrecon.operators.drr import Drr
 from tests.geometry.cameras.rigs import same
 

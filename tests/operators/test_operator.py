@@ -9,8 +9,8 @@ import torch
 
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.box import Box
-from mvrecon.methods.classical.iterative import sirt
 from mvrecon.methods.classical.mlem import mlem
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Cropped, LinearOperator, Scaled
 from mvrecon.operators.selection import RaySelection, ViewSelection
 from mvrecon.operators.stacked import Stacked

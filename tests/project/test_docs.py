@@ -22,7 +22,7 @@ from mvrecon.apps.list import SETTING
 from mvrecon.core.parts import LISTED, PROJECTORS
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from scripts import site_pages
 
 ROOT = Path(__file__).parents[2]

@@ -8,7 +8,7 @@ import torch
 
 from mvrecon.apps.config import compose
 from mvrecon.core.parts import METRICS
-from mvrecon.methods.classical.iterative import backprojection
+from mvrecon.methods.classical.sirt import backprojection
 from mvrecon.methods.method import Solver
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.report.comparison.rows import read

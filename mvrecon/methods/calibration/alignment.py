@@ -13,10 +13,80 @@ from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.methods.calibration.blur import blurred
+from mvrecon.core.division import divided
+from mvrecon.operators.operator import LinearOperator
+
+
+class Blur(LinearOperator):
+    """Gaussian blur along the axes of a tensor, symmetric; outside of the tensor is zero.
+
+    Args:
+        shape: of a volume (d, h, w), or of views (m, v, u).
+        sigmas: standard deviation along each axis, in voxels or pixels; 0: none.
+        device: where the operator computes.
+    """
+
+    def __init__(
+        self,
+        shape: Sequence[int],
+        sigmas: Sequence[float],
+        device: torch.device | str = "cpu",
+    ):
+        self.domain_shape = self.range_shape = tuple(shape)
+        self._bands = [
+            _band(size, sigma, torch.device(device)) if sigma else None
+            for size, sigma in zip(shape, sigmas, strict=True)
+        ]
+        self._device = torch.device(device)
+
+    @property
+    def device(self) -> torch.device:
+        return self._device
+
+    def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
+        for axis, band in enumerate(self._bands, start=2):
+            if band is not None:
+                x = (x.movedim(axis, -1) @ band.to(x)).movedim(-1, axis)
+        return x.contiguous()
+
+    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
+        return self.forward(y)
+
+
+def blurred(
+    views: Float[Tensor, "b c m v u"], sigma_px: float, mask: Bool[Tensor, "m v u"] | None = None
+) -> Float[Tensor, "b c m v u"]:
+    """Views blurred by a Gaussian in their own unit, from the pixels inside the detector alone.
+
+    Normalised convolution (Knutsson & Westin, Proc. CVPR 1993): the weights of the pixels that
+    count add up to one; zero where there are none.
+
+    Args:
+        views: measured integrals.
+        sigma_px: standard deviation along u and v, in pixels.
+        mask: the pixels that count; None: all.
+    """
+    shape = views.shape[2:]
+    blur = Blur(shape, (0.0, sigma_px, sigma_px), views.device)
+    counts = views.new_ones(1, 1, *shape) if mask is None else mask[None, None].to(views)
+    weight = blur(counts)
+    total = blur(torch.where(counts > 0, views, 0.0))
+    return divided(total, weight)
+
+
+def _band(size: int, sigma: float, device: torch.device) -> Float[Tensor, "n n"]:
+    """The weights of a Gaussian between the places of a row; the same whichever way they are read,
+    which needs the sum of the unbounded row for all of them.
+    """
+    place = torch.arange(size, dtype=torch.float64, device=device)
+    apart = (place[:, None] - place).abs()
+    most = int(8 * sigma + 1)
+    reach = torch.arange(-most, most + 1, dtype=torch.float64, device=device)
+    return torch.exp(-((apart / sigma) ** 2) / 2) / torch.exp(-((reach / sigma) ** 2) / 2).sum()
+
 
 #: Pixels of each side that count in `translated`, and the longest shift in pixels.
 REACH = LONGEST = 4
@@ -68,13 +138,6 @@ class Prior(NamedTuple):
 
     shift_px: float = 1.0
     gain: float = 0.05
-
-    def precision(self, like: Tensor) -> Float[Tensor, " 3"]:
-        """Inverse variances of both shifts and of the gain, as a tensor on the device of another,
-        which is not waited for.
-        """
-        shifts, gain = like.new_full((2,), self.shift_px), like.new_full((1,), self.gain)
-        return torch.cat([shifts, gain]).pow(-2)
 
 
 #: A pixel and 5 %.
@@ -181,7 +244,7 @@ def alignment(
     fit = _Fit(
         _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
-        prior.precision(views),
+        torch.cat([views.new_full((2,), prior.shift_px), views.new_full((1,), prior.gain)]).pow(-2),
     )
     for _ in range(steps):
         rest = (blurred(aligned(views, one), BLUR) - smooth) / unit

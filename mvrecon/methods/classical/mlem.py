@@ -2,7 +2,8 @@
 of the cameras.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Unpack
 
@@ -17,15 +18,7 @@ from mvrecon.methods.classical.poisson import (
     negative_log_likelihood,
     refuse_impossible,
 )
-from mvrecon.methods.classical.problem import (
-    Common,
-    Watch,
-    check_iterations,
-    check_start,
-    declares,
-    supported,
-    without_gradient,
-)
+from mvrecon.methods.classical.solver import Common, InverseProblem, Step, declares, solve
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import distant_order, ordered_subsets, usual_subsets
 
@@ -34,8 +27,7 @@ from mvrecon.operators.selection import distant_order, ordered_subsets, usual_su
 GONE = 1e-25
 
 
-@declares(views="counts", iterates=True)
-@without_gradient
+@declares(data_kind="counts", iterates=True, differentiable=False)
 def mlem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
@@ -76,20 +68,18 @@ def mlem(
             negative somewhere or not finite, a number of subsets that is below one or above that of
             the cameras, iterations that are no whole number of at least 0.
     """
-    check_iterations(iterations)
-    A, start = supported(mlem, A, common), common.get("start")
-    if start is not None:
-        check_start(A, start, counts)
-    parts = subset_likelihoods(A, counts, background, subsets, skip_zero_bins)
-    sums = [part.sensitivity(parts[0].counts.dtype) for part in parts]
-    x, share = admitted(parts, sums, start), torch.stack(sums).mean(dim=0)
-    watch = Watch(common.get("monitor"), partial(likelihood_of_residual, counts))
-    for number in range(1, iterations + 1):
-        for part, s in zip(parts, sums, strict=True):
-            x = _step(x, part, s, share)
-        if watch.ends(number, x, partial(unexplained, A, counts, background, x)):
-            break
-    return watch.result(x)
+    problem = InverseProblem.of(A, counts, iterations, common, background)
+    problem, parts, sums = ordered(problem, subsets, skip_zero_bins)
+    share = torch.stack(sums).mean(dim=0)
+
+    def steps() -> Iterator[Step]:
+        x = problem.first
+        while True:
+            for part, s in zip(parts, sums, strict=True):
+                x = _step(x, part, s, share)
+            yield Step(x)
+
+    return solve(problem, steps(), objective=partial(likelihood_of_residual, problem.views))
 
 
 def _step(
@@ -118,8 +108,7 @@ def _step(
     return torch.where(x < GONE * x.amax(dim=tuple(range(2, x.ndim)), keepdim=True), 0, x)
 
 
-@declares(views="counts", iterates=True)
-@without_gradient
+@declares(data_kind="counts", iterates=True, differentiable=False)
 def osem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
@@ -145,21 +134,26 @@ def osem(
     return mlem(A, counts, iterations, background, subsets, skip_zero_bins, **common)
 
 
-def subset_likelihoods(
-    A: LinearOperator,
-    counts: Float[Tensor, "b c m v u"],
-    background: float | Float[Tensor, "b c m v u"],
-    subsets: int,
-    skip_zero_bins: bool = True,
-) -> list[PoissonLikelihood]:
-    """The likelihood of each ordered subset of the cameras, in an order in which one is far from
-    those just before it.
+def ordered(
+    problem: InverseProblem, subsets: int, skip_zero_bins: bool = True
+) -> tuple[InverseProblem, list[PoissonLikelihood], list[Float[Tensor, "1 1 d h w"]]]:
+    """The problem of counts with its first volume, uniform by default, and likelihoods and
+    sensitivities of the ordered subsets of the cameras.
+
+    The subsets are in an order in which one is far from those just before it.
+
+    Raises:
+        ValueError: as `PoissonLikelihood` and `admitted`; a number of subsets that is below one or
+            above that of the cameras.
     """
+    A, counts, background = problem.A, problem.views, problem.background
     dealt = ordered_subsets(A.range_shape[0], subsets)
-    return [
+    parts = [
         PoissonLikelihood(A, counts, background, dealt[subset], skip_zero_bins)
         for subset in distant_order(subsets)
     ]
+    sums = [part.sensitivity(counts.dtype) for part in parts]
+    return replace(problem, start=admitted(parts, sums, problem.start)), parts, sums
 
 
 def admitted(
@@ -183,13 +177,6 @@ def admitted(
     x = x * (every > 0)
     refuse_impossible(int(torch.stack([part.impossible(part.mean(x)) for part in parts]).sum()))
     return x
-
-
-def unexplained(
-    A: LinearOperator, counts: Tensor, background: float | Tensor, x: Tensor
-) -> Float[Tensor, "b c m v u"]:
-    """The residual y - (A x + r) of counts, in counts."""
-    return counts - (A(x) + background)
 
 
 def likelihood_of_residual(counts: Tensor, volume: Tensor, residual: Tensor) -> Float[Tensor, " b"]:

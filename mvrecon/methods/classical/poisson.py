@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from mvrecon.kernels.precision import wide
+from mvrecon.methods.classical.solver import spread_background
 from mvrecon.operators.checks import check_measured
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import RaySelection, ViewSelection
@@ -57,7 +58,10 @@ class PoissonLikelihood:
             A,
             ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views),
         )
-        measured, added = wide(self.views(counts)), self.views(_spread(background, counts))
+        measured, added = (
+            wide(self.views(counts)),
+            self.views(spread_background(background, counts)),
+        )
         bins = {"counts": measured, "background": added}
         faults = [(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]
         full = (measured != 0).flatten(0, 1).any(dim=0)[None, None]
@@ -94,20 +98,16 @@ class PoissonLikelihood:
         want a gradient.
         """
         if self.A.pose_gradient or dtype not in self._sensitivity:
-            self._sensitivity[dtype] = self._summed(dtype)
+            like = self.counts.new_ones((), dtype=dtype)
+            chosen = like.expand(1, 1, *self.selection.range_shape).contiguous()
+            total = self.bins.T(chosen)
+            if self.selection is not self.views:
+                # a list of rays rounds otherwise than whole views, and MLEM divides what a list
+                # explains by this
+                others = like - self.views(self.selection.T(chosen))
+                total = total + self.A.subset(self.views).T(others)
+            self._sensitivity[dtype] = total
         return self._sensitivity[dtype]
-
-    def _summed(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
-        shapes = self.selection.range_shape, self.views.range_shape
-        chosen, ones = (
-            torch.ones(1, 1, *s, dtype=dtype, device=self.counts.device) for s in shapes
-        )
-        if self.selection is self.views:
-            return self.bins.T(chosen)
-        # a list of rays rounds otherwise than whole views, and MLEM divides what a list explains by
-        # this
-        rest = ones - self.views(self.selection.T(chosen))
-        return self.bins.T(chosen) + self.A.subset(self.views).T(rest)
 
     def expected(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
         """ybar, the counts to be expected in the bins that are computed.
@@ -126,7 +126,12 @@ class PoissonLikelihood:
         Raises:
             ValueError: a volume of another batch than the counts.
         """
-        self._check(volume)
+        if volume.shape[:2] != self.counts.shape[:2]:
+            batch = tuple(self.counts.shape[:2])
+            raise ValueError(
+                f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got "
+                f"{tuple(volume.shape)}"
+            )
         return self.bins(volume) + self.background
 
     def impossible(self, expected: Float[Tensor, "b c *n"]) -> Int64[Tensor, ""]:
@@ -165,14 +170,6 @@ class PoissonLikelihood:
         so.
         """
         return self.bins.T(_ratio(self.counts, self.mean(volume)))
-
-    def _check(self, volume: Tensor) -> None:
-        if volume.shape[:2] != self.counts.shape[:2]:
-            batch = tuple(self.counts.shape[:2])
-            raise ValueError(
-                f"Expected a volume [b c d h w] with the counts' [b c] {batch}, got "
-                f"{tuple(volume.shape)}"
-            )
 
 
 def refuse_impossible(bins: int) -> None:
@@ -215,20 +212,3 @@ def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
     """y / ybar, and 0 where either is."""
     counted = (counts > 0) & (expected > 0)
     return torch.where(counted, counts / torch.where(counted, expected, 1), 0)
-
-
-def _spread(background: float | Tensor, counts: Tensor) -> Tensor:
-    if not isinstance(background, Tensor | int | float):
-        raise TypeError(f"Expected a background of one number or views, got {background!r}")
-    like = wide(counts[:0])
-    if not isinstance(background, Tensor):
-        return like.new_full((), background).expand(counts.shape)
-    added = background.to(like)
-    try:
-        return added.expand(counts.shape)
-    except RuntimeError as error:
-        raise ValueError(
-            f"Expected a background of one number or views that broadcast to "
-            f"{tuple(counts.shape)}, "
-            f"got {tuple(added.shape)}"
-        ) from error

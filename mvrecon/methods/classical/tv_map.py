@@ -1,9 +1,8 @@
 """Counts with total variation: the Poisson likelihood by the method of Chambolle and Pock."""
 
 from collections.abc import Iterator, Sequence
-from functools import partial
-from itertools import islice
-from typing import NamedTuple, Unpack
+from dataclasses import replace
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
@@ -13,25 +12,21 @@ from mvrecon.core.division import divided, positive_mean
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels.differences import differences_for
 from mvrecon.kernels.differences.reference import Shrinkage
-from mvrecon.methods.classical.cgls import check_not_negative
-from mvrecon.methods.classical.mlem import admitted, likelihood_of_residual, unexplained, uniform
-from mvrecon.methods.classical.pdhg_tv import RELAXATION
+from mvrecon.methods.classical.mlem import admitted, likelihood_of_residual, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood
-from mvrecon.methods.classical.problem import (
+from mvrecon.methods.classical.solver import (
     Common,
-    Watch,
-    check_iterations,
-    check_start,
+    InverseProblem,
+    Step,
+    check_not_negative,
     declares,
-    supported,
-    without_gradient,
+    solve,
 )
-from mvrecon.methods.classical.total_variation import total_variation, voxel_steps
+from mvrecon.methods.classical.total_variation import RELAXATION, total_variation, voxel_steps
 from mvrecon.operators.operator import LinearOperator
 
 
-@declares(views="counts", iterates=True)
-@without_gradient
+@declares(data_kind="counts", iterates=True, differentiable=False)
 def tv_map(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
@@ -66,55 +61,44 @@ def tv_map(
     Raises:
         ValueError: as `mlem`; a weight that is negative, a balance that is not positive.
     """
-    check_iterations(iterations)
     check_not_negative(weight=weight)
     if not balance > 0:
         raise ValueError(f"Expected a positive balance, got {balance}")
-    A, start, steps = supported(tv_map, A, common), common.get("start"), voxel_steps(A)
-    if start is not None:
-        check_start(A, start, counts)
-    plain = PoissonLikelihood(A, counts, background)
-    s = plain.sensitivity(plain.counts.dtype)
+    steps, problem = voxel_steps(A), InverseProblem.of(A, counts, iterations, common, background)
+    plain = PoissonLikelihood(problem.A, problem.views, problem.background)
+    s = plain.sensitivity(problem.views.dtype)
     unit = uniform([plain], s)[..., :1, :1, :1]
     unit = torch.where(unit > 0, unit, 1)
-    fit = PoissonLikelihood(A, counts / unit, background / unit)
-    x = admitted([fit], [s], None if start is None else start / unit)
-    level = positive_mean(s, 1.0)
+    scaled = problem.divided(unit)
+    fit = PoissonLikelihood(scaled.A, scaled.views, scaled.background)
+    x, level = admitted([fit], [s], scaled.start), positive_mean(s, 1.0)
 
     def objective(volume: Tensor, residual: Tensor) -> Tensor:
         roughness = total_variation(volume, steps).sum(dim=1)
-        return likelihood_of_residual(counts, volume, residual) + weight * level * roughness
+        return likelihood_of_residual(problem.views, volume, residual) + weight * level * roughness
 
-    watch = Watch(common.get("monitor"), objective)
-    iterates = _iterates(fit, x, Pace(weight, level, balance, steps))
-    for number, x in enumerate(islice(iterates, iterations), 1):
-        volume = x * unit
-        if watch.ends(number, volume, partial(unexplained, A, counts, background, volume)):
-            break
-    return watch.result(x * unit)
+    iterates = _primal_dual(fit, x, weight, level, balance, steps)
+    return solve(replace(problem, start=x * unit), iterates, unit, objective)
 
 
-class Pace(NamedTuple):
-    """What the steps are made of.
+def _primal_dual(
+    fit: PoissonLikelihood,
+    x: Float[Tensor, "b c d h w"],
+    weight: float,
+    level: float,
+    balance: float,
+    steps: Sequence[float],
+) -> Iterator[Step]:
+    """The iterates of the method, without end, for counts and a start of about one.
 
     Args:
+        fit: the likelihood.
+        x: the start.
         weight: of the total variation, in mm.
         level: mean sensitivity c.
         balance: of the dual steps to the primal ones.
         steps: voxel size along (z, y, x), in mm.
     """
-
-    weight: float
-    level: float
-    balance: float
-    steps: Sequence[float]
-
-
-def _iterates(
-    fit: PoissonLikelihood, x: Float[Tensor, "b c d h w"], pace: Pace
-) -> Iterator[Float[Tensor, "b c d h w"]]:
-    """The volumes of the method, without end, for counts and a start of about one."""
-    weight, level, balance, steps = pace
     s = fit.sensitivity(x.dtype)
     rows, columns = fit.bins(torch.ones_like(x[:1, :1])), fit.bins.T(torch.ones_like(fit.counts))
     primal = (s > 0) / (balance * (columns[:1, :1] + level))
@@ -127,7 +111,7 @@ def _iterates(
     while True:
         volume = torch.addcmul(x, primal, fit.bins.T(ratio) - s)
         volume = kernels.primal(volume, field, shrinkage)
-        yield volume
+        yield Step(volume)
         ahead = torch.lerp(x, volume, 2)
         fresh = _stepped(fit.counts, dual * (fit.bins(ahead) + fit.background) - ratio, dual)
         ratio, x = ratio.lerp(fresh, RELAXATION), x.lerp(volume, RELAXATION)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from mvrecon.core.division import divided
 from mvrecon.core.registry import check_options
-from mvrecon.methods.classical.iterative import inverse_sums
+from mvrecon.methods.classical.sirt import inverse_sums
 from mvrecon.methods.learned.geometry import Geometry
 
 
@@ -84,7 +84,13 @@ class Consistency(nn.Module):
                 f"{count} and {noise!r}"
             )
         self.poisson = noise == "poisson"
-        self.em = _is_em(noise, str(options.get("rule", "gradient")))
+        rule = options.get("rule", "gradient")
+        if rule not in ("gradient", "em") or (rule == "em" and not self.poisson):
+            raise ValueError(
+                f"Expected the rule gradient, or em with the noise poisson, got {rule!r} with "
+                f"{noise!r}"
+            )
+        self.em = rule == "em"
         self.background = float(options.get("background", 0.0))
         if not 0 <= self.background < math.inf or (self.background and not self.em):
             raise ValueError(
@@ -111,14 +117,6 @@ class Consistency(nn.Module):
             else:
                 volume = volume + length * geometry.direction(views - expected)
         return volume
-
-
-def _is_em(noise: str, rule: str) -> bool:
-    if rule not in ("gradient", "em") or (rule == "em" and noise != "poisson"):
-        raise ValueError(
-            f"Expected the rule gradient, or em with the noise poisson, got {rule!r} with {noise!r}"
-        )
-    return rule == "em"
 
 
 def em_change(

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from mvrecon.core.division import divided
 from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.kernels.rays.lines import writes
-from mvrecon.methods.classical.iterative import SirtWeights, inverse_sums, sirt_weights
+from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt_weights
 from mvrecon.operators.checks import check_floating, check_measured
 from mvrecon.operators.operator import LinearOperator, Projector
 from mvrecon.operators.visual_hull.support import support_masks
@@ -41,18 +41,15 @@ def kept(A: LinearOperator, key: Hashable, make: Callable[[], Any]) -> Any:
     if A.pose_gradient or torch.compiler.is_dynamo_compiling():
         return make()
     results = _kept.setdefault(A, {})
-    state = key, A.device, *_versions(A)
+    # how often the tensors of the operator and of its cameras have been written to
+    tensors = [*A.parameters(), *A.buffers()] if isinstance(A, nn.Module) else []
+    written = [tensor._version for tensor in tensors if not tensor.is_inference()]
+    written += writes(A.cameras) if isinstance(A, Projector) else []
+    state = key, A.device, *written
     if results.get(key, (None, None))[0] != state:
         with torch.inference_mode(False), torch.no_grad():  # training may use it after evaluation
             results[key] = state, make()
     return results[key][1]
-
-
-def _versions(A: LinearOperator) -> list[int]:
-    """How often the tensors of an operator and of its cameras have been written to."""
-    tensors = [*A.parameters(), *A.buffers()] if isinstance(A, nn.Module) else []
-    counts = [tensor._version for tensor in tensors if not tensor.is_inference()]
-    return counts + (writes(A.cameras) if isinstance(A, Projector) else [])
 
 
 @dataclass(frozen=True, eq=False)

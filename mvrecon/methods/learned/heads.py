@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.view_frames import Frusta
 
 #: A prior of exactly zero could never be raised by a finite logit; relative to the prior's mean
 #: along the ray.

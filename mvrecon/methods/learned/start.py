@@ -11,9 +11,9 @@ from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.finer import check_factor, on_finer_grid
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.learned.geometry import Geometry
+from mvrecon.methods.method import check_factor, on_finer_grid
 
 
 def fingerprints(views: Float[Tensor, "b 1 m v u"]) -> list[bytes]:
@@ -27,30 +27,30 @@ Start = int | Mapping[str, Any]
 #: The key of that number in the mapping.
 FINER = "finer_grid"
 #: Bytes of volumes and views that a training keeps at most.
-ROOM = 2 << 30
+CACHE_BYTES = 2 << 30
 
 
-class Beginning(NamedTuple):
-    """What networks begin with.
+class Initialisation(NamedTuple):
+    """The classical initialisation of a network.
 
     Args:
         volume: a classical reconstruction, in the unit of (views / mm).
-        missed: the views of it on a finer grid less those of `volume`: what the grid's operator
-            misses of the views, in their unit; none without a finer grid.
+        grid_residual: views of the volume on a finer grid less those of `volume`: what the grid's
+            operator misses of the views, in their unit; None without a finer grid.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
-    missed: Float[Tensor, "b 1 m v u"] | None = None
+    grid_residual: Float[Tensor, "b 1 m v u"] | None = None
 
     @property
     def nbytes(self) -> int:
         """What it takes of memory."""
         return sum(part.nbytes for part in self if part is not None)
 
-    def to(self, other: Tensor) -> "Beginning":
+    def to(self, other: Tensor) -> "Initialisation":
         """The same with the device and the dtype of another tensor."""
-        missed = None if self.missed is None else self.missed.to(other)
-        return Beginning(self.volume.to(other), missed)
+        grid_residual = None if self.grid_residual is None else self.grid_residual.to(other)
+        return Initialisation(self.volume.to(other), grid_residual)
 
 
 class ClassicalStart:
@@ -88,17 +88,17 @@ class ClassicalStart:
                 f"Expected line integrals for a start with {FINER}: {self.finer_grid}, got counts "
                 f"(consistency with the noise poisson)"
             )
-        self._known: dict[bytes, Beginning] = {}
-        self._room = ROOM
+        self._known: dict[bytes, Initialisation] = {}
+        self._room = CACHE_BYTES
 
     @torch.no_grad()
     def __call__(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
-    ) -> Beginning:
+    ) -> Initialisation:
         """The volumes of views within each sample's support, and what their grid misses."""
         if not isinstance(self.start, Mapping):
             A, weights = geometry.A, geometry.weights
-            return Beginning(sirt(A, views, self.start, weights=weights, momentum=True))
+            return Initialisation(sirt(A, views, self.start, weights=weights, momentum=True))
         samples = range(len(views))
         if not training:
             return _batch([self._made(geometry, views, sample) for sample in samples])
@@ -107,16 +107,13 @@ class ClassicalStart:
             case = self._known.get(name)
             if case is None:
                 case = self._made(geometry, views, sample)
-                self._keep(name, case)
+                if case.nbytes <= self._room:
+                    self._room -= case.nbytes
+                    self._known[name] = case.to(torch.empty((), dtype=case.volume.dtype))
             cases.append(case.to(views))
         return _batch(cases)
 
-    def _keep(self, name: bytes, case: Beginning) -> None:
-        if case.nbytes <= self._room:
-            self._room -= case.nbytes
-            self._known[name] = case.to(torch.empty((), dtype=case.volume.dtype))
-
-    def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Beginning:
+    def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Initialisation:
         """The method's volume of a sample's views, scaled to a mean density of the rays of
         about one before, so that a weight of its options is relative to the content.
         """
@@ -126,16 +123,20 @@ class ClassicalStart:
         mask = None if geometry.support is None else geometry.support[sample, 0]
         if fine == 1:
             within = {} if mask is None else {"support": mask}
-            return Beginning(METHODS.from_config(self.start, A, case / level, **within) * level)
+            return Initialisation(
+                METHODS.from_config(self.start, A, case / level, **within) * level
+            )
         B, x = on_finer_grid(A, case / level, fine, self.start, mask)
         mean = avg_pool3d(x * level, fine)
-        return Beginning(mean, B(x * level) - A(mean))
+        return Initialisation(mean, B(x * level) - A(mean))
 
 
-def _batch(cases: list[Beginning]) -> Beginning:
+def _batch(cases: list[Initialisation]) -> Initialisation:
     """One case after the other, of a batch."""
-    volumes, missed = zip(*cases, strict=True)
-    return Beginning(torch.cat(volumes), None if missed[0] is None else torch.cat(missed))
+    volumes, grid_residual = zip(*cases, strict=True)
+    return Initialisation(
+        torch.cat(volumes), None if grid_residual[0] is None else torch.cat(grid_residual)
+    )
 
 
 def normalised(
@@ -149,9 +150,9 @@ def normalised(
     The views are without what the grid misses of them, where a finer one told it. The scale of
     views of nothing is zero.
     """
-    x, missed = start(geometry, views, training)
+    x, grid_residual = start(geometry, views, training)
     scale = content_scale(x)
-    y = views if missed is None else views - missed
+    y = views if grid_residual is None else views - grid_residual
     return y / scale, x / scale, scale * nonzero(views)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mvrecon.geometry.cameras.sinogram import sinogram_rig
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.filtered.filters import Filter
+from mvrecon.methods.classical.fdk import Filter
 from mvrecon.methods.learned.cross_view import GAIN
 from mvrecon.methods.learned.geometry import Geometry, geometry_of, kept, validated
 from mvrecon.methods.learned.start import ClassicalStart, Start, normalised, typical_chord

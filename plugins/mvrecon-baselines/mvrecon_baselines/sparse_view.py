@@ -18,9 +18,8 @@ from torch.nn.functional import pad
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.rigid import unit
-from mvrecon.methods.classical.filtered.fdk import fbp, fdk
-from mvrecon.methods.classical.filtered.filters import Filter
-from mvrecon.methods.classical.filtered.orbit import Orbit, orbit_of
+from mvrecon.methods.classical.fdk import Filter, fbp, fdk
+from mvrecon.methods.classical.orbit import Orbit, orbit_of
 from mvrecon.methods.learned.geometry import kept, validated
 from mvrecon.methods.learned.start import content_scale, nonzero, typical_chord
 from mvrecon.methods.reconstruction import Reconstruction

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.methods.classical.filtered.filters import Filter
+from mvrecon.methods.classical.fdk import Filter
 from mvrecon.methods.learned.geometry import geometry_of, kept, validated
 from mvrecon.methods.learned.start import content_scale, nonzero
 from mvrecon.methods.reconstruction import Reconstruction

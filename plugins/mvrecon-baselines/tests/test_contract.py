@@ -13,7 +13,7 @@ from mvrecon.apps.config.typed import check_parts
 from mvrecon.apps.train import train
 from mvrecon.core.files.tables import read_rows
 from mvrecon.core.parts import NETWORKS
-from mvrecon.methods.learned.network import network_by_name
+from mvrecon.methods.learned.baselines import network_by_name
 from mvrecon.methods.method import build_method
 from mvrecon.testing import check_method, check_network
 

@@ -5,7 +5,7 @@ import torch
 
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.methods.classical.filtered.fdk import fbp
+from mvrecon.methods.classical.fdk import fbp
 from mvrecon.training.losses import ReconstructionLoss
 from mvrecon_baselines.radon_unet import RadonUNet, half_circle
 

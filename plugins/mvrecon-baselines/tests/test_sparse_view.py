@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.methods.classical.filtered.fdk import fbp
+from mvrecon.methods.classical.fdk import fbp
 from mvrecon.methods.method import build_method
 from mvrecon.testing.projector import close
 from mvrecon.training.losses import ReconstructionLoss

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from mvrecon.methods.classical.filtered.fdk import fbp
-from mvrecon.methods.classical.fista_tv import power_norm
+from mvrecon.methods.classical.fdk import fbp
+from mvrecon.methods.classical.total_variation import power_norm
 from mvrecon.methods.method import build_method
 from mvrecon_baselines.breast import BreastSlices
 from mvrecon_baselines.unrolled import ItNet, growth, norm_bound

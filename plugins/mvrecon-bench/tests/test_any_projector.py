@@ -12,9 +12,9 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.iterative import sirt
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.method import build_method
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.selection import ray_subset, view_subset

@@ -12,7 +12,7 @@ import yaml
 from mvrecon.core.parts import NETWORKS
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.learned.network import network_by_name
+from mvrecon.methods.learned.baselines import network_by_name
 from mvrecon.methods.method import build_method
 from mvrecon.operators.drr import Drr
 from mvrecon.testing import check_network

@@ -5,9 +5,9 @@ import torch
 
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.iterative import sirt_weights
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.methods.classical.sirt import sirt_weights
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.selection import RaySelection
 from mvrecon_spect.projector import Spect

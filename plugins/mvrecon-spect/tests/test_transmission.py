@@ -8,9 +8,8 @@ from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.learned.cross_view import PerViewEstimates
-from mvrecon.methods.learned.frusta import Frusta
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.learned.view_frames import LEAST, ViewFrames, transmission
+from mvrecon.methods.learned.view_frames import LEAST, Frusta, ViewFrames, transmission
 from mvrecon.methods.method import build_method
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import PerSample

@@ -10,7 +10,7 @@ from mvrecon.data.acquisition.acquired import Acquired, Projection, source_of
 from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.drr import Drr
 from mvrecon.report.metrics import volume_metrics
 

@@ -8,7 +8,7 @@ import torch
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.kernels.warps import cuda, reference
-from mvrecon.methods.learned.frusta import frusta_lattice
+from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
 from tests.kernels.warps.scenes import OTHER, RIGS, SMALL, generic, lattices

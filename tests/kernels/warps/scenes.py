@@ -7,7 +7,7 @@ from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.frustum import depth_edges, depth_index
 from mvrecon.geometry.grid import Grid, pixel_centres
 from mvrecon.geometry.lattice import Lattice, grid_lattice
-from mvrecon.methods.learned.frusta import frusta_lattice
+from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.operators.rigs import CONE, GRID, PARALLEL, PINHOLES
 
 BODY = Grid.centred(size=(10, 8, 9), spacing=22.0)

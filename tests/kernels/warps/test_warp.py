@@ -13,7 +13,7 @@ from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.geometry.sample import normalised, sample
 from mvrecon.kernels.warps.warp import WARP, warp
-from mvrecon.methods.learned.frusta import frusta_lattice
+from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.kernels.warps.scenes import (
     DEPTH,
     OTHER,

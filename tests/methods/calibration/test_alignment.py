@@ -9,9 +9,9 @@ from mvrecon.methods.calibration.alignment import (
     Alignment,
     aligned,
     alignment,
+    blurred,
     translated,
 )
-from mvrecon.methods.calibration.blur import blurred
 from tests.methods.learned.rig import small_projector
 
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from mvrecon.methods.calibration.blur import Blur, blurred
+from mvrecon.methods.calibration.alignment import Blur, blurred
 
 
 def test_a_blur_is_symmetric_keeps_sums_and_has_its_width():

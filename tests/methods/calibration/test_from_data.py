@@ -10,8 +10,14 @@ from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.calibration import from_data
-from mvrecon.methods.calibration.from_data import Complement, Round, calibrated, derivatives
-from mvrecon.methods.calibration.unknowns import unknowns, without_motion
+from mvrecon.methods.calibration.from_data import (
+    Complement,
+    Round,
+    calibrated,
+    derivatives,
+    unknowns,
+    without_motion,
+)
 from mvrecon.operators.drr import Drr
 
 GRID = Grid.centred(24, spacing=4.0)

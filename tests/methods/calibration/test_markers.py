@@ -6,8 +6,7 @@ import torch
 from mvrecon.geometry.cameras.misalignment import perturbed
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import pixel_centres
-from mvrecon.methods.calibration.detection import centroids, helix
-from mvrecon.methods.calibration.markers import dlt, from_markers
+from mvrecon.methods.calibration.markers import centroids, dlt, from_markers, helix
 from tests.geometry.cameras.rigs import same
 
 SHAPE, PIXEL = (96, 128), (1.5, 1.0)

@@ -6,13 +6,13 @@ import torch
 from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
 from mvrecon.methods.calibration.alignment import Alignment, translated
+from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.calibration.self_alignment import (
     least_deviations,
     self_aligned,
     self_alignment,
     standing_still,
 )
-from mvrecon.methods.calibration.unknowns import motions
 from tests.methods.learned.rig import small_rig
 
 

@@ -59,7 +59,6 @@ PROMISES = {
     "pdhg_tv": Promise({"iterations": 200, "weight": 1e-6}, penalised=True),
     "mlem": Promise({"iterations": 100}, rate=2e-2),
     "osem": Promise({"iterations": 30}, rate=2e-2),
-    "bsrem": Promise({"iterations": 100, "weight": 1e-5}, rate=2e-2),
     "tv_map": Promise({"iterations": 300, "weight": 1e-5}, rate=2e-2),
 }
 #: Methods of certain rigs or of another grid, and one that does not iterate; tests of their own.

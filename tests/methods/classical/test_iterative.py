@@ -6,7 +6,7 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.iterative import sirt, sirt_weights
+from mvrecon.methods.classical.sirt import sirt, sirt_weights
 
 GRID = Grid.centred(size=(8, 7, 6), spacing=2.0)
 RIG = circular(9, 60.0, 100.0, {"pixels": [9, 11], "pixel_mm": 2.5}, start_degrees=5.0)

@@ -5,8 +5,8 @@ from functools import partial
 import pytest
 import torch
 
-from mvrecon.methods.classical.held_out import left_out_residual
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
+from mvrecon.methods.classical.stopping import left_out_residual
 from tests.methods.learned.rig import small_projector
 
 METHOD = partial(sirt, iterations=20, momentum=True)

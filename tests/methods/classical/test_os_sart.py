@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.methods.classical.iterative import sirt
-from mvrecon.methods.classical.os_sart import os_sart
+from mvrecon.methods.classical.sirt import os_sart, sirt
 from mvrecon.operators.selection import distant_order, ordered_subsets, usual_subsets
 from tests.methods.classical.methods import Dense, gap, projector, truth
 

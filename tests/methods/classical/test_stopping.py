@@ -3,11 +3,9 @@
 import pytest
 import torch
 
-from mvrecon.methods.classical.cgls import cgls
-from mvrecon.methods.classical.held_out import held_out
-from mvrecon.methods.classical.iterative import sirt
-from mvrecon.methods.classical.stopping import Curve, combined, corner, discrepancy
-from mvrecon.methods.classical.tikhonov import tikhonov
+from mvrecon.methods.classical.least_squares import cgls, tikhonov
+from mvrecon.methods.classical.sirt import sirt
+from mvrecon.methods.classical.stopping import Curve, combined, corner, discrepancy, held_out
 from tests.methods.classical.methods import NAMES, gap, projector, run, truth
 from tests.methods.classical.test_total_variation import slice_operator
 

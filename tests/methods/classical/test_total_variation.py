@@ -6,17 +6,18 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.fista_tv import fista_tv, power_norm, tv_objective
-from mvrecon.methods.classical.iterative import sirt
-from mvrecon.methods.classical.pdhg_tv import pdhg_tv
+from mvrecon.methods.classical.sirt import WeightedFit, sirt
 from mvrecon.methods.classical.total_variation import (
     Shrinkage,
+    fista_tv,
     gradient,
     gradient_adjoint,
+    pdhg_tv,
+    power_norm,
     total_variation,
+    tv_objective,
     tv_proximal,
 )
-from mvrecon.methods.classical.weighted_fit import WeightedFit
 from tests.methods.classical.methods import Dense, gap
 
 STEPS = (1.5, 2.0, 0.5)

@@ -8,8 +8,8 @@ from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical import iterative
-from mvrecon.methods.classical.iterative import sirt_weights
+from mvrecon.methods.classical import sirt as iterative
+from mvrecon.methods.classical.sirt import sirt_weights
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.ray_transform import RayTransform
 

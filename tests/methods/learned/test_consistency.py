@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.methods.classical.iterative import sirt_weights
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import negative_log_likelihood
+from mvrecon.methods.classical.sirt import sirt_weights
 from mvrecon.methods.learned.consistency import Consistency, em_change, weighted_for_counts
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.reconstruction import Reconstruction

@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.iterative import SirtWeights, sirt, sirt_weights
+from mvrecon.methods.classical.sirt import SirtWeights, sirt, sirt_weights
 from mvrecon.methods.learned.cross_view import FASTER, CrossView
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.learned.start import Beginning

@@ -7,7 +7,7 @@ from mvrecon.core.parts import CAMERAS
 from mvrecon.geometry.cameras.culling import seen_depth_range
 from mvrecon.geometry.frustum import depth_edges, depth_index
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.view_frames import Frusta
 from tests.methods.learned.rig import small_rig
 
 

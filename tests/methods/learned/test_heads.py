@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mvrecon.core.parts import HEADS
-from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon.testing import check_head
 from tests.methods.learned.rig import small_rig
 

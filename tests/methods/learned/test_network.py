@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from mvrecon.core.parts import NETWORKS
-from mvrecon.methods.learned.network import network_by_name
+from mvrecon.methods.learned.baselines import network_by_name
 from mvrecon.testing import check_method, check_network
 from tests.methods.learned.rig import SMALL, blob, small, small_projector
 

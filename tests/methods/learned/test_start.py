@@ -6,7 +6,7 @@ from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.learned import start as starts
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.learned.start import ClassicalStart
@@ -46,7 +46,7 @@ def test_a_volume_without_room_is_reconstructed_anew(made, monkeypatch):
     projector = small_projector()
     geometry, views = Geometry.of(projector), projector(blob(projector, 2))
     views[1] *= 2
-    monkeypatch.setattr(starts, "ROOM", 4 * 12**3)
+    monkeypatch.setattr(starts, "CACHE_BYTES", 4 * 12**3)
     start = ClassicalStart(SIRT)
     for _ in range(2):
         start(geometry, views, training=True)

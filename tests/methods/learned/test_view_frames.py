@@ -7,9 +7,8 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.learned.frusta import Frusta
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.learned.view_frames import LEAST, ViewFrames, means, transmission
+from mvrecon.methods.learned.view_frames import LEAST, Frusta, ViewFrames, means, transmission
 from mvrecon.operators.operator import PerSample, Wrapped
 from tests.methods.learned.rig import blob, small_projector, small_rig
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.visual_hull.support import support_from_views
 from mvrecon_bench.benchmarks.skip_scenes import Filled

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon_bench.benchmarks import report
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.columns import SMALL, SMALL_KEYS

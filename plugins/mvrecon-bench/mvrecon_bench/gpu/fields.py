@@ -16,7 +16,7 @@ from mvrecon.kernels.rays import attenuated_ops
 from mvrecon.kernels.voxels import ops as voxels
 from mvrecon.kernels.warps import warp as warps
 from mvrecon.kernels.warps.warp import warp
-from mvrecon.methods.learned.frusta import frusta_lattice
+from mvrecon.methods.learned.view_frames import frusta_lattice
 from mvrecon.operators.visual_hull.hull import visual_hull
 from mvrecon.operators.voxel_driven import backproject
 from mvrecon_bench.gpu.measuring import Results, throughput

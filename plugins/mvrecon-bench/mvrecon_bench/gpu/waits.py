@@ -15,8 +15,8 @@ import torch
 
 import mvrecon as mv
 from mvrecon.apps.config import compose
-from mvrecon.methods.classical.iterative import sirt_weights
 from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.methods.classical.sirt import sirt_weights
 from mvrecon.operators.selection import ray_subset, view_subset
 from mvrecon.operators.visual_hull.support import support_from_views
 from mvrecon.operators.voxel_driven import backproject

@@ -12,7 +12,7 @@ from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon.methods.method import build_method
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector

@@ -16,7 +16,7 @@ from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at
 from mvrecon.data.scenes.sample import Mapped, Pooling, Rays, Sample
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.iterative import sirt
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.drr import Drr
 
 #: The series of the scan's noise, apart from those that draw the patients.

@@ -5,9 +5,8 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.filtered import streaming
-from mvrecon.methods.classical.filtered.fdk import fbp, fdk
-from mvrecon.methods.classical.filtered.streaming import fdk_streamed
+from mvrecon.methods.classical import fdk as streaming
+from mvrecon.methods.classical.fdk import fbp, fdk, fdk_streamed
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
 from tests.methods.classical.filtered.scans import CONES, VOLUME

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.methods.classical.filtered.filters import (
+from mvrecon.methods.classical.fdk import (
     WINDOWS,
     filter_rows,
     padded_length,

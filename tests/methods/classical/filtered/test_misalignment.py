@@ -11,7 +11,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.methods.classical.filtered.fdk import fdk
+from mvrecon.methods.classical.fdk import fdk
 from mvrecon.operators.drr import Drr
 from tests.methods.classical.filtered.scans import views_of
 

@@ -8,9 +8,8 @@ import torch
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.methods.classical.filtered.fdk import fbp, fdk
-from mvrecon.methods.classical.filtered.orbit import orbit_of
-from mvrecon.methods.classical.filtered.scan_weights import scan_of
+from mvrecon.methods.classical.fdk import fbp, fdk
+from mvrecon.methods.classical.orbit import orbit_of, scan_of
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import Scaled
 from mvrecon.operators.radon import Radon

@@ -9,8 +9,8 @@ from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.methods.classical.filtered.fdk import fbp, fdk
-from mvrecon.methods.classical.filtered.scan_weights import redundancy, scan_of
+from mvrecon.methods.classical.fdk import fbp, fdk
+from mvrecon.methods.classical.orbit import redundancy, scan_of
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
 from tests.methods.classical.filtered.scans import (

@@ -7,8 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mvrecon.methods.learned.frusta import Frusta
-from mvrecon.methods.learned.view_frames import fuse
+from mvrecon.methods.learned.view_frames import Frusta, fuse
 from mvrecon.testing import check_head
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.learned_subjects import GRID, HeadSubject, small_rig

@@ -9,7 +9,7 @@ from torch import Tensor
 from mvrecon.geometry.cameras import convert
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.learned.frusta import Frusta
+from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon_bench.stresses.camera_subject import CameraSubject
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.cameras import EXACT

@@ -7,8 +7,8 @@ itself: here is what such logarithms, taken elsewhere, may leave in the views.
 
 import torch
 
-from mvrecon.methods.classical.iterative import sirt, sirt_weights
 from mvrecon.methods.classical.mlem import mlem
+from mvrecon.methods.classical.sirt import sirt, sirt_weights
 from mvrecon.operators.visual_hull.hull import visual_hull
 from mvrecon.operators.visual_hull.noise import noise_threshold
 from mvrecon_bench.stresses.case import Case

@@ -1,8 +1,8 @@
 """BSREM, which maximises the Poisson likelihood of counts with the relative difference prior."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from itertools import count, islice, product
+from dataclasses import replace
+from itertools import count, product
 from typing import Any, NamedTuple, Unpack
 
 import torch
@@ -11,23 +11,16 @@ from torch import Tensor
 
 from mvrecon.core.division import positive_mean
 from mvrecon.core.quantities import NonNegativeInt
-from mvrecon.methods.classical.cgls import check_not_negative
-from mvrecon.methods.classical.mlem import (
-    admitted,
-    likelihood_of_residual,
-    subset_likelihoods,
-    unexplained,
-    uniform,
-)
+from mvrecon.methods.classical.mlem import likelihood_of_residual, ordered, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood
-from mvrecon.methods.classical.problem import (
+from mvrecon.methods.classical.solver import (
     Common,
-    Watch,
-    check_iterations,
-    check_start,
+    InverseProblem,
+    Step,
+    check_not_negative,
     declares,
-    supported,
-    without_gradient,
+    power_of_two,
+    solve,
 )
 from mvrecon.methods.classical.total_variation import voxel_steps
 from mvrecon.operators.operator import LinearOperator
@@ -185,8 +178,7 @@ RELAXATION = 1 / 15
 FLOOR = 1e-6
 
 
-@declares(views="counts", iterates=True)
-@without_gradient
+@declares(data_kind="counts", iterates=True, differentiable=False)
 def bsrem(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
@@ -223,28 +215,23 @@ def bsrem(
         TypeError: an option that the prior does not have.
         ValueError: as `mlem` and `RelativeDifference`; a weight that is negative.
     """
-    check_iterations(iterations)
     check_not_negative(weight=weight)
-    A, start = supported(bsrem, A, common), common.get("start")
-    if start is not None:
-        check_start(A, start, counts)
     subsets = usual_subsets(A.range_shape[0]) if subsets is None else subsets
-    parts = subset_likelihoods(A, counts, background, subsets)
-    sums = [part.sensitivity(parts[0].counts.dtype) for part in parts]
+    problem = InverseProblem.of(A, counts, iterations, common, background)
+    # so that the prior squares no value beyond the range of float32
+    scale = power_of_two(problem.views, problem.start)
+    scaled, parts, sums = ordered(problem.divided(scale), subsets)
     whole = torch.stack(sums).sum(dim=0)
     visible = whole > 0
     penalty = RelativeDifference(voxel_steps(A), visible[0, 0], **(prior or {}))
     strength = weight * positive_mean(whole, 0.0)
 
     def objective(volume: Tensor, residual: Tensor) -> Tensor:
-        return likelihood_of_residual(counts, volume, residual) + strength * penalty(volume)
+        likelihood = likelihood_of_residual(problem.views, volume, residual)
+        return likelihood + strength * scale.flatten().double() * penalty(volume / scale)
 
-    x, watch = admitted(parts, sums, start), Watch(common.get("monitor"), objective)
-    iterates = _iterates(x, parts, sums, penalty, strength)
-    for number, x in enumerate(islice(iterates, iterations), 1):
-        if watch.ends(number, x, partial(unexplained, A, counts, background, x)):
-            break
-    return watch.result(x)
+    steps = _iterates(scaled.first, parts, sums, penalty, strength)
+    return solve(replace(problem, start=scaled.first * scale), steps, scale, objective)
 
 
 def _iterates(
@@ -253,8 +240,8 @@ def _iterates(
     sums: Sequence[Float[Tensor, "1 1 d h w"]],
     penalty: RelativeDifference,
     strength: float,
-) -> Iterator[Float[Tensor, "b c d h w"]]:
-    """The volumes of the method, without end; the penalty is `strength` R.
+) -> Iterator[Step]:
+    """The iterates of the method, without end; the penalty is `strength` R.
 
     A step is x <- x + a_n S D (grad L_k - grad penalty / S) for the k-th of S subsets, with relaxed
     a_n (De Pierro and Yamagishi, IEEE Trans. Med. Imaging 20 (2001) 280; with values kept above a
@@ -275,4 +262,4 @@ def _iterates(
             if strength:
                 slope = slope - strength / subsets * penalty.gradient(x)
             x = torch.addcmul(x, x * metric, slope, value=length).maximum(floor)
-        yield x
+        yield Step(x)

@@ -1,0 +1,392 @@
+"""FDK of cone beams and FBP of parallel and fan beams: rows weighted, filtered and back-projected,
+block by block, so that views may be larger than memory.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import unit
+from mvrecon.kernels.device_cache import device_cached, grid_key
+from mvrecon.kernels.precision import wide
+from mvrecon.methods.classical.orbit import (
+    Scan,
+    ScanKind,
+    along,
+    fan_coordinate,
+    redundancy,
+    scan_of,
+)
+from mvrecon.operators.checks import check_floating, check_measured, check_views
+from mvrecon.operators.operator import Projector, Scaled
+from mvrecon.operators.voxel_driven import Images, image_maps, looked
+
+Filter = Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
+
+#: Windows of the ramp as functions of frequency over the band limit, from 0 to 1.
+WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
+    "ram-lak": torch.ones_like,
+    "shepp-logan": lambda f: torch.sinc(f / 2),
+    "cosine": lambda f: torch.cos(math.pi / 2 * f),
+    "hamming": lambda f: 0.54 + 0.46 * torch.cos(math.pi * f),
+    "hann": lambda f: 0.5 + 0.5 * torch.cos(math.pi * f),
+}
+
+
+def padded_length(columns: int) -> int:
+    """The least even length of at least twice the columns without a prime factor above 5: one
+    period of the filter then holds a row and its whole response.
+    """
+    length = max(2, 2 * columns)
+    while length % 2 or _rough(length):
+        length += 1
+    return length
+
+
+def _rough(length: int) -> bool:
+    for prime in (2, 3, 5):
+        while length % prime == 0:
+            length //= prime
+    return length > 1
+
+
+def ramp_response(
+    columns: int, filter: Filter = "ram-lak", cutoff: float = 1.0
+) -> Float[Tensor, " frequency"]:
+    """The windowed ramp filter's frequency response for rows of pixels 1 mm wide, in 1/mm.
+
+    It is the transform of the ramp sampled in space, h(0) = 1/4, h(n) = -1 / (pi n)^2 for odd n,
+    else 0, so that a constant keeps its right level (Kak and Slaney, Principles of Computerized
+    Tomographic Imaging, 1988, ch. 3, eq. 61).
+
+    Args:
+        columns: pixels of a row.
+        filter: the window, "ram-lak" (none), "shepp-logan", "cosine", "hamming" or "hann".
+        cutoff: the band limit as a fraction of the Nyquist frequency, in (0, 1]; what lies above
+            is removed.
+
+    Raises:
+        ValueError: an unknown filter, or a band limit outside (0, 1].
+    """
+    if filter not in WINDOWS:
+        raise ValueError(f"Unknown filter {filter!r}. Known: {', '.join(WINDOWS)}")
+    if not 0 < cutoff <= 1:
+        raise ValueError(
+            f"Expected cutoff as a fraction of the Nyquist frequency in (0, 1], got {cutoff!r}"
+        )
+    length = padded_length(columns)
+    n = torch.arange(length, dtype=torch.float64)
+    n = torch.minimum(n, length - n)
+    kernel = torch.where(n % 2 == 1, -1 / (math.pi * n.clamp_min(1)) ** 2, 0.0)
+    kernel[0] = 0.25
+    fraction = torch.linspace(0, 1, length // 2 + 1, dtype=torch.float64) / cutoff
+    window = torch.where(fraction <= 1, WINDOWS[filter](fraction), 0.0)
+    return torch.fft.rfft(kernel).real * window
+
+
+def filter_rows(
+    views: Float[Tensor, "*n u"], response: Float[Tensor, " frequency"]
+) -> Float[Tensor, "*n u"]:
+    """Rows convolved with a filter of `ramp_response`, in (unit of the views) / pixel.
+
+    Divide by the pixel pitch in mm for (unit of the views) / mm. Rows are continued by zeros.
+    """
+    length = 2 * (len(response) - 1)
+    spectrum = torch.fft.rfft(views, n=length)
+    spectrum *= response.to(views)  # in place: a spectrum is twice as large as the views
+    return torch.fft.irfft(spectrum, n=length)[..., : views.shape[-1]]
+
+
+def pixel_weights(
+    rig: Cameras, scan: Scan, dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "m v u"]:
+    """The weights of views' pixels, without unit: radian per pixel times mm per mm.
+
+    Args:
+        rig: the views' cameras.
+        scan: of these views, on the cameras' device.
+        dtype: of the arithmetic over pixels; geometry is float64.
+    """
+    orbit, device = scan.orbit, rig.source.device
+    v, u = (torch.arange(n, dtype=dtype, device=device) for n in rig.shape)
+    tangents, rows, pitch = orbit.tangents, unit(rig.u), rig.u.norm(dim=-1)
+    slant = (tangents * rows).sum(dim=-1)
+    angle = (scan.steps / pitch).to(dtype)[:, None, None]
+    if scan.kind == "full":  # its shares do not depend on fan coordinates: one pixel a view
+        fan = u.new_zeros(len(rig), 1, 1)
+    else:
+        fan = fan_coordinate(rig, orbit, u, v)
+    share = redundancy(scan, fan) * angle
+    if rig.parallel:
+        return share / slant.abs().to(dtype)[:, None, None]
+    start = rig.origin - rig.source
+    by_row, by_motion = along(start, rig, rows, u, v), along(start, rig, tangents, u, v)
+    # squared distances of pixels from the source in mm^2
+    normal = unit(torch.linalg.cross(rows, unit(rig.v)))
+    level = along(start, rig, torch.linalg.cross(normal, rows), u, v)
+    square = (start * normal).sum(dim=-1).square().to(u)[:, None, None]
+    square = square + by_row.square() + level.square()
+    motion = slant.to(dtype)[:, None, None] * square - by_row * by_motion
+    return share * orbit.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
+
+
+#: Pixels in memory at a time, weighted and filtered: 8 bytes for each of them.
+BLOCK_PIXELS = 2**24
+#: Pixels filtered at a time, which takes about 24 bytes for each of them.
+FILTERED_PIXELS = 2**21
+
+#: read(first, last): the views [b c first..last v u].
+Read = Callable[[int, int], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Filtering:
+    """How views are weighted and filtered; see `fdk`."""
+
+    filter: Filter = "ram-lak"
+    cutoff: float = 1.0
+    scan: ScanKind = "auto"
+    weights_from: Cameras | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is computed of a rig before any view is filtered.
+
+    Args:
+        rig: that weights and filter belong to.
+        scan: of this rig.
+        response: of the filter.
+        images: where every voxel is seen in the filtered views.
+        pixels: of a filtered view.
+    """
+
+    rig: Cameras
+    scan: Scan
+    response: Float[Tensor, " frequency"]
+    images: Images
+    pixels: int
+
+    def to(self, device: torch.device) -> "Plan":
+        """The same on a device."""
+        rig, scan, response = (x.to(device) for x in (self.rig, self.scan, self.response))
+        images = self.images._replace(maps=self.images.maps.to(device))
+        return replace(self, rig=rig, scan=scan, response=response, images=images)
+
+    def filtered(self, views: Float[Tensor, "b c k v u"], part: slice) -> Tensor:
+        """Some of the views, weighted and filtered, a few at a time."""
+        volumes, rows = views.shape[0] * views.shape[1], []
+        size = max(1, FILTERED_PIXELS // (volumes * self.pixels))
+        for some in _slices(part.start, part.stop, size):
+            weights = pixel_weights(self.rig[some], self.scan.of(some), views.dtype)
+            block = views[:, :, some.start - part.start : some.stop - part.start]
+            block = pad(block * weights, self.scan.columns)
+            rows.append(filter_rows(block, self.response).contiguous())
+        return rows[0] if len(rows) == 1 else torch.cat(rows, dim=2)
+
+
+def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
+    rig = cameras if filtering.weights_from is None else filtering.weights_from
+    scan = scan_of(rig, grid, filtering.scan)
+    # further columns before and behind the rig's own
+    before, behind = scan.columns
+    shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
+    source = cameras.source - shift if cameras.parallel else cameras.source
+    target = replace(cameras, source=source, origin=cameras.origin - shift, shape=shape)
+    response = ramp_response(target.shape[1], filtering.filter, filtering.cutoff)
+    maps = image_maps(target, grid)
+    images = Images(maps, target.ray_extent, grid.shape)
+    return Plan(rig, scan, response, images, math.prod(target.shape))
+
+
+def _known(
+    cameras: Cameras, grid: Grid, filtering: Filtering, like: Tensor, make: Callable[[], Plan]
+) -> Plan:
+    """A plan that is made once on each device, but with weights from another rig, which may be
+    written to.
+    """
+    if filtering.weights_from is not None:
+        return make()
+    options = filtering.filter, filtering.cutoff, filtering.scan
+    return device_cached(cameras, ("filtering", grid_key(grid), *options), like, make)
+
+
+def _slices(first: int, last: int, size: int) -> Iterator[slice]:
+    """Consecutive parts of a range, each of so many at most."""
+    for start in range(first, last, size):
+        yield slice(start, min(start + size, last))
+
+
+def filtered_backprojection(
+    read: Read, cameras: Cameras, grid: Grid, volumes: int, filtering: Filtering
+) -> Float[Tensor, "b c d h w"]:
+    """FBP or FDK of views [b c m v u] that are read in blocks.
+
+    Args:
+        read: gives a block of views.
+        cameras: the rig, of all views.
+        grid: the voxels.
+        volumes: b c, for the size of the blocks.
+        filtering: the options.
+
+    Raises:
+        ValueError: a rig, option or block of views that does not fit.
+    """
+    ideal = cameras if filtering.weights_from is None else filtering.weights_from
+    if (len(ideal), ideal.shape) != (len(cameras), cameras.shape):
+        raise ValueError(
+            f"Expected weights_from as a rig of {len(cameras)} views of {cameras.shape}, got "
+            f"{len(ideal)} of {ideal.shape}"
+        )
+    plan = _known(cameras, grid, filtering, cameras.source, lambda: _plan(cameras, grid, filtering))
+    size = max(1, BLOCK_PIXELS // (volumes * plan.pixels))
+    total = None
+    for part in _slices(0, len(cameras), size):
+        views = read(part.start, part.stop)
+        check_views(views, cameras[part])
+        check_floating(views, "views")
+        near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
+        images = near.images._replace(maps=near.images.maps[part])
+        volume = looked(near.filtered(wide(views), part), images, weighted=True)
+        total = volume if total is None else total.add_(volume)
+    assert total is not None  # a rig has at least one camera
+    return total
+
+
+def fdk_streamed(
+    read: Callable[[int, int], Any],
+    cameras: Cameras,
+    grid: Grid,
+    filter: Filter = "ram-lak",
+    cutoff: float = 1.0,
+    scan: ScanKind = "auto",
+    weights_from: Cameras | None = None,
+) -> Float[Tensor, "1 1 d h w"]:
+    """FDK of views that are read block by block, in (unit of the views) / mm.
+
+    Memory: twice the volume, and a block of about 16 million pixels. The blocks come in order, each
+    view once.
+
+    Args:
+        read: read(first, last) gives the views first to last - 1 as an array [m v u].
+        cameras: the rig, of all views.
+        grid: the voxels.
+        filter, cutoff, scan, weights_from: as `fdk`.
+
+    Raises:
+        ValueError: a rig, option or block of views that does not fit.
+    """
+
+    def block(first: int, last: int) -> Tensor:
+        return torch.as_tensor(read(first, last))[None, None]
+
+    with torch.no_grad():
+        filtering = Filtering(filter, cutoff, scan, weights_from)
+        return filtered_backprojection(block, cameras, grid, 1, filtering)
+
+
+def fdk(
+    A: Projector,
+    views: Float[Tensor, "b c m v u"],
+    filter: Filter = "ram-lak",
+    cutoff: float = 1.0,
+    scan: ScanKind = "auto",
+    weights_from: Cameras | None = None,
+) -> Float[Tensor, "b c d h w"]:
+    """FDK reconstructs a cone-beam scan on a circle by filtered back-projection, in (unit of the
+    views) / mm.
+
+    Any camera of the record will do whose sources lie roughly on a circle and whose rows run
+    across its axis: steps may be uneven, detectors shifted and turned. The method is exact in the
+    plane of the sources, and approximate above and below it. Linear, and differentiable in the
+    views (Feldkamp, Davis and Kress, Practical cone-beam algorithm, JOSA A 1, 1984).
+
+    Args:
+        A: the operator, whose grid and cameras are used.
+        views: line integrals.
+        filter: the ramp's window, "ram-lak" (none), "shepp-logan", "cosine", "hamming" or "hann".
+        cutoff: band limit as a fraction of the detector's Nyquist frequency, in (0, 1].
+        scan: "full", "short" (Parker's weights; 180 degrees and the fan suffice), "offset" (Wang's
+            weights; a whole turn with the detector to one side), or "auto": an offset is taken for
+            one if the detector's narrow side does not reach around the grid's inscribed cylinder.
+        weights_from: the rig that weights and filter belong to, where it is not the one that is
+            back-projected with: the ideal geometry of a misaligned scanner (Karolczak and others,
+            Med. Phys. 28, 2001). None: A's own.
+
+    Raises:
+        ValueError: parallel beams, sources that are not on a circle, angles that do not suffice,
+            views that do not fit or are not finite, an unknown option, or an operator with weights.
+    """
+    cameras = _plain(A, "fdk")
+    if cameras.parallel:
+        raise ValueError("fdk needs a cone or fan beam, got parallel beams; use fbp")
+    return _reconstruct(A, views, Filtering(filter, cutoff, scan, weights_from))
+
+
+def fbp(
+    A: Projector,
+    views: Float[Tensor, "b c m v u"],
+    filter: Filter = "ram-lak",
+    cutoff: float = 1.0,
+    scan: ScanKind = "auto",
+) -> Float[Tensor, "b c d h w"]:
+    """Filtered back-projection reconstructs slices from parallel or fan beams, in (unit of the
+    views) / mm.
+
+    Parallel beams: one slice, a stack of slices, or a volume; angles in any order, over 180 degrees
+    or more, with uneven steps. Fan beams: a flat detector of one row in the plane of the sources, a
+    slice; a stack of slices is a batch. Linear, and differentiable in the views (Kak and Slaney,
+    Principles of Computerized Tomographic Imaging, 1988, ch. 3).
+
+    Args:
+        A: the operator, whose grid and cameras are used.
+        views: line integrals.
+        filter, cutoff, scan: as `fdk`.
+
+    Raises:
+        ValueError: a cone beam, angles that do not suffice, views that do not fit or are not
+            finite, an unknown option, or an operator with weights.
+    """
+    cameras = _plain(A, "fbp")
+    if not cameras.parallel and cameras.shape[0] > 1:
+        raise ValueError(
+            f"fbp needs parallel beams or fans of one row, got a cone beam of {cameras.shape[0]} "
+            f"rows; use fdk"
+        )
+    return _reconstruct(A, views, Filtering(filter, cutoff, scan))
+
+
+def _plain(A: Projector, name: str) -> Cameras:
+    """The cameras of an operator that integrates along their rays and no more."""
+    if isinstance(A, Scaled):
+        raise ValueError(
+            f"{name} needs plain line integrals, got an operator with weights, "
+            f"{type(A).__name__}; use sirt or mlem"
+        )
+    if not (hasattr(A, "grid") and hasattr(A, "cameras")):
+        raise ValueError(
+            f"{name} needs an operator with a grid and cameras, got {type(A).__name__}; use sirt"
+        )
+    return A.cameras
+
+
+def _reconstruct(
+    A: Projector, views: Float[Tensor, "b c m v u"], filtering: Filtering
+) -> Float[Tensor, "b c d h w"]:
+    check_measured(views, "views [b c m v u]", (len(A.cameras), *A.cameras.shape), views.device)
+
+    def read(first: int, last: int) -> Tensor:
+        return views[:, :, first:last]
+
+    volumes = views.shape[0] * views.shape[1]
+    x = filtered_backprojection(read, A.cameras, A.grid, volumes, filtering)
+    support = getattr(A, "support", None)
+    return x if support is None else torch.where(support, x, 0)

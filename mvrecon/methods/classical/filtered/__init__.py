@@ -1,1 +1,0 @@
-"""Filtered back-projection: FBP of parallel and fan beams, FDK of cone beams."""

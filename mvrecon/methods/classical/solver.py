@@ -1,0 +1,326 @@
+"""What all iterative methods share: a method yields its iterates, and `solve` consumes them."""
+
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import wraps
+from itertools import islice
+from numbers import Integral
+from typing import Literal, NamedTuple, ParamSpec, Self, TypedDict
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.core.registry import hint
+from mvrecon.geometry.cameras.views import check_finite
+from mvrecon.kernels.precision import wide
+from mvrecon.operators.checks import check, check_measured
+from mvrecon.operators.operator import LinearOperator
+
+P = ParamSpec("P")
+#: What a method's views are: line integrals, counts, or what a network was trained on.
+DataKind = Literal["integrals", "counts", "trained"]
+
+
+class Iterate(NamedTuple):
+    """An iterate x_n of a method, as a monitor sees it; its tensors must not be modified.
+
+    Args:
+        number: n, from 1.
+        volume: x_n, in the unit of the volume.
+        residual: y - A x_n, in the unit of the views.
+        gap: upper bound of how far the objective is above its minimum, relative to the objective;
+            None for methods, and for iterates, without this number.
+        objective: what the method minimises, of each sample; None for methods without this number.
+    """
+
+    number: int
+    volume: Float[Tensor, "b c d h w"]
+    residual: Float[Tensor, "b c m v u"]
+    gap: Float[Tensor, "b c"] | None = None
+    objective: Float[Tensor, " b"] | None = None
+
+
+#: Called with every iterate; the method ends with the one for which it returns true. A mask [b]
+#: ends single samples: each keeps its iterate, and the method goes on until all have ended.
+Monitor = Callable[[Iterate], bool | Bool[Tensor, " b"] | None]
+#: What a method minimises, of each sample [b], from a volume and its residual views.
+Objective = Callable[[Tensor, Tensor], Tensor]
+
+
+class Common(TypedDict, total=False):
+    """Options of every iterative method.
+
+    Args:
+        start: the first volume [b c d h w], in the unit of the volume; zero by default.
+        support: the voxels that may differ from zero, a mask [d h w].
+        monitor: called after every iteration; the method ends where it returns true.
+    """
+
+    start: Float[Tensor, "b c d h w"] | None
+    support: Bool[Tensor, "d h w"] | None
+    monitor: Monitor | None
+
+
+def declares(
+    data_kind: DataKind = "integrals", iterates: bool = False, differentiable: bool = True
+) -> Callable[[Callable[P, Tensor]], Callable[P, Tensor]]:
+    """Decorator that declares properties of a classical method f(A, views, **options).
+
+    `data_kind` and `iterates` become attributes of the function.
+
+    Args:
+        data_kind: line integrals, or counts.
+        iterates: whether it shows its iterates to a monitor, so that stopping rules, progress bars
+            and the choice of iterations apply.
+        differentiable: whether gradients flow from the volume to the views; a method without
+            refuses tensors that require one, and computes under `torch.no_grad`.
+
+    Raises:
+        TypeError: of the decorated function, an option that it does not have; the message gives the
+            nearest name and all names.
+        ValueError: of the decorated function, a tensor that requires a gradient, where gradients
+            are recorded and the method has none.
+    """
+
+    def declared(method: Callable[P, Tensor]) -> Callable[P, Tensor]:
+        name, parameters = (
+            getattr(method, "__name__", "method"),
+            inspect.signature(method).parameters,
+        )
+        known = set(parameters) - {"common"}
+        if "common" in parameters:
+            known |= set(Common.__annotations__)
+
+        @wraps(method)
+        def checked(*args: P.args, **options: P.kwargs) -> Tensor:
+            for option in set(options) - known:
+                raise TypeError(f"{name} has no option {option!r}{hint(option, known)}")
+            if differentiable:
+                return method(*args, **options)
+            tensors = [value for value in (*args, *options.values()) if isinstance(value, Tensor)]
+            if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+                raise ValueError(
+                    f"Expected tensors without gradient for {name}, which has none, got one that "
+                    f"requires it; take tikhonov, sirt, fbp or fdk, which are differentiable, or "
+                    f"views.detach()"
+                )
+            with torch.no_grad():
+                return method(*args, **options)
+
+        setattr(checked, "data_kind", data_kind)  # noqa: B010 - no such attribute by type
+        setattr(checked, "iterates", iterates)  # noqa: B010
+        return checked
+
+    return declared
+
+
+@dataclass(frozen=True, eq=False)
+class InverseProblem:
+    """y = A x + r, solved for x: the checked arguments of a method.
+
+    Args:
+        A: the operator, restricted to the support.
+        views: y.
+        start: the first volume, zero outside the support; None: zero.
+        iterations: the most that are made.
+        support: the voxels that may differ from zero; None: all.
+        monitor: called with every iterate.
+        background: r, expected counts of other origin.
+    """
+
+    A: LinearOperator
+    views: Float[Tensor, "b c m v u"]
+    start: Float[Tensor, "b c d h w"] | None
+    iterations: int
+    support: Bool[Tensor, "d h w"] | None = None
+    monitor: Monitor | None = None
+    background: float | Float[Tensor, "b c m v u"] = 0.0  # a number is zero
+
+    @classmethod
+    def of(
+        cls,
+        A: LinearOperator,
+        views: Float[Tensor, "b c m v u"],
+        iterations: int,
+        options: Common,
+        background: float | Float[Tensor, "b c m v u"] | None = None,
+    ) -> Self:
+        """The problem that a method is given, checked; its tensors are float32 or float64.
+
+        Args:
+            A, views, iterations: the method's arguments.
+            options: those that all methods have.
+            background: of counts, whose values `PoissonLikelihood` checks; None: the views are line
+                integrals.
+
+        Raises:
+            ValueError: views or a start of another shape than the operator's, on another device, or
+                with values that are not finite; an empty batch; a support that is no mask of the
+                volume's shape; iterations that are no whole number of at least 0.
+        """
+        if not isinstance(iterations, Integral) or iterations < 0:
+            raise ValueError(
+                f"Expected iterations, a whole number of at least 0, got {iterations!r}"
+            )
+        support, start = options.get("support"), options.get("start")
+        if support is not None:
+            if support.dtype != torch.bool or tuple(support.shape) != tuple(A.domain_shape):
+                got = f"{support.dtype} {tuple(support.shape)}"
+                raise ValueError(
+                    f"Expected a support, a mask of {tuple(A.domain_shape)}, got {got}"
+                )
+            A = A.with_support(support)
+            support = support.to(A.device)
+        kind = "views" if background is None else "counts [b c m v u]"
+        check_measured(views, kind, A.range_shape, A.device)
+        if background is None:
+            check_finite(views, on_gpu=False)
+        views = wide(views)
+        if start is not None:
+            # on a GPU, which is not synchronised, results from bad values are not finite either
+            check(start, "start", A.domain_shape, A.device)
+            if start.shape[:2] != views.shape[:2] or (start.is_cpu and not start.isfinite().all()):
+                raise ValueError(
+                    f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
+                    f"{tuple(start.shape)} with {int((~start.isfinite()).sum())} values that are "
+                    f"not finite"
+                )
+            start = start.to(views.dtype)
+            start = start if support is None else start * support
+        if background is None or (isinstance(background, int | float) and background == 0):
+            background = 0.0
+        else:
+            background = spread_background(background, views)
+        return cls(A, views, start, iterations, support, options.get("monitor"), background)
+
+    @property
+    def first(self) -> Float[Tensor, "b c d h w"]:
+        """The first volume."""
+        if self.start is not None:
+            return self.start
+        return self.views.new_zeros(*self.views.shape[:2], *self.A.domain_shape)
+
+    def divided(self, scale: Float[Tensor, "b c 1 1 1"]) -> Self:
+        """The same with views, start and background divided by a scale."""
+        start = None if self.start is None else self.start / scale
+        background = self.background
+        background = background / scale if isinstance(background, Tensor) else background
+        return replace(self, views=self.views / scale, start=start, background=background)
+
+    def residual(self, volume: Float[Tensor, "b c d h w"] | None) -> Float[Tensor, "b c m v u"]:
+        """y - (A x + r); of no volume the views, without a projection."""
+        if volume is None:
+            return self.views
+        expected = self.A(volume)
+        if isinstance(self.background, Tensor):
+            expected = expected + self.background
+        return self.views - expected
+
+
+class Step(NamedTuple):
+    """What a method yields after an iteration.
+
+    Args:
+        volume: x_n.
+        residual: y - A x_n, where the method knows it; else it is computed for a monitor.
+        gap: see `Iterate`.
+    """
+
+    volume: Float[Tensor, "b c d h w"]
+    residual: Float[Tensor, "b c m v u"] | None = None
+    gap: Float[Tensor, "b c"] | None = None
+
+
+def solve(
+    problem: InverseProblem,
+    steps: Iterable[Step],
+    scale: Float[Tensor, "#b #c 1 1 1"] | None = None,
+    objective: Objective | None = None,
+) -> Float[Tensor, "b c d h w"]:
+    """The volume of the last iterate, in the unit of the volume.
+
+    A sample that a monitor ends before the others keeps its iterate, so that a batch gives what its
+    samples alone would.
+
+    Args:
+        problem: whose iterations are made, whose monitor is called.
+        steps: the iterates of a method, without end or until it has converged.
+        scale: by which the method has divided views and start; None: one.
+        objective: what is shown to the monitor; None: nothing.
+    """
+    step: Step | None = None
+    done: Tensor | None = None
+    kept: Tensor | None = None
+
+    def scaled(tensor: Tensor) -> Tensor:
+        return tensor if scale is None else tensor * scale
+
+    for number, step in enumerate(islice(steps, problem.iterations), 1):
+        if problem.monitor is None:
+            continue
+        volume, residual = scaled(step.volume), step.residual
+        residual = problem.residual(volume) if residual is None else scaled(residual)
+        value = None if objective is None else objective(volume, residual)
+        verdict = problem.monitor(Iterate(number, volume, residual, step.gap, value))
+        if not isinstance(verdict, Tensor):
+            if verdict:
+                break
+            continue
+        verdict = verdict.to(volume.device)[:, None, None, None, None]
+        kept = volume if kept is None or done is None else torch.where(done, kept, volume)
+        done = verdict if done is None else done | verdict
+        if done.all():
+            break
+    volume = problem.first if step is None else scaled(step.volume)
+    return volume if kept is None or done is None else torch.where(done, kept, volume)
+
+
+def spread_background(
+    background: float | Tensor, counts: Float[Tensor, "b c m v u"]
+) -> Float[Tensor, "b c m v u"]:
+    """A background of counts as views, without copies.
+
+    Raises:
+        TypeError: neither a number nor a tensor.
+        ValueError: a tensor that does not broadcast to the counts.
+    """
+    if not isinstance(background, Tensor | int | float):
+        raise TypeError(f"Expected a background of one number or views, got {background!r}")
+    like = wide(counts[:0])
+    if not isinstance(background, Tensor):
+        return like.new_full((), background).expand(counts.shape)
+    added = background.to(like)
+    try:
+        return added.expand(counts.shape)
+    except RuntimeError as error:
+        raise ValueError(
+            f"Expected a background of one number or views that broadcast to "
+            f"{tuple(counts.shape)}, "
+            f"got {tuple(added.shape)}"
+        ) from error
+
+
+def power_of_two(*tensors: Tensor | None) -> Float[Tensor, "b c 1 1 1"]:
+    """The greatest power of two up to the largest absolute value of each sample in all tensors; one
+    for zeros.
+
+    Division by it changes no digit, so a method that is computed on views of about one squares no
+    value beyond the range of float32.
+    """
+    peaks = [t.abs().flatten(2).amax(dim=2) for t in tensors if t is not None]
+    peak = torch.stack(peaks).amax(dim=0)
+    scale = peak / (2 * torch.frexp(peak).mantissa)
+    return torch.where((peak > 0) & peak.isfinite(), scale, 1)[..., None, None, None]
+
+
+def check_not_negative(**options: float) -> None:
+    """Refuse options that are negative or not finite.
+
+    Raises:
+        ValueError: with the option's name.
+    """
+    for name, value in options.items():
+        if not 0 <= value < float("inf"):
+            raise ValueError(f"Expected {name} of at least 0, got {value}")

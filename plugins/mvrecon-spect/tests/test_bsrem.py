@@ -1,0 +1,220 @@
+"""BSREM ends at the minimum of its objective, told by another method; the relative difference prior
+has its value by hand, its derivative and its invariances.
+"""
+
+import pytest
+import torch
+
+from mvrecon.methods.classical.mlem import mlem
+from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.methods.classical.stopping import discrepancy
+from mvrecon.methods.classical.total_variation import voxel_steps
+from mvrecon.testing import check_method
+from mvrecon_spect.bsrem import RelativeDifference, bsrem
+from tests.methods.classical.methods import Dense, gap, projector, truth
+from tests.methods.classical.test_penalised_counts import counted, scale
+
+SHAPE, STEPS = (4, 5, 6), (2.0, 1.0, 1.0)
+
+
+def prior(**options) -> RelativeDifference:
+    mask = torch.ones(SHAPE, dtype=torch.bool)
+    mask[0, :2] = False
+    return RelativeDifference(STEPS, mask, **options)
+
+
+def volume() -> torch.Tensor:
+    random = torch.Generator().manual_seed(0)
+    x = torch.rand(2, 1, *SHAPE, dtype=torch.float64, generator=random)
+    x[..., 2:4, 2:4] = 0
+    return x
+
+
+def anatomy() -> torch.Tensor:
+    """Two tissues, one above the other."""
+    image = torch.zeros(SHAPE)
+    image[:, :, 3:] = 100.0
+    return image
+
+
+def test_two_voxels_cost_what_the_formula_says():
+    """Two slices 2 mm apart in voxels of 1 mm: half the weight."""
+    R = RelativeDifference((2.0, 1.0, 1.0), torch.ones(2, 1, 1, dtype=torch.bool), gamma=3.0)
+    x = torch.tensor([1.0, 5.0], dtype=torch.float64).reshape(1, 1, 2, 1, 1)
+    assert R(x).item() == pytest.approx(0.5 * 16 / (6 + 3 * 4))
+    R = RelativeDifference((1.0, 1.0, 1.0), torch.ones(1, 2, 2, dtype=torch.bool), gamma=0.0)
+    x = torch.tensor([[1.0, 1.0], [1.0, 3.0]], dtype=torch.float64).reshape(1, 1, 1, 2, 2)
+    assert R(x).item() == pytest.approx((2 + 2**-0.5) * 4 / 4, rel=1e-6)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 2.0, 10.0])
+@pytest.mark.parametrize("guided", [False, True])
+def test_the_derivative_is_that_of_autograd(gamma, guided):
+    R = prior(gamma=gamma, anatomy=anatomy() if guided else None)
+    x = volume().clamp_min(1e-3).requires_grad_()
+    (slope,) = torch.autograd.grad(R(x).sum(), x)
+    torch.testing.assert_close(R.gradient(x.detach()), slope, rtol=1e-10, atol=1e-12)
+
+
+def test_it_is_homogeneous_and_between_zeros_it_has_no_slope():
+    R, x = prior(), volume()
+    torch.testing.assert_close(R(7 * x), 7 * R(x))
+    torch.testing.assert_close((R.gradient(x) * x).flatten(1).sum(dim=1), R(x))
+    assert R.gradient(x).isfinite().all() and not R.gradient(torch.zeros_like(x)).any()
+    assert not R.gradient(x)[:, :, 0, :2].any()  # outside the mask
+
+
+def test_its_curvature_times_the_value_is_bounded_by_the_weights():
+    """What the step of BSREM relies on, by Gershgorin's circles of x^(1/2) H x^(1/2)."""
+    R = prior()
+    x = volume().clamp_min(1e-3)[:1]
+    hessian = torch.autograd.functional.hessian(lambda v: R(v).sum(), x).reshape(120, 120)
+    root = x.flatten().sqrt()
+    scaled = root[:, None] * hessian * root
+    bound = 2 * R.weights(x).flatten()
+    norms = torch.linalg.eigvalsh(scaled / (bound[:, None] * bound).sqrt().clamp_min(1e-9))
+    assert -1e-9 < norms.min() and norms.max() <= 1
+
+
+def test_ct_takes_away_the_cost_of_an_edge_that_it_shows():
+    edge = (1 + anatomy()[None, None]).double()
+    plain, guided = prior(), prior(anatomy=anatomy(), similar=7)
+    assert plain(edge).item() > 1 and guided(edge).item() == 0
+    # within a tissue all neighbours are equal, and all count
+    inner = edge.clone()
+    inner[..., 2, 2, 1] = 3.0
+    assert guided(inner).item() == pytest.approx(plain(torch.where(edge > 1, 1, inner)).item())
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gamma": -1.0},
+        {"gamma": torch.inf},
+        {"similar": 0},
+        {"anatomy": torch.zeros(4, 5, 5)},
+        {"anatomy": torch.full(SHAPE, torch.nan)},
+    ],
+)
+def test_a_prior_that_cannot_be_is_refused(options):
+    """The relative difference prior refuses a negative gamma, no neighbours, and an anatomy of
+    another shape or with NaN.
+    """
+    with pytest.raises(ValueError, match="Expected a finite"):
+        prior(**options)
+
+
+@pytest.mark.parametrize("make", [projector, Dense])
+@pytest.mark.parametrize("weight", [0.02, 0.3])
+def test_bsrem_ends_where_another_method_does(make, weight):
+    """L-BFGS of torch on the square root of the volume, with autograd's gradients."""
+    A = make()
+    counts, added = counted(A), 0.5
+    x = bsrem(A, counts, 200, weight, subsets=3, background=added)
+    L = PoissonLikelihood(A, counts, added, skip_zero_bins=False)
+    seen = L.sensitivity(torch.float64)[0, 0] > 0
+    R = RelativeDifference(voxel_steps(A), seen)
+    strength = weight * scale(A, counts)
+
+    root = mlem(A, counts, 5, added).sqrt().requires_grad_()
+    search = torch.optim.LBFGS([root], max_iter=200, line_search_fn="strong_wolfe", history_size=30)
+
+    def objective() -> torch.Tensor:
+        search.zero_grad()
+        volume = root.square() * seen
+        value = (L(volume) + strength * R(volume)).sum()
+        value.backward()
+        return value
+
+    search.step(objective)
+    other = root.detach().square() * seen
+    values = [(L(v) + strength * R(v)).item() for v in (x, other)]
+    assert values[0] - values[1] < 1e-5 * abs(values[1])
+    assert gap(x, other) < 2e-2
+    assert gap(A(x), A(other)) < 3e-3
+
+
+def test_the_objective_of_each_iteration_is_shown_and_falls():
+    A, values = projector(), []
+    bsrem(
+        A,
+        counted(A),
+        12,
+        0.05,
+        1,
+        background=0.2,
+        monitor=lambda iterate: values.append(iterate.objective.item()),
+    )
+    assert len(values) == 12
+    assert all(b < a for a, b in zip(values, values[1:], strict=False))
+
+
+def test_more_weight_means_less_noise_at_any_number_of_counts():
+    A = projector()
+    views = A(torch.ones(1, 1, *A.domain_shape, dtype=torch.float64))
+    for level in (5.0, 500.0):
+        counts = torch.poisson(
+            level / views.mean() * views, generator=torch.Generator().manual_seed(4)
+        )
+        spreads = []
+        for weight in (1e-3, 0.02, 0.3):
+            x = bsrem(A, counts, 30, weight)
+            seen = x > 0
+            spreads.append((x[seen].std() / x[seen].mean()).item())
+        assert spreads[0] > spreads[1] > spreads[2] and spreads[2] < 0.1
+
+
+def test_it_keeps_the_contract_of_methods():
+    check_method("bsrem", projector(), iterations=4)
+
+
+@pytest.mark.parametrize("make", [projector, Dense])
+def test_it_explains_consistent_views(make):
+    A = make()
+    views = A(truth(A))
+    x = bsrem(A, views, 100, 1e-5)
+    assert gap(A(x), views) < 2e-2
+
+
+@pytest.mark.parametrize("exponent", [-100, -60, 40])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_multiple_of_the_counts_gives_that_multiple_of_the_volume(exponent, dtype):
+    A, shown = projector(), {}
+    counts, added = counted(A).to(dtype), 0.5
+    for factor in (1.0, 2.0**exponent):
+        values = shown[factor] = []
+
+        def monitor(iterate, values=values, factor=factor):
+            values.append(iterate.objective.item() / factor)
+
+        background = added * factor
+        shown[factor, "x"] = bsrem(A, factor * counts, 5, 0.03, background=background) / factor
+        bsrem(A, factor * counts, 5, 0.03, background=background, monitor=monitor)
+    assert torch.equal(shown[1.0, "x"], shown[2.0**exponent, "x"])
+    # the likelihood of a multiple differs by a constant
+    ordinary, scaled = (
+        torch.tensor(shown[key], dtype=torch.float64).diff() for key in (1.0, 2.0**exponent)
+    )
+    assert gap(scaled, ordinary) < (1e-3 if dtype == torch.float32 else 1e-6)
+
+
+def test_the_noise_ends_every_sample_of_a_batch_where_it_would_end_alone():
+    A = projector()
+    x = truth(A, batch=3)
+    x[0], x[1] = 0.1 * x[0], 1
+    views = A(x)
+    monitor = discrepancy(0.02 * views.max().item())
+    whole = bsrem(A, views, 30, 1e-5, monitor=monitor)
+    for n in range(3):
+        assert gap(whole[n], bsrem(A, views[n : n + 1], 30, 1e-5, monitor=monitor)[0]) < 1e-9
+
+
+def test_options_that_do_not_fit_are_refused():
+    A = Dense()
+    counts = counted(A)
+    with pytest.raises(ValueError, match="weight"):
+        bsrem(A, counts, weight=-1.0)
+    with pytest.raises(TypeError, match="gama"):
+        bsrem(A, counts, prior={"gama": 2.0})
+    with pytest.raises(ValueError, match="requires it"):
+        bsrem(A, counts.clone().requires_grad_())

@@ -1,0 +1,66 @@
+"""A multiple of the views gives that multiple of the volume, however small or large it is."""
+
+import pytest
+import torch
+
+from mvrecon.methods.classical.least_squares import cgls, tikhonov
+from mvrecon.methods.classical.mlem import mlem, osem
+from mvrecon.methods.classical.sirt import os_sart, sirt
+from tests.methods.classical.methods import projector, truth
+
+#: Methods that are homogeneous: with options that do not depend on the unit of the views.
+RUNS = {
+    "sirt": lambda A, y, **o: sirt(A, y, 8, momentum=True, **o),
+    "os_sart": lambda A, y, **o: os_sart(A, y, 3, **o),
+    "cgls": lambda A, y, **o: cgls(A, y, 8, **o),
+    "damped cgls": lambda A, y, **o: cgls(A, y, 8, damping=2.0, tolerance=1e-3, **o),
+    "tikhonov": lambda A, y, **o: tikhonov(A, y, 8, **o),
+    "identity": lambda A, y, **o: tikhonov(A, y, 8, 0.3, penalty="identity", **o),
+    "mlem": lambda A, y, **o: mlem(A, y, 5, **o),
+    "osem": lambda A, y, **o: osem(A, y, 3, **o),
+}
+
+
+@pytest.mark.parametrize("exponent", [-100, -70, 40])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", RUNS)
+def test_a_multiple_of_the_views_gives_that_multiple_of_the_volume(name, dtype, exponent):
+    A = projector()
+    start, factor = truth(A, 2, dtype), 2.0**exponent
+    views = A(start.flip(-1)) + 0.1
+    for options in ({}, {"start": start}):
+        x = RUNS[name](A, views, **options)
+        moved = {key: factor * value for key, value in options.items()}
+        scaled = RUNS[name](A, factor * views, **moved) / factor
+        # what is below the range of float32 is lost at 2^-100
+        torch.testing.assert_close(scaled, x, rtol=1e-6, atol=1e-6 * x.abs().max().item())
+
+
+def test_one_sample_of_a_batch_may_be_much_fainter_than_another():
+    A = projector()
+    views = A(truth(A, 2, torch.float32))
+    views[1] *= 2.0**-80
+    for name in ("cgls", "tikhonov"):
+        whole, alone = RUNS[name](A, views), RUNS[name](A, views[1:])
+        torch.testing.assert_close(whole[1:] * 2.0**80, alone * 2.0**80, rtol=1e-4, atol=1e-5)
+
+
+def test_a_monitor_sees_iterates_in_the_unit_of_the_volume():
+    A, seen = projector(), []
+    views = 2.0**-90 * A(truth(A, 1, torch.float32))
+    x = cgls(A, views, 5, monitor=lambda iterate: seen.append(iterate))
+    assert torch.equal(seen[-1].volume, x)
+    torch.testing.assert_close(
+        2.0**90 * seen[-1].residual, 2.0**90 * (views - A(x)), rtol=1e-3, atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("factor", [2.0**-90, 2.0**40])
+def test_the_gradient_of_tikhonov_does_not_depend_on_the_unit_of_the_loss(factor):
+    A = projector()
+    views = A(truth(A, 1, torch.float32)).requires_grad_()
+    gradients = [
+        torch.autograd.grad((scale * tikhonov(A, views, 8)).sum(), views)[0] / scale
+        for scale in (1.0, factor)
+    ]
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-5, atol=1e-6)
