@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from mvrecon.apps.config import launch, to_plain
 from mvrecon.core.files.atomic import check_writable
-from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, leaves
+from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
 from mvrecon.core.plugins import import_plugins
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def _check_places(settings: dict[str, Any], out: Path, folder: Path) -> None:
     if settings["calibrate"]:
         written.append(beside(out))
     places = {path.resolve() for path in written}
-    for keys, value in leaves({**settings, "out": None}):
+    for keys, value in flatten({**settings, "out": None}):
         if isinstance(value, str) and Path(value).expanduser().resolve() in places:
             raise ValueError(
                 f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "

@@ -59,7 +59,7 @@ def test_the_commands_of_the_project_compose(project):
     assert CHOICES <= {word for command in commands for word in command}
     for _, *overrides in commands:
         settings = compose(*overrides)
-        check_settings(OmegaConf.create(settings))
+        check_settings(OmegaConf.create(settings), "train")
         check_parts(settings)
 
 

@@ -5,10 +5,12 @@ torch's defaults and no loop pays for a config object. Importing this file impor
 Lightning.
 """
 
+import os
 import re
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import wraps
 from io import TextIOWrapper
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,13 +23,13 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
-from mvrecon.apps.config.errors import OF_METHODS, one_line
-from mvrecon.apps.config.guard import guarded
+from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
+from mvrecon.apps.config.guard import CommandLine, Guard, quoted, register_untrusted_source
 from mvrecon.apps.config.typed import check_parts
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.plugins import check_plugins
 from mvrecon.core.quiet import silence_libraries
-from mvrecon.core.registry import installed, locate
+from mvrecon.core.registry import hint, installed, locate
 
 
 @dataclass
@@ -45,7 +47,7 @@ class Measurement:
 
 
 @dataclass
-class Simulation(Measurement):
+class SimulateSettings(Measurement):
     """Every top-level key of `mvrecon-simulate`."""
 
     rtk: bool = False
@@ -54,7 +56,7 @@ class Simulation(Measurement):
 
 
 @dataclass
-class Settings(Measurement):
+class TrainSettings(Measurement):
     """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a
     silent extra.
     """
@@ -75,7 +77,7 @@ class Settings(Measurement):
 
 
 @dataclass
-class ScanSettings:
+class ReconstructSettings:
     """Every top-level key of `mvrecon-reconstruct`."""
 
     name: str = MISSING
@@ -97,7 +99,7 @@ class ScanSettings:
 
 
 @dataclass
-class Evaluation:
+class EvalSettings:
     """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the method, are
     not keys.
     """
@@ -115,11 +117,12 @@ class Evaluation:
     plugins: Any = field(default_factory=list)
 
 
+#: What Hydra compares an app's settings with, and the app takes.
 SCHEMAS = {
-    "schema": Settings,
-    "evaluation_schema": Evaluation,
-    "simulation_schema": Simulation,
-    "reconstruction_schema": ScanSettings,
+    "train_schema": TrainSettings,
+    "eval_schema": EvalSettings,
+    "simulate_schema": SimulateSettings,
+    "reconstruct_schema": ReconstructSettings,
 }
 
 
@@ -155,20 +158,6 @@ def with_options_added(arguments: Sequence[str], sections: Collection[str]) -> l
         else argument
         for argument in arguments
     ]
-
-
-def with_flag_first(arguments: Sequence[str]) -> list[str]:
-    """Arguments with the flag of a sweep before all settings: between two of them Hydra would not
-    know those behind it.
-    """
-    return sorted(arguments, key=lambda argument: argument not in ("-m", "--multirun"))
-
-
-def quoted(value: str | Sequence[str]) -> str:
-    """A value in the grammar of Hydra's command line."""
-    if not isinstance(value, str):
-        return f"[{','.join(map(quoted, value))}]"
-    return "'" + value.replace("'", r"\'") + "'"
 
 
 VERSION_BASE = "1.3"
@@ -225,6 +214,7 @@ def prepare_hydra() -> None:
     for name, schema in SCHEMAS.items():
         ConfigStore.instance().store(name=name, node=schema)
     Plugins.instance().register(PluginConf)
+    register_untrusted_source()
 
 
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
@@ -237,8 +227,8 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     Raises:
         SystemExit: an error, or Ctrl-C.
     """
-    sys.argv[1:] = arguments = with_options_added(
-        with_paths_quoted(with_flag_first(sys.argv[1:])), (*OF_PARTS, *OF_RUN.get(config_name, ()))
+    arguments = with_options_added(
+        with_paths_quoted(sys.argv[1:]), (*OF_PARTS, *OF_RUN.get(config_name, ()))
     )
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
@@ -249,32 +239,67 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         )  # as stderr: a path that it cannot write must not end a run
     if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
-    prepare_hydra()
-    silence_libraries()
-    guard = guarded(conf_dir(), plugin_conf_dirs(), check_settings)
-    with one_line(f"mvrecon-{config_name}"), guard:
-        if any(argument.startswith("--e") for argument in arguments):
-            raise PermissionError(
-                "--experimental-rerun unpickles a file, which can run anything; use resume=<run "
-                "folder>"
-            )
+    with one_line(f"mvrecon-{config_name}"):
+        prepare_hydra()
+        silence_libraries()
+        command = CommandLine.of(arguments)
+        sys.argv[1:] = [*command.overrides, *command.flags]
+        if {"-sc", "--shell-completion"} & set(command.flags):
+            if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
+                return  # files of these folders are not read for a word that is being typed
+        else:
+            for config in _guard(config_name, command).checked():
+                check_settings(config, config_name)
+
+        @reported
+        @wraps(task)
+        def checked(config: DictConfig) -> Any:
+            check_settings(config, config_name)
+            return task(config)
+
         hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(
-            task
+            checked
         )()
 
 
-def check_settings(config: DictConfig) -> None:
-    """Check plugins and parts of a composed config, whose missing settings may come later.
+def _guard(app: str, command: CommandLine) -> Guard:
+    return Guard(app, command, [conf_dir(), *plugin_conf_dirs()], VERSION_BASE)
+
+
+def check_settings(config: DictConfig, app: str) -> None:
+    """Check keys, plugins and parts of a composed config of an app, whose missing settings may come
+    later.
 
     Raises:
         ImportError, PermissionError: a module of `plugins` that is none.
-        LookupError, TypeError: a part's name, option or value.
+        LookupError, TypeError: a setting that the app does not use, a part's name, option or value.
     """
     plain: Any = OmegaConf.to_container(config, resolve=False)
     settings = {key: value for key, value in plain.items() if key != "hydra"}
+    check_keys(settings, app)
     if settings.get("plugins") != "???":
         check_plugins(settings.get("plugins"))
     check_parts(settings)
+
+
+def check_keys(settings: Mapping[str, Any], app: str) -> None:
+    """Check that every top-level key is one of the app's; Hydra itself accepts any `+key=...`.
+
+    Raises:
+        LookupError: a key that the app does not have, so that nothing would come of it; the message
+            names it.
+    """
+    written = yaml_of(app_file(app))
+    entries = [entry for entry in written.get("defaults", ()) if isinstance(entry, dict)]
+    groups = {str(next(iter(entry))).rpartition("@")[2] for entry in entries}
+    schema = SCHEMAS.get(f"{app}_schema")
+    names = [f.name for f in fields(schema)] if schema else []
+    allowed = {*written, *groups, *names} - {"defaults"}
+    if unused := [key for key in settings if key not in allowed]:
+        known = {key for key in allowed if key.isidentifier()} - {"hydra", "experiment"}
+        raise LookupError(
+            f"This app does not use the setting {unused[0]!r}{hint(unused[0], known)}"
+        )
 
 
 def help_text(config_name: str) -> str:
@@ -322,10 +347,9 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
     prepare_hydra()
-    guard = guarded(conf_dir(), plugin_conf_dirs())
-    with guard, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
-        added = with_options_added(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
-        config = hydra.compose(config_name, added, return_hydra_config=True)
+    added = with_options_added(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+    (config,) = _guard(config_name, CommandLine.of(added)).checked()
+    check_keys({str(key): None for key in config if key != "hydra"}, config_name)
     choices = dict(config.hydra.runtime.choices)
     with open_dict(config):
         del config["hydra"]

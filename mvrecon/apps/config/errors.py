@@ -4,13 +4,13 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import PurePosixPath
 from typing import Any
 
-from hydra._internal import utils
-from hydra.core.utils import JobReturn, JobStatus
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -18,6 +18,8 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from mvrecon.core.registry import hint
 
+#: The environment variable by which Hydra raises errors as they are.
+FULL_ERROR = "HYDRA_FULL_ERROR"
 #: What a user's settings, files and machine can cause; anything else is a fault of the program.
 EXPECTED = (
     *(HydraException, OmegaConfBaseException),
@@ -55,36 +57,54 @@ def one_line(app: str) -> Iterator[None]:
     Raises:
         SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
     """
-    report, value = utils.run_and_report, JobReturn.return_value
-    shown = warnings.formatwarning
+    traceback_asked, shown = os.environ.get(FULL_ERROR), warnings.formatwarning
     warnings.formatwarning = lambda message, category, *_: (
         f"{app}: {category.__name__}: {message}\n"
     )
-    # Hydra's own print tracebacks, and a line more
-    utils.run_and_report = lambda function: function()
-    JobReturn.return_value = value.getter(_result)  # type: ignore[method-assign]
+    os.environ[FULL_ERROR] = "1"  # Hydra's own report is several lines; so it raises the error
     try:
         yield
     except KeyboardInterrupt as stop:
         sys.stderr.write(f"{app}: stopped by Ctrl-C\n")
         raise SystemExit(130) from stop
-    except EXPECTED as error:
-        if os.environ.get("HYDRA_FULL_ERROR") == "1" or _is_fault(error):
-            raise
+    except (TaskFailed, *EXPECTED) as raised:
+        error = raised.error if isinstance(raised, TaskFailed) else raised
+        if traceback_asked == "1" or not isinstance(error, EXPECTED) or _is_fault(error):
+            raise error from error.__cause__
         sys.stderr.write(f"{app}: {sentence(error)}\n")
         raise SystemExit(1) from error
     finally:
-        utils.run_and_report, JobReturn.return_value = report, value  # type: ignore[method-assign]
+        if traceback_asked is None:
+            del os.environ[FULL_ERROR]
+        else:
+            os.environ[FULL_ERROR] = traceback_asked
         warnings.formatwarning = shown
 
 
-def _result(job: JobReturn) -> Any:
-    """What a job of Hydra's returned, or its error, which in a sweep tells the job."""
-    if job.status == JobStatus.COMPLETED:
-        return job._return_value
-    if job.hydra_cfg is not None and job.hydra_cfg.hydra.mode == RunMode.MULTIRUN:
-        job._return_value.add_note(f"in the job {' '.join(job.overrides or ())}")
-    raise job._return_value
+class TaskFailed(BaseException):
+    """The error of a single run's task on its way through Hydra, which would write it out."""
+
+    def __init__(self, error: Exception):
+        super().__init__(error)
+        self.error = error
+
+
+def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+    """A task of Hydra's whose error passes through Hydra as it is; in a sweep it names the job, and
+    the other jobs go on.
+    """
+
+    @wraps(task)
+    def run(config: DictConfig) -> Any:
+        try:
+            return task(config)
+        except Exception as error:
+            if HydraConfig.get().mode != RunMode.MULTIRUN:
+                raise TaskFailed(error) from error
+            error.add_note(f"in the job {' '.join(HydraConfig.get().overrides.task)}")
+            raise
+
+    return run
 
 
 def _is_fault(error: BaseException) -> bool:

@@ -53,12 +53,12 @@ def read_results(folder: Path) -> dict[str, Any]:
     return table
 
 
-def leaves(settings: Any, keys: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+def flatten(settings: Any, keys: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """List the values of nested mappings, each with its keys from the outermost on; an empty
     mapping is a value.
     """
     if isinstance(settings, Mapping) and settings:
         for key, value in settings.items():
-            yield from leaves(value, (*keys, key))
+            yield from flatten(value, (*keys, key))
     else:
         yield keys, settings

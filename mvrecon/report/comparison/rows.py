@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mvrecon.core.files.checks import Refused, blaming, shown, yaml_of
-from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, leaves, read_results
+from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read_results
 
 #: Figures of merit that are compared; larger is better for those of `RISING`.
 FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
@@ -144,4 +144,4 @@ def _settings(folder: Path) -> Mapping[str, Any]:
 
 
 def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    return ((".".join(map(str, keys)), value) for keys, value in leaves(settings))
+    return ((".".join(map(str, keys)), value) for keys, value in flatten(settings))
