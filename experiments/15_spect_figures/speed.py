@@ -15,7 +15,7 @@ import torch
 import mvrecon as mv
 from mvrecon.apps.config import compose
 from mvrecon.apps.simulate import simulate
-from mvrecon.core.files.tables import write_rows
+from mvrecon.core.files.runs import write_rows
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon_spect.projector import Spect
 

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 
 from mvrecon.apps.run_method import bar
 from mvrecon.apps.scan import Scan
-from mvrecon.core.files.memory import check_memory
+from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.misalignment import misaligned

@@ -9,9 +9,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import launch, to_plain
-from mvrecon.core.files.places import of_weights
-from mvrecon.core.files.runs import EVALUATION, folder_of_run
-from mvrecon.core.plugins import import_plugins
+from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
+from mvrecon.core.registry import import_plugins
 
 
 def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -32,7 +31,7 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
         FileExistsError: the folder is a run's own.
     """
     import_plugins(options["plugins"])
-    from mvrecon.core.device import device_of
+    from mvrecon.core.machine import device_of
     from mvrecon.training import checkpoints, evaluation, export, fit, run_folder
 
     device = device_of(options["device"])
@@ -53,7 +52,7 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     see = save if options["save"] else None
     elsewhere = bool(options["camera"] or options["grid"])
     run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
-    with run_folder.taken(folder, options, EVALUATION):
+    with run_folder.run_lock(folder, options, EVALUATION):
         table = evaluation.results(settings, run, data, device, see, elsewhere)
         table["checkpoint"] = str(run)
         table["acquisition_of_run"] = trained["acquisition"]
@@ -102,10 +101,10 @@ def task(config: DictConfig) -> None:
     settings = to_plain(config)
     folder_of_run(of_weights(settings["checkpoint"]))  # before torch is imported, which takes long
     from mvrecon.training.report import show
-    from mvrecon.training.run_folder import anchored
+    from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    table = evaluate(anchored(settings), folder)
+    table = evaluate(absolute_paths(settings), folder)
     show(table, folder)
 
 

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from mvrecon.apps.config import launch, to_plain
 from mvrecon.core.files.atomic import check_writable
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
-from mvrecon.core.plugins import import_plugins
+from mvrecon.core.registry import import_plugins
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,7 +51,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.apps import calibrate, correction, scan
     from mvrecon.apps import run_method as solve
     from mvrecon.apps.sanity_checks import doubts
-    from mvrecon.core.device import device_of
+    from mvrecon.core.machine import device_of
     from mvrecon.data.volume_files import check_ending
     from mvrecon.geometry.cameras import files
     from mvrecon.report.viz import review, rig
@@ -71,10 +71,10 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     solve.check(settings)  # what does not fit is told before the folder is anybody's
     correction.check(settings)
     estimate, device = None, device_of(settings["device"])
-    with run_folder.taken(folder, settings, products=WRITTEN):
+    with run_folder.run_lock(folder, settings, products=WRITTEN):
         if free:
             case, estimate = calibrate.calibrate(case, free, device)
-            files.save(case.cameras, beside(out))
+            files.save(case.cameras, sibling_path(out))
         case, alignment = correction.corrected_scan(case, settings, device)
         if alignment is not None:
             image = cameras.alignments(alignment.shift_px[0], alignment.gain[0])
@@ -94,7 +94,9 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
         }
         if estimate is not None:
-            table["calibration"] = calibrate.table(estimate, free) | {"cameras": str(beside(out))}
+            table["calibration"] = calibrate.table(estimate, free) | {
+                "cameras": str(sibling_path(out))
+            }
         run_folder.write_results(folder, table)
     return table
 
@@ -111,7 +113,7 @@ def _save(out: Path, outcome: "Outcome", unit: str, grid: "Grid") -> None:
         return
     if in_hu:  # half of what lies between, as the scale bends at water
         sigma = (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
-    save_volume(beside(out, ".sigma.nii.gz"), sigma, grid)
+    save_volume(sibling_path(out, ".sigma.nii.gz"), sigma, grid)
 
 
 def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
@@ -137,7 +139,7 @@ def _values(volume: "Tensor", unit: str) -> dict[str, list[float]]:
     return {"percentiles_1_99": (hounsfield(ends) if unit == "HU" else ends).tolist()}
 
 
-def beside(volume: Path, ending: str = ".cameras.json") -> Path:
+def sibling_path(volume: Path, ending: str = ".cameras.json") -> Path:
     """The file beside a volume with its name and another ending, that of a calibrated rig."""
     from mvrecon.data.volume_files import name_of
 
@@ -152,9 +154,9 @@ def _check_places(settings: dict[str, Any], out: Path, folder: Path) -> None:
         OSError: a place that cannot be written.
     """
     check_writable(out)
-    written = [out, beside(out, ".sigma.nii.gz"), *(folder / name for name in WRITTEN)]
+    written = [out, sibling_path(out, ".sigma.nii.gz"), *(folder / name for name in WRITTEN)]
     if settings["calibrate"]:
-        written.append(beside(out))
+        written.append(sibling_path(out))
     places = {path.resolve() for path in written}
     for keys, value in flatten({**settings, "out": None}):
         if isinstance(value, str) and Path(value).expanduser().resolve() in places:
@@ -169,11 +171,11 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.data.attenuation import WATER
-    from mvrecon.training.run_folder import anchored
+    from mvrecon.training.run_folder import absolute_paths
     from mvrecon.training.wrong_cameras import little_weight, sentences
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    table = reconstruct(anchored(to_plain(config)), folder)
+    table = reconstruct(absolute_paths(to_plain(config)), folder)
     peak = table["peak_bytes"]
     memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
     console = Console(markup=False, highlight=False)

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor
 
 from mvrecon.apps.scan import Scan
-from mvrecon.core.files.memory import peak
+from mvrecon.core.machine import peak
 from mvrecon.core.parts import METHODS, STREAMED
 from mvrecon.methods.classical.held_out import Choice, held_out, left_out_residual
 from mvrecon.methods.classical.problem import Iterate

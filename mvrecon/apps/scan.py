@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.core.files.memory import check_memory
+from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import Corrected, MeasuredViews

@@ -14,7 +14,7 @@ from mvrecon.core.parts import LISTED, REGISTRIES
 from mvrecon.core.registry import installed, locate
 
 #: What the apps and the models pass in, no options.
-GIVEN = {
+INJECTED_ARGS = {
     *("self", "cls", "grid", "cameras", "projector", "task", "params"),
     *("inputs", "outputs", "A", "views", "counts", "read"),
 }
@@ -210,7 +210,7 @@ def _arguments(
             _written(default), _written(argument.annotation), texts.get(argument.arg, "")
         )
         for argument, default in pairs
-        if argument.arg not in GIVEN
+        if argument.arg not in INJECTED_ARGS
     }
     return options, a.kwarg is not None
 

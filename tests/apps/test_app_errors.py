@@ -15,7 +15,7 @@ from mvrecon.apps.config import conf_dir, launch
 from mvrecon.apps.config.errors import sentence
 from mvrecon.apps.config.typed import check_parts, fits
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.core.plugins import check_plugins, import_plugins, names
+from mvrecon.core.registry import check_plugins, import_plugins, names
 
 MISTAKES = {
     "camera.view=4": r"the camera 'circular'.* has no option 'view'; did you mean 'n_views'\?",

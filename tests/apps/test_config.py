@@ -18,8 +18,7 @@ from hydra.errors import ConfigCompositionException, MissingConfigException
 from mvrecon.apps import config
 from mvrecon.apps.config import compose, conf_dir, help_text, with_paths_quoted
 from mvrecon.apps.config.guard import CommandLine
-from mvrecon.core.plugins import import_plugins
-from mvrecon.core.registry import GROUP
+from mvrecon.core.registry import GROUP, import_plugins
 from mvrecon.core.targets import instantiate
 
 EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))

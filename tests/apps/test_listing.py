@@ -12,7 +12,7 @@ import pytest
 from mvrecon.apps.list import main
 from mvrecon.core import registry
 from mvrecon.core.parts import LISTED, REGISTRIES
-from mvrecon.core.signatures import GIVEN, describe
+from mvrecon.core.signatures import INJECTED_ARGS, describe
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.names()]
@@ -26,9 +26,9 @@ def test_what_is_read_is_what_an_import_gives(kind: str, name: str):
     parameters = {
         n: p for n, p in inspect.signature(imported).parameters.items() if p.kind not in CATCH_ALL
     }
-    assert set(part.options) == set(parameters) - GIVEN
+    assert set(part.options) == set(parameters) - INJECTED_ARGS
     needed = {n for n, p in parameters.items() if p.default is p.empty}
-    assert {n for n, option in part.options.items() if not option.default} == needed - GIVEN
+    assert {n for n, option in part.options.items() if not option.default} == needed - INJECTED_ARGS
     assert part.summary
     assert [option for option, what in part.options.items() if not what.text] == []
     assert " ".join(inspect.getdoc(imported).split()).startswith(part.summary)

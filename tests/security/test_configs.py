@@ -13,7 +13,7 @@ import torch
 from mvrecon.apps.config import compose, conf_dir, prepare_hydra
 from mvrecon.apps.config.guard import CommandLine, Guard
 from mvrecon.core.files.checks import Refused, yaml_of
-from mvrecon.core.plugins import import_plugins
+from mvrecon.core.registry import import_plugins
 from mvrecon.core.targets import instantiate
 from tests.faults.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
 

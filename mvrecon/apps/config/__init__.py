@@ -27,9 +27,8 @@ from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
 from mvrecon.apps.config.guard import CommandLine, Guard, quoted, register_untrusted_source
 from mvrecon.apps.config.typed import check_parts
 from mvrecon.core.files.checks import shown, yaml_of
-from mvrecon.core.plugins import check_plugins
-from mvrecon.core.quiet import silence_libraries
-from mvrecon.core.registry import hint, installed, locate
+from mvrecon.core.machine import silence_libraries
+from mvrecon.core.registry import check_plugins, hint, installed, locate
 
 
 @dataclass

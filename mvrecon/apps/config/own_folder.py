@@ -9,8 +9,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from mvrecon.apps.config.guard import quoted
 from mvrecon.core.files.atomic import check_plain, new_folder
-from mvrecon.core.files.rank import world
 from mvrecon.core.files.runs import run_around
+from mvrecon.core.machine import world
 
 #: Where Hydra keeps the names of settings that the names of a sweep's runs leave out.
 UNNAMED = "hydra.job.config.override_dirname.exclude_keys"

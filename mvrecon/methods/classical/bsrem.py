@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.division import positive_mean
+from mvrecon.core.numbers import positive_mean
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.methods.classical.cgls import check_not_negative
 from mvrecon.methods.classical.mlem import (

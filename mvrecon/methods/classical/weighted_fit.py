@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.division import divided, positive_mean
+from mvrecon.core.numbers import divided, positive_mean
 from mvrecon.methods.classical.iterative import SirtWeights, sirt_weights
 from mvrecon.operators.operator import LinearOperator
 

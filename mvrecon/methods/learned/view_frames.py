@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.division import divided
+from mvrecon.core.numbers import divided
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.methods.learned.frusta import Frusta

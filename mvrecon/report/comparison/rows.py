@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.checks import Refused, blaming, shown, yaml_of
+from mvrecon.core.files.checks import Refused, file_errors, shown, yaml_of
 from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read_results
 
 #: Figures of merit that are compared; larger is better for those of `RISING`.
@@ -72,7 +72,7 @@ def _runs(place: Path) -> list[Path]:
 
 def _rows(folder: Path, name: str) -> Iterator[Row]:
     table = read_results(folder)
-    with blaming(folder / RESULTS, "is no table of results"):
+    with file_errors(folder / RESULTS, "is no table of results"):
         yield from rows_of(table, name, folder)
 
 

@@ -11,7 +11,7 @@ import mvrecon_baselines.conf
 from mvrecon.apps.config import compose
 from mvrecon.apps.config.typed import check_parts
 from mvrecon.apps.train import train
-from mvrecon.core.files.tables import read_rows
+from mvrecon.core.files.runs import read_rows
 from mvrecon.core.parts import NETWORKS
 from mvrecon.methods.learned.network import network_by_name
 from mvrecon.methods.method import build_method

@@ -1,9 +1,15 @@
-"""Memory of this process: its peak, and what is free."""
+"""This process: its device, its memory and what is free of it, its rank among the processes of a
+run, and what libraries write in it.
+"""
 
+import logging
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+
+from mvrecon.core.registry import hint
 
 try:
     import resource
@@ -85,3 +91,56 @@ def _sizes(path: Path) -> dict[str, int]:
     """Sizes in bytes by name, of a file of /proc whose lines are `name: number kB`."""
     lines = (line.split() for line in path.read_text().splitlines() if line.endswith(" kB"))
     return {name.rstrip(":"): int(number) * 1024 for name, number, _ in lines}
+
+
+#: Variables with the number of this process and with the number of all, by precedence.
+RANKS, WORLDS = ("RANK", "SLURM_PROCID"), ("WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
+
+
+def rank() -> int:
+    """Number of this process among those of its run; the first, 0, writes the run's files."""
+    return _number(RANKS, 0) if world() > 1 else 0
+
+
+def world() -> int:
+    """Number of processes that a launcher outside has started for this run; 1 without a
+    launcher.
+    """
+    return _number(WORLDS, 1)
+
+
+def _number(names: tuple[str, ...], default: int) -> int:
+    return int(next((os.environ[name] for name in names if name in os.environ), default))
+
+
+#: Where an app can compute, by Lightning's names.
+ACCELERATORS = ("auto", "cpu", "gpu", "cuda")
+
+
+def device_of(accelerator: str) -> str:
+    """The device that an app computes on, for Lightning's name of an accelerator.
+
+    Raises:
+        ValueError: a name that is not known, or a GPU where torch sees none.
+    """
+    if accelerator not in ACCELERATORS:
+        raise ValueError(f"Unknown device {accelerator!r}{hint(str(accelerator), ACCELERATORS)}")
+    import torch
+
+    available = torch.cuda.is_available()
+    if accelerator in ("gpu", "cuda") and not available:
+        raise ValueError(f"Expected a GPU for device {accelerator!r}, but torch sees none here")
+    return "cuda" if accelerator != "cpu" and available else "cpu"
+
+
+def silence_libraries() -> None:
+    """Leave libraries' own lines about devices, seeds and fonts out; their warnings stay.
+
+    Some write while they are imported, so this comes before.
+    """
+    for library in ("lightning.pytorch", "lightning.fabric", "matplotlib"):
+        logging.getLogger(library).setLevel(logging.WARNING)
+    # Lightning's own use of torch, of which no user can be rid
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")
+    # what is logged are steps, of whatever epoch
+    warnings.filterwarnings("ignore", "The number of training batches")

@@ -4,7 +4,7 @@ import csv
 
 import pytest
 
-from mvrecon.core.files.tables import read_rows, renewed, write_rows
+from mvrecon.core.files.runs import read_rows, renewed, write_rows
 
 
 def test_rows_come_back_and_a_failed_write_leaves_the_earlier_file(tmp_path):
