@@ -199,7 +199,8 @@ def _check_offset(
         down, right = expected.offset_mm
         raise Refused(
             f"{views.options.path}: expected the detector's offset_mm [{down:g}, {right:g}] (v, u) "
-            f"by the file's origin, got [{got[0]:g}, {got[1]:g}]"
+            f"by the file's origin, got [{got[0]:g}, {got[1]:g}]; where the camera's own file has "
+            f"the offsets, write the views with their origin at 0"
         )
 
 

@@ -1,4 +1,6 @@
-"""Random numbers that depend on the seed and the case alone; division where the divisor may be zero."""
+"""Random numbers that depend on the seed and the case alone, and division where the divisor may be
+zero.
+"""
 
 import math
 from collections.abc import Iterator

@@ -19,7 +19,7 @@ INJECTED_ARGS = {
     *("inputs", "outputs", "A", "views", "counts", "read"),
 }
 #: Kinds of the settings that are called otherwise.
-KINDS = {"test_scene": "scene"}
+KINDS = {"test_scene": "scene", "start": "method"}
 #: Settings that are no parts, and what takes them.
 SECTIONS = {
     "grid": "mvrecon.geometry.grid:Grid.centred",
@@ -29,10 +29,6 @@ SECTIONS = {
 }
 
 Definition = ast.ClassDef | ast.FunctionDef
-#: The lines of a class or a function in a module, its decorators included.
-LINES = re.compile(
-    r"^(?:@.*\n(?:[ )\]}].*\n)*)*(?:class|def) (\w+)\b.*\n(?:(?:[ \t)\]}].*)?\n)*", re.M
-)
 
 
 @dataclass(frozen=True)
@@ -48,8 +44,8 @@ class Option:
 
 @dataclass(frozen=True)
 class Part:
-    """What a reader wants to know of one part: `catch_all` says that it takes further options;
-    `error` says why it cannot be used or described.
+    """What a reader wants to know of one part: `catch_all` says that it takes further options,
+    `is_class` that it is no function; `error` says why it cannot be used or described.
     """
 
     kind: str
@@ -58,6 +54,7 @@ class Part:
     summary: str = ""
     options: Mapping[str, Option] = field(default_factory=dict)
     catch_all: bool = False
+    is_class: bool = False
     error: str = ""
 
 
@@ -76,7 +73,8 @@ def describe(kind: str, name: str, check: bool = False) -> Part:
         return Part(kind, name, origin, error=str(error))
     summary = (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ")
     options, catch_all = _options(module, node)
-    return Part(kind, name, origin + _release(kind, name), summary, options, catch_all)
+    origin += _release(kind, name)
+    return Part(kind, name, origin, summary, options, catch_all, isinstance(node, ast.ClassDef))
 
 
 def definition(module: str, name: str) -> tuple[str, Definition]:
@@ -85,11 +83,7 @@ def definition(module: str, name: str) -> tuple[str, Definition]:
     Raises:
         ImportError: there is no such module, or no such name in it.
     """
-    with suppress(SyntaxError):  # a string whose lines begin at the margin; the module then tells
-        body = ast.parse(_lines(module).get(name, "")).body
-        if body and isinstance(body[0], Definition):
-            return module, body[0]
-    for node in _tree(module).body:  # ten times as slow as its lines alone
+    for node in _tree(module).body:
         if isinstance(node, Definition) and node.name == name:
             return module, node
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -139,21 +133,10 @@ def parts_in(
 
 @cache
 def _tree(module: str) -> ast.Module:
-    return ast.parse(_source(module))
-
-
-@cache
-def _lines(module: str) -> dict[str, str]:
-    """The lines of each class and function of a module, the first of a name."""
-    return {m[1]: m[0] for m in reversed([*LINES.finditer(_source(module))])}
-
-
-@cache
-def _source(module: str) -> str:
     spec = locate(module)
     if spec is None or not spec.origin or not spec.origin.endswith(".py"):
         raise ImportError(f"No source found for module {module!r}")
-    return Path(spec.origin).read_text(encoding="utf-8")
+    return ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
 
 
 def _options(module: str, node: Definition) -> tuple[dict[str, Option], bool]:

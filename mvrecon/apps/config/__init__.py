@@ -22,6 +22,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
 from mvrecon.apps.config.guard import CommandLine, Guard, quoted, register_untrusted_source
@@ -279,6 +280,22 @@ def check_settings(config: DictConfig, app: str) -> None:
     if settings.get("plugins") != "???":
         check_plugins(settings.get("plugins"))
     check_parts(settings)
+    check_references(config)
+
+
+def check_references(config: DictConfig) -> None:
+    """Check that each setting that takes its value from another one has one.
+
+    Raises:
+        InterpolationKeyError: the other setting is not there.
+    """
+    settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    try:
+        OmegaConf.to_container(settings, resolve=True)
+    except InterpolationKeyError:
+        raise
+    except OmegaConfBaseException:
+        pass  # such as a setting that is yet to be given: the task says so
 
 
 def check_keys(settings: Mapping[str, Any], app: str) -> None:

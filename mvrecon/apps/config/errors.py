@@ -14,7 +14,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationKeyError,
+    OmegaConfBaseException,
+)
 
 from mvrecon.core.registry import hint
 
@@ -42,6 +47,8 @@ OF_METHODS = {"head", "network"}
 RENAMED = {"model": "method", "reconstructor": "method"}
 #: Hydra's words for a group that a run does not take.
 UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean to override)")
+#: OmegaConf's words for a reference to a setting that is not there.
+REFERENCE = re.compile(r"Interpolation key '([^']+)' not found")
 #: Hydra's words for an experiment that chooses what the app does not have.
 FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
 
@@ -123,9 +130,8 @@ def sentence(error: BaseException) -> str:
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
     if isinstance(cause, ConfigKeyError | ConfigAttributeError):
         parent = cause.parent_node
-        old, _, rest = str(cause.full_key).partition(".")
-        if old in RENAMED:
-            return f"{cause.full_key!r} is called {RENAMED[old]}{'.' * bool(rest)}{rest} now"
+        if now := _renamed(str(cause.full_key)):
+            return now
         known = {str(key) for key in parent or ()} - {"hydra"}
         if not known:  # as the camera of an evaluation, which is the run's
             return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
@@ -133,9 +139,15 @@ def sentence(error: BaseException) -> str:
         if inside and cause.full_key == cause.key:
             return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
+    if isinstance(cause, InterpolationKeyError):
+        source = REFERENCE.search(str(cause))
+        return (
+            f"{cause.full_key} takes its value from {source[1] if source else 'a setting'}, which "
+            f"has none here; set {cause.full_key}=..."
+        )
     if part := UNMATCHED.match(str(error)):
-        if part[1] in RENAMED:
-            return f"{part[1]!r} is called {RENAMED[part[1]]!r} now: {RENAMED[part[1]]}=..."
+        if now := _renamed(part[1]):
+            return now
         if part[1] in OF_METHODS:
             return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
         return f"This app chooses no {part[1]!r}; --help shows what it chooses"
@@ -145,6 +157,12 @@ def sentence(error: BaseException) -> str:
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])
     return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
+
+
+def _renamed(key: str) -> str:
+    """What a setting of version 0.1.0 is called now; "" for others."""
+    old, dot, rest = key.partition(".")
+    return f"{key!r} is called {RENAMED[old]}{dot}{rest} now" if old in RENAMED else ""
 
 
 def _keys(settings: Any, part: str) -> set[str]:

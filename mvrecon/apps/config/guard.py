@@ -37,9 +37,8 @@ REFUSED_FLAGS = ("--config", "-cd", "-cp", "-cn", "--e")
 @cache
 def register_untrusted_source() -> None:
     """Make folders of the scheme `untrusted://` known to Hydra, in this process only."""
-    file_source: Any = next(
-        source for source in Plugins.instance().discover(ConfigSource) if source.scheme() == "file"
-    )
+    sources: Any = Plugins.instance().discover(ConfigSource)
+    file_source: Any = next(source for source in sources if source.scheme() == "file")
 
     class UntrustedFolder(file_source):
         """A folder from elsewhere. Every file is bounded, and calls no resolver."""
@@ -126,7 +125,8 @@ class CommandLine:
             elif argument.startswith("-") or not (sign or argument.startswith("~")):
                 flags.append(argument)
             elif name == "hydra.searchpath":
-                searchpath += OverridesParser.create().parse_override(argument).value() or []
+                paths: Any = OverridesParser.create().parse_override(argument).value()
+                searchpath += paths or []
             else:
                 overrides.append(argument)
         folders = [

@@ -2,86 +2,14 @@
 imported.
 """
 
-import ast
 from collections.abc import Mapping
 from typing import Any
 
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import LOSSES, REGISTRIES
-from mvrecon.core.quantities import LENGTHS, RANGES
+from mvrecon.core.quantities import fits, in_words
 from mvrecon.core.registry import check_options, hint
 from mvrecon.core.signatures import SECTIONS, Option, describe, options_of, parts_in
-
-#: What a value of a plain type may be; a whole number serves as a float.
-PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
-
-
-def fits(value: Any, type: ast.expr) -> bool:
-    """Whether a plain value has a written type; True where the type is none of those known here."""
-    match type:
-        case ast.BinOp(left, ast.BitOr(), right):
-            return fits(value, left) or fits(value, right)
-        case ast.Constant(None):
-            return value is None
-        case ast.Name(name) if name in RANGES:
-            plain, least = RANGES[name]
-            return fits(value, ast.Name(plain)) and (value > 0 or (value == 0 and least == ">= 0"))
-        case ast.Name(name) if name in PLAIN:
-            # bool is a kind of int for Python, not for a reader
-            return isinstance(value, PLAIN[name]) and isinstance(value, bool) == (name == "bool")
-        case ast.Subscript(ast.Name("Literal"), names):
-            return value in _literals(names)
-        case ast.Subscript(ast.Name("Sequence" | "list" | "tuple" | "Pair" | "Triple"), _):
-            items, open_end = _items(type)
-            if not isinstance(value, list) or not (open_end or len(value) == len(items)):
-                return False
-            expected = items * len(value) if open_end else items
-            return all(map(fits, value, expected))
-    return True
-
-
-def in_words(type: str) -> str:
-    """A written type as a user would write a value of it in YAML; "" stays."""
-    return _spoken(parsed(type)) if type else ""
-
-
-def parsed(type: str) -> ast.expr:
-    """The syntax tree of a written type."""
-    return ast.parse(type, mode="eval").body
-
-
-def _spoken(type: ast.expr) -> str:
-    match type:
-        case ast.BinOp(left, ast.BitOr(), right):
-            return f"{_spoken(left)} or {_spoken(right)}"
-        case ast.Constant(None):
-            return "null"
-        case ast.Name(name) if name in RANGES:
-            return " ".join(RANGES[name])
-        case ast.Subscript(ast.Name("Literal"), names):
-            return " or ".join(map(str, _literals(names)))
-        case ast.Subscript(ast.Name("Sequence" | "list" | "tuple" | "Pair" | "Triple"), _):
-            items, open_end = _items(type)
-            return f"[{', '.join(map(_spoken, items))}{', ...' if open_end else ''}]"
-    return ast.unparse(type)
-
-
-def _literals(names: ast.expr) -> list[Any]:
-    return [ast.literal_eval(n) for n in (names.elts if isinstance(names, ast.Tuple) else [names])]
-
-
-def _items(type: ast.Subscript) -> tuple[list[ast.expr], bool]:
-    """The types of a list's entries, and whether there may be any number of the first."""
-    name = type.value.id if isinstance(type.value, ast.Name) else ""
-    if name in LENGTHS:
-        return [type.slice] * LENGTHS[name], False
-    if name != "tuple" or not isinstance(type.slice, ast.Tuple):
-        return [type.slice], True
-    first, *others = type.slice.elts
-    if others and isinstance(others[-1], ast.Constant) and others[-1].value is ...:
-        return [first], True
-    return [first, *others], False
-
 
 LENGTH = "PositiveInt | Literal[-1]"
 #: Types of settings that no signature of ours has.
@@ -137,6 +65,8 @@ def check_parts(settings: Mapping[str, Any]) -> None:
                 continue
             raise LookupError(f"{path}.name: no {kind} is {name!r}{hint(name, registry.names())}")
         options = {key: value for key, value in node.items() if key != "name"}
+        if path.endswith(".start"):
+            options.pop("finer_grid", None)
         if path == "method" or path.rpartition(".")[0] == "compare":
             _check_assumed(path, options.pop("assume", None), settings.get("projector"))
         _check_options(path, kind, name, options)
@@ -166,6 +96,8 @@ def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) 
     part = describe(kind, name)
     if part.error:
         return  # whoever builds it says what is wrong
+    if path.endswith(".start") and part.is_class:
+        raise TypeError(f"{path}.name: expected a classical method, got the learned one {name!r}")
     if not part.catch_all:
         check_options(f"{path} (the {kind} {name!r})", options, part.options)
     for key, value in options.items():
@@ -185,9 +117,9 @@ def _check_assumed(path: str, assumed: Any, projector: Mapping[str, Any] | None)
 
 
 def _check_type(path: str, value: Any, option: Option) -> None:
-    if not option.type or _later(value):
+    if _later(value):
         return
-    if not fits(value, parsed(option.type)):
+    if not fits(value, option.type):
         text = f" ({option.text})" if option.text else ""
         raise TypeError(f"{path}: expected {in_words(option.type)}, got {shown(value)}{text}")
 
