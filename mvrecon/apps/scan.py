@@ -89,33 +89,40 @@ class Scan:
         return Scaled(A, pixels=mask.to(views)), views * mask
 
 
-def open_scan(settings: Mapping[str, Any]) -> Scan:
-    """The scan that the settings `views`, `camera`, `grid` and `projector` describe.
+def open_scan(
+    views: Mapping[str, Any],
+    camera: Mapping[str, Any],
+    grid: Mapping[str, Any],
+    projector: Mapping[str, Any],
+    method: Mapping[str, Any],
+) -> Scan:
+    """The scan that these settings describe.
 
     Args:
-        settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
-            counts them from the other end (`flip_rows`); what a camera's detector leaves open
-            (None) is that of the views on disk, see `_detector`; `grid` has size, spacing and
-            centre, or like; without any of them it is that of a trained network's training, or
-            `auto_grid`'s.
+        views: options of `Measured`, whose rows are reversed where the camera's file counts them
+            from the other end (`flip_rows`).
+        camera: name and options; what its detector leaves open (None) is that of the views on disk,
+            see `_detector`.
+        grid: size, spacing and centre, or like; without any of them it is that of a trained
+            network's training, or `auto_grid`'s.
+        projector: name and options.
+        method: name and options.
 
     Raises:
         ValueError: another number of cameras than of views, a detector that contradicts spacing or
             origin of the views' file, a rig that does not see the grid, a grid that does not fit
             into memory; what the parts raise.
     """
-    flipped = settings["views"]["flip_rows"] or flips_rows(settings["camera"])
-    views = {**settings["views"], "flip_rows": flipped}
-    measured = MeasuredViews.of(Measured(**views))
+    flipped = views["flip_rows"] or flips_rows(camera)
+    measured = MeasuredViews.of(Measured(**{**views, "flip_rows": flipped}))
     known = _detector(measured)
-    _check_offset(settings["camera"], known, measured)
-    rig = CAMERAS.from_config(_completed(settings["camera"], known))
-    cameras = measured.cameras(rig)
-    grid = _grid(settings["grid"], settings["method"], cameras)
-    seeing = int(check_rig_sees(cameras, grid).nonzero()[0, 0])
-    bytes_needed = 4 * VOLUMES * math.prod(grid.shape)
-    check_memory(bytes_needed, f"A reconstruction of {grid.shape} voxels")
-    scan = Scan(measured, cameras, grid, settings["projector"])
+    _check_offset(camera, known, measured)
+    cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known)))
+    voxels = _grid(grid, method, cameras)
+    seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
+    bytes_needed = 4 * VOLUMES * math.prod(voxels.shape)
+    check_memory(bytes_needed, f"A reconstruction of {voxels.shape} voxels")
+    scan = Scan(measured, cameras, voxels, projector)
     unit = measured.stack.unit
     if unit is not None:
         check_unit(unit, scan, seeing)

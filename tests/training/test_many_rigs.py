@@ -7,7 +7,7 @@ import torch
 
 import mvrecon as mv
 import mvrecon.apps.eval
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import EvalSettings, compose
 from mvrecon.core import targets as places
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import PROJECTORS
@@ -197,7 +197,7 @@ def test_a_run_is_evaluated_on_another_rig_and_grid(run, tmp_path):
     assert call(mvrecon.apps.eval, f"checkpoint={run}", *options, where) == 0
     merged = mvrecon.apps.eval.merged(
         run_folder.read_settings(run),
-        compose(f"checkpoint={run}", *options, config_name="eval"),
+        EvalSettings(**compose(f"checkpoint={run}", *options, config_name="eval")),
     )
     assert merged["camera"]["n_views"] == [5, 5] and merged["camera"]["pixels"] == [13, 17]
     assert merged["grid"] == {"size": [9, 9, 7], "spacing": 16.0}
