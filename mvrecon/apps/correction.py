@@ -4,19 +4,18 @@ is calibrated from its views.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from mvrecon.apps.run_method import bar
-from mvrecon.apps.scan import Scan
+from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CORRECTIONS, PROJECTORS
-from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.misalignment import misaligned
 from mvrecon.geometry.grid import Grid, coarse
@@ -24,34 +23,6 @@ from mvrecon.methods.calibration.alignment import Alignment
 from mvrecon.methods.calibration.blur import blurred
 from mvrecon.methods.calibration.from_data import Estimate, calibrated
 from mvrecon.methods.calibration.unknowns import KINDS, unknowns
-
-
-@dataclass(frozen=True, eq=False)
-class ViewsInMemory:
-    """Views that are read no more, in the place of `MeasuredViews`.
-
-    Args:
-        views: line integrals.
-        mask: pixels that were measured.
-    """
-
-    views: Float[Tensor, "m v u"]
-    mask: Bool[Tensor, "m v u"]
-
-    def read(self, first: int, last: int) -> Corrected:
-        """Views `first` to `last - 1`."""
-        return Corrected(self.views[first:last], self.mask[first:last])
-
-    def whole(self) -> Corrected:
-        """All views."""
-        return Corrected(self.views, self.mask)
-
-    def divided_by(self, gains: Float[Tensor, " m"]) -> "ViewsInMemory":
-        """The same views with each one's integrals divided by its gain."""
-        return replace(self, views=self.views / gains[:, None, None])
-
-    def warn_of_values(self, saturated: int, floored: int) -> None:
-        """No warning: it came when the views were read."""
 
 
 def check_correction(correct: Mapping[str, Any] | None, self_calibrate: bool) -> None:

@@ -76,7 +76,7 @@ def merged(run: dict[str, Any], options: EvalSettings) -> dict[str, Any]:
     kept = {key: value for key, value in run["grid"].items() if key not in sizes}
     return {
         **run,
-        "name": f"{run['name']} ({options['name']})",
+        "name": f"{run['name']} ({options.name})",
         "test_scene": scene,
         "acquisition": {**run["acquisition"], **(options.acquisition or {})},
         "camera": camera if "name" in camera else over(run["camera"], camera),

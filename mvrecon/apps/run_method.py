@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from inspect import signature
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from torch import Tensor
 from mvrecon.apps.scan import Scan
 from mvrecon.core.machine import peak
 from mvrecon.core.parts import METHODS, STREAMED
-from mvrecon.methods.classical.held_out import Choice, held_out, left_out_residual
+from mvrecon.methods.classical.held_out import held_out, left_out_residual
 from mvrecon.methods.classical.problem import Iterate
 from mvrecon.methods.classical.stopping import Curve, combined, discrepancy
 from mvrecon.methods.method import build_method
@@ -95,41 +95,18 @@ def run_method(
     name, options = method["name"], {k: v for k, v in method.items() if k != "name"}
     start = time.perf_counter()
     if name in STREAMED.names():
-        run = _streamed(scan, name, options)
+        volume, misfit, more = _streamed(scan, name, options)
     elif _iterates(name):
-        run = _iterated(scan, name, options, stop_sigma, choose, device)
+        volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device)
     else:
-        run = _direct(scan, method, device)
+        volume, misfit, more = _direct(scan, method, device)
     seconds = time.perf_counter() - start
-    volume = run.volume[0, 0].cpu()
-    sigma = None if run.sigma is None else run.sigma[0, 0].cpu()
-    return Outcome(
-        volume,
-        seconds,
-        peak(),
-        view_nrmse=run.misfit(),
-        residuals=run.residuals,
-        chosen=run.chosen,
-        sigma=sigma,
-        camera_weights=run.camera_weights,
-    )
+    return Outcome(volume[0, 0].cpu(), seconds, peak(), misfit(), **more)
 
 
-class _Run(NamedTuple):
-    """What a method gave.
-
-    Args:
-        volume: in the unit of the views per mm.
-        misfit: |y - A x| / |y|, computed without the method's time.
-        residuals, chosen, sigma, camera_weights: as of `Outcome`.
-    """
-
-    volume: Float[Tensor, "1 1 d h w"]
-    misfit: Callable[[], float]
-    residuals: list[float] = []
-    chosen: dict[str, Any] = {}
-    sigma: Float[Tensor, "1 1 d h w"] | None = None
-    camera_weights: list[float] = []
+#: A volume [1 1 d h w], |y - A x| / |y| computed without the method's time, and further entries of
+#: `Outcome`.
+_Run = tuple[Tensor, Callable[[], float], dict[str, Any]]
 
 
 class _Runs:
@@ -170,20 +147,19 @@ def _iterated(
         if choose:
             options["monitor"] = runs
             choice = held_out(METHODS.get(name), A, views, options=options, **choose)
-            volume, chosen = choice.volume, _choice_row(choice)
+            volume = choice.volume
+            chosen = {  # of the one sample that a scan is
+                "iterations": choice.iterations[0],
+                "weight": choice.weights[0] if choice.weights else None,
+                "trials": [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials],
+            }
         else:
             monitor = runs if stop_sigma is None else combined(runs, discrepancy(stop_sigma))
             volume = METHODS.build(name, A, views, monitor=monitor, **options)
     residuals, size = runs.curve.residuals, views.norm().item()
     last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
-    return _Run(volume, lambda: _share(last, size), residuals, chosen)
-
-
-def _choice_row(choice: Choice) -> dict[str, Any]:
-    """The choice of the one sample that a scan is."""
-    trials = [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials]
-    weight = choice.weights[0] if choice.weights else None
-    return {"iterations": choice.iterations[0], "weight": weight, "trials": trials}
+    more = {"residuals": residuals, "chosen": chosen}
+    return volume, lambda: _share(last, size), more
 
 
 def _direct(scan: Scan, method: Mapping[str, Any], device: str) -> _Run:
@@ -199,7 +175,8 @@ def _direct(scan: Scan, method: Mapping[str, Any], device: str) -> _Run:
         return _share(rest[mask].norm().item(), views[0, 0][mask].norm().item())
 
     weights = [] if out.camera_weights is None else out.camera_weights[0].tolist()
-    return _Run(out.volume, misfit, sigma=out.sigma, camera_weights=weights)
+    sigma = None if out.sigma is None else out.sigma[0, 0].cpu()
+    return out.volume, misfit, {"sigma": sigma, "camera_weights": weights}
 
 
 def _share(rest: float, whole: float) -> float:
@@ -220,7 +197,7 @@ def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> _Run:
 
         volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
     scan.measured.warn_of_values(saturated, floored)
-    return _Run(volume, lambda: _residual(scan, volume[0, 0]))
+    return volume, lambda: _residual(scan, volume[0, 0]), {}
 
 
 def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
@@ -36,24 +36,32 @@ LINE = 0.02
 ATTENUATION, EMISSION = "1/mm", "activity"
 
 
-class Views(Protocol):
-    """Views of a scan, whole or a few at a time."""
+@dataclass(frozen=True, eq=False)
+class ViewsInMemory:
+    """Views that are read no more, in the place of `MeasuredViews`.
+
+    Args:
+        views: line integrals.
+        mask: pixels that were measured.
+    """
+
+    views: Float[Tensor, "m v u"]
+    mask: Bool[Tensor, "m v u"]
 
     def read(self, first: int, last: int) -> Corrected:
-        """Views `first` to `last - 1` as line integrals."""
-        ...
+        """Views `first` to `last - 1`."""
+        return Corrected(self.views[first:last], self.mask[first:last])
 
     def whole(self) -> Corrected:
         """All views."""
-        ...
+        return Corrected(self.views, self.mask)
 
-    def divided_by(self, gains: Float[Tensor, " m"]) -> "Views":
+    def divided_by(self, gains: Float[Tensor, " m"]) -> "ViewsInMemory":
         """The same views with each one's integrals divided by its gain."""
-        ...
+        return replace(self, views=self.views / gains[:, None, None])
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
-        """Warn how many pixels were saturated or at the floor, where any was."""
-        ...
+        """No warning: it came when the views were read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +76,7 @@ class Scan:
         unit: of the volume.
     """
 
-    measured: Views
+    measured: MeasuredViews | ViewsInMemory
     cameras: Cameras
     grid: Grid
     projector: Mapping[str, Any]

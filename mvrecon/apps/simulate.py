@@ -53,7 +53,11 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     scene = Acquired(SCENES.from_config(settings.scene), settings.projector, acquisition)
     cases = SceneDataset(scene, grid, cameras, settings.cases, settings.seed, cache=False)
     unit, where = scene.unit_of_views(grid, cameras), folder / "cases"
-    case_folders = []
+    case_folders, nibabel = [], find_spec("nibabel")
+    if not nibabel:
+        warnings.warn(
+            "The truth is not written: NIfTI needs nibabel: pip install 'mvrecon[io]'", stacklevel=2
+        )
     with run_folder.run_lock(folder, vars(settings)):
         files.save(cameras, folder / run_folder.RIG)
         if settings.rtk:
@@ -66,7 +70,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             case_folders.append(export.save_views(where, name, case["views"][0], unit))
             if settings.rtk:
                 export.save_greys(where, name, case["views"][0])
-            if has_nibabel():
+            if nibabel:
                 export.save_truth(where, name, case["volume"][0], grid, scene.unit)
             placement = scene.placement(index, settings.seed, grid)
             if placement is not None:
@@ -95,20 +99,6 @@ def simulate_events(settings: SimulateSettings, folder: Path) -> list[Path]:
     with run_folder.run_lock(folder, {**vars(settings), "events": events}):
         files.save(maker.cameras, folder / run_folder.RIG)
         return write_events(folder / "events", maker, vars(settings))
-
-
-def has_nibabel() -> bool:
-    """Whether nibabel, which writes the truth, is there.
-
-    Warns:
-        UserWarning: it is not.
-    """
-    if find_spec("nibabel"):
-        return True
-    warnings.warn(
-        "The truth is not written: NIfTI needs nibabel: pip install 'mvrecon[io]'", stacklevel=2
-    )
-    return False
 
 
 def task(config: DictConfig) -> None:

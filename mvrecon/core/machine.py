@@ -6,7 +6,6 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 from mvrecon.core.registry import hint
@@ -64,27 +63,21 @@ def memory_at_hand() -> int | None:
     """Free memory for this process in bytes, within the limits set for it; None: not known."""
     if resource is None:
         return None
-    rooms = [*_free(), *_left_in_group()]
+    rooms = []
+    if FREE.exists():
+        sizes = _sizes(FREE)
+        rooms.append(sizes["MemAvailable"] + sizes.get("SwapFree", 0))
+    else:  # macOS does not say what is free
+        rooms.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    # within the limit of the container (Linux, cgroup v2)
+    most, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
+    if most.exists() and used.exists() and (text := most.read_text().strip()) != "max":
+        rooms.append(int(text) - int(used.read_text()))
     soft = resource.getrlimit(resource.RLIMIT_AS)[0]
     statm = Path("/proc/self/statm")
     if soft != resource.RLIM_INFINITY and statm.exists():
         rooms.append(soft - int(statm.read_text().split()[0]) * resource.getpagesize())
-    return max(0, min(rooms)) if rooms else None
-
-
-def _free() -> Iterator[int]:
-    if FREE.exists():
-        sizes = _sizes(FREE)
-        yield sizes["MemAvailable"] + sizes.get("SwapFree", 0)
-    else:  # macOS does not say what is free
-        yield os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
-def _left_in_group() -> Iterator[int]:
-    """Free memory in bytes within the limit of the container (Linux, cgroup v2)."""
-    most, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
-    if most.exists() and used.exists() and (text := most.read_text().strip()) != "max":
-        yield int(text) - int(used.read_text())
+    return max(0, min(rooms))
 
 
 def _sizes(path: Path) -> dict[str, int]:

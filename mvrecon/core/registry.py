@@ -272,7 +272,8 @@ def check_plugins(modules: str | Iterable[str] | None) -> None:
                 f"current folder",
                 name=module,
             )
-        if not _imports_mvrecon(spec):
+        source = Path(spec.origin or "")
+        if source.suffix != ".py" or not IMPORT.search(source.read_text(encoding="utf-8")):
             raise PermissionError(
                 f"The setting 'plugins' names {shown(module)}; expected a module on Python's path "
                 f"whose own source imports mvrecon"
@@ -282,9 +283,3 @@ def check_plugins(modules: str | Iterable[str] | None) -> None:
 def names(modules: str | Iterable[str] | None) -> list[str]:
     """The module names in the setting `plugins`."""
     return [modules] if isinstance(modules, str) else [str(module) for module in modules or ()]
-
-
-def _imports_mvrecon(spec: ModuleSpec) -> bool:
-    if not spec.origin or not spec.origin.endswith(".py"):
-        return False
-    return IMPORT.search(Path(spec.origin).read_text(encoding="utf-8")) is not None

@@ -16,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
 from mvrecon.apps import config
-from mvrecon.apps.config import compose, conf_dir, help_text, with_paths_quoted
+from mvrecon.apps.config import compose, conf_dir, help_text
 from mvrecon.apps.config.guard import CommandLine
 from mvrecon.core.registry import GROUP, import_plugins
 from mvrecon.core.targets import instantiate
@@ -119,10 +119,10 @@ def test_a_path_is_one_value_whatever_signs_are_in_it(tmp_path: Path):
     parser = OverridesParser.create()
     for name in ("camera.n_views=4,method=sirt", "my scan (2)", "o'brien, {3}"):
         (tmp_path / name).mkdir()
-        lines = with_paths_quoted([f"checkpoint={tmp_path / name}"])
+        lines = CommandLine.of([f"checkpoint={tmp_path / name}"]).overrides
         assert parser.parse_overrides(lines)[0].value() == str(tmp_path / name)
-    for line in ("method=sirt,cross_view", "data.sizes={train: 3}", "--config-dir=a,b", "seed=3"):
-        assert with_paths_quoted([line]) == [line]
+    for line in ("method=sirt,cross_view", "data.sizes={train: 3}", "seed=3"):
+        assert CommandLine.of([line]).overrides == [line]
 
 
 @pytest.fixture

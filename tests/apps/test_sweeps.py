@@ -9,7 +9,7 @@ from hydra.core.config_store import ConfigStore
 
 import mvrecon.apps.train
 from mvrecon.apps import config
-from mvrecon.apps.config.guard import CommandLine, Guard
+from mvrecon.apps.config.guard import CommandLine, checked_configs
 from mvrecon.training import fit
 from tests.training.lives import OPTIONS
 from tests.training.runs import call
@@ -61,7 +61,7 @@ def test_a_sweep_in_other_processes_takes_no_config_from_elsewhere(tmp_path):
     def check(*arguments):
         config.prepare_hydra()
         command = CommandLine.of(["-m", "seed=0,1", "hydra/launcher=elsewhere", *arguments])
-        return len(list(Guard("train", command, [config.conf_dir()]).checked()))
+        return len(list(checked_configs("train", command, [config.conf_dir()])))
 
     assert check() == 3
     with pytest.raises(PermissionError, match="composes its jobs in other processes"):

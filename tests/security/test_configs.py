@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mvrecon.apps.config import compose, conf_dir, prepare_hydra
-from mvrecon.apps.config.guard import CommandLine, Guard
+from mvrecon.apps.config.guard import CommandLine, checked_configs
 from mvrecon.core.files.checks import Refused, yaml_of
 from mvrecon.core.registry import import_plugins
 from mvrecon.core.targets import instantiate
@@ -215,7 +215,7 @@ def test_no_choice_of_a_sweep_sets_what_is_hydras_own(folder):
 
 def checked_sweep(*overrides: str) -> None:
     prepare_hydra()
-    list(Guard("train", CommandLine.of(["-m", *overrides]), [conf_dir()]).checked())
+    list(checked_configs("train", CommandLine.of(["-m", *overrides]), [conf_dir()]))
 
 
 def test_a_fetched_experiment_composes_the_same_at_any_time(folder):

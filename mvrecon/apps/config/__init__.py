@@ -8,7 +8,7 @@ Lightning.
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import wraps
 from io import TextIOWrapper
@@ -25,7 +25,12 @@ from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
-from mvrecon.apps.config.guard import CommandLine, Guard, quoted, register_untrusted_source
+from mvrecon.apps.config.guard import (
+    VERSION_BASE,
+    CommandLine,
+    checked_configs,
+    register_untrusted_source,
+)
 from mvrecon.apps.config.typed import check_parts
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.machine import silence_libraries
@@ -126,41 +131,6 @@ SCHEMAS = {
 }
 
 
-#: What an unquoted value of Hydra's must not have in it.
-SIGNS = set("=,;()[]{}' ")
-
-
-def with_paths_quoted(arguments: Sequence[str]) -> list[str]:
-    """Arguments in which each value that is the path of a file or folder is quoted where it has to
-    be: the run of a sweep is called camera.n_views=4,model=sirt.
-    """
-    return [_with_path_quoted(argument) for argument in arguments]
-
-
-def _with_path_quoted(argument: str) -> str:
-    key, sign, value = argument.partition("=")
-    if not sign or key.startswith("-") or not SIGNS & set(value):
-        return argument
-    try:
-        is_path = Path(value).expanduser().exists()
-    except (OSError, ValueError):  # too long for a path
-        return argument
-    return f"{key}={quoted(value)}" if is_path else argument
-
-
-def with_options_added(arguments: Sequence[str], sections: Collection[str]) -> list[str]:
-    """Arguments in which an option of one of these sections, such as camera.n_views=12, is set
-    whether the app's own file has it or not, as by Hydra's ++.
-    """
-    return [
-        f"++{argument}"
-        if "." in (key := argument.partition("=")[0]) and key.partition(".")[0] in sections
-        else argument
-        for argument in arguments
-    ]
-
-
-VERSION_BASE = "1.3"
 #: Settings whose options need not be in a file: those of parts are in their signatures.
 OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
 #: Further such settings of an app: those of the run that it evaluates, or of `EventSettings`.
@@ -171,7 +141,7 @@ class PluginConf(SearchPathPlugin):
     """Adds the config folders of installed plugins to Hydra's search path."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for folder in plugin_conf_dirs():
+        for folder in trusted_folders()[1:]:
             search_path.append(provider="mvrecon plugin", path=f"file://{folder}")
 
 
@@ -181,17 +151,13 @@ def conf_dir() -> Path:
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
-def plugin_conf_dirs() -> list[Path]:
-    """The config folders that installed plugins declare (entry points named "conf.*"), found
-    without an import.
+def trusted_folders() -> list[Path]:
+    """The folders of configs: mvrecon's own, and those that installed plugins declare (entry points
+    named "conf.*"), found without an import.
     """
     packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
-    return [
-        Path(folder)
-        for package in packages
-        if package
-        for folder in package.submodule_search_locations or ()
-    ]
+    found = (package.submodule_search_locations or () for package in packages if package)
+    return [conf_dir(), *(Path(folder) for folders in found for folder in folders)]
 
 
 def app_file(config_name: str) -> Path:
@@ -200,12 +166,12 @@ def app_file(config_name: str) -> Path:
     Raises:
         FileNotFoundError: no app has such a file.
     """
-    folders = [conf_dir(), *plugin_conf_dirs()]
-    for file in (folder / f"{config_name}.yaml" for folder in folders):
+    folders = [str(folder) for folder in trusted_folders()]
+    for file in (Path(folder, f"{config_name}.yaml") for folder in folders):
         if file.is_file():
             return file
     raise FileNotFoundError(
-        f"No app has the settings {config_name}.yaml in any of {shown(map(str, folders))}"
+        f"No app has the settings {config_name}.yaml in any of {shown(folders)}"
     )
 
 
@@ -227,9 +193,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     Raises:
         SystemExit: an error, or Ctrl-C.
     """
-    arguments = with_options_added(
-        with_paths_quoted(sys.argv[1:]), (*OF_PARTS, *OF_RUN.get(config_name, ()))
-    )
+    arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
         return
@@ -242,13 +206,13 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     with one_line(f"mvrecon-{config_name}"):
         prepare_hydra()
         silence_libraries()
-        command = CommandLine.of(arguments)
+        command = CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(config_name, ())))
         sys.argv[1:] = [*command.overrides, *command.flags]
         if {"-sc", "--shell-completion"} & set(command.flags):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
                 return  # files of these folders are not read for a word that is being typed
         else:
-            for config in _guard(config_name, command).checked():
+            for config in checked_configs(config_name, command, trusted_folders()):
                 check_settings(config, config_name)
 
         @reported
@@ -260,10 +224,6 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(
             checked
         )()
-
-
-def _guard(app: str, command: CommandLine) -> Guard:
-    return Guard(app, command, [conf_dir(), *plugin_conf_dirs()], VERSION_BASE)
 
 
 def check_settings(config: DictConfig, app: str) -> None:
@@ -323,7 +283,7 @@ def help_text(config_name: str) -> str:
     settings with comments.
     """
     choices: dict[str, set[str]] = {}
-    for folder in (conf_dir(), *plugin_conf_dirs()):
+    for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):
             choices.setdefault(file.parent.name, set()).add(file.stem)
     taken = groups_of(app_file(config_name))
@@ -363,8 +323,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
     prepare_hydra()
-    added = with_options_added(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
-    (config,) = _guard(config_name, CommandLine.of(added)).checked()
+    command = CommandLine.of(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+    (config,) = checked_configs(config_name, command, trusted_folders())
     check_keys({str(key): None for key in config if key != "hydra"}, config_name)
     choices = dict(config.hydra.runtime.choices)
     with open_dict(config):

@@ -9,7 +9,7 @@ compositions are equal.
 
 import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -27,11 +27,14 @@ from mvrecon.core.files.checks import plain_name, shown, yaml_of
 from mvrecon.core.files.runs import flatten
 
 #: Keys of the section `hydra` that any file may set, or that Hydra fills in when it composes.
-OPEN = {"mode", "verbose", "help", "sweeper.params", "runtime", "overrides", "job.override_dirname"}
+OPEN = re.compile(
+    r"hydra\.(mode|verbose|help|sweeper\.params|runtime|overrides|job\.override_dirname)\."
+)
 #: Scheme of folders whose files are checked when Hydra reads them.
 UNTRUSTED = "untrusted"
-#: Flags that choose configs of other apps, or that Hydra shortens to them.
-REFUSED_FLAGS = ("--config", "-cd", "-cp", "-cn", "--e")
+#: What an unquoted value of Hydra's must not have in it.
+SIGNS = set("=,;()[]{}' ")
+VERSION_BASE = "1.3"
 
 
 @cache
@@ -81,6 +84,17 @@ def quoted(value: str | Sequence[str]) -> str:
     return "'" + value.replace("'", r"\'") + "'"
 
 
+def quoted_path(value: str) -> str:
+    """A typed value, quoted where it is the path of a file or folder and has to be: the run of a
+    sweep is called camera.n_views=4,method=sirt.
+    """
+    try:
+        is_path = bool(SIGNS & set(value)) and Path(value).expanduser().exists()
+    except (OSError, ValueError):  # too long for a path
+        return value
+    return quoted(value) if is_path else value
+
+
 @dataclass(frozen=True)
 class CommandLine:
     """What a user typed for Hydra.
@@ -96,51 +110,53 @@ class CommandLine:
     folders: list[str]
 
     @classmethod
-    def of(cls, arguments: Sequence[str]) -> "CommandLine":
+    def of(cls, arguments: Sequence[str], sections: Collection[str] = ()) -> "CommandLine":
         """Split arguments; `--config-dir` becomes an entry of `hydra.searchpath`.
+
+        Args:
+            arguments: as typed.
+            sections: of settings whose options are set whether the app's own file has them or not,
+                as by Hydra's ++.
 
         Raises:
             PermissionError: a flag that chooses configs of other apps, or that unpickles a file;
                 configs of Hydra's own in a folder from elsewhere.
             FileNotFoundError: no folder is there.
         """
-        flags, overrides, searchpath, rest = [], [], [], iter(arguments)
+        flags, overrides, paths, rest = [], [], [], iter(arguments)
         for argument in rest:
-            name, sign, value = argument.partition("=")
-            if name in ("--config-dir", "-cd"):
+            key, sign, value = argument.partition("=")
+            if key in ("--config-dir", "-cd"):
                 folder = Path(value if sign else next(rest, "")).absolute()
                 if not folder.is_dir():
                     raise FileNotFoundError(f"Expected a folder of configs, got {folder}")
-                searchpath.append(f"file://{folder}")
+                paths.append(f"file://{folder}")
             elif argument.startswith("--e"):
                 raise PermissionError(
                     "--experimental-rerun unpickles a file, which can run anything; use "
                     "resume=<run folder>"
                 )
-            elif argument.startswith(REFUSED_FLAGS):
+            elif argument.startswith(("--co", "-cd", "-cp", "-cn")):
                 raise PermissionError(
                     f"{argument}: --config-path and --config-name of other apps are not allowed; "
                     f"use --config-dir=..."
                 )
             elif argument.startswith("-") or not (sign or argument.startswith("~")):
                 flags.append(argument)
-            elif name == "hydra.searchpath":
-                paths: Any = OverridesParser.create().parse_override(argument).value()
-                searchpath += paths or []
+            elif key == "hydra.searchpath":
+                typed: Any = OverridesParser.create().parse_override(argument).value()
+                paths += typed or []
             else:
-                overrides.append(argument)
-        folders = [
-            path.removeprefix("file://")
-            for path in searchpath
-            if path.startswith("file://") or "://" not in path
-        ]
-        if hydras := [folder for folder in folders if (Path(folder) / "hydra").exists()]:
+                set_anyway = "++" if "." in key and key.partition(".")[0] in sections else ""
+                overrides.append(f"{set_anyway}{key}{sign}{quoted_path(value)}")
+        packages = [path for path in paths if path.startswith("pkg://")]
+        folders = [path.removeprefix("file://") for path in paths if path not in packages]
+        if hydras := [folder for folder in folders if Path(folder, "hydra").exists()]:
             raise PermissionError(
                 f"{shown(hydras)} has configs of Hydra's own; expected none in a folder of "
                 f"experiments"
             )
-        if searchpath:
-            packages = [path for path in searchpath if path.startswith("pkg://")]
+        if paths:
             checked = [f"{UNTRUSTED}://{folder}" for folder in folders]
             overrides.insert(0, f"hydra.searchpath={quoted([*packages, *checked])}")
         return cls(flags, overrides, folders)
@@ -151,119 +167,107 @@ class CommandLine:
         return not {"-m", "--multirun"}.isdisjoint(self.flags)
 
 
-class Guard:
-    """Composes what a command line of an app chooses, and checks it.
+def checked_configs(
+    app: str, command: CommandLine, trusted: Sequence[Path]
+) -> Iterator[DictConfig]:
+    """The configs that Hydra would run with: of a sweep, that of the sweep itself, then those of
+    its jobs.
+
+    Every combination of the choices of config groups is among these jobs, and every value of
+    another setting once.
 
     Args:
         app: name of its file of settings.
-        command: the command line.
-        trusted: folders of configs that are trusted; the first is mvrecon's own.
-        version_base: of Hydra.
+        command: what was typed.
+        trusted: folders of configs; the first is mvrecon's own.
+
+    Raises:
+        PermissionError: a file from elsewhere sets what only the command line may, or its jobs
+            would be composed in other processes.
+        Refused: a YAML file that is too large, or a `name` that leads out of the folder of outputs.
+        HydraException: no such choice or setting.
     """
+    parser, lines = OverridesParser.create(), command.overrides
 
-    def __init__(
-        self, app: str, command: CommandLine, trusted: Sequence[Path], version_base: str = "1.3"
-    ):
-        self.app, self.command, self.trusted = app, command, trusted
-        self.version_base = version_base
-
-    def checked(self) -> Iterator[DictConfig]:
-        """The configs that Hydra would run with: of a sweep, that of the sweep itself, then those
-        of its jobs.
-
-        Every combination of the choices of config groups is among these jobs, and every value of
-        another setting once.
-
-        Raises:
-            PermissionError: a file from elsewhere sets what only the command line may, or its jobs
-                would be composed in other processes.
-            Refused: a YAML file that is too large, or a `name` that leads out of the folder of
-                outputs.
-            HydraException: no such choice or setting.
-        """
-        with hydra.initialize_config_dir(str(self.trusted[0]), version_base=self.version_base):
-            parser, lines = OverridesParser.create(), self.command.overrides
-            fixed = [
-                line
-                for line, override in zip(lines, parser.parse_overrides(lines), strict=True)
-                if not override.is_sweep_override()
-            ]
-            config = self._checked(fixed)
-            sweeps = self.command.sweeps or config.hydra.mode == RunMode.MULTIRUN
-            if not sweeps:
-                yield config if fixed == lines else self._checked(lines)  # Hydra refuses these
-                return
-            yield config
-            if self.command.folders and config.hydra.runtime.choices["hydra/launcher"] != "basic":
-                raise PermissionError(
-                    f"A sweep by another launcher composes its jobs in other processes, where "
-                    f"configs are not checked; expected no --config-dir, got "
-                    f"{shown(self.command.folders)}"
-                )
-            params = [f"{k}={v}" for k, v in (config.hydra.sweeper.get("params") or {}).items()]
-            if self.command.folders and not any("hydra.sweeper.params" in line for line in lines):
-                check_varied(parser.parse_overrides(params))
-            for job in self._jobs(parser.parse_overrides([*params, *lines])):
-                yield self._checked(job)
-
-    def _jobs(self, overrides: Sequence[Override]) -> Iterator[list[str]]:
-        """The overrides of a sweep's jobs; a range that is not discrete chooses no file."""
-        groups, others = {}, {}
-        for override in overrides:
-            key = override.get_key_element()
-            if not override.is_sweep_override():
-                lines = [f"{key}={override.get_value_element_as_str()}"]
-            elif override.is_discrete_sweep():
-                lines = [f"{key}={value}" for value in override.sweep_string_iterator()]
-            else:
-                continue
-            group = override.key_or_group
-            folders = (*self.trusted, *self.command.folders)
-            is_group = any(Path(folder, group.partition("@")[0]).is_dir() for folder in folders)
-            (groups if is_group else others)[key] = lines  # the later one wins
-        first = [lines[0] for lines in others.values()]
-        for choice in itertools.product(*groups.values()):
-            yield [*choice, *first]
-        choice = [lines[0] for lines in groups.values()]
-        for key, lines in others.items():
-            rest = [other[0] for name, other in others.items() if name != key]
-            for line in lines[1:]:
-                yield [*choice, *rest, line]
-
-    def _checked(self, overrides: list[str]) -> DictConfig:
-        config = self._composed(overrides)
-        if self.command.folders:
-            self._check_foreign(config)
+    def checked(overrides: list[str]) -> DictConfig:
+        config = hydra.compose(app, overrides, return_hydra_config=True)
+        if command.folders:
+            typed = [line for line in lines if line.lstrip("+~").startswith(("hydra", "out="))]
+            check_foreign(config, hydra.compose(app, typed, return_hydra_config=True), typed)
         for part in str(config.name).split("/") if "name" in config else []:
             plain_name(part, f"The setting name={config.name}")
         return config
 
-    def _composed(self, overrides: list[str]) -> DictConfig:
-        return hydra.compose(self.app, overrides, return_hydra_config=True)
+    with hydra.initialize_config_dir(str(trusted[0]), version_base=VERSION_BASE):
+        typed = parser.parse_overrides(lines)
+        fixed = [o.input_line or "" for o in typed if not o.is_sweep_override()]
+        config = checked(fixed)
+        if not command.sweeps and config.hydra.mode != RunMode.MULTIRUN:
+            yield config if len(fixed) == len(lines) else checked(lines)  # Hydra refuses these
+            return
+        yield config
+        if command.folders and config.hydra.runtime.choices["hydra/launcher"] != "basic":
+            raise PermissionError(
+                f"A sweep by another launcher composes its jobs in other processes, where configs "
+                f"are not checked; expected no --config-dir, got {shown(command.folders)}"
+            )
+        params = config.hydra.sweeper.get("params") or {}
+        varied = parser.parse_overrides([f"{key}={value}" for key, value in params.items()])
+        if command.folders and not any("hydra.sweeper.params" in line for line in lines):
+            check_varied(varied)
+        for job in sweep_jobs([*varied, *typed], [*trusted, *map(Path, command.folders)]):
+            yield checked(job)
 
-    def _check_foreign(self, config: DictConfig) -> None:
-        """Check that files from elsewhere change neither Hydra's own section nor `out`, the folder
-        that an app writes to.
 
-        Raises:
-            PermissionError: they differ.
-            Refused: an `out` that is made of settings which lead out of the folder of outputs.
-        """
-        lines = self.command.overrides
-        typed = [line for line in lines if line.lstrip("+~").startswith(("hydra", "out="))]
-        section = dict(flatten(_hydra_section(config)))
-        expected = dict(flatten(_hydra_section(self._composed(typed))))
-        changed = sorted(
-            name
-            for keys in {**section, **expected}
-            if section.get(keys) != expected.get(keys)
-            and not _is_open(name := ".".join(map(str, keys)))
-        )
-        if changed:
-            raise PermissionError(f"A config sets {shown(changed)}; only a command line may")
-        if "out" in config and not any(line.startswith("out=") for line in lines):
-            for part in str(config.out).split("/"):
-                plain_name(part, f"The setting out={config.out}")
+def sweep_jobs(overrides: Sequence[Override], folders: Sequence[Path]) -> Iterator[list[str]]:
+    """The overrides of a sweep's jobs, of the settings beside config groups one value at a time; a
+    range that is not discrete chooses no file, and is left out.
+    """
+    groups, others = {}, {}
+    for override in overrides:
+        key = override.get_key_element()
+        if not override.is_sweep_override():
+            lines = [f"{key}={override.get_value_element_as_str()}"]
+        elif override.is_discrete_sweep():
+            lines = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        else:
+            continue
+        group = override.key_or_group.partition("@")[0]
+        is_group = any((folder / group).is_dir() for folder in folders)
+        (groups if is_group else others)[key] = lines  # of a key that stands twice, the later one
+    first = {key: lines[0] for key, lines in others.items()}
+    for choice in itertools.product(*groups.values()):
+        yield [*choice, *first.values()]
+    choice = [lines[0] for lines in groups.values()]
+    for key, lines in others.items():
+        for line in lines[1:]:
+            yield [*choice, *(first | {key: line}).values()]
+
+
+def check_foreign(config: DictConfig, expected: DictConfig, typed: Sequence[str]) -> None:
+    """Check that files from elsewhere change neither Hydra's own section nor `out`, the folder that
+    an app writes to.
+
+    Args:
+        config: composed.
+        expected: composed without these files.
+        typed: overrides of Hydra's section and of `out` on the command line.
+
+    Raises:
+        PermissionError: they differ.
+        Refused: an `out` that is made of settings which lead out of the folder of outputs.
+    """
+    found, allowed = (
+        dict(flatten({key: plain[key] for key in ("hydra", "out") if key in plain}))
+        for plain in (OmegaConf.to_container(c, resolve=False) for c in (config, expected))
+        if isinstance(plain, dict)
+    )
+    names = {".".join(map(str, k)) for k in {**found, **allowed} if found.get(k) != allowed.get(k)}
+    if changed := sorted(name for name in names if not OPEN.match(f"{name}.")):
+        raise PermissionError(f"A config sets {shown(changed)}; only a command line may")
+    if "out" in config and not any(line.startswith("out=") for line in typed):
+        for part in str(config.out).split("/"):
+            plain_name(part, f"The setting out={config.out}")
 
 
 def check_varied(overrides: Sequence[Override]) -> None:
@@ -283,13 +287,3 @@ def check_varied(overrides: Sequence[Override]) -> None:
             raise PermissionError(
                 f"A config varies {shown(line)} in hydra.sweeper.params; expected no path there"
             )
-
-
-def _hydra_section(config: DictConfig) -> dict[str, Any]:
-    """Hydra's own section as it is written, and the folder of outputs that it refers to."""
-    written: Any = OmegaConf.to_container(config, resolve=False)
-    return {key: written[key] for key in ("hydra", "out") if key in written}
-
-
-def _is_open(key: str) -> bool:
-    return any(f"{key}.".startswith(f"hydra.{prefix}.") for prefix in OPEN)

@@ -81,16 +81,6 @@ def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def renewed(
-    path: str | Path, rows: Sequence[Mapping[str, Any]], keys: Sequence[str]
-) -> list[Mapping[str, Any]]:
-    """The rows of a CSV file with those of the same keys replaced by new ones, and the others of
-    these behind them.
-    """
-    stored = {tuple(str(row[key]) for key in keys): row for row in (*read_rows(path), *rows)}
-    return list(stored.values())
-
-
 def read_rows(path: str | Path) -> list[dict[str, Any]]:
     """Read the rows of a CSV file with texts as values; none of a file that is not there."""
     if not Path(path).exists():
