@@ -11,10 +11,10 @@ import pytest
 from omegaconf import OmegaConf
 
 from mvrecon.apps.config import check_settings, compose
-from mvrecon.apps.config.typed import check_parts
 from mvrecon.apps.list import main, new_plugin
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import GROUP
+from mvrecon.core.signatures import check_parts
 from tests.faults.plugins import plugin
 
 NAME = "seven_kinds"

@@ -31,10 +31,10 @@ from mvrecon.apps.config.guard import (
     checked_configs,
     register_untrusted_source,
 )
-from mvrecon.apps.config.typed import check_parts
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.registry import check_plugins, hint, installed, locate
+from mvrecon.core.signatures import check_parts
 
 
 @dataclass
