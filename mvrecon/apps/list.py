@@ -7,6 +7,7 @@ Sources are read, not imported, so the answer comes at once and a broken plugin 
 
 import argparse
 import keyword
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -99,15 +100,13 @@ def show(parts: Sequence[Part]) -> None:
 
 def report(parts: Sequence[Part]) -> int:
     """Write one line for each part that was imported; the exit status, 1 where one is broken."""
-    from rich.console import Console
-
     lines = [
         f"{part.kind:<15} {part.name:<22} {f'broken: {part.error}' if part.error else part.origin}"
         for part in parts
     ]
     broken = sum(bool(part.error) for part in parts)
     lines.append(f"{len(parts)} parts imported, {broken} of them broken")
-    Console(markup=False, highlight=False).print("\n".join(lines), soft_wrap=True)
+    sys.stdout.write("\n".join(lines) + "\n")
     return int(broken > 0)
 
 
@@ -115,20 +114,6 @@ def _line(name: str, option: Option) -> str:
     """An option with its default, its type where it has none, and its text, with the unit."""
     value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
     return f"  {name}{value}  {option.text}".rstrip()
-
-
-def start_project(name: str, parser: argparse.ArgumentParser) -> int:
-    """Write the project of a new plugin into the current folder, and say what comes next."""
-    from rich.console import Console
-
-    try:
-        files = new_plugin(name, Path.cwd())
-    except (ValueError, OSError) as error:
-        parser.error(str(error))
-    Console(markup=False, highlight=False).print(
-        f"{len(files)} files in {name}; next: pip install -e {name}; pytest {name}", soft_wrap=True
-    )
-    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -151,8 +136,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="write a project with a part of every kind into the new folder NAME",
     )
     options = parser.parse_args(arguments)
-    if options.new_plugin:
-        return start_project(options.new_plugin, parser)
+    if name := options.new_plugin:
+        try:
+            files = new_plugin(name, Path.cwd())
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
+        sys.stdout.write(
+            f"{len(files)} files in {name}; next: pip install -e {name}; pytest {name}\n"
+        )
+        return 0
     if not options.kind and not options.check:
         overview()
         return 0

@@ -76,7 +76,8 @@ def one_line(app: str) -> Iterator[None]:
         raise SystemExit(130) from stop
     except (TaskFailed, *EXPECTED) as raised:
         error = raised.error if isinstance(raised, TaskFailed) else raised
-        if traceback_asked == "1" or not isinstance(error, EXPECTED) or _is_fault(error):
+        is_fault = isinstance(error, FAULTS) and not isinstance(error, OmegaConfBaseException)
+        if traceback_asked == "1" or is_fault or not isinstance(error, EXPECTED):
             raise error from error.__cause__
         sys.stderr.write(f"{app}: {sentence(error)}\n")
         raise SystemExit(1) from error
@@ -112,10 +113,6 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
             raise
 
     return run
-
-
-def _is_fault(error: BaseException) -> bool:
-    return isinstance(error, FAULTS) and not isinstance(error, OmegaConfBaseException)
 
 
 def sentence(error: BaseException) -> str:
