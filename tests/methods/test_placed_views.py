@@ -125,3 +125,15 @@ def test_views_whose_file_mirrors_them_are_refused(tmp_path):
     rtk_xml.write(circular(4, 200.0, 300.0, PLATE), tmp_path / "rig.xml")
     with pytest.raises(Refused, match="expected views with columns along x and rows along y, got"):
         open_scan(**settings(path, rtk(tmp_path / "rig.xml")))
+
+
+def test_an_offset_in_the_views_file_and_in_the_cameras_table_is_told_as_such(tmp_path):
+    """Both would be added, so that one of the two is to go."""
+    path = placed(tmp_path / "views.mha", (0.0, 4.0))
+    (tmp_path / "rig.csv").write_text(
+        "angle_degrees,offset_u_mm\n" + "".join(f"{90 * k},4.0\n" for k in range(4))
+    )
+    detector = {"pixels": None, "pixel_mm": [2.0, 1.5], "offset_mm": [0.0, 0.0]}
+    table = {"name": "angles", "path": str(tmp_path / "rig.csv"), "detector": detector}
+    with pytest.raises(Refused, match="camera's own file has the offsets, write the views with"):
+        open_scan(**settings(path, {**table, "sid_mm": 200.0, "sdd_mm": 300.0}))

@@ -190,6 +190,7 @@ def test_a_settings_file_of_a_gigabyte_is_not_read(tmp_path: Path):
     ("text", "message"),
     [
         ("{hydra.job.env_set.A: '1,2'}", r"sets 'hydra.job.env_set.A=1,2' in hydra.sweeper.params"),
+        ("{+hydra.job.env_set.A: b}", "only a command line may"),
         ("{hydra/job_logging: none}", "only a command line may"),
         ("{label: ../../../out}", "expected no path"),
     ],
