@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.tables import write_rows
+from mvrecon.core.files.runs import write_rows
 
 FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside", "view_nrmse")
 

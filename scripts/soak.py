@@ -20,7 +20,7 @@ import torch
 
 from mvrecon.apps import eval as evaluation
 from mvrecon.apps import train
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import EvalSettings, compose
 
 OPTIONS = (
     "experiment=smoke",
@@ -45,9 +45,8 @@ def once(turn: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         train.train(compose(*OPTIONS, f"data.workers={turn % 2}", f"seed={turn}"), run)
-        evaluation.evaluate(
-            compose(f"checkpoint={run}", "device=cpu", config_name="eval"), Path(folder) / "eval"
-        )
+        settings = compose(f"checkpoint={run}", "device=cpu", config_name="eval")
+        evaluation.evaluate(EvalSettings(**settings), Path(folder) / "eval")
 
 
 def growth(megabytes: list[float]) -> float:

@@ -7,7 +7,7 @@ import argparse
 import warnings
 from functools import partial
 
-from mvrecon.core.files.tables import write_rows
+from mvrecon.core.files.runs import write_rows
 from mvrecon.core.parts import SCENES
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid

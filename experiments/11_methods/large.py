@@ -5,7 +5,7 @@ import time
 import torch
 
 import mvrecon as mv
-from mvrecon.core.files.memory import peak
+from mvrecon.core.machine import peak
 from mvrecon.data.scenes.solids import Phantom, Solids
 
 N, N_VIEWS, VALUE = 512, 720, 0.02

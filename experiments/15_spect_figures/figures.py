@@ -12,7 +12,7 @@ from geometry import HOLE, ball, counts_of, geometry
 from PIL import Image
 
 import mvrecon as mv
-from mvrecon.core.files.tables import read_rows, write_rows
+from mvrecon.core.files.runs import read_rows, write_rows
 from mvrecon.data.scenes.derenzo import derenzo
 from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.report.viz.montage import enlarged, radiographs, tiled

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
-from mvrecon.core.files.tables import write_rows
+from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.cameras.field import sees

@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import SimulateSettings, compose
 from mvrecon.apps.simulate import simulate
-from mvrecon.core.files.tables import write_rows
+from mvrecon.core.files.runs import write_rows
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon_spect.projector import Spect
 
@@ -90,7 +90,7 @@ def events(voxels: int, pixels: int) -> dict[str, str]:
     settings = compose("experiment=events", *sizes, *asked, config_name="simulate")
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        simulate(settings, Path(folder))
+        simulate(SimulateSettings(**settings), Path(folder))
         took = (time.perf_counter() - start) / EVENTS
     return {"what": f"an event, {voxels}^3, 80 x {pixels}^2", "seconds": f"{took:.3f}"}
 

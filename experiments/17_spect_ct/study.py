@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 import mvrecon as mv
-from mvrecon.core.files.tables import write_rows
+from mvrecon.core.files.runs import write_rows
 from mvrecon.data.attenuation import attenuation, hounsfield, tissue_at
 from mvrecon.data.resample import resample
 from mvrecon.data.scenes.solids import Phantom, Solids

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 import mvrecon as mv
-from mvrecon.core.files.tables import write_rows
+from mvrecon.core.files.runs import write_rows
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon_spect.bsrem import bsrem
 from mvrecon_spect.metrics.contrast import contrast_to_noise, count_bias, defect_contrast

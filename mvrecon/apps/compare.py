@@ -14,7 +14,7 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.runs import RESULTS
 from mvrecon.core.registry import hint
 from mvrecon.report.comparison import pareto, tables
-from mvrecon.report.comparison.rows import FIGURES, Row, read
+from mvrecon.report.comparison.rows import FIGURES, read
 
 #: Columns of a terminal that the table is made for.
 WIDTH = 150
@@ -41,7 +41,10 @@ def compare(
         Refused: a file that is none of a run's.
     """
     rows = read(places)
-    first = _reference(rows, reference)
+    labels = {row.method for row in rows}
+    if reference is not None and reference not in labels:
+        raise LookupError(f"No method is labelled {reference!r}{hint(reference, labels)}")
+    first = next(row for row in rows if reference in (None, row.method))
     table = tables.cells(rows, first, figure)
     if out is not None:
         texts = {
@@ -88,13 +91,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser().parse_args(arguments)
     with one_line("mvrecon-compare"):
         show(compare(options.runs, options.reference, options.figure, options.out))
-
-
-def _reference(rows: Sequence[Row], label: str | None) -> Row:
-    labels = {row.method for row in rows}
-    if label is not None and label not in labels:
-        raise LookupError(f"No method is labelled {label!r}{hint(label, labels)}")
-    return next(row for row in rows if label in (None, row.method))
 
 
 if __name__ == "__main__":

@@ -1,85 +1,189 @@
-"""A scan after correction of its views or calibration of its cameras."""
+"""Correction of a measured scan before it is reconstructed: views that are aligned, and a rig that
+is calibrated from its views.
+"""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from jaxtyping import Bool, Float
+import torch
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from mvrecon.apps.scan import Scan
-from mvrecon.core.parts import CORRECTIONS
-from mvrecon.data.projections.views import Corrected
-from mvrecon.methods.calibration.alignment import Alignment
-
-
-@dataclass(frozen=True, eq=False)
-class ViewsInMemory:
-    """Views that are read no more, in the place of `MeasuredViews`.
-
-    Args:
-        views: line integrals.
-        mask: pixels that were measured.
-    """
-
-    views: Float[Tensor, "m v u"]
-    mask: Bool[Tensor, "m v u"]
-
-    def read(self, first: int, last: int) -> Corrected:
-        """Views `first` to `last - 1`."""
-        return Corrected(self.views[first:last], self.mask[first:last])
-
-    def whole(self) -> Corrected:
-        """All views."""
-        return Corrected(self.views, self.mask)
-
-    def divided_by(self, gains: Float[Tensor, " m"]) -> "ViewsInMemory":
-        """The same views with each one's integrals divided by its gain."""
-        return replace(self, views=self.views / gains[:, None, None])
-
-    def warn_of_values(self, saturated: int, floored: int) -> None:
-        """No warning: it came when the views were read."""
+from mvrecon.apps.run_method import bar
+from mvrecon.apps.scan import Scan, ViewsInMemory
+from mvrecon.core.machine import check_memory
+from mvrecon.core.parts import CORRECTIONS, PROJECTORS
+from mvrecon.geometry.cameras.field import resolution
+from mvrecon.geometry.cameras.misalignment import misaligned
+from mvrecon.geometry.grid import Grid, coarse
+from mvrecon.methods.calibration.alignment import Alignment, blurred
+from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
 
 
-def check(settings: Mapping[str, Any]) -> None:
+def check_correction(correct: Mapping[str, Any] | None, self_calibrate: bool) -> None:
     """Check the settings `correct` and `self_calibrate` before any view is read.
 
     Raises:
         LookupError, TypeError: no such correction, or no such option of it.
         ValueError: calibration without a correction that tells what is wrong with the cameras.
     """
-    correct, calibrate = settings["correct"], settings["self_calibrate"]
     if correct is not None:
         CORRECTIONS.check(correct)
-    if calibrate and correct is None:
+    if self_calibrate and correct is None:
         raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
 
 
 def corrected_scan(
-    scan: Scan, settings: Mapping[str, Any], device: str = "cpu"
+    scan: Scan, correct: Mapping[str, Any], self_calibrate: bool = False, device: str = "cpu"
 ) -> tuple[Scan, Alignment | None]:
-    """The scan with corrected views, by the setting `correct`, and what is wrong with its cameras
-    where that is known.
+    """The scan with corrected views, and what is wrong with its cameras where that is known.
 
-    With `self_calibrate` no view is moved: each camera is where its view says, and gains alone are
-    undone.
+    Args:
+        scan: as it was measured.
+        correct: name and options of the correction.
+        self_calibrate: no view is moved: each camera is where its view says, and gains alone are
+            undone.
+        device: to compute on.
 
     Raises:
         ValueError: pixels that were not measured; what the correction raises.
     """
-    if settings["correct"] is None:
-        return scan, None
     whole = scan.measured.whole()
     if missing := int((~whole.mask).sum()):
         raise ValueError(
-            f"expected every pixel to be measured for correct={settings['correct']['name']}, got "
+            f"expected every pixel to be measured for correct={correct['name']}, got "
             f"{missing} dead or saturated ones; crop them by views.rows and views.columns"
         )
     views = whole.views[None, None].to(device)
-    corrected, by = CORRECTIONS.from_config(settings["correct"], scan.operator().to(device), views)
+    corrected, by = CORRECTIONS.from_config(correct, scan.operator().to(device), views)
     by = None if by is None else by.to("cpu")
-    if by is not None and settings["self_calibrate"]:
+    if by is not None and self_calibrate:
         measured = ViewsInMemory(whole.views, whole.mask).divided_by(by.gain[0])
         cameras = scan.cameras.shifted(by.shift_px[0].to(scan.cameras.origin))
         return replace(scan, measured=measured, cameras=cameras), by
     return replace(scan, measured=ViewsInMemory(corrected[0, 0].cpu(), whole.mask)), by
+
+
+#: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
+COARSE, ROUNDS = 64, 12
+#: Arrays of the views' size that a fit holds.
+ARRAYS = 8
+
+
+def check_calibration(free: Any, scan: Scan) -> None:
+    """Check the setting `calibrate` before any view is read.
+
+    Raises:
+        ValueError: no list of names, names that `unknowns` refuses, parallel beams, or views that
+            do not fit into memory.
+    """
+    if not isinstance(free, Sequence) or isinstance(free, str):
+        raise ValueError(
+            f"Expected calibrate as a list of names, such as calibrate=[offset_u,tilt], got {free}"
+        )
+    numbers = unknowns(scan.cameras, free)
+    misaligned(scan.cameras, numbers.misalignment(torch.zeros(numbers.basis.shape[:2]).double()))
+    check_memory(
+        4 * ARRAYS * len(scan.cameras) * math.prod(scan.cameras.shape),
+        "Calibration holds all views (views.binning=2 or views.every=2 takes fewer; or calibrate "
+        "once so, and give the rig that it writes to the streamed run): it",
+    )
+
+
+def calibrate(scan: Scan, free: Sequence[str], device: str = "cpu") -> tuple[Scan, Estimate]:
+    """The scan with the rig and the gains that its views tell, and the estimate in pixels of the
+    scan and degrees.
+
+    The fit sees the scan's box in at most `COARSE` voxels a side, and as many pixels joined into
+    one as fit into a voxel's image.
+
+    Raises:
+        ValueError: as `calibrated`.
+    """
+    grid = coarse(scan.grid, COARSE)
+    joined = _joined(scan, grid)
+    rig = scan.cameras.binned(joined)
+
+    def operator_of(cameras):
+        return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
+
+    with bar("calibrate", ROUNDS) as advance:
+        views = _filled(scan, joined).to(device)
+        fit = calibrated(
+            operator_of, rig, views, free, rounds=ROUNDS, monitor=lambda r: advance(r.number)
+        )
+    by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
+    cameras = misaligned(scan.cameras, by)
+    measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
+    estimate = fit._replace(cameras=cameras, misalignment=by)
+    return replace(scan, cameras=cameras, measured=measured), estimate
+
+
+def in_words(estimate: Estimate, free: Sequence[str]) -> str:
+    """What was wrong with a rig, in pixels and degrees, and the residual before and after."""
+    parts, by = [], estimate.misalignment
+    for name in free:
+        if name in estimate.kept:
+            parts.append(f"{name} kept at the nominal value")
+        elif name == "shifts":
+            length = by.offset_px.norm(dim=1)
+            parts.append(
+                f"shifts of {length.square().mean().sqrt():.2f} pixels (rms), at most "
+                f"{length.max():.2f} (view {int(length.argmax())})"
+            )
+        elif name == "gains":
+            off = estimate.gains - 1
+            parts.append(
+                f"gains off by {off.square().mean().sqrt():.2%} (rms), at most "
+                f"{off.abs().max():.2%} (view {int(off.abs().argmax())})"
+            )
+        else:
+            kind = KINDS[name]
+            value = getattr(by, kind.field or "")[0, kind.column]
+            unit = "pixels" if kind.field == "offset_px" else "degrees"
+            parts.append(f"{name} {value:+.3f} {unit}")
+    before, after = estimate.residual[0], estimate.residual[-1]
+    rounds = f"{len(estimate.residual) - 1} rounds"
+    return (
+        f"{', '.join(parts)}; residual of the blurred views {before:.3g} before, {after:.3g} after "
+        f"{rounds if estimate.settled else rounds + ', in the last of which the rig still changed'}"
+    )
+
+
+def calibration_table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]:
+    """The estimate in words and as plain numbers, for `results.json`."""
+    by = estimate.misalignment
+    return {
+        "words": in_words(estimate, free),
+        "free": list(free),
+        "offset_px": by.offset_px.tolist(),
+        "tilt_degrees": by.tilt_degrees.tolist(),
+        "gains": estimate.gains.tolist(),
+        "residual": estimate.residual,
+        "kept": estimate.kept,
+        "left_out": list(estimate.left_out),
+        "settled": estimate.settled,
+    }
+
+
+def _joined(scan: Scan, grid: Grid) -> int:
+    """Pixels joined into one each way: the most that a voxel's image holds and the detector has a
+    multiple of.
+    """
+    fitting = max(grid.spacing) / resolution(scan.cameras, grid.centre)
+    rows, columns = scan.cameras.shape
+    shared = math.gcd(rows, columns)
+    return max(n for n in range(1, shared + 1) if shared % n == 0 and (n == 1 or n <= fitting))
+
+
+def _filled(scan: Scan, joined: int) -> Float[Tensor, "1 1 m v u"]:
+    """All views, binned, and pixels that were not measured filled from their neighbours."""
+    whole = scan.measured.whole()
+    counts = avg_pool2d(whole.mask.float(), joined)
+    total = avg_pool2d(torch.where(whole.mask, whole.views, 0.0), joined)
+    views = (total / counts.clamp_min(1e-9))[None, None]
+    mask = counts > 0
+    return views if mask.all() else torch.where(mask, views, blurred(views, 2.0, mask))

@@ -8,13 +8,12 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import launch, to_plain
-from mvrecon.core.files.places import of_weights
-from mvrecon.core.files.runs import EVALUATION, folder_of_run
-from mvrecon.core.plugins import import_plugins
+from mvrecon.apps.config import EvalSettings, launch, to_plain
+from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
+from mvrecon.core.registry import import_plugins
 
 
-def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
+def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     """Evaluate a run's methods and write `results.json` (with `save`, the cases too) into a folder.
 
     Args:
@@ -31,13 +30,13 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
             that the run has trained, which its checkpoint decides.
         FileExistsError: the folder is a run's own.
     """
-    import_plugins(options["plugins"])
-    from mvrecon.core.device import device_of
+    import_plugins(options.plugins)
+    from mvrecon.core.machine import device_of
     from mvrecon.training import checkpoints, evaluation, export, fit, run_folder
 
-    device = device_of(options["device"])
-    run = folder_of_run(options["checkpoint"])
-    described = (label for label, model in options["compare"].items() if model)
+    device = device_of(options.device)
+    run = folder_of_run(options.checkpoint)
+    described = (label for label, model in options.compare.items() if model)
     if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
         raise ValueError(
             f"compare describes {trained}, which the run has trained already; expected other labels"
@@ -50,10 +49,10 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     def save(scene: dict[str, Any], volumes: dict[str, Any]) -> None:
         export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
 
-    see = save if options["save"] else None
-    elsewhere = bool(options["camera"] or options["grid"])
+    see = save if options.save else None
+    elsewhere = bool(options.camera or options.grid)
     run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
-    with run_folder.taken(folder, options, EVALUATION):
+    with run_folder.run_lock(folder, vars(options), EVALUATION):
         table = evaluation.results(settings, run, data, device, see, elsewhere)
         table["checkpoint"] = str(run)
         table["acquisition_of_run"] = trained["acquisition"]
@@ -63,27 +62,27 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     return table
 
 
-def merged(run: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+def merged(run: dict[str, Any], options: EvalSettings) -> dict[str, Any]:
     """A run's settings with the test scene, the acquisition, the camera, the grid, the data options
     and the compared methods that an evaluation gives.
 
     A camera with a name takes the place of the run's; without, its options change those of the
     run's. Cases are of one rig.
     """
-    data = over(run["data"], options["data"] or {})
-    scene = options["test_scene"] or run["test_scene"]
-    camera, grid = options["camera"] or {}, options["grid"] or {}
+    data = over(run["data"], options.data or {})
+    scene = options.test_scene or run["test_scene"]
+    camera, grid = options.camera or {}, options.grid or {}
     sizes = {"size", "shape"} if {"size", "shape"} & set(grid) else set()
     kept = {key: value for key, value in run["grid"].items() if key not in sizes}
     return {
         **run,
-        "name": f"{run['name']} ({options['name']})",
+        "name": f"{run['name']} ({options.name})",
         "test_scene": scene,
-        "acquisition": {**run["acquisition"], **(options["acquisition"] or {})},
+        "acquisition": {**run["acquisition"], **(options.acquisition or {})},
         "camera": camera if "name" in camera else over(run["camera"], camera),
         "grid": {**kept, **grid},
         "data": {**data, "rigs": 0},
-        "compare": {**run["compare"], **options["compare"]},
+        "compare": {**run["compare"], **options.compare},
     }
 
 
@@ -102,10 +101,10 @@ def task(config: DictConfig) -> None:
     settings = to_plain(config)
     folder_of_run(of_weights(settings["checkpoint"]))  # before torch is imported, which takes long
     from mvrecon.training.report import show
-    from mvrecon.training.run_folder import anchored
+    from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    table = evaluate(anchored(settings), folder)
+    table = evaluate(EvalSettings(**absolute_paths(settings)), folder)
     show(table, folder)
 
 

@@ -1,5 +1,5 @@
-"""`mvrecon-list`: every part by name in a line each; of one kind also its options, and where it
-comes from.
+"""`mvrecon-list`: the names of all parts, a line for each kind; of one kind also their options, and
+where they come from.
 
 Sources are read, not imported, so the answer comes at once and a broken plugin disturbs nobody;
 `--check` imports.
@@ -7,10 +7,12 @@ Sources are read, not imported, so the answer comes at once and a broken plugin 
 
 import argparse
 import keyword
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from mvrecon.core.parts import LISTED
+from mvrecon.core.quantities import in_words
 from mvrecon.core.signatures import SECTIONS, Option, Part, describe, describe_section
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
@@ -60,19 +62,18 @@ def listed(kind: str | None = None, check: bool = False) -> list[Part]:
     return parts
 
 
-def overview(parts: Sequence[Part]) -> None:
-    """Write one line for each part to the console, as wide as that is, under their kinds."""
+def overview() -> None:
+    """Write each kind with the names of its parts to the console."""
     from rich.console import Console
-    from rich.text import Text
+    from rich.table import Table
 
-    console, width, kind = Console(highlight=False), max(len(part.name) for part in parts), ""
-    for part in parts:
-        if part.kind != kind:
-            kind = part.kind
-            console.print(Text(kind, style="bold"))
-        what = (f"broken: {part.error}", "red") if part.error else part.summary
-        line = Text.assemble((f"  {part.name:<{width}}  ", "cyan"), what)
-        console.print(line, no_wrap=True, overflow="ellipsis")
+    table = Table.grid(padding=(0, 2))
+    for kind, registry in {**LISTED, SETTING: None}.items():
+        names = list(SECTIONS) if registry is None else registry.names()
+        if names:
+            table.add_row(kind, ", ".join(names))
+    console = Console(highlight=False)
+    console.print(table)
     console.print("mvrecon-list KIND shows the options of one kind, and where its parts come from.")
 
 
@@ -99,38 +100,20 @@ def show(parts: Sequence[Part]) -> None:
 
 def report(parts: Sequence[Part]) -> int:
     """Write one line for each part that was imported; the exit status, 1 where one is broken."""
-    from rich.console import Console
-
     lines = [
         f"{part.kind:<15} {part.name:<22} {f'broken: {part.error}' if part.error else part.origin}"
         for part in parts
     ]
     broken = sum(bool(part.error) for part in parts)
     lines.append(f"{len(parts)} parts imported, {broken} of them broken")
-    Console(markup=False, highlight=False).print("\n".join(lines), soft_wrap=True)
+    sys.stdout.write("\n".join(lines) + "\n")
     return int(broken > 0)
 
 
 def _line(name: str, option: Option) -> str:
     """An option with its default, its type where it has none, and its text, with the unit."""
-    from mvrecon.apps.config.typed import in_words  # Hydra's import takes longer than all the rest
-
     value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
     return f"  {name}{value}  {option.text}".rstrip()
-
-
-def start_project(name: str, parser: argparse.ArgumentParser) -> int:
-    """Write the project of a new plugin into the current folder, and say what comes next."""
-    from rich.console import Console
-
-    try:
-        files = new_plugin(name, Path.cwd())
-    except (ValueError, OSError) as error:
-        parser.error(str(error))
-    Console(markup=False, highlight=False).print(
-        f"{len(files)} files in {name}; next: pip install -e {name}; pytest {name}", soft_wrap=True
-    )
-    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -153,14 +136,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="write a project with a part of every kind into the new folder NAME",
     )
     options = parser.parse_args(arguments)
-    if options.new_plugin:
-        return start_project(options.new_plugin, parser)
+    if name := options.new_plugin:
+        try:
+            files = new_plugin(name, Path.cwd())
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
+        sys.stdout.write(
+            f"{len(files)} files in {name}; next: pip install -e {name}; pytest {name}\n"
+        )
+        return 0
+    if not options.kind and not options.check:
+        overview()
+        return 0
     parts = listed(options.kind, options.check)
     if options.check:
         return report(parts)
     if not parts:
         parser.exit(message=f"No {options.kind} has a name here; a plugin may bring one.\n")
-    (show if options.kind else overview)(parts)
+    show(parts)
     return 0
 
 

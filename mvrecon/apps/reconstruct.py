@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import launch, to_plain
+from mvrecon.apps.config import ReconstructSettings, launch, to_plain
 from mvrecon.core.files.atomic import check_writable
-from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, leaves
-from mvrecon.core.plugins import import_plugins
+from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
+from mvrecon.core.registry import import_plugins
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from mvrecon.apps.run_method import Outcome
-    from mvrecon.apps.scan import Scan
     from mvrecon.geometry.grid import Grid
 
 UNITS = ("1/mm", "HU")
@@ -31,7 +30,7 @@ WRITTEN = (
 )
 
 
-def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     """Reconstruct a measured scan; returns what `results.json` then holds.
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
@@ -47,54 +46,67 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
         ValueError: the folder's run has other settings; an input would be written to; views, rig,
             grid or method do not fit.
     """
-    import_plugins(settings["plugins"])
-    from mvrecon.apps import calibrate, correction, scan
-    from mvrecon.apps import run_method as solve
-    from mvrecon.apps.sanity_checks import doubts
-    from mvrecon.core.device import device_of
+    import_plugins(settings.plugins)
+    from mvrecon.apps import correction, run_method, sanity_checks, scan
+    from mvrecon.core.machine import device_of
     from mvrecon.data.volume_files import check_ending
     from mvrecon.geometry.cameras import files
     from mvrecon.report.viz import review, rig
-    from mvrecon.report.viz import rig as cameras
     from mvrecon.training import export, run_folder, wrong_cameras
 
-    if settings["unit"] not in UNITS:
-        raise ValueError(f"Expected the unit 1/mm or HU, got {settings['unit']!r}")
-    out = Path(settings["out"] or folder / "volume.nii.gz").expanduser()
+    method, unit, free = settings.method, settings.unit, settings.calibrate
+    if unit not in UNITS:
+        raise ValueError(f"Expected the unit 1/mm or HU, got {unit!r}")
+    out = Path(settings.out or folder / "volume.nii.gz").expanduser()
     check_ending(out)
     _check_places(settings, out, folder)
-    case = scan.open_scan(settings)
-    if settings["unit"] == "HU" and case.unit != scan.ATTENUATION:
+    case = scan.open_scan(
+        settings.views, settings.camera, settings.grid, settings.projector, method
+    )
+    if unit == "HU" and case.unit != scan.ATTENUATION:
         raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
-    if free := settings["calibrate"]:
-        calibrate.check(free, case)
-    solve.check(settings)  # what does not fit is told before the folder is anybody's
-    correction.check(settings)
-    estimate, device = None, device_of(settings["device"])
-    with run_folder.taken(folder, settings, products=WRITTEN):
+    if free:
+        correction.check_calibration(free, case)
+    # what does not fit is told before the folder is anybody's
+    stop_sigma, choose = settings.stop["sigma"], settings.choose
+    run_method.check_method(method, stop_sigma, choose)
+    correction.check_correction(settings.correct, settings.self_calibrate)
+    estimate, alignment, device = None, None, device_of(settings.device)
+    with run_folder.run_lock(folder, vars(settings), products=WRITTEN):
         if free:
-            case, estimate = calibrate.calibrate(case, free, device)
-            files.save(case.cameras, beside(out))
-        case, alignment = correction.corrected_scan(case, settings, device)
+            case, estimate = correction.calibrate(case, free, device)
+            files.save(case.cameras, sibling_path(out))
+        if settings.correct is not None:
+            case, alignment = correction.corrected_scan(
+                case, settings.correct, settings.self_calibrate, device
+            )
         if alignment is not None:
-            image = cameras.alignments(alignment.shift_px[0], alignment.gain[0])
+            image = rig.alignments(alignment.shift_px[0], alignment.gain[0])
             export.save_png(folder / "cameras.png", image)
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
-        outcome = solve.solve(case, settings, device)
+        outcome = run_method.run_method(case, method, stop_sigma, choose, device)
         shown = review.Case(out.name, case.grid, 1.0, case.unit)
         export.save_png(folder / "planes.png", review.scan(shown, outcome.volume))
-        _save(out, outcome, settings["unit"], case.grid)
+        _save(out, outcome, unit, case.grid)
         table = {
-            **_row(settings, case, out),
+            "name": settings.name,
+            "method": method["name"],
+            "volume": str(out),
+            "unit": "HU" if unit == "HU" else case.unit,
+            "grid": {"shape": list(case.grid.shape), "spacing_mm": list(case.grid.spacing)},
+            "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
             **outcome.row(),
-            **_values(outcome.volume, settings["unit"]),
-            "doubts": doubts(case, settings["method"]["name"], outcome.view_nrmse, device),
-            "left_out": solve.left_out(case, settings, device) if settings["left_out"] else None,
+            "percentiles_1_99": _percentiles(outcome.volume, unit),
+            "sanity_checks": sanity_checks.sanity_checks(
+                case, method["name"], outcome.view_nrmse, device
+            ),
+            "left_out": run_method.left_out(case, method, device) if settings.left_out else None,
             **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
         }
         if estimate is not None:
-            table["calibration"] = calibrate.table(estimate, free) | {"cameras": str(beside(out))}
+            fit = correction.calibration_table(estimate, free)
+            table["calibration"] = fit | {"cameras": str(sibling_path(out))}
         run_folder.write_results(folder, table)
     return table
 
@@ -111,22 +123,10 @@ def _save(out: Path, outcome: "Outcome", unit: str, grid: "Grid") -> None:
         return
     if in_hu:  # half of what lies between, as the scale bends at water
         sigma = (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
-    save_volume(beside(out, ".sigma.nii.gz"), sigma, grid)
+    save_volume(sibling_path(out, ".sigma.nii.gz"), sigma, grid)
 
 
-def _row(settings: dict[str, Any], case: "Scan", out: Path) -> dict[str, Any]:
-    """What was reconstructed, from what."""
-    return {
-        "name": settings["name"],
-        "method": settings["method"]["name"],
-        "volume": str(out),
-        "unit": "HU" if settings["unit"] == "HU" else case.unit,
-        "grid": {"shape": list(case.grid.shape), "spacing_mm": list(case.grid.spacing)},
-        "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
-    }
-
-
-def _values(volume: "Tensor", unit: str) -> dict[str, list[float]]:
+def _percentiles(volume: "Tensor", unit: str) -> list[float]:
     """The 1st and the 99th percentile of a volume in the unit; of a large one, of every n-th
     voxel.
     """
@@ -134,17 +134,17 @@ def _values(volume: "Tensor", unit: str) -> dict[str, list[float]]:
 
     values = volume.flatten()[:: 1 + volume.numel() // 2**20].double()
     ends = values.quantile(values.new_tensor([0.01, 0.99]))
-    return {"percentiles_1_99": (hounsfield(ends) if unit == "HU" else ends).tolist()}
+    return (hounsfield(ends) if unit == "HU" else ends).tolist()
 
 
-def beside(volume: Path, ending: str = ".cameras.json") -> Path:
+def sibling_path(volume: Path, ending: str = ".cameras.json") -> Path:
     """The file beside a volume with its name and another ending, that of a calibrated rig."""
     from mvrecon.data.volume_files import name_of
 
     return volume.with_name(name_of(volume) + ending)
 
 
-def _check_places(settings: dict[str, Any], out: Path, folder: Path) -> None:
+def _check_places(settings: ReconstructSettings, out: Path, folder: Path) -> None:
     """Check that the volume can be written, and that no input is written to.
 
     Raises:
@@ -152,11 +152,11 @@ def _check_places(settings: dict[str, Any], out: Path, folder: Path) -> None:
         OSError: a place that cannot be written.
     """
     check_writable(out)
-    written = [out, beside(out, ".sigma.nii.gz"), *(folder / name for name in WRITTEN)]
-    if settings["calibrate"]:
-        written.append(beside(out))
+    written = [out, sibling_path(out, ".sigma.nii.gz"), *(folder / name for name in WRITTEN)]
+    if settings.calibrate:
+        written.append(sibling_path(out))
     places = {path.resolve() for path in written}
-    for keys, value in leaves({**settings, "out": None}):
+    for keys, value in flatten({**vars(settings), "out": None}):
         if isinstance(value, str) and Path(value).expanduser().resolve() in places:
             raise ValueError(
                 f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "
@@ -169,11 +169,12 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.data.attenuation import WATER
-    from mvrecon.training.run_folder import anchored
+    from mvrecon.training.run_folder import absolute_paths
     from mvrecon.training.wrong_cameras import little_weight, sentences
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    table = reconstruct(anchored(to_plain(config)), folder)
+    settings = ReconstructSettings(**absolute_paths(to_plain(config)))
+    table = reconstruct(settings, folder)
     peak = table["peak_bytes"]
     memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
     console = Console(markup=False, highlight=False)
@@ -187,7 +188,7 @@ def task(config: DictConfig) -> None:
         f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{water}",
         *sentences(table.get("cameras")),
         *little_weight(table["camera_weights"]),
-        *(f"doubt: {words}" for words in table["doubts"]),
+        *(f"sanity check: {words}" for words in table["sanity_checks"]),
         sep="\n",
         soft_wrap=True,
     )

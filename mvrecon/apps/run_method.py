@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from inspect import signature
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,11 +14,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor
 
 from mvrecon.apps.scan import Scan
-from mvrecon.core.files.memory import peak
+from mvrecon.core.machine import peak
 from mvrecon.core.parts import METHODS, STREAMED
 from mvrecon.methods.classical.solver import Iterate
 from mvrecon.methods.classical.stopping import (
-    Choice,
     Curve,
     combined,
     discrepancy,
@@ -62,66 +61,57 @@ class Outcome:
         return {name: value for name, value in vars(self).items() if name not in volumes}
 
 
-def check(settings: Mapping[str, Any]) -> None:
-    """Check the settings `method`, `stop` and `choose` before any view is read.
+def check_method(
+    method: Mapping[str, Any], stop_sigma: float | None, choose: Mapping[str, Any] | None
+) -> None:
+    """Check a method and its rules before any view is read; see `run_method`.
 
     Raises:
         LookupError, TypeError: no such method, or no such option of it.
         ValueError: a rule to stop or to choose for a method that does not iterate.
     """
-    name = settings["method"]["name"]
-    METHODS.check(settings["method"])
-    ruled = settings["choose"] or settings["stop"]["sigma"] is not None
-    if ruled and not _iterates(name):
+    METHODS.check(method)
+    name = method["name"]
+    if (choose or stop_sigma is not None) and not _iterates(name):
         raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")
 
 
-def solve(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> Outcome:
-    """The volume of a scan by the method that the settings `method`, `stop` and `choose`
-    describe.
+def run_method(
+    scan: Scan,
+    method: Mapping[str, Any],
+    stop_sigma: float | None = None,
+    choose: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+) -> Outcome:
+    """The volume of a scan by a method.
+
+    Args:
+        scan: to reconstruct.
+        method: name and options.
+        stop_sigma: standard deviation of the line integrals' noise: a method that iterates stops
+            where it explains the residual.
+        choose: options of `held_out`, which chooses iterations and weight by views that are left
+            out.
+        device: to compute on.
 
     Raises:
         ValueError: what the method raises.
     """
-    name, options = settings["method"]["name"], dict(settings["method"])
-    del options["name"]
+    name, options = method["name"], {k: v for k, v in method.items() if k != "name"}
     start = time.perf_counter()
     if name in STREAMED.names():
-        run = _streamed(scan, name, options)
+        volume, misfit, more = _streamed(scan, name, options)
     elif _iterates(name):
-        run = _iterated(scan, settings, options, device)
+        volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device)
     else:
-        run = _direct(scan, settings["method"], device)
+        volume, misfit, more = _direct(scan, method, device)
     seconds = time.perf_counter() - start
-    volume = run.volume[0, 0].cpu()
-    sigma = None if run.sigma is None else run.sigma[0, 0].cpu()
-    return Outcome(
-        volume,
-        seconds,
-        peak(),
-        view_nrmse=run.misfit(),
-        residuals=run.residuals,
-        chosen=run.chosen,
-        sigma=sigma,
-        camera_weights=run.camera_weights,
-    )
+    return Outcome(volume[0, 0].cpu(), seconds, peak(), misfit(), **more)
 
 
-class _Run(NamedTuple):
-    """What a method gave.
-
-    Args:
-        volume: in the unit of the views per mm.
-        misfit: |y - A x| / |y|, computed without the method's time.
-        residuals, chosen, sigma, camera_weights: as of `Outcome`.
-    """
-
-    volume: Float[Tensor, "1 1 d h w"]
-    misfit: Callable[[], float]
-    residuals: list[float] = []
-    chosen: dict[str, Any] = {}
-    sigma: Float[Tensor, "1 1 d h w"] | None = None
-    camera_weights: list[float] = []
+#: A volume [1 1 d h w], |y - A x| / |y| computed without the method's time, and further entries of
+#: `Outcome`.
+_Run = tuple[Tensor, Callable[[], float], dict[str, Any]]
 
 
 class _Runs:
@@ -138,43 +128,43 @@ class _Runs:
         return self.curve(iterate)
 
 
-def left_out(scan: Scan, settings: Mapping[str, Any], device: str = "cpu") -> list[float]:
+def left_out(scan: Scan, method: Mapping[str, Any], device: str = "cpu") -> list[float]:
     """The relative error of each view as the method predicts it from the others."""
-    method = build_method(settings["method"]).to(device)
+    built, A = build_method(method).to(device), scan.operator().to(device)
     views = scan.measured.whole().views[None, None].to(device)
-    return left_out_residual(lambda A, y: method(y, A).volume, scan.operator().to(device), views)[
-        0
-    ].tolist()
+    return left_out_residual(lambda A, y: built(y, A).volume, A, views)[0].tolist()
 
 
 def _iterated(
-    scan: Scan, settings: Mapping[str, Any], options: dict[str, Any], device: str
+    scan: Scan,
+    name: str,
+    options: dict[str, Any],
+    stop_sigma: float | None,
+    choose: Mapping[str, Any] | None,
+    device: str,
 ) -> _Run:
-    name, rule = settings["method"]["name"], settings["choose"]
     A, views = scan.posed(device)
     parameters = signature(METHODS.get(name)).parameters
     most, chosen = options.get("iterations", parameters["iterations"].default), {}
-    trials = 0 if not rule else len(rule.get("weights") or [None])
+    trials = 0 if not choose else len(choose.get("weights") or [None])
     with bar(name, most and most * (1 + trials)) as advance:
         runs = _Runs(advance, most)
-        if rule:
+        if choose:
             options["monitor"] = runs
-            choice = held_out(METHODS.get(name), A, views, options=options, **rule)
-            volume, chosen = choice.volume, _choice_row(choice)
+            choice = held_out(METHODS.get(name), A, views, options=options, **choose)
+            volume = choice.volume
+            chosen = {  # of the one sample that a scan is
+                "iterations": choice.iterations[0],
+                "weight": choice.weights[0] if choice.weights else None,
+                "trials": [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials],
+            }
         else:
-            sigma = settings["stop"]["sigma"]
-            monitor = runs if sigma is None else combined(runs, discrepancy(sigma))
+            monitor = runs if stop_sigma is None else combined(runs, discrepancy(stop_sigma))
             volume = METHODS.build(name, A, views, monitor=monitor, **options)
     residuals, size = runs.curve.residuals, views.norm().item()
     last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
-    return _Run(volume, lambda: _share(last, size), residuals, chosen)
-
-
-def _choice_row(choice: Choice) -> dict[str, Any]:
-    """The choice of the one sample that a scan is."""
-    trials = [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials]
-    weight = choice.weights[0] if choice.weights else None
-    return {"iterations": choice.iterations[0], "weight": weight, "trials": trials}
+    more = {"residuals": residuals, "chosen": chosen}
+    return volume, lambda: _share(last, size), more
 
 
 def _direct(scan: Scan, method: Mapping[str, Any], device: str) -> _Run:
@@ -190,7 +180,8 @@ def _direct(scan: Scan, method: Mapping[str, Any], device: str) -> _Run:
         return _share(rest[mask].norm().item(), views[0, 0][mask].norm().item())
 
     weights = [] if out.camera_weights is None else out.camera_weights[0].tolist()
-    return _Run(out.volume, misfit, sigma=out.sigma, camera_weights=weights)
+    sigma = None if out.sigma is None else out.sigma[0, 0].cpu()
+    return out.volume, misfit, {"sigma": sigma, "camera_weights": weights}
 
 
 def _share(rest: float, whole: float) -> float:
@@ -211,7 +202,7 @@ def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> _Run:
 
         volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
     scan.measured.warn_of_values(saturated, floored)
-    return _Run(volume, lambda: _residual(scan, volume[0, 0]))
+    return volume, lambda: _residual(scan, volume[0, 0]), {}
 
 
 def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:

@@ -44,10 +44,10 @@ CURES = {
 STORED, COLUMNS, ROWS, EXCHANGED, TURNED = "stored", *CURES
 
 
-def doubts(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> list[str]:
+def sanity_checks(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> list[str]:
     """What speaks against a scan's reconstruction, in words, without a unit; empty for most.
 
-    A projector whose `pixel_integral` says nothing, and one of weighted integrals, have doubts of
+    A projector whose `pixel_integral` says nothing, and one of weighted integrals, are judged by
     their volume's residual alone; a method declares its data, `declares`.
 
     Args:
@@ -100,7 +100,7 @@ def oriented_nrmse(scan: Scan, device: str = "cpu") -> dict[str, float]:
 
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
-    """The doubt of a view whose values are whole numbers that no line integral reaches."""
+    """What speaks against a view whose values are whole numbers that no line integral reaches."""
     if view.max() <= OPAQUE or not _whole(view):
         return []
     return [

@@ -3,15 +3,15 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.core.files.memory import check_memory
+from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import Corrected, MeasuredViews
@@ -36,24 +36,32 @@ LINE = 0.02
 ATTENUATION, EMISSION = "1/mm", "activity"
 
 
-class Views(Protocol):
-    """Views of a scan, whole or a few at a time."""
+@dataclass(frozen=True, eq=False)
+class ViewsInMemory:
+    """Views that are read no more, in the place of `MeasuredViews`.
+
+    Args:
+        views: line integrals.
+        mask: pixels that were measured.
+    """
+
+    views: Float[Tensor, "m v u"]
+    mask: Bool[Tensor, "m v u"]
 
     def read(self, first: int, last: int) -> Corrected:
-        """Views `first` to `last - 1` as line integrals."""
-        ...
+        """Views `first` to `last - 1`."""
+        return Corrected(self.views[first:last], self.mask[first:last])
 
     def whole(self) -> Corrected:
         """All views."""
-        ...
+        return Corrected(self.views, self.mask)
 
-    def divided_by(self, gains: Float[Tensor, " m"]) -> "Views":
+    def divided_by(self, gains: Float[Tensor, " m"]) -> "ViewsInMemory":
         """The same views with each one's integrals divided by its gain."""
-        ...
+        return replace(self, views=self.views / gains[:, None, None])
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
-        """Warn how many pixels were saturated or at the floor, where any was."""
-        ...
+        """No warning: it came when the views were read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +76,7 @@ class Scan:
         unit: of the volume.
     """
 
-    measured: Views
+    measured: MeasuredViews | ViewsInMemory
     cameras: Cameras
     grid: Grid
     projector: Mapping[str, Any]
@@ -89,33 +97,40 @@ class Scan:
         return Scaled(A, pixels=mask.to(views)), views * mask
 
 
-def open_scan(settings: Mapping[str, Any]) -> Scan:
-    """The scan that the settings `views`, `camera`, `grid` and `projector` describe.
+def open_scan(
+    views: Mapping[str, Any],
+    camera: Mapping[str, Any],
+    grid: Mapping[str, Any],
+    projector: Mapping[str, Any],
+    method: Mapping[str, Any],
+) -> Scan:
+    """The scan that these settings describe.
 
     Args:
-        settings: `views` are options of `Measured`, whose rows are reversed where the camera's file
-            counts them from the other end (`flip_rows`); what a camera's detector leaves open
-            (None) is that of the views on disk, see `_detector`; `grid` has size, spacing and
-            centre, or like; without any of them it is that of a trained network's training, or
-            `auto_grid`'s.
+        views: options of `Measured`, whose rows are reversed where the camera's file counts them
+            from the other end (`flip_rows`).
+        camera: name and options; what its detector leaves open (None) is that of the views on disk,
+            see `_detector`.
+        grid: size, spacing and centre, or like; without any of them it is that of a trained
+            network's training, or `auto_grid`'s.
+        projector: name and options.
+        method: name and options.
 
     Raises:
         ValueError: another number of cameras than of views, a detector that contradicts spacing or
             origin of the views' file, a rig that does not see the grid, a grid that does not fit
             into memory; what the parts raise.
     """
-    flipped = settings["views"]["flip_rows"] or flips_rows(settings["camera"])
-    views = {**settings["views"], "flip_rows": flipped}
-    measured = MeasuredViews.of(Measured(**views))
+    flipped = views["flip_rows"] or flips_rows(camera)
+    measured = MeasuredViews.of(Measured(**{**views, "flip_rows": flipped}))
     known = _detector(measured)
-    _check_offset(settings["camera"], known, measured)
-    rig = CAMERAS.from_config(_completed(settings["camera"], known))
-    cameras = measured.cameras(rig)
-    grid = _grid(settings["grid"], settings["method"], cameras)
-    seeing = int(check_rig_sees(cameras, grid).nonzero()[0, 0])
-    bytes_needed = 4 * VOLUMES * math.prod(grid.shape)
-    check_memory(bytes_needed, f"A reconstruction of {grid.shape} voxels")
-    scan = Scan(measured, cameras, grid, settings["projector"])
+    _check_offset(camera, known, measured)
+    cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known)))
+    voxels = _grid(grid, method, cameras)
+    seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
+    bytes_needed = 4 * VOLUMES * math.prod(voxels.shape)
+    check_memory(bytes_needed, f"A reconstruction of {voxels.shape} voxels")
+    scan = Scan(measured, cameras, voxels, projector)
     unit = measured.stack.unit
     if unit is not None:
         check_unit(unit, scan, seeing)
@@ -199,7 +214,8 @@ def _check_offset(
         down, right = expected.offset_mm
         raise Refused(
             f"{views.options.path}: expected the detector's offset_mm [{down:g}, {right:g}] (v, u) "
-            f"by the file's origin, got [{got[0]:g}, {got[1]:g}]"
+            f"by the file's origin, got [{got[0]:g}, {got[1]:g}]; where the camera's own file has "
+            f"the offsets, write the views with their origin at 0"
         )
 
 

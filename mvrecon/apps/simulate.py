@@ -5,16 +5,15 @@ numbers, and the truth.
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import launch, to_plain
-from mvrecon.core.plugins import import_plugins
+from mvrecon.apps.config import SimulateSettings, launch, to_plain
+from mvrecon.core.registry import import_plugins
 
 
-def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
+def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
 
     A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
@@ -34,8 +33,8 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     Warns:
         UserWarning: nibabel, which writes the truth, is not installed.
     """
-    import_plugins(settings["plugins"])
-    if settings["events"] is not None:
+    import_plugins(settings.plugins)
+    if settings.events is not None:
         return simulate_events(settings, folder)
     from rich.console import Console
     from rich.progress import track
@@ -49,33 +48,37 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     from mvrecon.geometry.grid import Grid
     from mvrecon.training import export, run_folder
 
-    grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
-    acquisition = Acquisition.of(settings["acquisition"])
-    scene = Acquired(SCENES.from_config(settings["scene"]), settings["projector"], acquisition)
-    cases = SceneDataset(scene, grid, cameras, settings["cases"], settings["seed"], cache=False)
+    grid, cameras = Grid.centred(**settings.grid), CAMERAS.from_config(settings.camera)
+    acquisition = Acquisition.of(settings.acquisition)
+    scene = Acquired(SCENES.from_config(settings.scene), settings.projector, acquisition)
+    cases = SceneDataset(scene, grid, cameras, settings.cases, settings.seed, cache=False)
     unit, where = scene.unit_of_views(grid, cameras), folder / "cases"
-    case_folders = []
-    with run_folder.taken(folder, settings):
+    case_folders, nibabel = [], find_spec("nibabel")
+    if not nibabel:
+        warnings.warn(
+            "The truth is not written: NIfTI needs nibabel: pip install 'mvrecon[io]'", stacklevel=2
+        )
+    with run_folder.run_lock(folder, vars(settings)):
         files.save(cameras, folder / run_folder.RIG)
-        if settings["rtk"]:
+        if settings.rtk:
             # RTK's FDK weights views by their gantry angles, about the file's y: z in IEC's axes
             rtk_xml.write(cameras, folder / "geometry.xml", "IEC")
         console = Console(stderr=True)
         for item in track(range(len(cases)), "Simulating", transient=True, console=console):
-            case, index = cases[item], settings["cases"][item]
+            case, index = cases[item], settings.cases[item]
             name = case["name"]
             case_folders.append(export.save_views(where, name, case["views"][0], unit))
-            if settings["rtk"]:
+            if settings.rtk:
                 export.save_greys(where, name, case["views"][0])
-            if has_nibabel():
+            if nibabel:
                 export.save_truth(where, name, case["volume"][0], grid, scene.unit)
-            placement = scene.placement(index, settings["seed"], grid)
+            placement = scene.placement(index, settings.seed, grid)
             if placement is not None:
                 export.save_placement(where, name, placement)
     return case_folders
 
 
-def simulate_events(settings: dict[str, Any], folder: Path) -> list[Path]:
+def simulate_events(settings: SimulateSettings, folder: Path) -> list[Path]:
     """Make a data set of events in `<folder>/events` and return its files.
 
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`. A run that
@@ -91,37 +94,23 @@ def simulate_events(settings: dict[str, Any], folder: Path) -> list[Path]:
     from mvrecon.geometry.cameras import files
     from mvrecon.training import run_folder
 
-    maker = EventMaker.of(settings)
-    events = {key: value for key, value in settings["events"].items() if key != "workers"}
-    with run_folder.taken(folder, {**settings, "events": events}):
+    maker = EventMaker.of(vars(settings))
+    events = {key: value for key, value in settings.events.items() if key != "workers"}
+    with run_folder.run_lock(folder, {**vars(settings), "events": events}):
         files.save(maker.cameras, folder / run_folder.RIG)
-        return write_events(folder / "events", maker, settings)
-
-
-def has_nibabel() -> bool:
-    """Whether nibabel, which writes the truth, is there.
-
-    Warns:
-        UserWarning: it is not.
-    """
-    if find_spec("nibabel"):
-        return True
-    warnings.warn(
-        "The truth is not written: NIfTI needs nibabel: pip install 'mvrecon[io]'", stacklevel=2
-    )
-    return False
+        return write_events(folder / "events", maker, vars(settings))
 
 
 def task(config: DictConfig) -> None:
     """One run of the app."""
     from rich.console import Console
 
-    from mvrecon.training.run_folder import anchored
+    from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    settings = anchored(to_plain(config))
+    settings = SimulateSettings(**absolute_paths(to_plain(config)))
     case_folders, what = simulate(settings, folder), "case(s)"
-    if settings["events"] is not None:
+    if settings.events is not None:
         what = "file(s) of events"
     Console(markup=False, highlight=False).print(
         f"{len(case_folders)} {what} written to {folder}", soft_wrap=True

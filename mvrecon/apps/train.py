@@ -14,10 +14,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import labelled, launch, to_plain
-from mvrecon.core.files.rank import rank
 from mvrecon.core.files.runs import RESULTS, folder_of_run, read_results
-from mvrecon.core.plugins import import_plugins
-from mvrecon.core.quiet import silence_libraries
+from mvrecon.core.machine import rank, silence_libraries
+from mvrecon.core.registry import import_plugins
 
 #: The one setting that a resumed run takes.
 STEPS = "trainer.max_steps"
@@ -43,7 +42,7 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     """
     silence_libraries()  # again: a sweep's run may be in a process of its own
     import_plugins(settings["plugins"])
-    from mvrecon.core.device import device_of
+    from mvrecon.core.machine import device_of
     from mvrecon.training import evaluation, fit, processes, run_folder
     from mvrecon.training import tensorboard_summary as board
 
@@ -52,7 +51,7 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     if rank() > 0:
         fit.fit_all(settings, data, folder)
         return {}
-    with run_folder.taken(folder, settings):
+    with run_folder.run_lock(folder, settings):
         run_folder.keep_measurement(folder, data)
         with processes.started(folder, settings["trainer"]):
             fit.fit_all(settings, data, folder)
@@ -102,7 +101,7 @@ def task(config: DictConfig) -> float:
     from mvrecon.training.report import show
 
     runtime = HydraConfig.get().runtime
-    settings = run_folder.anchored(labelled(to_plain(config), runtime.choices))
+    settings = run_folder.absolute_paths(labelled(to_plain(config), runtime.choices))
     folder = Path(runtime.output_dir)
     if settings["resume"]:
         import_plugins(settings["plugins"])

@@ -10,6 +10,7 @@ A part comes from one of three places: mvrecon's own tables (`parts.py`), the de
 
 import difflib
 import inspect
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -17,7 +18,10 @@ from importlib import import_module
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
+
+from mvrecon.core.files.checks import shown
 
 GROUP = "mvrecon.plugins"
 #: What was registered, in turn: the table, the name, and what had it before.
@@ -224,3 +228,58 @@ def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
 
 def _where(part: Any) -> str:
     return part if isinstance(part, str) else f"{part.__module__}:{part.__qualname__}"
+
+
+#: A line of Python that imports mvrecon.
+IMPORT = re.compile(r"^\s*(from|import(.*,)?)\s+mvrecon\b", re.MULTILINE)
+#: In place of the spec of what cannot be a module's name.
+NOT_A_NAME = ModuleSpec("", None)
+
+
+def import_plugins(modules: str | Iterable[str] | None) -> None:
+    """Import the modules that the setting `plugins` names; they add parts by `@REGISTRY.register`.
+
+    Args:
+        modules: their names; one string is one module.
+
+    Raises:
+        ModuleNotFoundError: a module is not on Python's path.
+        ImportError: a module does not import; the message names it.
+        PermissionError: a module that is not a plugin.
+    """
+    check_plugins(modules)
+    for module in names(modules):
+        with importing(f"The plugin module {module!r} (setting 'plugins')"):
+            import_module(module)
+
+
+def check_plugins(modules: str | Iterable[str] | None) -> None:
+    """Check the modules that the setting `plugins` names, without importing any.
+
+    A setting can come from a file of somebody else, so only a module that was written for mvrecon
+    is imported: one with a line that imports mvrecon. The file is read before any of it runs.
+
+    Raises:
+        ModuleNotFoundError: a module is not on Python's path.
+        PermissionError: a module that is not a plugin.
+    """
+    for module in names(modules):
+        spec = locate(module) if all(map(str.isidentifier, module.split("."))) else NOT_A_NAME
+        if spec is None:
+            raise ModuleNotFoundError(
+                f"The setting 'plugins' names {shown(module)}, and no such module is installed or "
+                f"on Python's path; plugins=[{module}] on the command line also looks into the "
+                f"current folder",
+                name=module,
+            )
+        source = Path(spec.origin or "")
+        if source.suffix != ".py" or not IMPORT.search(source.read_text(encoding="utf-8")):
+            raise PermissionError(
+                f"The setting 'plugins' names {shown(module)}; expected a module on Python's path "
+                f"whose own source imports mvrecon"
+            )
+
+
+def names(modules: str | Iterable[str] | None) -> list[str]:
+    """The module names in the setting `plugins`."""
+    return [modules] if isinstance(modules, str) else [str(module) for module in modules or ()]

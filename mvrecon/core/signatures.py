@@ -1,4 +1,6 @@
-"""What a part is and takes, read from its source and not imported: docstring, options, defaults."""
+"""What a part is and takes, read from its source and not imported (docstring, options, defaults);
+and plain settings, compared with it before anything heavy is imported.
+"""
 
 import ast
 import re
@@ -10,16 +12,18 @@ from importlib.util import resolve_name
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.parts import LISTED, REGISTRIES
-from mvrecon.core.registry import installed, locate
+from mvrecon.core.files.checks import shown
+from mvrecon.core.parts import LISTED, LOSSES, REGISTRIES
+from mvrecon.core.quantities import fits, in_words
+from mvrecon.core.registry import check_options, hint, installed, locate
 
 #: What the apps and the models pass in, no options.
-GIVEN = {
+INJECTED_ARGS = {
     *("self", "cls", "grid", "cameras", "projector", "task", "params"),
     *("inputs", "outputs", "A", "views", "counts", "read"),
 }
 #: Kinds of the settings that are called otherwise.
-KINDS = {"test_scene": "scene"}
+KINDS = {"test_scene": "scene", "start": "method"}
 #: Settings that are no parts, and what takes them.
 SECTIONS = {
     "grid": "mvrecon.geometry.grid:Grid.centred",
@@ -29,10 +33,6 @@ SECTIONS = {
 }
 
 Definition = ast.ClassDef | ast.FunctionDef
-#: The lines of a class or a function in a module, its decorators included.
-LINES = re.compile(
-    r"^(?:@.*\n(?:[ )\]}].*\n)*)*(?:class|def) (\w+)\b.*\n(?:(?:[ \t)\]}].*)?\n)*", re.M
-)
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Option:
 
 @dataclass(frozen=True)
 class Part:
-    """What a reader wants to know of one part: `catch_all` says that it takes further options;
-    `error` says why it cannot be used or described.
+    """What a reader wants to know of one part: `catch_all` says that it takes further options,
+    `is_class` that it is no function; `error` says why it cannot be used or described.
     """
 
     kind: str
@@ -58,6 +58,7 @@ class Part:
     summary: str = ""
     options: Mapping[str, Option] = field(default_factory=dict)
     catch_all: bool = False
+    is_class: bool = False
     error: str = ""
 
 
@@ -76,7 +77,8 @@ def describe(kind: str, name: str, check: bool = False) -> Part:
         return Part(kind, name, origin, error=str(error))
     summary = (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ")
     options, catch_all = _options(module, node)
-    return Part(kind, name, origin + _release(kind, name), summary, options, catch_all)
+    origin += _release(kind, name)
+    return Part(kind, name, origin, summary, options, catch_all, isinstance(node, ast.ClassDef))
 
 
 def definition(module: str, name: str) -> tuple[str, Definition]:
@@ -85,11 +87,7 @@ def definition(module: str, name: str) -> tuple[str, Definition]:
     Raises:
         ImportError: there is no such module, or no such name in it.
     """
-    with suppress(SyntaxError):  # a string whose lines begin at the margin; the module then tells
-        body = ast.parse(_lines(module).get(name, "")).body
-        if body and isinstance(body[0], Definition):
-            return module, body[0]
-    for node in _tree(module).body:  # ten times as slow as its lines alone
+    for node in _tree(module).body:
         if isinstance(node, Definition) and node.name == name:
             return module, node
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -139,21 +137,10 @@ def parts_in(
 
 @cache
 def _tree(module: str) -> ast.Module:
-    return ast.parse(_source(module))
-
-
-@cache
-def _lines(module: str) -> dict[str, str]:
-    """The lines of each class and function of a module, the first of a name."""
-    return {m[1]: m[0] for m in reversed([*LINES.finditer(_source(module))])}
-
-
-@cache
-def _source(module: str) -> str:
     spec = locate(module)
     if spec is None or not spec.origin or not spec.origin.endswith(".py"):
         raise ImportError(f"No source found for module {module!r}")
-    return Path(spec.origin).read_text(encoding="utf-8")
+    return ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
 
 
 def _options(module: str, node: Definition) -> tuple[dict[str, Option], bool]:
@@ -210,7 +197,7 @@ def _arguments(
             _written(default), _written(argument.annotation), texts.get(argument.arg, "")
         )
         for argument, default in pairs
-        if argument.arg not in GIVEN
+        if argument.arg not in INJECTED_ARGS
     }
     return options, a.kwarg is not None
 
@@ -238,3 +225,121 @@ def _release(kind: str, name: str) -> str:
         if point.name == f"{kind}.{name}" and point.dist is not None:
             return f" ({point.dist.name} {point.dist.version})"
     return ""
+
+
+LENGTH = "PositiveInt | Literal[-1]"
+#: Types of settings that no signature of ours has.
+WRITTEN = {
+    "camera.detector": {
+        "pixels": "PositiveInt | Pair[PositiveInt] | None",
+        "pixel_mm": "PositiveFloat | Pair[PositiveFloat] | None",
+        "offset_mm": "float | Pair[float] | None",
+    },
+    "grid": {"like": "str"},
+    "data": {"overlap": "bool", "sizes": ""},
+    "data.sizes": dict.fromkeys(("train", "val", "test"), "NonNegativeInt"),
+    "optimizer": {
+        "lr": "PositiveFloat",
+        "weight_decay": "NonNegativeFloat",
+        "momentum": "NonNegativeFloat",
+        "schedule": "Literal['cosine', 'one_cycle', 'constant']",
+        "warmup": "NonNegativeFloat",
+    },
+    "trainer": {
+        "max_steps": LENGTH,
+        "max_epochs": LENGTH,
+        "num_nodes": "PositiveInt",
+        "devices": "PositiveInt | Literal[-1] | str | Sequence[NonNegativeInt]",
+        "accumulate_grad_batches": "PositiveInt",
+        "gradient_clip_val": "NonNegativeFloat | None",
+        "val_check_interval": "PositiveInt | PositiveFloat | None",
+        "log_every_n_steps": "NonNegativeInt",
+    },
+}
+#: Sections that have options of torch's and Lightning's besides.
+OPEN_ENDED = ("optimizer", "trainer")
+
+
+def check_parts(settings: Mapping[str, Any]) -> None:
+    """Check every part that the settings name against its source: the name, the options, and the
+    values whose type, range and length are known; those of the grid, the data, the acquisition,
+    the loss, the optimiser and the trainer, too.
+
+    A name or an option that the modules of `plugins` may bring is left to them.
+
+    Raises:
+        LookupError: an unknown name.
+        TypeError: an option that a part does not have, or a value of another type.
+    """
+    _check_sections(settings)
+    for path, kind, node in parts_in(settings):
+        registry, name = REGISTRIES[kind], node["name"]
+        if _later(name):
+            continue
+        if name not in registry.names():
+            if settings.get("plugins"):
+                continue
+            raise LookupError(f"{path}.name: no {kind} is {name!r}{hint(name, registry.names())}")
+        options = {key: value for key, value in node.items() if key != "name"}
+        if path.endswith(".start"):
+            options.pop("finer_grid", None)
+        if path == "method" or path.rpartition(".")[0] == "compare":
+            _check_assumed(path, options.pop("assume", None), settings.get("projector"))
+        _check_options(path, kind, name, options)
+
+
+def _check_sections(settings: Mapping[str, Any]) -> None:
+    """Check the settings that are no parts, such as those of the grid."""
+    known = {section: dict(options_of(section)) for section in SECTIONS}
+    for section, types in WRITTEN.items():
+        known.setdefault(section, {}).update({key: Option(type=t) for key, t in types.items()})
+    known["loss"] |= dict.fromkeys(LOSSES.names(), Option(type="float"))
+    open_ended = (*OPEN_ENDED, "loss") if settings.get("plugins") else OPEN_ENDED
+    for section, options in known.items():
+        node: Any = settings
+        for key in section.split("."):
+            node = node.get(key) if isinstance(node, Mapping) else None
+        if not isinstance(node, Mapping):
+            continue
+        if section not in open_ended:
+            check_options(section, node, options)
+        for key, value in node.items():
+            if value is not None or section != "grid":  # null: chosen by the app
+                _check_type(f"{section}.{key}", value, options.get(key, Option()))
+
+
+def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) -> None:
+    part = describe(kind, name)
+    if part.error:
+        return  # whoever builds it says what is wrong
+    if path.endswith(".start") and part.is_class:
+        raise TypeError(f"{path}.name: expected a classical method, got the learned one {name!r}")
+    if not part.catch_all:
+        check_options(f"{path} (the {kind} {name!r})", options, part.options)
+    for key, value in options.items():
+        _check_type(f"{path}.{key}", value, part.options.get(key, Option()))
+
+
+def _check_assumed(path: str, assumed: Any, projector: Mapping[str, Any] | None) -> None:
+    """Check what a method takes the projector for: some of its options."""
+    if assumed is None or not projector or "name" not in projector:
+        return
+    if not isinstance(assumed, Mapping):
+        raise TypeError(f"{path}.assume: expected options of the projector, got {shown(assumed)}")
+    part = describe("projector", projector["name"])
+    if not part.error and not part.catch_all:
+        where = f"{path}.assume (the projector {projector['name']!r})"
+        check_options(where, assumed, part.options)
+
+
+def _check_type(path: str, value: Any, option: Option) -> None:
+    if _later(value):
+        return
+    if not fits(value, option.type):
+        text = f" ({option.text})" if option.text else ""
+        raise TypeError(f"{path}: expected {in_words(option.type)}, got {shown(value)}{text}")
+
+
+def _later(value: Any) -> bool:
+    """Whether a setting has its value from another one, or is not given yet."""
+    return isinstance(value, str) and (value == "???" or "${" in value)

@@ -9,8 +9,8 @@ from rich.progress import track
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from mvrecon.core.files.rank import rank
-from mvrecon.core.random_numbers import case_numbers, generator, mixed
+from mvrecon.core.machine import rank
+from mvrecon.core.numbers import case_numbers, generator, mixed
 from mvrecon.data.scenes.sample import Sample, Scene, Thin
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid

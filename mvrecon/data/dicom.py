@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, VOLUME, Refused, blaming
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors
 
 #: Endings of DICOM files; a file of another name is one if it says so from byte 128 on.
 DICOM = (".dcm", ".dicom", ".ima")
@@ -38,7 +38,7 @@ def header_of(path: Path) -> Any:
         ImportError: pydicom is not installed.
         Refused: not DICOM, cut short, in colour, or without an image.
     """
-    with blaming(path, "cannot be read as DICOM"):
+    with file_errors(path, "cannot be read as DICOM"):
         dataset = _pydicom(path).dcmread(path, stop_before_pixels=True)
         rows, columns = int(dataset.get("Rows") or 0), int(dataset.get("Columns") or 0)
         if not (0 < rows <= EDGE and 0 < columns <= EDGE):
@@ -87,7 +87,7 @@ def pixels_of(path: Path) -> np.ndarray:
         ImportError: pydicom is not installed.
         Refused: cut short or damaged, or compressed in a way that SimpleITK does not read either.
     """
-    with blaming(path, "has pixels that cannot be read"):
+    with file_errors(path, "has pixels that cannot be read"):
         dataset = _pydicom(path).dcmread(path)
         frames = frames_of(dataset)
         if 4 * frames * int(dataset.Rows) * int(dataset.Columns) > VOLUME:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, VOLUME, Refused, blaming, shown
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, shown
 from mvrecon.data.dicom import dicom_file, frames_of, header_of, pixels_of, value_of
 from mvrecon.data.orientation import Planes, oriented
 from mvrecon.data.slabs import Slabs, planes
@@ -138,7 +138,7 @@ def _slices(path: Path) -> list[Slice]:
 
 def _slice(path: Path, dataset: Any, frame: int | None) -> Slice:
     for name in ("RescaleSlope", "RescaleIntercept"):
-        with blaming(path, f"has a {name} that cannot be read"):
+        with file_errors(path, f"has a {name} that cannot be read"):
             value = value_of(dataset, name, frame or 0)
             if value is None or not np.isfinite(float(value)):
                 raise Refused(f"{path}: expected a finite {name} of a CT slice, got {value}")
@@ -161,7 +161,7 @@ def _slice(path: Path, dataset: Any, frame: int | None) -> Slice:
 
 
 def _numbers(path: Path, name: str, value: Any, count: int) -> np.ndarray:
-    with blaming(path, f"has a {name} that cannot be read"):
+    with file_errors(path, f"has a {name} that cannot be read"):
         values = np.array([] if value is None else [float(x) for x in value])
         if values.shape != (count,) or not np.isfinite(values).all():
             raise Refused(f"{path}: expected {name} as {count} finite numbers, got {shown(value)}")

@@ -31,7 +31,15 @@ import numpy as np
 import torch
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import NAME, SPACING, Refused, blaming, check_file, plain_name, shown
+from mvrecon.core.files.checks import (
+    NAME,
+    SPACING,
+    Refused,
+    check_file,
+    file_errors,
+    plain_name,
+    shown,
+)
 from mvrecon.data.attenuation import UNITS, StoredUnit
 from mvrecon.data.slabs import Slab, Slabs, planes
 from mvrecon.data.storage import check_chunks, dataset_in
@@ -341,13 +349,13 @@ class VolumeFile:
 
     def _about(self, index: int) -> tuple[str, Spacing]:
         names = self._checked()[1]["id"]
-        with blaming(self.path, f"volume {index} cannot be read"):
+        with file_errors(self.path, f"volume {index} cannot be read"):
             z, y, x = self._dataset("spacing")[index].tolist()
             return plain_name(names[index], self.path), (z, y, x)
 
     def _parts(self, index: int, dataset: str = "ct") -> Iterator[tuple[int, np.ndarray]]:
         """Planes of a volume as they are stored, chunk by chunk, with the first one's index."""
-        with blaming(self.path, f"volume {index} cannot be read"):
+        with file_errors(self.path, f"volume {index} cannot be read"):
             values = self._dataset(dataset)
             if (dataset, index) not in self._sound:
                 check_chunks(self.path, values, index)
@@ -362,7 +370,7 @@ def _opened(path: Path) -> tuple[h5py.File, Texts]:
     check_file(path, EXPECTED)
     if not h5py.is_hdf5(path):
         raise Refused(f"{path}: not an HDF5 file; expected {EXPECTED}")
-    with blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"):
+    with file_errors(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"):
         file = reading(path)
         try:
             return file, _check(path, file)

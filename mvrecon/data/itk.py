@@ -21,8 +21,8 @@ from mvrecon.core.files.checks import (
     EDGE,
     VOLUME,
     Refused,
-    blaming,
     check_file,
+    file_errors,
     plain_name,
     shown,
 )
@@ -64,7 +64,7 @@ class ItkImage(NamedTuple):
         reader = _reader(self.path)
         reader.SetExtractIndex([0, 0, first])
         reader.SetExtractSize([*self.size[:2], last - first])
-        with blaming(self.path, f"planes {first} to {last - 1} cannot be read"):
+        with file_errors(self.path, f"planes {first} to {last - 1} cannot be read"):
             return simple_itk(self.path).GetArrayFromImage(reader.Execute())
 
 
@@ -80,7 +80,7 @@ def itk_image(path: Path) -> ItkImage:
     check_file(path, ", ".join(IO))
     data, packed, mm = _data_file(path)
     reader = _reader(path)
-    with blaming(path, "cannot be read"):
+    with file_errors(path, "cannot be read"):
         reader.ReadImageInformation()
         size, kind = reader.GetSize(), simple_itk(path).GetPixelIDValueAsString(reader.GetPixelID())
         if len(size) != 3 or kind not in TYPES or max(size) > EDGE:

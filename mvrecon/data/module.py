@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 from mvrecon import __version__
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import check_options
@@ -106,7 +106,7 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
         "inside": (volume, "bool"),
     }
     values = {}
-    with blaming(path, "is not a case that can be read"), reading(path) as file:
+    with file_errors(path, "is not a case that can be read"), reading(path) as file:
         maps = {name: (volume, "float32") for name in file if name not in expected}
         for name, kind in {**expected, **maps}.items():
             dataset = dataset_in(path, file, name, "a case")

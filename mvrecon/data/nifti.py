@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, blaming, check_file
+from mvrecon.core.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, check_file, file_errors
 from mvrecon.data.orientation import Planes, oriented, right_angled
 from mvrecon.data.slabs import Slabs, planes
 from mvrecon.geometry.grid import Grid
@@ -56,7 +56,7 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
     nibabel = _nibabel(path)
     path = Path(path)
     check_file(path, EXPECTED)
-    with blaming(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"):
+    with file_errors(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"):
         header = _header(path, nibabel)
         shape = _shape(path, header)
         affine = header.get_best_affine()
@@ -86,7 +86,7 @@ def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
     i, j, k = stored.shape
     step = planes(i * j)
     with (
-        blaming(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"),
+        file_errors(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"),
         _opened(path) as file,
     ):
         for first in range(0, k, step):

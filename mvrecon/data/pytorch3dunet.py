@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import VOLUME, Refused, blaming, check_file
+from mvrecon.core.files.checks import VOLUME, Refused, check_file, file_errors
 from mvrecon.data.events.shards import header_of
 from mvrecon.data.hdf5 import FORMAT, reading
 from mvrecon.data.storage import check_chunks, dataset_in
@@ -44,7 +44,7 @@ def read_example(path: str | Path) -> Example:
     path = Path(path).expanduser()
     check_file(path, EXPECTED)
     with (
-        blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
+        file_errors(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
         reading(path) as file,
     ):
         arrays = {
@@ -85,7 +85,7 @@ def write_view(
     """
     events = Path(events).resolve()
     _, count = header_of(events)
-    with blaming(events, "cannot be opened"), reading(events) as file:
+    with file_errors(events, "cannot be opened"), reading(events) as file:
         parts = {"raw": raw, "label": "truth"}
         shapes = {key: dataset_in(events, file, name, raw).shape for key, name in parts.items()}
     if not 0 <= item < count or shapes["raw"] != shapes["label"]:

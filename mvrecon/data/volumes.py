@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.random_numbers import generator, uniform
+from mvrecon.core.numbers import generator, uniform
 from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from mvrecon.core.files.memory import check_memory
+from mvrecon.core.machine import check_memory
 from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.rigid import check_rotation

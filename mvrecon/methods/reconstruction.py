@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d
 
-from mvrecon.core.division import divided
+from mvrecon.core.numbers import divided
 from mvrecon.methods.calibration.alignment import Alignment
 
 

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d, pad
 from torch.utils.checkpoint import checkpoint
 
-from mvrecon.core.files.memory import peak, restarted_peak
-from mvrecon.core.files.places import check_places
+from mvrecon.core.machine import peak, restarted_peak
+from mvrecon.core.targets import check_places
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.methods.method import build_method
 from mvrecon.methods.reconstruction import Reconstruction

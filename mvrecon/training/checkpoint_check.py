@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.checks import TEXT, Refused, blaming, shown
+from mvrecon.core.files.checks import TEXT, Refused, file_errors, shown
 from mvrecon.core.parts import LOSSES, REGISTRIES
 from mvrecon.core.signatures import parts_in
 from mvrecon.training.losses import TERMS
@@ -38,7 +38,7 @@ def check_archive(path: Path) -> None:
             it is, with anything in its pickle but tensors and plain values, or bytes that do not
             fit their checksums, which torch does not compare.
     """
-    with blaming(path, "is cut short or no checkpoint"), zipfile.ZipFile(path) as archive:
+    with file_errors(path, "is cut short or no checkpoint"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if foreign := [m.filename for m in members if not MEMBERS.fullmatch(m.filename)]:
             raise Refused(f"{path}: holds {shown(foreign)}, which no checkpoint does")

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import blaming, plain_name
+from mvrecon.core.files.checks import file_errors, plain_name
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
@@ -141,12 +141,16 @@ def load(path: Path) -> Trained:
             f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it"
         )
     check_archive(path)
-    with blaming(path, "cannot be read"):
+    with file_errors(path, "cannot be read"):
         state = read(path)
-    with blaming(path, "does not fit this version's method", "was it written by another version?"):
+    with file_errors(
+        path, "does not fit this version's method", "was it written by another version?"
+    ):
         settings = check_settings(path, state["hyper_parameters"])
     check_known(path, settings)
-    with blaming(path, "does not fit this version's method", "was it written by another version?"):
+    with file_errors(
+        path, "does not fit this version's method", "was it written by another version?"
+    ):
         module = ReconstructionModule(**settings)
         module.load_state_dict(state["state_dict"])
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))

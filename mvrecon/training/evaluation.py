@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from mvrecon.core.files.memory import peak_since, restarted_peak
+from mvrecon.core.machine import peak_since, restarted_peak
 from mvrecon.core.parts import METRICS
 from mvrecon.data import digests
 from mvrecon.data.dataset import single_cases

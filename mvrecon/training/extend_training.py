@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from mvrecon.core.files.atomic import claimed
-from mvrecon.core.files.rank import world
 from mvrecon.core.files.runs import RESULTS
+from mvrecon.core.machine import world
 from mvrecon.data.module import SceneData
 from mvrecon.training import run_folder
 from mvrecon.training.checkpoints import finished, unfinished

@@ -8,7 +8,7 @@ from typing import Any
 import lightning.pytorch as L
 from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 
-from mvrecon.core.files.rank import world
+from mvrecon.core.machine import world
 from mvrecon.core.parts import LOGGERS
 from mvrecon.core.targets import instantiate
 from mvrecon.data.module import SceneData

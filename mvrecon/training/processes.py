@@ -21,9 +21,8 @@ import torch
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from torch import distributed
 
-from mvrecon.core.files.rank import world
-from mvrecon.core.plugins import import_plugins
-from mvrecon.core.quiet import silence_libraries
+from mvrecon.core.machine import silence_libraries, world
+from mvrecon.core.registry import import_plugins
 from mvrecon.training import fit, run_folder
 
 

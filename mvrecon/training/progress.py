@@ -14,7 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from mvrecon.core.files.rank import rank
+from mvrecon.core.machine import rank
 
 SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
 

@@ -16,9 +16,8 @@ import yaml
 
 from mvrecon import __version__
 from mvrecon.core.files.atomic import claimed, written_whole
-from mvrecon.core.files.checks import Refused, blaming, shown, text_of, yaml_of
-from mvrecon.core.files.places import of_weights
-from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
+from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml_of
+from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, of_weights
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras import files
@@ -32,7 +31,7 @@ WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 
 @contextmanager
-def taken(
+def run_lock(
     folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
 ) -> Iterator[None]:
     """Context that locks a run folder, new or started with the same settings, and writes the
@@ -115,7 +114,7 @@ def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
     path = folder / DIGESTS
     if not path.is_file():
         return
-    with blaming(path, "is not JSON"):
+    with file_errors(path, "is not JSON"):
         expected = json.loads(text_of(path))
     if not isinstance(expected, dict):
         raise Refused(f"{path}: expected digests by name, got {shown(expected)}")
@@ -166,16 +165,16 @@ def read_settings(folder: Path) -> dict[str, Any]:
     return settings
 
 
-def anchored(value: Any) -> Any:
+def absolute_paths(value: Any) -> Any:
     """Settings with every file and folder in them (`PLACES`) made absolute, so that they mean the
     same from any other folder.
     """
     if isinstance(value, dict):
         return {
-            key: _absolute(key, item) if key in PLACES else anchored(item)
+            key: _absolute(key, item) if key in PLACES else absolute_paths(item)
             for key, item in value.items()
         }
-    return [anchored(item) for item in value] if isinstance(value, list) else value
+    return [absolute_paths(item) for item in value] if isinstance(value, list) else value
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:
@@ -205,7 +204,7 @@ def _cleared_on_failure(folder: Path, names: Sequence[str]) -> Iterator[None]:
 
 def _absolute(key: str, path: Any) -> Any:
     if isinstance(path, dict | list):
-        return anchored(path)
+        return absolute_paths(path)
     if not isinstance(path, str):
         return path
     trained = key in ("checkpoint", "init_from")

@@ -19,8 +19,8 @@ from lightning.fabric.plugins import CheckpointIO
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, blaming, shown
-from mvrecon.core.files.places import inside
+from mvrecon.core.files.checks import Refused, file_errors, shown
+from mvrecon.core.targets import inside
 from mvrecon.training.checkpoint_check import check_archive
 
 TAG = b"sha256:"
@@ -121,7 +121,7 @@ def read(path: Path) -> dict[str, Any]:
         check_archive(path)
         file.seek(0)
         checkpoint = torch.load(file, map_location="cpu", weights_only=True)
-    with blaming(path, "is no checkpoint"):
+    with file_errors(path, "is no checkpoint"):
         bad = not_finite(checkpoint)
     if bad:
         raise Refused(

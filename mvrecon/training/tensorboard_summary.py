@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mvrecon.core.files.runs import leaves
+from mvrecon.core.files.runs import flatten
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.comparison.rows import rows_of
 from mvrecon.report.comparison.tables import Cells, cells, markdown
@@ -55,7 +55,7 @@ def close(
             f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
         }
         settled = {"label": label, "method": method}
-        values = {".".join(keys): v for keys, v in leaves(settled | shared)}
+        values = {".".join(keys): v for keys, v in flatten(settled | shared)}
         board.log_session({k: _plain(v) for k, v in values.items()}, figures | costs)
         if label == next(iter(table["methods"])):
             rows = list(rows_of(table, settings["name"], folder))

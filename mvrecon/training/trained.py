@@ -10,11 +10,9 @@ from torch import Tensor
 
 from mvrecon import __version__
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import TEXT, Refused, blaming, shown
-from mvrecon.core.files.places import of_weights, shipped_weights
-from mvrecon.core.files.runs import folder_of_run
-from mvrecon.core.plugins import import_plugins
-from mvrecon.core.registry import hint
+from mvrecon.core.files.checks import TEXT, Refused, file_errors, shown
+from mvrecon.core.files.runs import folder_of_run, of_weights, shipped_weights
+from mvrecon.core.registry import hint, import_plugins
 from mvrecon.training import checkpoints
 from mvrecon.training import trained as weights_file
 from mvrecon.training.checkpoint_check import check_settings
@@ -71,12 +69,12 @@ def read(path: Path) -> Trained:
 
     if not path.is_file():
         raise FileNotFoundError(f"No weights are at {path}")
-    with blaming(path, f"is no {ENDING} file"), safe_open(path, framework="pt") as file:
+    with file_errors(path, f"is no {ENDING} file"), safe_open(path, framework="pt") as file:
         text = (file.metadata() or {}).get(KEY, "")
         weights = {name: file.get_tensor(name) for name in file.keys()}
     if not 0 < len(text) <= TEXT:
         raise Refused(f"{path}: expected a description under {KEY!r} of at most {TEXT} bytes")
-    with blaming(path, "is not described by JSON"):
+    with file_errors(path, "is not described by JSON"):
         record = json.loads(text)
         digest, settings, training = (record[key] for key in ("sha256", "settings", "training"))
         found = _digest(path.read_bytes(), digest)
@@ -93,7 +91,9 @@ def read(path: Path) -> Trained:
 def _trained(
     path: Path, settings: Any, weights: dict[str, Tensor], training: Mapping[str, Any]
 ) -> Trained:
-    with blaming(path, "does not fit this version's method", "was it written by another version?"):
+    with file_errors(
+        path, "does not fit this version's method", "was it written by another version?"
+    ):
         module = ReconstructionModule(**check_settings(path, settings))
         module.load_state_dict(weights)
         seconds, steps = float(training["seconds"]), int(training["steps"])

@@ -4,7 +4,7 @@ pixels.
 
 import torch
 
-from mvrecon.apps import calibrate
+from mvrecon.apps import correction
 from mvrecon.apps.scan import Scan
 from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
@@ -33,7 +33,7 @@ class Measured:
 
 def test_offset_gains_and_dead_pixels_of_a_scan(monkeypatch):
     """Half the voxels and pixels each way; one pixel in fifty is dead, with a wild value."""
-    monkeypatch.setattr(calibrate, "COARSE", 16)
+    monkeypatch.setattr(correction, "COARSE", 16)
     rng = torch.Generator().manual_seed(0)
     truth = Misalignment.none(20)
     truth.offset_px[:, 0] = 2.6
@@ -43,14 +43,14 @@ def test_offset_gains_and_dead_pixels_of_a_scan(monkeypatch):
     exact = Drr(GRID, misaligned(RIG, truth))(x.float()[None, None])[0, 0] * gains[:, None, None]
     mask = torch.rand(exact.shape, generator=rng) > 0.02
     scan = Scan(Measured(torch.where(mask, exact, 99.0), mask), RIG, GRID, {"name": "drr"})
-    mended, fit = calibrate.calibrate(scan, ["offset_u", "gains"])
+    mended, fit = correction.calibrate(scan, ["offset_u", "gains"])
     assert (fit.misalignment.offset_px[:, 0] - 2.6).abs().max() < 0.1
     assert (mended.cameras.origin - misaligned(RIG, truth).origin).norm(dim=1).max() < 0.1 * 3.2
     views = mended.measured.whole().views
     assert ((views - exact / gains[:, None, None])[mask].norm() / exact[mask].norm()) < 0.01
-    assert "offset_u +2." in calibrate.in_words(fit, ["offset_u", "gains"])
+    assert "offset_u +2." in correction.in_words(fit, ["offset_u", "gains"])
     kept = fit._replace(kept=["offset_u"], settled=False)
-    words = calibrate.table(kept, ["offset_u", "gains"])["words"]
+    words = correction.calibration_table(kept, ["offset_u", "gains"])["words"]
     assert "offset_u kept at the nominal value" in words and "still changed" in words
 
 

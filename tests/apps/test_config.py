@@ -16,9 +16,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
 from mvrecon.apps import config
-from mvrecon.apps.config import compose, conf_dir, help_text, with_flag_first, with_paths_quoted
-from mvrecon.core.plugins import import_plugins
-from mvrecon.core.registry import GROUP
+from mvrecon.apps.config import compose, conf_dir, help_text
+from mvrecon.apps.config.guard import CommandLine
+from mvrecon.core.registry import GROUP, import_plugins
 from mvrecon.core.targets import instantiate
 
 EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))
@@ -119,10 +119,10 @@ def test_a_path_is_one_value_whatever_signs_are_in_it(tmp_path: Path):
     parser = OverridesParser.create()
     for name in ("camera.n_views=4,method=sirt", "my scan (2)", "o'brien, {3}"):
         (tmp_path / name).mkdir()
-        lines = with_paths_quoted([f"checkpoint={tmp_path / name}"])
+        lines = CommandLine.of([f"checkpoint={tmp_path / name}"]).overrides
         assert parser.parse_overrides(lines)[0].value() == str(tmp_path / name)
-    for line in ("method=sirt,cross_view", "data.sizes={train: 3}", "--config-dir=a,b", "seed=3"):
-        assert with_paths_quoted([line]) == [line]
+    for line in ("method=sirt,cross_view", "data.sizes={train: 3}", "seed=3"):
+        assert CommandLine.of([line]).overrides == [line]
 
 
 @pytest.fixture
@@ -141,7 +141,7 @@ def test_a_mistyped_key_in_an_experiment_is_an_error(user_conf):
     with pytest.raises(ConfigCompositionException) as error:
         compose(*user_conf("name: mine\nprojectr: {name: drr}"))
     assert "experiment/mine" in str(error.value)
-    assert "Key 'projectr' not in 'Settings'" in f"{error.value}{error.value.__cause__}"
+    assert "Key 'projectr' not in 'TrainSettings'" in f"{error.value}{error.value.__cause__}"
 
 
 def test_a_mistyped_choice_in_an_experiment_lists_what_there_is(user_conf):
@@ -256,9 +256,6 @@ def test_a_target_of_an_allowed_library_is_built(tmp_path: Path):
 
 def test_the_flag_of_a_sweep_may_stand_anywhere():
     """Hydra's own parser takes it before or behind all settings, not between two."""
-    between = ["experiment=smoke", "-m", "seed=0,1", "logger=csv"]
-    assert (moved := with_flag_first(between)) == ["-m", "experiment=smoke", *between[2:]]
-    parser = hydra._internal.utils.get_args_parser()
-    assert parser.parse_args(moved).overrides == moved[1:]
-    with pytest.raises(SystemExit):
-        parser.parse_args(between)
+    command = CommandLine.of(["experiment=smoke", "-m", "seed=0,1", "logger=csv"])
+    assert command.flags == ["-m"] and command.sweeps
+    assert command.overrides == ["experiment=smoke", "seed=0,1", "logger=csv"]

@@ -11,10 +11,10 @@ import pytest
 from omegaconf import OmegaConf
 
 from mvrecon.apps.config import check_settings, compose
-from mvrecon.apps.config.typed import check_parts
 from mvrecon.apps.list import main, new_plugin
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import GROUP
+from mvrecon.core.signatures import check_parts
 from tests.faults.plugins import plugin
 
 NAME = "seven_kinds"
@@ -59,7 +59,7 @@ def test_the_commands_of_the_project_compose(project):
     assert CHOICES <= {word for command in commands for word in command}
     for _, *overrides in commands:
         settings = compose(*overrides)
-        check_settings(OmegaConf.create(settings))
+        check_settings(OmegaConf.create(settings), "train")
         check_parts(settings)
 
 

@@ -15,6 +15,7 @@ from PIL import Image as Pillow
 
 import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
+from mvrecon.apps.config import ReconstructSettings
 from mvrecon.apps.scan import Scan, check_unit, open_scan
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
@@ -186,7 +187,7 @@ def test_a_place_that_cannot_be_written_is_refused_first(
     """A volume that cannot be written is refused before any view is read."""
     (tmp_path / "file").touch()
     (tmp_path / "folder.nii.gz").mkdir()
-    monkeypatch.setattr("mvrecon.apps.scan.open_scan", lambda _: pytest.fail("views are read"))
+    monkeypatch.setattr("mvrecon.apps.scan.open_scan", lambda *_: pytest.fail("views are read"))
     assert run(scan, tmp_path / "run", f"out={tmp_path / place}") == 1
     assert f"{tmp_path / place}: expected" in capsys.readouterr().err
 
@@ -200,10 +201,10 @@ def test_the_endings_that_the_settings_list_for_a_volume_are_written():
 @pytest.mark.parametrize("method", ["fdk", "cgls", "os_sart"])
 def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, monkeypatch):
     """Told from the method's own last residual, or one projection: never from the files anew, which
-    doubts read in part.
+    sanity checks read in part.
     """
     reads = []
-    monkeypatch.setattr("mvrecon.apps.sanity_checks.doubts", lambda *_: [])
+    monkeypatch.setattr("mvrecon.apps.sanity_checks.sanity_checks", lambda *_: [])
     read = MeasuredViews.read
     monkeypatch.setattr(MeasuredViews, "read", lambda *a: reads.append(a) or read(*a))
     options = (f"method={method}", "views.every=4", f"out={tmp_path}/volume.nii.gz")
@@ -211,7 +212,8 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, monkeypatc
     last = {"fdk": 2}.get(method, 1)  # FDK is streamed: its views need not fit into memory
     assert sum(b - a for _, a, b in reads) == last * 10
     settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    case = open_scan(settings)
+    names = ("views", "camera", "grid", "projector", "method")
+    case = open_scan(**{name: settings[name] for name in names})
     A, y = case.posed("cpu")
     x = read_volume(tmp_path / "volume.nii.gz")[0][None, None]
     expected = ((y - A(x)).norm() / y.norm()).item()
@@ -230,7 +232,9 @@ def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
     first = read_volume(tmp_path / "run" / "volume.nii.gz")[0]
     settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
     monkeypatch.chdir(scan / "elsewhere")
-    again = mvrecon.apps.reconstruct.reconstruct(settings, tmp_path / "again")
+    again = mvrecon.apps.reconstruct.reconstruct(
+        ReconstructSettings(**settings), tmp_path / "again"
+    )
     assert torch.equal(read_volume(again["volume"])[0], first)
 
 
@@ -243,7 +247,7 @@ def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypa
         raise MemoryError("no room left")
 
     with monkeypatch.context() as patch:
-        patch.setattr("mvrecon.apps.run_method.solve", fails)
+        patch.setattr("mvrecon.apps.run_method.run_method", fails)
         assert run(scan, tmp_path / "run", "views.every=4") == 1
     assert "no room left" in capsys.readouterr().err
     assert {file.name for file in (tmp_path / "run").iterdir()} <= {".lock", "reconstruct.log"}

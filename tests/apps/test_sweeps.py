@@ -5,10 +5,11 @@ run.
 import json
 
 import pytest
-from omegaconf import OmegaConf
+from hydra.core.config_store import ConfigStore
 
 import mvrecon.apps.train
-from mvrecon.apps.config import own_folder
+from mvrecon.apps import config
+from mvrecon.apps.config.guard import CommandLine, checked_configs
 from mvrecon.training import fit
 from tests.training.lives import OPTIONS
 from tests.training.runs import call
@@ -54,15 +55,14 @@ def test_a_sweep_in_other_processes_takes_no_config_from_elsewhere(tmp_path):
     """A sweep whose jobs run in processes of their own, where configs are not checked, takes none
     from elsewhere.
     """
+    launcher = {"_target_": "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher"}
+    ConfigStore.instance().store("elsewhere", launcher, group="hydra/launcher")
 
-    def config(launcher, *folders):
-        sources = [{"path": str(f), "schema": "file", "provider": "x"} for f in folders]
-        target = {"_target_": launcher}
-        section = {"launcher": target, "runtime": {"config_sources": sources}}
-        return OmegaConf.create({"hydra": section})
+    def check(*arguments):
+        config.prepare_hydra()
+        command = CommandLine.of(["-m", "seed=0,1", "hydra/launcher=elsewhere", *arguments])
+        return len(list(checked_configs("train", command, [config.conf_dir()])))
 
-    joblib = "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher"
-    own_folder.check_launcher(config(joblib, own_folder.conf_dir()))
-    own_folder.check_launcher(config(own_folder.IN_TURN, tmp_path))
+    assert check() == 3
     with pytest.raises(PermissionError, match="composes its jobs in other processes"):
-        own_folder.check_launcher(config(joblib, tmp_path))
+        check(f"--config-dir={tmp_path}")

@@ -5,8 +5,7 @@ import.
 import pytest
 
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.core.plugins import import_plugins
-from mvrecon.core.registry import Registry
+from mvrecon.core.registry import Registry, import_plugins
 from mvrecon.operators.drr import Drr
 from tests.faults.plugins import plugin
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvrecon.core.files.memory import peak
+from mvrecon.core.machine import peak
 
 #: What a reader may raise; its message names the file.
 REFUSALS = (ValueError, OSError, KeyError)

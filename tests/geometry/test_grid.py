@@ -171,7 +171,7 @@ def test_a_grid_that_memory_cannot_take_is_refused_with_both_sizes(make):
 
 def test_memory_at_hand_is_no_more_than_a_limit_leaves(run_python):
     code = (
-        "import resource, mvrecon.core.files.memory as m;"
+        "import resource, mvrecon.core.machine as m;"
         "resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32));"
         "assert 0 < m.memory_at_hand() < 2**32; m.check_memory(2**30, 'a');"
         "m.check_memory(3 * 2**31, 'This')"

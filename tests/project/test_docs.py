@@ -17,9 +17,9 @@ from hydra.core.override_parser.types import Override
 
 from mvrecon.apps import compare, view
 from mvrecon.apps.config import compose
-from mvrecon.apps.config.typed import check_parts
 from mvrecon.apps.list import SETTING
 from mvrecon.core.parts import LISTED, PROJECTORS
+from mvrecon.core.signatures import check_parts
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt

@@ -78,7 +78,7 @@ def test_ssim_is_that_of_torchmetrics_in_a_hundredth_of_its_memory(shape):
 def test_figures_of_64_voxels_an_edge_take_a_few_volumes_of_memory(run_python):
     code = (
         "import torch; from mvrecon.report.metrics import volume_metrics;"
-        "from mvrecon.core.files.memory import peak_since, restarted_peak;"
+        "from mvrecon.core.machine import peak_since, restarted_peak;"
         "a, b = torch.rand(2, 1, 64, 64, 64); volume_metrics(a, b, a > 0, 1.0);"
         "start = restarted_peak(); volume_metrics(a, b, a > 0, 1.0);"
         "assert start is None or peak_since(start) < 20 * 8 * 64**3, peak_since(start)"

@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import compose, conf_dir, prepare_hydra
+from mvrecon.apps.config.guard import CommandLine, checked_configs
 from mvrecon.core.files.checks import Refused, yaml_of
-from mvrecon.core.plugins import import_plugins
+from mvrecon.core.registry import import_plugins
 from mvrecon.core.targets import instantiate
 from tests.faults.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
 
@@ -183,3 +184,54 @@ def test_a_settings_file_of_a_gigabyte_is_not_read(tmp_path: Path):
         file.truncate(2**30)  # a hole: a gigabyte on no disk
     with pytest.raises(Refused, match=r"evil\.yaml: is larger than"):
         yaml_of(tmp_path / "evil.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{hydra.job.env_set.A: '1,2'}", r"sets 'hydra.job.env_set.A=1,2' in hydra.sweeper.params"),
+        ("{+hydra.job.env_set.A: b}", "only a command line may"),
+        ("{hydra/job_logging: none}", "only a command line may"),
+        ("{label: ../../../out}", "expected no path"),
+    ],
+)
+def test_a_fetched_experiment_varies_nothing_of_hydras_own(text: str, message: str, folder):
+    """What the jobs of a sweep are made of is checked before any of them is begun."""
+    evil = folder(f"hydra: {{sweeper: {{params: {text}}}}}")
+    with pytest.raises(PermissionError, match=message):
+        checked_sweep(*evil)
+
+
+def test_no_choice_of_a_sweep_sets_what_is_hydras_own(folder):
+    """Every file that a sweep chooses is checked, whether the experiment that varies it or the
+    command line names it.
+    """
+    worse = {"experiment/worse.yaml": "# @package _global_\nhydra: {job: {env_set: {A: b}}}\n"}
+    place, chosen = folder("hydra: {sweeper: {params: {experiment: 'evil,worse'}}}", **worse)
+    for varied in ("experiment=evil,worse", "experiment=choice(evil,worse)"):
+        with pytest.raises(PermissionError, match=r"A config sets .*'hydra.job.env_set.A'"):
+            checked_sweep(place, varied)
+    checked_sweep(place, chosen)  # the command line wins
+
+
+def checked_sweep(*overrides: str) -> None:
+    prepare_hydra()
+    list(checked_configs("train", CommandLine.of(["-m", *overrides]), [conf_dir()]))
+
+
+def test_a_fetched_experiment_composes_the_same_at_any_time(folder):
+    """A file whose contents change between the check and the run would not have been checked."""
+    for text in ("defaults: ['other_${now:%S}']", "name: '${oc.select:label,x}'"):
+        with pytest.raises(PermissionError, match="calls another resolver"):
+            compose(*folder(text))
+
+
+def test_a_sweep_with_a_fetched_experiment_is_refused_before_hydra_acts(tmp_path: Path, root: Path):
+    text = "hydra: {sweeper: {params: {hydra.job.env_set.A: b}}}"
+    experiment(tmp_path, text)
+    place = f"hydra.sweep.dir={tmp_path}/out"
+    command = [sys.executable, "-m", "mvrecon.apps.simulate", "-m", place, "experiment=evil"]
+    command += ["--config-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "only a command line may" in done.stderr
+    assert not (tmp_path / "out").exists()

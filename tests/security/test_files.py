@@ -13,7 +13,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from mvrecon.core.files import memory
+from mvrecon.core import machine as memory
 from mvrecon.core.files.checks import Refused, plain_name, text_of
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes

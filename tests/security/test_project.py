@@ -129,8 +129,8 @@ FLOORS = {
         ["2.6.6"],
         ["2.6.2", "2.6.3", "2.6.5"],
     ),  # 2.6.2 and 2.6.3 ran foreign code when imported
-    # before 1.3.6: a target by an alias of another module; others: config/guard.py is not tried
-    "hydra-core": (["1.3.8"], ["1.3.2", "1.3.5", "1.3.7", "1.3.9", "1.4"]),
+    # before 1.3.6: a target by an alias of another module
+    "hydra-core": (["1.3.6", "1.3.8", "1.4.1"], ["1.3.2", "1.3.5", "1.5"]),
     "h5py": (["3.14"], ["3.13"]),
     "pydicom": (["3.0.2"], ["3.0.1"]),
 }

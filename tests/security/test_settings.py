@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import EvalSettings, compose
 from mvrecon.apps.eval import evaluate
 
 APPS = {
@@ -72,4 +72,4 @@ def test_an_evaluation_does_not_describe_a_trained_method_anew(tmp_path: Path):
     with pytest.raises(
         ValueError, match=r"compare describes \['mine'\], which the run has trained already"
     ):
-        evaluate(settings, tmp_path / "out")
+        evaluate(EvalSettings(**settings), tmp_path / "out")

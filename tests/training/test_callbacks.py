@@ -53,4 +53,4 @@ def test_where_the_system_tells_no_memory_the_clock_logs_the_rest(monkeypatch):
         batch = {"views": torch.zeros(2, 1)}
         Clock().on_train_batch_end(SimpleNamespace(world_size=1), Module(), None, batch, 0)
         assert set(logged) == {"time/step_ms", "time/volumes_per_s", "time/seconds"} | known
-        monkeypatch.setattr("mvrecon.core.files.memory.resource", None)
+        monkeypatch.setattr("mvrecon.core.machine.resource", None)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.core.device import device_of
+from mvrecon.core.machine import device_of
 
 
 def test_a_device_that_there_is_not_is_refused(monkeypatch):

@@ -7,8 +7,8 @@ import torch
 
 import mvrecon as mv
 import mvrecon.apps.eval
-from mvrecon.apps.config import compose
-from mvrecon.core.files import places
+from mvrecon.apps.config import EvalSettings, compose
+from mvrecon.core import targets as places
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.methods.method import build_method
@@ -154,7 +154,7 @@ def test_weights_in_a_file_are_the_trained_ones_and_fit_a_rig_never_seen(
     assert volume.shape[2:] == A.grid.shape and volume.isfinite().all() and volume.any()
     words = [str(w.message) for w in messages if "trained with" in str(w.message)]
     assert len(words) == 1 and "another grid" in words[0], "any rig is as in training"
-    settings = run_folder.anchored({"checkpoint": "ours"})
+    settings = run_folder.absolute_paths({"checkpoint": "ours"})
     assert settings == {"checkpoint": str(path)}
     with pytest.raises(FileNotFoundError, match="is at .*theirs.*Known: ours"):
         mv.load("theirs")
@@ -197,7 +197,7 @@ def test_a_run_is_evaluated_on_another_rig_and_grid(run, tmp_path):
     assert call(mvrecon.apps.eval, f"checkpoint={run}", *options, where) == 0
     merged = mvrecon.apps.eval.merged(
         run_folder.read_settings(run),
-        compose(f"checkpoint={run}", *options, config_name="eval"),
+        EvalSettings(**compose(f"checkpoint={run}", *options, config_name="eval")),
     )
     assert merged["camera"]["n_views"] == [5, 5] and merged["camera"]["pixels"] == [13, 17]
     assert merged["grid"] == {"size": [9, 9, 7], "spacing": 16.0}

@@ -11,10 +11,10 @@ import torch
 import mvrecon.apps.train
 from mvrecon import load
 from mvrecon.apps.config import compose
-from mvrecon.apps.config.typed import check_parts
 from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CALLBACKS, LOGGERS
+from mvrecon.core.signatures import check_parts
 from mvrecon.core.targets import instantiate
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.training.losses import ReconstructionLoss

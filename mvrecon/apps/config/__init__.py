@@ -5,10 +5,12 @@ torch's defaults and no loop pays for a config object. Importing this file impor
 Lightning.
 """
 
+import os
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from functools import wraps
 from io import TextIOWrapper
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -20,14 +22,19 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
-from mvrecon.apps.config.errors import OF_METHODS, one_line
-from mvrecon.apps.config.guard import guarded
-from mvrecon.apps.config.typed import check_parts
+from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
+from mvrecon.apps.config.guard import (
+    VERSION_BASE,
+    CommandLine,
+    checked_configs,
+    register_untrusted_source,
+)
 from mvrecon.core.files.checks import shown, yaml_of
-from mvrecon.core.plugins import check_plugins
-from mvrecon.core.quiet import silence_libraries
-from mvrecon.core.registry import installed, locate
+from mvrecon.core.machine import silence_libraries
+from mvrecon.core.registry import check_plugins, hint, installed, locate
+from mvrecon.core.signatures import check_parts
 
 
 @dataclass
@@ -45,7 +52,7 @@ class Measurement:
 
 
 @dataclass
-class Simulation(Measurement):
+class SimulateSettings(Measurement):
     """Every top-level key of `mvrecon-simulate`."""
 
     rtk: bool = False
@@ -54,7 +61,7 @@ class Simulation(Measurement):
 
 
 @dataclass
-class Settings(Measurement):
+class TrainSettings(Measurement):
     """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a
     silent extra.
     """
@@ -75,7 +82,7 @@ class Settings(Measurement):
 
 
 @dataclass
-class ScanSettings:
+class ReconstructSettings:
     """Every top-level key of `mvrecon-reconstruct`."""
 
     name: str = MISSING
@@ -97,7 +104,7 @@ class ScanSettings:
 
 
 @dataclass
-class Evaluation:
+class EvalSettings:
     """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the method, are
     not keys.
     """
@@ -115,63 +122,15 @@ class Evaluation:
     plugins: Any = field(default_factory=list)
 
 
+#: What Hydra compares an app's settings with, and the app takes.
 SCHEMAS = {
-    "schema": Settings,
-    "evaluation_schema": Evaluation,
-    "simulation_schema": Simulation,
-    "reconstruction_schema": ScanSettings,
+    "train_schema": TrainSettings,
+    "eval_schema": EvalSettings,
+    "simulate_schema": SimulateSettings,
+    "reconstruct_schema": ReconstructSettings,
 }
 
 
-#: What an unquoted value of Hydra's must not have in it.
-SIGNS = set("=,;()[]{}' ")
-
-
-def with_paths_quoted(arguments: Sequence[str]) -> list[str]:
-    """Arguments in which each value that is the path of a file or folder is quoted where it has to
-    be: the run of a sweep is called camera.n_views=4,model=sirt.
-    """
-    return [_with_path_quoted(argument) for argument in arguments]
-
-
-def _with_path_quoted(argument: str) -> str:
-    key, sign, value = argument.partition("=")
-    if not sign or key.startswith("-") or not SIGNS & set(value):
-        return argument
-    try:
-        is_path = Path(value).expanduser().exists()
-    except (OSError, ValueError):  # too long for a path
-        return argument
-    return f"{key}={quoted(value)}" if is_path else argument
-
-
-def with_options_added(arguments: Sequence[str], sections: Collection[str]) -> list[str]:
-    """Arguments in which an option of one of these sections, such as camera.n_views=12, is set
-    whether the app's own file has it or not, as by Hydra's ++.
-    """
-    return [
-        f"++{argument}"
-        if "." in (key := argument.partition("=")[0]) and key.partition(".")[0] in sections
-        else argument
-        for argument in arguments
-    ]
-
-
-def with_flag_first(arguments: Sequence[str]) -> list[str]:
-    """Arguments with the flag of a sweep before all settings: between two of them Hydra would not
-    know those behind it.
-    """
-    return sorted(arguments, key=lambda argument: argument not in ("-m", "--multirun"))
-
-
-def quoted(value: str | Sequence[str]) -> str:
-    """A value in the grammar of Hydra's command line."""
-    if not isinstance(value, str):
-        return f"[{','.join(map(quoted, value))}]"
-    return "'" + value.replace("'", r"\'") + "'"
-
-
-VERSION_BASE = "1.3"
 #: Settings whose options need not be in a file: those of parts are in their signatures.
 OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
 #: Further such settings of an app: those of the run that it evaluates, or of `EventSettings`.
@@ -182,7 +141,7 @@ class PluginConf(SearchPathPlugin):
     """Adds the config folders of installed plugins to Hydra's search path."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for folder in plugin_conf_dirs():
+        for folder in trusted_folders()[1:]:
             search_path.append(provider="mvrecon plugin", path=f"file://{folder}")
 
 
@@ -192,17 +151,13 @@ def conf_dir() -> Path:
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
-def plugin_conf_dirs() -> list[Path]:
-    """The config folders that installed plugins declare (entry points named "conf.*"), found
-    without an import.
+def trusted_folders() -> list[Path]:
+    """The folders of configs: mvrecon's own, and those that installed plugins declare (entry points
+    named "conf.*"), found without an import.
     """
     packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
-    return [
-        Path(folder)
-        for package in packages
-        if package
-        for folder in package.submodule_search_locations or ()
-    ]
+    found = (package.submodule_search_locations or () for package in packages if package)
+    return [conf_dir(), *(Path(folder) for folders in found for folder in folders)]
 
 
 def app_file(config_name: str) -> Path:
@@ -211,12 +166,12 @@ def app_file(config_name: str) -> Path:
     Raises:
         FileNotFoundError: no app has such a file.
     """
-    folders = [conf_dir(), *plugin_conf_dirs()]
-    for file in (folder / f"{config_name}.yaml" for folder in folders):
+    folders = [str(folder) for folder in trusted_folders()]
+    for file in (Path(folder, f"{config_name}.yaml") for folder in folders):
         if file.is_file():
             return file
     raise FileNotFoundError(
-        f"No app has the settings {config_name}.yaml in any of {shown(map(str, folders))}"
+        f"No app has the settings {config_name}.yaml in any of {shown(folders)}"
     )
 
 
@@ -225,6 +180,7 @@ def prepare_hydra() -> None:
     for name, schema in SCHEMAS.items():
         ConfigStore.instance().store(name=name, node=schema)
     Plugins.instance().register(PluginConf)
+    register_untrusted_source()
 
 
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
@@ -237,9 +193,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     Raises:
         SystemExit: an error, or Ctrl-C.
     """
-    sys.argv[1:] = arguments = with_options_added(
-        with_paths_quoted(with_flag_first(sys.argv[1:])), (*OF_PARTS, *OF_RUN.get(config_name, ()))
-    )
+    arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
         return
@@ -249,32 +203,79 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         )  # as stderr: a path that it cannot write must not end a run
     if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
-    prepare_hydra()
-    silence_libraries()
-    guard = guarded(conf_dir(), plugin_conf_dirs(), check_settings)
-    with one_line(f"mvrecon-{config_name}"), guard:
-        if any(argument.startswith("--e") for argument in arguments):
-            raise PermissionError(
-                "--experimental-rerun unpickles a file, which can run anything; use resume=<run "
-                "folder>"
-            )
+    with one_line(f"mvrecon-{config_name}"):
+        prepare_hydra()
+        silence_libraries()
+        command = CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+        sys.argv[1:] = [*command.overrides, *command.flags]
+        if {"-sc", "--shell-completion"} & set(command.flags):
+            if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
+                return  # files of these folders are not read for a word that is being typed
+        else:
+            for config in checked_configs(config_name, command, trusted_folders()):
+                check_settings(config, config_name)
+
+        @reported
+        @wraps(task)
+        def checked(config: DictConfig) -> Any:
+            check_settings(config, config_name)
+            return task(config)
+
         hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(
-            task
+            checked
         )()
 
 
-def check_settings(config: DictConfig) -> None:
-    """Check plugins and parts of a composed config, whose missing settings may come later.
+def check_settings(config: DictConfig, app: str) -> None:
+    """Check keys, plugins and parts of a composed config of an app, whose missing settings may come
+    later.
 
     Raises:
         ImportError, PermissionError: a module of `plugins` that is none.
-        LookupError, TypeError: a part's name, option or value.
+        LookupError, TypeError: a setting that the app does not use, a part's name, option or value.
     """
     plain: Any = OmegaConf.to_container(config, resolve=False)
     settings = {key: value for key, value in plain.items() if key != "hydra"}
+    check_keys(settings, app)
     if settings.get("plugins") != "???":
         check_plugins(settings.get("plugins"))
     check_parts(settings)
+    check_references(config)
+
+
+def check_references(config: DictConfig) -> None:
+    """Check that each setting that takes its value from another one has one.
+
+    Raises:
+        InterpolationKeyError: the other setting is not there.
+    """
+    settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    try:
+        OmegaConf.to_container(settings, resolve=True)
+    except InterpolationKeyError:
+        raise
+    except OmegaConfBaseException:
+        pass  # such as a setting that is yet to be given: the task says so
+
+
+def check_keys(settings: Mapping[str, Any], app: str) -> None:
+    """Check that every top-level key is one of the app's; Hydra itself accepts any `+key=...`.
+
+    Raises:
+        LookupError: a key that the app does not have, so that nothing would come of it; the message
+            names it.
+    """
+    written = yaml_of(app_file(app))
+    entries = [entry for entry in written.get("defaults", ()) if isinstance(entry, dict)]
+    groups = {str(next(iter(entry))).rpartition("@")[2] for entry in entries}
+    schema = SCHEMAS.get(f"{app}_schema")
+    names = [f.name for f in fields(schema)] if schema else []
+    allowed = {*written, *groups, *names} - {"defaults"}
+    if unused := [key for key in settings if key not in allowed]:
+        known = {key for key in allowed if key.isidentifier()} - {"hydra", "experiment"}
+        raise LookupError(
+            f"This app does not use the setting {unused[0]!r}{hint(unused[0], known)}"
+        )
 
 
 def help_text(config_name: str) -> str:
@@ -282,7 +283,7 @@ def help_text(config_name: str) -> str:
     settings with comments.
     """
     choices: dict[str, set[str]] = {}
-    for folder in (conf_dir(), *plugin_conf_dirs()):
+    for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):
             choices.setdefault(file.parent.name, set()).add(file.stem)
     taken = groups_of(app_file(config_name))
@@ -322,10 +323,9 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
     prepare_hydra()
-    guard = guarded(conf_dir(), plugin_conf_dirs())
-    with guard, hydra.initialize_config_dir(str(conf_dir()), version_base=VERSION_BASE):
-        added = with_options_added(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
-        config = hydra.compose(config_name, added, return_hydra_config=True)
+    command = CommandLine.of(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+    (config,) = checked_configs(config_name, command, trusted_folders())
+    check_keys({str(key): None for key in config if key != "hydra"}, config_name)
     choices = dict(config.hydra.runtime.choices)
     with open_dict(config):
         del config["hydra"]

@@ -4,20 +4,27 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import PurePosixPath
 from typing import Any
 
-from hydra._internal import utils
-from hydra.core.utils import JobReturn, JobStatus
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationKeyError,
+    OmegaConfBaseException,
+)
 
 from mvrecon.core.registry import hint
 
+#: The environment variable by which Hydra raises errors as they are.
+FULL_ERROR = "HYDRA_FULL_ERROR"
 #: What a user's settings, files and machine can cause; anything else is a fault of the program.
 EXPECTED = (
     *(HydraException, OmegaConfBaseException),
@@ -40,6 +47,8 @@ OF_METHODS = {"head", "network"}
 RENAMED = {"model": "method", "reconstructor": "method"}
 #: Hydra's words for a group that a run does not take.
 UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean to override)")
+#: OmegaConf's words for a reference to a setting that is not there.
+REFERENCE = re.compile(r"Interpolation key '([^']+)' not found")
 #: Hydra's words for an experiment that chooses what the app does not have.
 FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
 
@@ -55,40 +64,55 @@ def one_line(app: str) -> Iterator[None]:
     Raises:
         SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
     """
-    report, value = utils.run_and_report, JobReturn.return_value
-    shown = warnings.formatwarning
+    traceback_asked, shown = os.environ.get(FULL_ERROR), warnings.formatwarning
     warnings.formatwarning = lambda message, category, *_: (
         f"{app}: {category.__name__}: {message}\n"
     )
-    # Hydra's own print tracebacks, and a line more
-    utils.run_and_report = lambda function: function()
-    JobReturn.return_value = value.getter(_result)  # type: ignore[method-assign]
+    os.environ[FULL_ERROR] = "1"  # Hydra's own report is several lines; so it raises the error
     try:
         yield
     except KeyboardInterrupt as stop:
         sys.stderr.write(f"{app}: stopped by Ctrl-C\n")
         raise SystemExit(130) from stop
-    except EXPECTED as error:
-        if os.environ.get("HYDRA_FULL_ERROR") == "1" or _is_fault(error):
-            raise
+    except (TaskFailed, *EXPECTED) as raised:
+        error = raised.error if isinstance(raised, TaskFailed) else raised
+        is_fault = isinstance(error, FAULTS) and not isinstance(error, OmegaConfBaseException)
+        if traceback_asked == "1" or is_fault or not isinstance(error, EXPECTED):
+            raise error from error.__cause__
         sys.stderr.write(f"{app}: {sentence(error)}\n")
         raise SystemExit(1) from error
     finally:
-        utils.run_and_report, JobReturn.return_value = report, value  # type: ignore[method-assign]
+        if traceback_asked is None:
+            del os.environ[FULL_ERROR]
+        else:
+            os.environ[FULL_ERROR] = traceback_asked
         warnings.formatwarning = shown
 
 
-def _result(job: JobReturn) -> Any:
-    """What a job of Hydra's returned, or its error, which in a sweep tells the job."""
-    if job.status == JobStatus.COMPLETED:
-        return job._return_value
-    if job.hydra_cfg is not None and job.hydra_cfg.hydra.mode == RunMode.MULTIRUN:
-        job._return_value.add_note(f"in the job {' '.join(job.overrides or ())}")
-    raise job._return_value
+class TaskFailed(BaseException):
+    """The error of a single run's task on its way through Hydra, which would write it out."""
+
+    def __init__(self, error: Exception):
+        super().__init__(error)
+        self.error = error
 
 
-def _is_fault(error: BaseException) -> bool:
-    return isinstance(error, FAULTS) and not isinstance(error, OmegaConfBaseException)
+def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+    """A task of Hydra's whose error passes through Hydra as it is; in a sweep it names the job, and
+    the other jobs go on.
+    """
+
+    @wraps(task)
+    def run(config: DictConfig) -> Any:
+        try:
+            return task(config)
+        except Exception as error:
+            if HydraConfig.get().mode != RunMode.MULTIRUN:
+                raise TaskFailed(error) from error
+            error.add_note(f"in the job {' '.join(HydraConfig.get().overrides.task)}")
+            raise
+
+    return run
 
 
 def sentence(error: BaseException) -> str:
@@ -103,9 +127,8 @@ def sentence(error: BaseException) -> str:
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
     if isinstance(cause, ConfigKeyError | ConfigAttributeError):
         parent = cause.parent_node
-        old, _, rest = str(cause.full_key).partition(".")
-        if old in RENAMED:
-            return f"{cause.full_key!r} is called {RENAMED[old]}{'.' * bool(rest)}{rest} now"
+        if now := _renamed(str(cause.full_key)):
+            return now
         known = {str(key) for key in parent or ()} - {"hydra"}
         if not known:  # as the camera of an evaluation, which is the run's
             return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
@@ -113,9 +136,15 @@ def sentence(error: BaseException) -> str:
         if inside and cause.full_key == cause.key:
             return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
+    if isinstance(cause, InterpolationKeyError):
+        source = REFERENCE.search(str(cause))
+        return (
+            f"{cause.full_key} takes its value from {source[1] if source else 'a setting'}, which "
+            f"has none here; set {cause.full_key}=..."
+        )
     if part := UNMATCHED.match(str(error)):
-        if part[1] in RENAMED:
-            return f"{part[1]!r} is called {RENAMED[part[1]]!r} now: {RENAMED[part[1]]}=..."
+        if now := _renamed(part[1]):
+            return now
         if part[1] in OF_METHODS:
             return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
         return f"This app chooses no {part[1]!r}; --help shows what it chooses"
@@ -125,6 +154,12 @@ def sentence(error: BaseException) -> str:
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])
     return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
+
+
+def _renamed(key: str) -> str:
+    """What a setting of version 0.1.0 is called now; "" for others."""
+    old, dot, rest = key.partition(".")
+    return f"{key!r} is called {RENAMED[old]}{dot}{rest} now" if old in RENAMED else ""
 
 
 def _keys(settings: Any, part: str) -> set[str]:

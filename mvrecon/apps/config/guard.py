@@ -2,160 +2,288 @@
 
 Before it calls a task, Hydra builds callbacks, launchers and log handlers from its own section,
 sets environment variables and makes folders. A file that a user fetched must not choose these; the
-command line may. Hydra has no hook between composing and acting, so the guard replaces two of its
-internal functions; `pyproject.toml` therefore asks for one exact version of Hydra.
+command line may. So the same command line, and every job of a sweep, is composed and checked
+before Hydra acts on it. Files of untrusted folders call no resolver (`${now:...}`), so that both
+compositions are equal.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import itertools
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.sources_registry import SourcesRegistry
+import hydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigSource
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from mvrecon.core.files.checks import plain_name, shown, yaml_of
-from mvrecon.core.files.runs import leaves
-from mvrecon.core.registry import hint
+from mvrecon.core.files.runs import flatten
 
 #: Keys of the section `hydra` that any file may set, or that Hydra fills in when it composes.
-OPEN = {"mode", "verbose", "help", "sweeper.params", "runtime", "overrides", "job.override_dirname"}
+OPEN = re.compile(
+    r"hydra\.(mode|verbose|help|sweeper\.params|runtime|overrides|job\.override_dirname)\."
+)
+#: Scheme of folders whose files are checked when Hydra reads them.
+UNTRUSTED = "untrusted"
+#: What an unquoted value of Hydra's must not have in it.
+SIGNS = set("=,;()[]{}' ")
+VERSION_BASE = "1.3"
 
 
-@contextmanager
-def guarded(
-    main: Path, others: Sequence[Path], check: Callable[[DictConfig], None] | None = None
-) -> Iterator[None]:
-    """Context in which every config that Hydra composes is checked before Hydra acts on it.
+@cache
+def register_untrusted_source() -> None:
+    """Make folders of the scheme `untrusted://` known to Hydra, in this process only."""
+    sources: Any = Plugins.instance().discover(ConfigSource)
+    file_source: Any = next(source for source in sources if source.scheme() == "file")
+
+    class UntrustedFolder(file_source):
+        """A folder from elsewhere. Every file is bounded, and calls no resolver."""
+
+        @staticmethod
+        def scheme() -> str:
+            return UNTRUSTED
+
+        def load_config(self, config_path: str) -> Any:
+            path = Path(self.path, self._normalize_file_name(config_path))
+            if path.is_file():
+                check_no_resolver(yaml_of(path), path)
+            return super().load_config(config_path)
+
+    Plugins.instance().register(UntrustedFolder)
+
+
+def check_no_resolver(values: Any, path: Path) -> None:
+    """Check that no text in plain values calls a resolver of OmegaConf.
+
+    Raises:
+        PermissionError: one does; the message names the file.
+    """
+    if isinstance(values, Mapping):
+        values = [*values, *values.values()]
+    if isinstance(values, list):
+        for value in values:
+            check_no_resolver(value, path)
+    elif isinstance(values, str) and re.search(r"\$\{.*:", values, re.DOTALL):
+        raise PermissionError(
+            f"{path}: reads environment variables or calls another resolver by {shown(values)}; "
+            f"only a command line may"
+        )
+
+
+def quoted(value: str | Sequence[str]) -> str:
+    """A value in the grammar of Hydra's command line."""
+    if not isinstance(value, str):
+        return f"[{','.join(map(quoted, value))}]"
+    return "'" + value.replace("'", r"\'") + "'"
+
+
+def quoted_path(value: str) -> str:
+    """A typed value, quoted where it is the path of a file or folder and has to be: the run of a
+    sweep is called camera.n_views=4,method=sirt.
+    """
+    try:
+        is_path = bool(SIGNS & set(value)) and Path(value).expanduser().exists()
+    except (OSError, ValueError):  # too long for a path
+        return value
+    return quoted(value) if is_path else value
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """What a user typed for Hydra.
 
     Args:
-        main: the folder of mvrecon's own configs.
-        others: further folders that are trusted: those of installed plugins.
-        check: a further check of each composed config, which raises what it likes.
+        flags: such as `--cfg` and `job`.
+        overrides: in Hydra's grammar; folders of configs are in `hydra.searchpath`.
+        folders: of configs from elsewhere.
+    """
+
+    flags: list[str]
+    overrides: list[str]
+    folders: list[str]
+
+    @classmethod
+    def of(cls, arguments: Sequence[str], sections: Collection[str] = ()) -> "CommandLine":
+        """Split arguments; `--config-dir` becomes an entry of `hydra.searchpath`.
+
+        Args:
+            arguments: as typed.
+            sections: of settings whose options are set whether the app's own file has them or not,
+                as by Hydra's ++.
+
+        Raises:
+            PermissionError: a flag that chooses configs of other apps, or that unpickles a file;
+                configs of Hydra's own in a folder from elsewhere.
+            FileNotFoundError: no folder is there.
+        """
+        flags, overrides, paths, rest = [], [], [], iter(arguments)
+        for argument in rest:
+            key, sign, value = argument.partition("=")
+            if key in ("--config-dir", "-cd"):
+                folder = Path(value if sign else next(rest, "")).absolute()
+                if not folder.is_dir():
+                    raise FileNotFoundError(f"Expected a folder of configs, got {folder}")
+                paths.append(f"file://{folder}")
+            elif argument.startswith("--e"):
+                raise PermissionError(
+                    "--experimental-rerun unpickles a file, which can run anything; use "
+                    "resume=<run folder>"
+                )
+            elif argument.startswith(("--co", "-cd", "-cp", "-cn")):
+                raise PermissionError(
+                    f"{argument}: --config-path and --config-name of other apps are not allowed; "
+                    f"use --config-dir=..."
+                )
+            elif argument.startswith("-") or not (sign or argument.startswith("~")):
+                flags.append(argument)
+            elif key == "hydra.searchpath":
+                typed: Any = OverridesParser.create().parse_override(argument).value()
+                paths += typed or []
+            else:
+                set_anyway = "++" if "." in key and key.partition(".")[0] in sections else ""
+                overrides.append(f"{set_anyway}{key}{sign}{quoted_path(value)}")
+        packages = [path for path in paths if path.startswith("pkg://")]
+        folders = [path.removeprefix("file://") for path in paths if path not in packages]
+        if hydras := [folder for folder in folders if Path(folder, "hydra").exists()]:
+            raise PermissionError(
+                f"{shown(hydras)} has configs of Hydra's own; expected none in a folder of "
+                f"experiments"
+            )
+        if paths:
+            checked = [f"{UNTRUSTED}://{folder}" for folder in folders]
+            overrides.insert(0, f"hydra.searchpath={quoted([*packages, *checked])}")
+        return cls(flags, overrides, folders)
+
+    @property
+    def sweeps(self) -> bool:
+        """Whether a flag asks for a sweep."""
+        return not {"-m", "--multirun"}.isdisjoint(self.flags)
+
+
+def checked_configs(
+    app: str, command: CommandLine, trusted: Sequence[Path]
+) -> Iterator[DictConfig]:
+    """The configs that Hydra would run with: of a sweep, that of the sweep itself, then those of
+    its jobs.
+
+    Every combination of the choices of config groups is among these jobs, and every value of
+    another setting once.
+
+    Args:
+        app: name of its file of settings.
+        command: what was typed.
+        trusted: folders of configs; the first is mvrecon's own.
 
     Raises:
-        PermissionError: a file from elsewhere sets what only the command line may, or reads
-            environment variables.
-        LookupError: a setting that the app does not use.
+        PermissionError: a file from elsewhere sets what only the command line may, or its jobs
+            would be composed in other processes.
         Refused: a YAML file that is too large, or a `name` that leads out of the folder of outputs.
+        HydraException: no such choice or setting.
     """
-    # fills the registry with classes of its own, other than those that an import gives
-    Plugins.instance()
-    files: Any = SourcesRegistry.instance().resolve("file")
-    load, read = ConfigLoaderImpl.load_configuration, files.load_config
-    trusted = {str(folder) for folder in (main, *others)}
+    parser, lines = OverridesParser.create(), command.overrides
 
-    def loaded(loader: Any, config_name: str, overrides: list[str], **options: Any) -> DictConfig:
-        def composed(of: list[str]) -> DictConfig:
-            return load(loader, config_name, of, **options)
-
-        config = composed(overrides)
-        foreign = [
-            s.path
-            for s in config.hydra.runtime.config_sources
-            if s.schema == "file" and s.path not in trusted
-        ]
-        if foreign:
-            if not any((folder / f"{config_name}.yaml").is_file() for folder in (main, *others)):
-                raise PermissionError(
-                    f"--config-name={config_name} is no app of mvrecon's; choose an experiment=..."
-                )
-            check_foreign(config, foreign, overrides, composed)
-        config = _named(used(config, composed([]) if overrides else config))
-        if check is not None:
-            check(config)
+    def checked(overrides: list[str]) -> DictConfig:
+        config = hydra.compose(app, overrides, return_hydra_config=True)
+        if command.folders:
+            typed = [line for line in lines if line.lstrip("+~").startswith(("hydra", "out="))]
+            check_foreign(config, hydra.compose(app, typed, return_hydra_config=True), typed)
+        for part in str(config.name).split("/") if "name" in config else []:
+            plain_name(part, f"The setting name={config.name}")
         return config
 
-    def bounded(source: Any, config_path: str) -> Any:
-        path = Path(source.path) / source._normalize_file_name(config_path)
-        if source.path not in trusted and path.is_file():
-            yaml_of(path)
-        return read(source, config_path)
+    with hydra.initialize_config_dir(str(trusted[0]), version_base=VERSION_BASE):
+        typed = parser.parse_overrides(lines)
+        fixed = [o.input_line or "" for o in typed if not o.is_sweep_override()]
+        config = checked(fixed)
+        if not command.sweeps and config.hydra.mode != RunMode.MULTIRUN:
+            yield config if len(fixed) == len(lines) else checked(lines)  # Hydra refuses these
+            return
+        yield config
+        if command.folders and config.hydra.runtime.choices["hydra/launcher"] != "basic":
+            raise PermissionError(
+                f"A sweep by another launcher composes its jobs in other processes, where configs "
+                f"are not checked; expected no --config-dir, got {shown(command.folders)}"
+            )
+        params = config.hydra.sweeper.get("params") or {}
+        varied = parser.parse_overrides([f"{key}={value}" for key, value in params.items()])
+        if command.folders and not any("hydra.sweeper.params" in line for line in lines):
+            check_varied(varied)
+        for job in sweep_jobs([*varied, *typed], [*trusted, *map(Path, command.folders)]):
+            yield checked(job)
 
-    ConfigLoaderImpl.load_configuration, files.load_config = loaded, bounded  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        ConfigLoaderImpl.load_configuration, files.load_config = load, read
 
-
-def used(config: DictConfig, app: DictConfig) -> DictConfig:
-    """Return the config if every top-level key is one of the app's; Hydra itself accepts any
-    `+key=...`.
-
-    Raises:
-        LookupError: a key that the app does not have, so that nothing would come of it; the message
-            names it.
+def sweep_jobs(overrides: Sequence[Override], folders: Sequence[Path]) -> Iterator[list[str]]:
+    """The overrides of a sweep's jobs, of the settings beside config groups one value at a time; a
+    range that is not discrete chooses no file, and is left out.
     """
-    # `key in app` is false for a setting that the user has yet to give
-    allowed = {str(key) for key in app}
-    if unused := [str(key) for key in config if key not in allowed]:
-        raise LookupError(
-            f"This app does not use the setting {unused[0]!r}{hint(unused[0], allowed - {'hydra'})}"
-        )
-    return config
+    groups, others = {}, {}
+    for override in overrides:
+        key = override.get_key_element()
+        if not override.is_sweep_override():
+            lines = [f"{key}={override.get_value_element_as_str()}"]
+        elif override.is_discrete_sweep():
+            lines = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        else:
+            continue
+        group = override.key_or_group.partition("@")[0]
+        is_group = any((folder / group).is_dir() for folder in folders)
+        (groups if is_group else others)[key] = lines  # of a key that stands twice, the later one
+    first = {key: lines[0] for key, lines in others.items()}
+    for choice in itertools.product(*groups.values()):
+        yield [*choice, *first.values()]
+    choice = [lines[0] for lines in groups.values()]
+    for key, lines in others.items():
+        for line in lines[1:]:
+            yield [*choice, *(first | {key: line}).values()]
 
 
-def _named(config: DictConfig) -> DictConfig:
-    for part in str(config.name).split("/") if "name" in config else []:
-        plain_name(part, f"The setting name={config.name}")
-    return config
-
-
-def check_foreign(
-    config: DictConfig,
-    folders: list[str],
-    overrides: list[str],
-    compose: Callable[[list[str]], DictConfig],
-) -> None:
+def check_foreign(config: DictConfig, expected: DictConfig, typed: Sequence[str]) -> None:
     """Check that files from elsewhere change neither Hydra's own section nor `out`, the folder that
     an app writes to.
 
+    Args:
+        config: composed.
+        expected: composed without these files.
+        typed: overrides of Hydra's section and of `out` on the command line.
+
     Raises:
-        PermissionError: they differ, or the folders' files cannot be told apart.
+        PermissionError: they differ.
         Refused: an `out` that is made of settings which lead out of the folder of outputs.
     """
-    if any((Path(folder) / "hydra").exists() for folder in folders):
-        raise PermissionError(
-            f"{shown(folders)} has configs of Hydra's own; expected none in a folder of experiments"
-        )
-    if not any(
-        source.provider == "main" and source.path not in folders
-        for source in config.hydra.runtime.config_sources
-    ):
-        raise PermissionError(
-            "--config-path and --config-name of other apps are not allowed; use --config-dir"
-        )
-    trusted = compose(
-        [line for line in overrides if line.lstrip("+~").startswith(("hydra", "out="))]
+    found, allowed = (
+        dict(flatten({key: plain[key] for key in ("hydra", "out") if key in plain}))
+        for plain in (OmegaConf.to_container(c, resolve=False) for c in (config, expected))
+        if isinstance(plain, dict)
     )
-    section, expected = (dict(leaves(_hydra(c))) for c in (config, trusted))
-    changed = sorted(
-        name
-        for keys in {**section, **expected}
-        if section.get(keys) != expected.get(keys) and not _open(name := ".".join(map(str, keys)))
-    )
-    if changed:
+    names = {".".join(map(str, k)) for k in {**found, **allowed} if found.get(k) != allowed.get(k)}
+    if changed := sorted(name for name in names if not OPEN.match(f"{name}.")):
         raise PermissionError(f"A config sets {shown(changed)}; only a command line may")
-    if "out" in config and not any(line.startswith("out=") for line in overrides):
+    if "out" in config and not any(line.startswith("out=") for line in typed):
         for part in str(config.out).split("/"):
             plain_name(part, f"The setting out={config.out}")
-    settings = OmegaConf.to_yaml(
-        OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    )
-    if "oc.env" in settings and not any("oc.env" in line for line in overrides):
-        raise PermissionError(
-            "A config reads environment variables by ${oc.env:...}; only a command line may"
-        )
 
 
-def _hydra(config: DictConfig) -> dict[str, Any]:
-    """Hydra's own section as it is written, and the folder of outputs that it refers to."""
-    written: Any = OmegaConf.to_container(config, resolve=False)
-    return {key: written[key] for key in ("hydra", "out") if key in written}
+def check_varied(overrides: Sequence[Override]) -> None:
+    """Check what an experiment's `hydra.sweeper.params` varies, which becomes the overrides and the
+    names of a sweep's jobs.
 
-
-def _open(key: str) -> bool:
-    return any(f"{key}.".startswith(f"hydra.{prefix}.") for prefix in OPEN)
+    Raises:
+        PermissionError: a setting of Hydra's own, `out`, or a value with a path in it.
+    """
+    for override in overrides:
+        line = override.input_line or ""
+        if override.key_or_group.startswith("hydra") or override.key_or_group == "out":
+            raise PermissionError(
+                f"A config sets {shown(line)} in hydra.sweeper.params; only a command line may"
+            )
+        if set("/\\") & set(line):
+            raise PermissionError(
+                f"A config varies {shown(line)} in hydra.sweeper.params; expected no path there"
+            )

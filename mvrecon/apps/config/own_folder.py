@@ -7,14 +7,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from mvrecon.apps.config import conf_dir, plugin_conf_dirs, quoted
+from mvrecon.apps.config.guard import quoted
 from mvrecon.core.files.atomic import check_plain, new_folder
-from mvrecon.core.files.checks import shown
-from mvrecon.core.files.rank import world
 from mvrecon.core.files.runs import run_around
+from mvrecon.core.machine import world
 
-#: Hydra's own way to run the jobs of a sweep: one after the other, in this process.
-IN_TURN = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 #: Where Hydra keeps the names of settings that the names of a sweep's runs leave out.
 UNNAMED = "hydra.job.config.override_dirname.exclude_keys"
 
@@ -44,13 +41,7 @@ class OwnFolder(Callback):
         self._prepare(config, "hydra.run.dir", {})
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """A sweep's folder.
-
-        Raises:
-            PermissionError: the sweep's jobs would compose configs from elsewhere in processes of
-                their own, which do not check them.
-        """
-        check_launcher(config)
+        """A sweep's folder."""
         tasks = OverridesParser.create().parse_overrides(list(config.hydra.overrides.task))
         fixed = [task.key_or_group for task in tasks if not task.is_sweep_override()]
         self._prepare(config, "hydra.sweep.dir", {UNNAMED: fixed})
@@ -72,23 +63,3 @@ class OwnFolder(Callback):
             return new_folder(OmegaConf.select(config, key))
         check_plain(run)  # before Hydra opens a log in it
         return run
-
-
-def check_launcher(config: DictConfig) -> None:
-    """Check that a sweep whose jobs run in other processes takes no config from elsewhere: what
-    `guarded` replaces is replaced in this process alone.
-
-    Raises:
-        PermissionError: it does; the message names the folders.
-    """
-    trusted = {str(folder) for folder in (conf_dir(), *plugin_conf_dirs())}
-    foreign = [
-        source.path
-        for source in config.hydra.runtime.config_sources
-        if source.schema == "file" and source.path not in trusted
-    ]
-    if foreign and config.hydra.launcher._target_ != IN_TURN:
-        raise PermissionError(
-            f"A sweep by {config.hydra.launcher._target_} composes its jobs in other processes, "
-            f"where configs are not checked; expected no --config-dir, got {shown(foreign)}"
-        )

@@ -131,19 +131,15 @@ def check_plain(folder: Path) -> None:
     """
     for parent, folders, files in os.walk(folder):  # does not follow links
         for path in (Path(parent, name) for name in (*folders, *files)):
-            if _leads_elsewhere(path):
+            try:
+                kind = path.lstat().st_mode
+            except FileNotFoundError:  # its writer has just put it in its place
+                continue
+            if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
                 raise PermissionError(
                     f"{folder} holds {path.relative_to(folder)}, a link, a pipe or a device; "
                     f"expected files and folders"
                 )
-
-
-def _leads_elsewhere(path: Path) -> bool:
-    try:
-        kind = path.lstat().st_mode
-    except FileNotFoundError:  # its writer has just put it in its place
-        return False
-    return not (stat.S_ISREG(kind) or stat.S_ISDIR(kind))
 
 
 def _flush(path: Path, flags: int) -> None:

@@ -26,7 +26,7 @@ class Refused(ValueError):
 
 
 @contextmanager
-def blaming(
+def file_errors(
     path: str | Path, what: str, hint: str = "is it cut short or damaged?"
 ) -> Iterator[None]:
     """Context that turns any error of a library into one that names the file: a damaged file can
@@ -72,7 +72,7 @@ def yaml_of(path: str | Path) -> Any:
     import yaml
 
     text = text_of(path, YAML)
-    with blaming(path, "is not YAML"):
+    with file_errors(path, "is not YAML"):
         loader = yaml.SafeLoader(text)
         root = loader.get_single_node()
         if root is not None and _unfolded(root, {}) > NODES:

@@ -1,15 +1,20 @@
-"""Files of a run folder by name; its settings one by one, and its table of results."""
+"""Files of a run folder by name: its settings one by one, its tables of results and of figures
+(CSV), and files of weights.
+"""
 
+import csv
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.atomic import check_plain
-from mvrecon.core.files.checks import Refused, blaming, shown, text_of
+from mvrecon.core.files.atomic import check_plain, written_whole
+from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 
 SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
+#: Trained weights that are part of mvrecon.
+WEIGHTS = Path(__file__).parents[2] / "weights"
 
 
 def folder_of_run(path: str | Path) -> Path:
@@ -46,19 +51,54 @@ def read_results(folder: Path) -> dict[str, Any]:
         Refused: it has none, or the file is none of a run's.
     """
     path = folder / RESULTS
-    with blaming(path, "is no table of results"):
+    with file_errors(path, "is no table of results"):
         table = json.loads(text_of(path))
     if not isinstance(table, dict) or "methods" not in table:
         raise Refused(f"{path}: expected a table of results, got {shown(table)}")
     return table
 
 
-def leaves(settings: Any, keys: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+def flatten(settings: Any, keys: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """List the values of nested mappings, each with its keys from the outermost on; an empty
     mapping is a value.
     """
     if isinstance(settings, Mapping) and settings:
         for key, value in settings.items():
-            yield from leaves(value, (*keys, key))
+            yield from flatten(value, (*keys, key))
     else:
         yield keys, settings
+
+
+def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a CSV file, whole or not at all; the names of the first row are its header.
+
+    Raises:
+        ValueError: a row with a name that the first does not have.
+    """
+    with written_whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read_rows(path: str | Path) -> list[dict[str, Any]]:
+    """Read the rows of a CSV file with texts as values; none of a file that is not there."""
+    if not Path(path).exists():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def shipped_weights() -> dict[str, Path]:
+    """The files of trained weights that are part of mvrecon, by name."""
+    return {path.stem: path for path in sorted(WEIGHTS.glob("*.safetensors"))}
+
+
+def of_weights(path: str | os.PathLike[str]) -> Path:
+    """The absolute path of a checkpoint; a name at which nothing is may be that of weights that are
+    part of mvrecon.
+    """
+    local = Path(path).expanduser()
+    return (
+        local.absolute() if local.exists() else shipped_weights().get(str(path), local.absolute())
+    )

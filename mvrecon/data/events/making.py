@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.numbers import generator, mixed, uniform
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
-from mvrecon.core.random_numbers import generator, mixed, uniform
 from mvrecon.core.registry import check_options
 from mvrecon.data.acquisition.acquired import NOISE, Acquired
 from mvrecon.data.acquisition.detector import counted, emitted

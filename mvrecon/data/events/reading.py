@@ -12,7 +12,7 @@ import h5py
 import torch
 from torch.utils.data import Dataset
 
-from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.core.registry import hint
 from mvrecon.data.events.shards import EXPECTED, checked, header_of
 from mvrecon.data.hdf5 import reading
@@ -82,7 +82,7 @@ class Events(Dataset[dict[str, Any]]):
         row = item - (self._ends[shard - 1] if shard else 0)
         path, arrays = self.paths[shard], self._arrays(shard)
         event: dict[str, Any] = {}
-        with blaming(path, f"event {row} cannot be read", "is it damaged?"):
+        with file_errors(path, f"event {row} cannot be read", "is it damaged?"):
             for name in self.names:
                 if (shard, row, name) not in self._sound:
                     check_chunks(path, arrays[name], row)
@@ -102,7 +102,7 @@ class Events(Dataset[dict[str, Any]]):
             self._reset()
         if shard not in self._files:
             path = self.paths[shard]
-            with blaming(path, "cannot be opened", f"expected {EXPECTED}"):
+            with file_errors(path, "cannot be opened", f"expected {EXPECTED}"):
                 file = reading(path)
                 arrays = checked(path, file)
             self._files[shard] = file, arrays

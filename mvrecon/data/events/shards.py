@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, blaming, shown
+from mvrecon.core.files.checks import Refused, file_errors, shown
 from mvrecon.data.hdf5 import FORMAT, reading
 from mvrecon.data.storage import check_chunks, dataset_in
 from mvrecon.data.texts import variable
@@ -94,7 +94,7 @@ def header_of(path: Path) -> tuple[Header, int]:
         Refused: not a file of events, cut short, or with arrays that do not agree.
     """
     with (
-        blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
+        file_errors(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
         reading(path) as file,
     ):
         return _header(path, file), len(checked(path, file)["index"])
@@ -139,7 +139,7 @@ def verify(path: Path) -> None:
         Refused: it is damaged; the message names it.
     """
     with (
-        blaming(path, "is damaged", "delete it to have it made again"),
+        file_errors(path, "is damaged", "delete it to have it made again"),
         reading(path) as file,
     ):
         for array in checked(path, file).values():

@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, Refused, blaming, check_file
+from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors
 from mvrecon.data.hdf5 import reading
 from mvrecon.data.itk import itk_image
 from mvrecon.data.projections.stack import ProjectionStack
@@ -29,7 +29,7 @@ class NpyViews(ProjectionStack):
 
     def __init__(self, path: Path):
         check_file(path, "a NumPy array [m v u]")
-        with blaming(path, "cannot be read as a NumPy array"):
+        with file_errors(path, "cannot be read as a NumPy array"):
             self._array = np.lib.format.open_memmap(path, mode="r")
         if self._array.ndim == 2:
             self._array = self._array[None]
@@ -95,7 +95,7 @@ class Hdf5Views(ProjectionStack):
     @contextmanager
     def _opened(path: Path) -> Iterator[h5py.File]:
         with (
-            blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
+            file_errors(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
             reading(path) as file,
         ):
             yield file

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, Refused, blaming, check_file, shown
+from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.data.dicom import dicom_file, frames_of, header_of, pixels_of
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 
@@ -229,7 +229,7 @@ def field_files(folder: Path, field: str) -> list[Path]:
 
 def _images(folder: Path, pattern: str | None = None) -> list[Path]:
     files = []
-    with blaming(folder, f"has no names like {pattern!r}", "expected such as scan_*.tif"):
+    with file_errors(folder, f"has no names like {pattern!r}", "expected such as scan_*.tif"):
         inside = sorted(folder.glob(pattern or "*"))
     for file in inside:
         if file.is_file() and not file.name.startswith(".") and _ending(file):
@@ -254,7 +254,7 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
     numbers: dict[Path, int | None] = {}
     series = set()
     for file in files:
-        with blaming(file, "has an InstanceNumber that cannot be read"):
+        with file_errors(file, "has an InstanceNumber that cannot be read"):
             dataset = header_of(file)
             number = dataset.get("InstanceNumber")
             numbers[file] = None if number is None else int(number)
@@ -295,7 +295,7 @@ def header(file: Path) -> Header:
         Refused: not such an image, in colour, or with pages of several sizes.
     """
     check_file(file, "an image (TIFF, PNG or DICOM)")
-    with blaming(file, "cannot be read as an image"):
+    with file_errors(file, "cannot be read as an image"):
         if file.suffix.lower() not in PILLOW:
             dataset = header_of(file)
             if dataset.get("Modality") == "NM" and frames_of(dataset) > 1:
@@ -341,7 +341,7 @@ def _head(file: Path, image: Any, pages: int) -> Header:
 
 
 def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
-    with blaming(file, f"pages {first} to {last - 1} cannot be read"):
+    with file_errors(file, f"pages {first} to {last - 1} cannot be read"):
         if file.suffix.lower() not in PILLOW:
             values = pixels_of(file)
             yield from values.reshape(-1, *values.shape[-2:])[first:last]

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, blaming
-from mvrecon.core.files.memory import check_memory
+from mvrecon.core.files.checks import Refused, file_errors
+from mvrecon.core.machine import check_memory
 
 #: Views that a stack may have.
 VIEWS = 2**16
@@ -81,7 +81,7 @@ class ProjectionStack(ABC):
             )
         rows, columns = self.shape
         check_memory(8 * (last - first) * rows * columns, f"{last - first} views of {self.path}")
-        with blaming(self.path, f"views {first} to {last - 1} cannot be read"):
+        with file_errors(self.path, f"views {first} to {last - 1} cannot be read"):
             values = torch.from_numpy(self._block(first, last).astype(np.float32))
             if tuple(values.shape) != (last - first, rows, columns):
                 raise Refused(

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.core.files.memory import check_memory
+from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom import dicom_file
 from mvrecon.data.projections.images import PILLOW, ImageFiles, field_files, image_folder

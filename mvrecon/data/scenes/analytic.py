@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.numbers import generator
 from mvrecon.core.quantities import PositiveFloat
-from mvrecon.core.random_numbers import generator
 from mvrecon.data.scenes.sample import Rays, Sample
 from mvrecon.data.scenes.solids import Phantom
 from mvrecon.data.scenes.voxelise import voxelise

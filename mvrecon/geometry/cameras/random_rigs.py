@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.numbers import generator, uniform
 from mvrecon.core.quantities import NonNegativeInt, Pair, PositiveFloat, PositiveInt
-from mvrecon.core.random_numbers import generator, uniform
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.detector import Detector
 from mvrecon.geometry.cameras.rigs import arc, circular, dome

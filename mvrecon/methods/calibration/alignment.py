@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.division import divided
+from mvrecon.core.numbers import divided
 from mvrecon.operators.operator import LinearOperator
 
 

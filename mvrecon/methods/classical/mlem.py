@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.division import divided
+from mvrecon.core.numbers import divided
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.methods.classical.poisson import (
     PoissonLikelihood,

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.division import divided, positive_mean
+from mvrecon.core.numbers import divided, positive_mean
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels.differences import differences_for
 from mvrecon.kernels.differences.reference import Shrinkage

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.core.division import divided
+from mvrecon.core.numbers import divided
 from mvrecon.core.registry import check_options
 from mvrecon.methods.classical.sirt import inverse_sums
 from mvrecon.methods.learned.geometry import Geometry

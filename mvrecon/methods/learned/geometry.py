@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.core.division import divided
+from mvrecon.core.numbers import divided
 from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.kernels.rays.lines import writes
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt_weights

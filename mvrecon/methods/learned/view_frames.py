@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.division import divided
+from mvrecon.core.numbers import divided
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import to_frustum
 from mvrecon.geometry.cameras.culling import seen_depth_range

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.checks import Refused, blaming, shown, yaml_of
-from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, leaves, read_results
+from mvrecon.core.files.checks import Refused, file_errors, shown, yaml_of
+from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read_results
 
 #: Figures of merit that are compared; larger is better for those of `RISING`.
 FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
@@ -72,7 +72,7 @@ def _runs(place: Path) -> list[Path]:
 
 def _rows(folder: Path, name: str) -> Iterator[Row]:
     table = read_results(folder)
-    with blaming(folder / RESULTS, "is no table of results"):
+    with file_errors(folder / RESULTS, "is no table of results"):
         yield from rows_of(table, name, folder)
 
 
@@ -144,4 +144,4 @@ def _settings(folder: Path) -> Mapping[str, Any]:
 
 
 def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    return ((".".join(map(str, keys)), value) for keys, value in leaves(settings))
+    return ((".".join(map(str, keys)), value) for keys, value in flatten(settings))

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from mvrecon.core.random_numbers import generator, uniform
+from mvrecon.core.numbers import generator, uniform
 from mvrecon.data.scenes.sample import Sample
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid

@@ -4,8 +4,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from mvrecon.core.numbers import generator
 from mvrecon.core.parts import CAMERAS, PROJECTORS
-from mvrecon.core.random_numbers import generator
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.total_variation import gradient
 from mvrecon_baselines.breast import (

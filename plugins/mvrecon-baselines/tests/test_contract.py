@@ -9,10 +9,10 @@ import yaml
 
 import mvrecon_baselines.conf
 from mvrecon.apps.config import compose
-from mvrecon.apps.config.typed import check_parts
 from mvrecon.apps.train import train
-from mvrecon.core.files.tables import read_rows
+from mvrecon.core.files.runs import read_rows
 from mvrecon.core.parts import NETWORKS
+from mvrecon.core.signatures import check_parts
 from mvrecon.methods.learned.baselines import network_by_name
 from mvrecon.methods.method import build_method
 from mvrecon.testing import check_method, check_network

@@ -7,7 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import launch, to_plain
-from mvrecon.core.plugins import import_plugins
+from mvrecon.core.registry import import_plugins
 
 
 def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import launch, to_plain
-from mvrecon.core.plugins import import_plugins
+from mvrecon.core.registry import import_plugins
 
 
 def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
@@ -21,8 +21,8 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
         PermissionError: anything but files and folders is in it.
     """
     import_plugins(settings["plugins"])
-    from mvrecon.core.device import device_of
     from mvrecon.core.files.atomic import claimed
+    from mvrecon.core.machine import device_of
     from mvrecon.training import run_folder
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.stresses.stress import Stress

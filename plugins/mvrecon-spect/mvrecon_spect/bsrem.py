@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.division import positive_mean
+from mvrecon.core.numbers import positive_mean
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.methods.classical.mlem import likelihood_of_residual, ordered, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood

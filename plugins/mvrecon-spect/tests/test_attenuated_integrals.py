@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.scenes.attenuating import attenuated_integrals

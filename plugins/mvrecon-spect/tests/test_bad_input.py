@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import SimulateSettings, compose
 from mvrecon.apps.simulate import simulate
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import save_volume
@@ -133,7 +133,7 @@ def test_the_app_refuses_them_before_it_writes(tmp_path: Path, options: list, me
     """`mvrecon-simulate` refuses a rig or options that pinholes cannot have, in one sentence."""
     with pytest.raises((TypeError, ValueError), match=message) as refusal:
         settings = compose("scene=derenzo", *options, config_name="simulate")
-        simulate(settings, tmp_path / "run")
+        simulate(SimulateSettings(**settings), tmp_path / "run")
     assert not (tmp_path / "run").exists() and str(refusal.value).count("Expected") <= 1
 
 

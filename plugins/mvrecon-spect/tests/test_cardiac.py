@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.solids import Phantom
 from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mvrecon.apps.config import compose
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.dataset import SceneDataset

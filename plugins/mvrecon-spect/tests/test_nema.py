@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.scenes.nema import CIRCLE, DIAMETERS, Nema

@@ -7,7 +7,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.apps.config import compose
-from mvrecon.apps.config.typed import check_parts
+from mvrecon.core.signatures import check_parts
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.fit import build_data, build_module, methods
 from mvrecon.training.module import build_projector

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import ReconstructSettings, compose
 from mvrecon.apps.reconstruct import reconstruct
 from mvrecon.apps.scan import open_scan
 from mvrecon.core import registry
@@ -216,28 +216,34 @@ def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
         "grid.spacing=2.0",
     )
     settings = compose(*options, config_name="reconstruct")
-    table = reconstruct(settings, tmp_path / "run")
+    table = reconstruct(ReconstructSettings(**settings), tmp_path / "run")
     volume, placed = read_volume(tmp_path / "run" / "volume.nii.gz")
     torch.testing.assert_close(placed.affine, grid.affine)
     assert table["view_nrmse"] < 0.05 and table["unit"] == "activity"
     assert (volume - truth[0, 0]).norm() < 0.3 * truth.norm()
     assert volume.sum().item() == pytest.approx(truth.sum().item(), rel=0.02)
     with pytest.raises(ValueError, match="for the unit HU, got activity"):
-        reconstruct({**settings, "unit": "HU"}, tmp_path / "in_hu")
+        reconstruct(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
 
 
 @pytest.mark.parametrize("name", ["counts.hs", "counts.npy"])
 def test_counts_without_attenuation_are_of_activity_and_have_no_hounsfield_units(tmp_path, name):
     settings = settings_of_counts(tmp_path, name, "projector=spect", "method=osem")
-    assert open_scan(settings).unit == "activity"
+    assert open_scan(**of_scan(settings)).unit == "activity"
     with pytest.raises(ValueError, match="for the unit HU, got activity"):
-        reconstruct({**settings, "unit": "HU"}, tmp_path / "in_hu")
+        reconstruct(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
     assert not (tmp_path / "in_hu").exists()
 
 
 def test_interfile_counts_are_no_line_integrals(tmp_path: Path):
     with pytest.raises(Refused, match="expected line integrals for the projector 'drr'"):
-        open_scan(settings_of_counts(tmp_path, "counts.hs"))
+        open_scan(**of_scan(settings_of_counts(tmp_path, "counts.hs")))
+
+
+def of_scan(settings: dict) -> dict:
+    """The settings that a scan is opened by."""
+    names = ("views", "camera", "grid", "projector", "method")
+    return {name: settings[name] for name in names}
 
 
 def settings_of_counts(folder: Path, name: str, *options: str) -> dict:

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.analytic import render
 from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.cameras.rigs import parallel

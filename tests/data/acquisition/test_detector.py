@@ -6,7 +6,7 @@ import re
 import pytest
 import torch
 
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.acquisition.detector import WIDTH, blurred, detected
 from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.geometry.cameras.rigs import parallel

@@ -6,8 +6,8 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
+from mvrecon.core.numbers import generator
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
-from mvrecon.core.random_numbers import generator
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
 from mvrecon.data.acquisition.rig_errors import RigErrors

@@ -10,7 +10,7 @@ import SimpleITK as sitk
 import torch
 from PIL import Image as Pillow
 
-from mvrecon.core.files import memory
+from mvrecon.core import machine as memory
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.images import INTERLACED, PLAIN, ordered
 from mvrecon.data.projections.views import open_projections

@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
+from mvrecon.core.numbers import generator, mixed
 from mvrecon.core.parts import SCENES
-from mvrecon.core.random_numbers import generator, mixed
 from mvrecon.data.scenes.analytic import render
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.derenzo import RandomDerenzo, derenzo, sector_wells
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.ellipsoids import RandomEllipsoids
 
 

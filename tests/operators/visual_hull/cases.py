@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from mvrecon.core.random_numbers import uniform
+from mvrecon.core.numbers import uniform
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.dcspect80 import dcspect80

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import blaming, text_of
+from mvrecon.core.files.checks import file_errors, text_of
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.detector import Detector, detector_centre
@@ -72,7 +72,7 @@ def read(
         OSError: the file cannot be read.
         ValueError: not such a table, values that are not finite, angles in radians, SID > SDD.
     """
-    with blaming(path, "is not a table of angles"):
+    with file_errors(path, "is not a table of angles"):
         table = _table(text_of(path), {"sid_mm": sid_mm, "sdd_mm": sdd_mm})
         check_degrees(table["angle_degrees"].tolist(), small_arc, "angle_degrees")
         for sid, sdd in zip(table["sid_mm"].tolist(), table["sdd_mm"].tolist(), strict=True):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_astra, to_astra
 from mvrecon.geometry.cameras.detector import Detector
@@ -44,7 +44,7 @@ def read(
     vectors = (
         _npy(Path(path)) if str(path).endswith(".npy") else rows_of(path, number_lines(path), 12)
     )
-    with blaming(path, "is no rig", f"it was read with flip_rows={str(flip_rows).lower()}"):
+    with file_errors(path, "is no rig", f"it was read with flip_rows={str(flip_rows).lower()}"):
         if not 0 < unit_mm < float("inf"):
             raise ValueError(f"expected unit_mm as positive mm, got {unit_mm}")
         cameras = from_astra(vectors * unit_mm, shape, parallel, flip_rows=flip_rows)
@@ -53,7 +53,7 @@ def read(
 
 def _npy(path: Path) -> torch.Tensor:
     """Vectors of a .npy file; its size is checked before any memory is asked for."""
-    with blaming(path, "is not a .npy file of vectors"), path.open("rb") as file:
+    with file_errors(path, "is not a .npy file of vectors"), path.open("rb") as file:
         version = np.lib.format.read_magic(file)
         reader = {
             (1, 0): np.lib.format.read_array_header_1_0,

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_matrix
 from mvrecon.geometry.cameras.detector import Detector
@@ -50,7 +50,7 @@ def read(
     if lines and {len(line) for line in lines} == {4} and len(lines) % 3 == 0:
         lines = [sum(lines[row : row + 3], []) for row in range(0, len(lines), 3)]
     P = rows_of(path, lines, 12).unflatten(1, (3, 4))
-    with blaming(path, "holds no matrices of a cone beam", "are units and pixels as expected?"):
+    with file_errors(path, "holds no matrices of a cone beam", "are units and pixels as expected?"):
         P = _facing(_from_zero(P, first_pixel), torch.tensor([*centre, 1.0], dtype=torch.float64))
         if flip_rows:
             P = torch.stack([P[:, 0], (plate.pixels[0] - 1) * P[:, 2] - P[:, 1], P[:, 2]], dim=1)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, blaming, shown, text_of
+from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.detector import Detector, detector_centre
 from mvrecon.geometry.cameras.formats.text import (
@@ -76,7 +76,7 @@ def read(
     if not flip_rows:
         raise Refused(f"{path}: RTK's rows run upwards; expected flip_rows=true, got false")
     text, plate = DOCTYPE.sub("", text_of(path), count=1), Detector.of(detector)
-    with blaming(path, "is not an RTK geometry"):
+    with file_errors(path, "is not an RTK geometry"):
         if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
             raise ValueError("expected no document type but RTKGEOMETRY, and no entities")
         table = _table(ElementTree.fromstring(text))

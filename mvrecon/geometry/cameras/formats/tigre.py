@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, blaming, shown, text_of
+from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.detector import Detector, detector_centre
@@ -52,7 +52,7 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
     """
     if not flip_rows:
         raise Refused(f"{path}: TIGRE's rows run upwards; expected flip_rows=true, got false")
-    with blaming(path, "is not a geometry of TIGRE's"):
+    with file_errors(path, "is not a geometry of TIGRE's"):
         return from_world(_cameras(_checked(json.loads(text_of(path)))), world)
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import torch
 
-from mvrecon.core.device import device_of
+from mvrecon.core.machine import device_of
+from mvrecon.core.numbers import generator
 from mvrecon.core.parts import SCENES
-from mvrecon.core.random_numbers import generator
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras import rigs
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from mvrecon.core.files.memory import peak
+from mvrecon.core.machine import peak
 
 Call = Callable[[], Any]
 #: A fast call is repeated until it took so many seconds, or MORE times as often as asked.

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.numbers import generator
 from mvrecon.core.parts import CAMERAS, SCENES
-from mvrecon.core.random_numbers import generator
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.body import body, enclosed
 from mvrecon.data.scenes.analytic import AnalyticScene

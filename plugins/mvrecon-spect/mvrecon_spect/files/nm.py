@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.data.dicom import frames_of, header_of, pixels_of
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -84,9 +84,9 @@ def read_nm(path: str | Path) -> NmStudy:
     pixels = torch.from_numpy(pixels_of(path)).reshape(frames, dataset.Rows, dataset.Columns)
     if not (pixels >= 0).all():
         raise Refused(f"{path}: expected counts, not negative, got {pixels.min().item():g}")
-    with blaming(path, "has no PixelSpacing in mm"):
+    with file_errors(path, "has no PixelSpacing in mm"):
         down, along = (float(step) for step in dataset.PixelSpacing)
-    with blaming(path, "describes its windows, detectors or rotations wrongly"):
+    with file_errors(path, "describes its windows, detectors or rotations wrongly"):
         views = tuple(_view(dataset, key) for key in known)
         energies = tuple(_window(dataset, index) for index in windows)
     counts = tuple(pixels[[order[w, key] for key in known]][None, None] for w in windows)

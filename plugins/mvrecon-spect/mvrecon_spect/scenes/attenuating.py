@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.random_numbers import generator
+from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.analytic import AnalyticScene
 from mvrecon.data.scenes.sample import Rays, Sample
 from mvrecon.data.scenes.solids import PAIRS, Phantom

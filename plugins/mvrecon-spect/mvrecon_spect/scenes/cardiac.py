@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.random_numbers import generator, uniform
+from mvrecon.core.numbers import generator, uniform
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_degrees, euler_rotation, random_in_ball, unit

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.numbers import generator, mixed
 from mvrecon.core.parts import CAMERAS, SCENES
-from mvrecon.core.random_numbers import generator, mixed
 from mvrecon.data.acquisition.detector import detected
 from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
-from mvrecon.core.random_numbers import generator, mixed, uniform
+from mvrecon.core.numbers import generator, mixed, uniform
 from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy
 from mvrecon.data.body import body, enclosed
 from mvrecon.data.resample import resample

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.apps.sanity_checks import doubts, oriented_nrmse
+from mvrecon.apps.sanity_checks import oriented_nrmse, sanity_checks
 from mvrecon.apps.scan import Scan
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.projections.views import Corrected
@@ -50,8 +50,8 @@ def scan_of(views, projector="drr"):
     return Scan(InMemory(views), RIG, GRID, {"name": projector})
 
 
-def test_a_right_scan_raises_no_doubt(views):
-    assert doubts(scan_of(views), "fdk", 0.05) == []
+def test_a_right_scan_passes_every_check(views):
+    assert sanity_checks(scan_of(views), "fdk", 0.05) == []
 
 
 def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):
@@ -60,16 +60,16 @@ def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):
     assert figures["columns reversed"] == pytest.approx(oriented_nrmse(scan_of(views))["stored"])
     backwards = replace(scan_of(views), cameras=RIG[[0, *range(23, 0, -1)]])
     for wrong in (scan_of(views.flip(-1)), backwards):
-        (words,) = doubts(wrong, "fdk", 0.1)
+        (words,) = sanity_checks(wrong, "fdk", 0.1)
         assert "columns reversed" in words and "views.flip_columns" in words
 
 
 def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
     """Counts taken for line integrals, and a volume that does not explain its views, are told."""
     counts = scan_of((4e4 * torch.exp(-views)).round())
-    (words,) = doubts(counts, "fdk", 0.5)
+    (words,) = sanity_checks(counts, "fdk", 0.5)
     assert "expected line integrals, got whole numbers up to" in words
-    assert "osem" not in "".join(doubts(counts, "osem", 0.1))
+    assert "osem" not in "".join(sanity_checks(counts, "osem", 0.1))
 
 
 @pytest.mark.parametrize("shape", [(24, 26), (12, 30)])
@@ -77,18 +77,18 @@ def test_views_whose_axes_were_exchanged_are_told(shape):
     """Views stored as [u, v], whose detector has the file's number of pixels, are told."""
     rig = circular(12, 300.0, 450.0, {"pixels": list(shape), "pixel_mm": 6.0})
     right = Drr(GRID, rig)(two_cubes())[0, 0]
-    assert doubts(Scan(InMemory(right), rig, GRID, {"name": "drr"}), "fdk", 0.05) == []
+    assert sanity_checks(Scan(InMemory(right), rig, GRID, {"name": "drr"}), "fdk", 0.05) == []
     taken = rig.transposed()  # of the file's rows and columns
     for stored, what in (
         (right.mT, "exchanged fit"),
         (right.flip(-1).mT, "exchanged and columns reversed fit"),
     ):
         wrong = Scan(InMemory(stored), taken, auto_grid(taken), {"name": "drr"})
-        (words,) = doubts(wrong, "fdk", 0.4)
+        (words,) = sanity_checks(wrong, "fdk", 0.4)
         assert what in words and "swapaxes(1, 2)" in words
 
 
-def test_a_plugins_own_words_decide_what_is_doubted(views, monkeypatch):
+def test_a_plugins_own_words_decide_what_is_checked(views, monkeypatch):
     """A projector says what its pixels are, a method what its views are, whatever its name;
     every view is read once.
     """
@@ -99,17 +99,19 @@ def test_a_plugins_own_words_decide_what_is_doubted(views, monkeypatch):
     METHODS.register("of_lines")(lambda A, views: views)
     METHODS.register("of_counts")(declares(data_kind="counts")(lambda A, counts: counts))
     counts = (4e4 * torch.exp(-views)).round()
-    assert "whole numbers" in "".join(doubts(scan_of(counts, "as_lines"), "of_lines", 0.1))
-    assert "whole numbers" not in "".join(doubts(scan_of(counts, "as_lines"), "of_counts", 0.1))
-    assert doubts(scan_of(counts, "doubled"), "of_lines", 0.1) == []
-    (words,) = doubts(scan_of(views, "doubled"), "of_lines", 0.5)
+    assert "whole numbers" in "".join(sanity_checks(scan_of(counts, "as_lines"), "of_lines", 0.1))
+    assert "whole numbers" not in "".join(
+        sanity_checks(scan_of(counts, "as_lines"), "of_counts", 0.1)
+    )
+    assert sanity_checks(scan_of(counts, "doubled"), "of_lines", 0.1) == []
+    (words,) = sanity_checks(scan_of(views, "doubled"), "of_lines", 0.5)
     assert "does not explain" in words
     scan = scan_of(views.flip(-1), "as_lines")
-    assert "columns reversed" in "".join(doubts(scan, "of_lines", 0.1))
+    assert "columns reversed" in "".join(sanity_checks(scan, "of_lines", 0.1))
     assert scan.measured.ranges == [(n, n + 1) for n in range(24)], "every view once"
-    (words,) = doubts(scan_of(views, "doubled"), "of_counts", 0.5)
+    (words,) = sanity_checks(scan_of(views, "doubled"), "of_counts", 0.5)
     assert "expected counts, got numbers that are not whole" in words
-    assert doubts(scan_of(views, "doubled"), "of_counts", 0.1) == []
+    assert sanity_checks(scan_of(views, "doubled"), "of_counts", 0.1) == []
 
 
 @pytest.mark.parametrize("factor", [1.0, 5.7e-5])
@@ -125,13 +127,13 @@ def test_few_counts_need_not_be_explained_better_than_their_noise_lets_them(
     noise = ((counts - mean).norm() / counts.norm()).item()
     assert (noise > 0.25) == (level < 1)
     scan = scan_of(factor * counts, "doubled")
-    assert doubts(scan, "osem", noise) == []
-    (words,) = doubts(scan, "osem", max(0.25, noise) * 1.5)
+    assert sanity_checks(scan, "osem", noise) == []
+    (words,) = sanity_checks(scan, "osem", max(0.25, noise) * 1.5)
     assert "does not explain" in words
 
 
 @pytest.mark.parametrize("slices", [1, 12])
-def test_parallel_beams_raise_no_doubt_of_their_own(slices):
+def test_parallel_beams_pass_every_check(slices):
     """Reversed columns of a parallel scan are those of the object turned by half a circle."""
     rig = parallel(24, {"pixels": [slices, 26], "pixel_mm": [6.0, 6.0]})
     grid = Grid.centred(size=(16, 16, slices), spacing=6.0)
@@ -139,4 +141,4 @@ def test_parallel_beams_raise_no_doubt_of_their_own(slices):
     mu[..., 3:7, 4:11] = 0.02
     mu[..., 9:12, 10:13] = 0.04
     scan = Scan(InMemory(Radon(grid, rig)(mu)[0, 0]), rig, grid, {"name": "radon"})
-    assert doubts(scan, "fbp", 0.05) == []
+    assert sanity_checks(scan, "fbp", 0.05) == []

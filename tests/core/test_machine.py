@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from mvrecon.core.files.memory import peak, peak_since, restarted_peak
+from mvrecon.core.machine import peak, peak_since, restarted_peak
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the other systems do not tell")

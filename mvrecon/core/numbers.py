@@ -1,9 +1,14 @@
-"""Random numbers that depend on the seed and the case alone."""
+"""Random numbers that depend on the seed and the case alone, and division where the divisor may be
+zero.
+"""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 
 def generator(seed: int, index: int) -> torch.Generator:
@@ -44,3 +49,22 @@ def mixed(seed: int, index: int) -> int:
 def uniform(rng: torch.Generator, low: float, high: float) -> float:
     """A number uniform between two others."""
     return low + (high - low) * torch.rand((), generator=rng, dtype=torch.float64).item()
+
+
+def divided(
+    dividend: Float[Tensor, "*#n"] | float, divisor: Float[Tensor, "*#n"], otherwise: float = 0.0
+) -> Float[Tensor, "*n"]:
+    """Ratio of two tensors where the divisor is positive, elsewhere a number; its gradient is
+    finite in both.
+    """
+    positive = divisor > 0
+    return torch.where(positive, dividend / torch.where(positive, divisor, 1), otherwise)
+
+
+def positive_mean(values: Float[Tensor, "*n"], otherwise: float) -> float:
+    """Mean of the positive values of a tensor, in their unit, or a number where there are none; a
+    GPU is waited for once.
+    """
+    positive = values > 0
+    mean = (torch.where(positive, values, 0).sum() / positive.sum()).item()
+    return otherwise if math.isnan(mean) else mean
