@@ -14,7 +14,7 @@ from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.cpu import columns, packed_volume, plan
 from mvrecon.kernels.rays.cpu import operators as cpu
 from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room_of
-from mvrecon.kernels.rays.cpu.rig import Reads, Slabs, Units, rig_of
+from mvrecon.kernels.rays.cpu.trace import Reads, Slabs, Units, rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from tests.operators.cases import CASES, OPTIONS, Case, noise
@@ -122,7 +122,7 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
 
     narrow = results()
 
-    def wide(volumes, near):
+    def to_accumulation_dtype(volumes, near):
         narrow = packed_volume.store(volumes, near)
         assert narrow.strides.dtype == np.int32
         return narrow._replace(strides=narrow.strides.astype(np.int64))

@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cpu import columns, plan
-from mvrecon.kernels.rays.cpu.rig import rig_of
+from mvrecon.kernels.rays.cpu.trace import rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.operators.cases import CASES, OPTIONS, UPRIGHT, Case, gap, noise
 

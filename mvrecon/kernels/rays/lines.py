@@ -21,11 +21,22 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 
+#: How a ray's integral is made of voxels.
+JOSEPH, SIDDON, TRILINEAR = 0, 1, 2
+METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
 #: The four linear maps of a view in `lines_of`.
 DIRECTION, MOMENT, START, WORLD = range(4)
 #: Axes whose components differ by less than this part tie; the first of them is the main axis, in
 #: every back end.
 TIE = 1e-12
+
+
+def numbered(method: str) -> tuple[int, int]:
+    """The number of a method, and its samples a ray: "trilinear" has them behind its name,
+    ":samples".
+    """
+    name, _, samples = method.partition(":")
+    return METHODS[name], int(samples or 0)
 
 
 def beside(tensor: Tensor, like: Tensor) -> Tensor:

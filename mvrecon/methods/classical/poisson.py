@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.operators.checks import check_measured
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import RaySelection, ViewSelection
@@ -57,7 +57,10 @@ class PoissonLikelihood:
             A,
             ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views),
         )
-        measured, added = wide(self.views(counts)), self.views(_spread(background, counts))
+        measured, added = (
+            to_accumulation_dtype(self.views(counts)),
+            self.views(_spread(background, counts)),
+        )
         bins = {"counts": measured, "background": added}
         faults = [(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]
         full = (measured != 0).flatten(0, 1).any(dim=0)[None, None]
@@ -220,7 +223,7 @@ def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
 def _spread(background: float | Tensor, counts: Tensor) -> Tensor:
     if not isinstance(background, Tensor | int | float):
         raise TypeError(f"Expected a background of one number or views, got {background!r}")
-    like = wide(counts[:0])
+    like = to_accumulation_dtype(counts[:0])
     if not isinstance(background, Tensor):
         return like.new_full((), background).expand(counts.shape)
     added = background.to(like)

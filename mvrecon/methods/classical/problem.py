@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.views import check_finite
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.operators.checks import check, check_measured
 from mvrecon.operators.operator import LinearOperator
 
@@ -142,7 +142,11 @@ def posed(
     within = supported(method, A, options)
     check_measured(views, "views", A.range_shape, A.device)
     check_finite(views, on_gpu=False)
-    views, support, start = wide(views), options.get("support"), options.get("start")
+    views, support, start = (
+        to_accumulation_dtype(views),
+        options.get("support"),
+        options.get("start"),
+    )
     started = start is not None
     if start is None:
         start = views.new_zeros(*views.shape[:2], *A.domain_shape)

@@ -11,8 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.differences import differences_for
-from mvrecon.kernels.differences.reference import Shrinkage, Stride, gradient, gradient_adjoint
+from mvrecon.kernels.differences import (
+    Shrinkage,
+    Stride,
+    differences_for,
+    gradient,
+    gradient_adjoint,
+)
 from mvrecon.operators.operator import LinearOperator
 
 __all__ = [

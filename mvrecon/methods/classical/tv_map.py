@@ -11,8 +11,7 @@ from torch import Tensor
 
 from mvrecon.core.division import divided, positive_mean
 from mvrecon.core.quantities import NonNegativeInt
-from mvrecon.kernels.differences import differences_for
-from mvrecon.kernels.differences.reference import Shrinkage
+from mvrecon.kernels.differences import Shrinkage, differences_for
 from mvrecon.methods.classical.cgls import check_not_negative
 from mvrecon.methods.classical.mlem import admitted, likelihood_of_residual, unexplained, uniform
 from mvrecon.methods.classical.pdhg_tv import RELAXATION

@@ -25,7 +25,7 @@ from mvrecon.geometry.lattice import (
     grid_lattice,
     lattice_maps,
 )
-from mvrecon.kernels.warps.warp import warp
+from mvrecon.kernels.warps import warp
 
 
 def frusta_lattice(cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"]) -> Lattice:

@@ -73,7 +73,7 @@ class ViewFrames:
 
         def of_operator() -> tuple[Frusta, Tensor | None]:
             frusta = device_cached(A.cameras, (cut, grid_key(A.grid)), like, frusta_of_rig)
-            mu = A.attenuation()
+            mu = A.mu_map()
             if mu is None:
                 return frusta, None
             mu = mu.detach().to(like)

@@ -12,7 +12,7 @@ from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.geometry.sample import normalised, sample
-from mvrecon.kernels.warps.warp import WARP, warp
+from mvrecon.kernels.warps import WARP, warp
 from mvrecon.methods.learned.frusta import frusta_lattice
 from tests.kernels.warps.scenes import (
     DEPTH,
@@ -129,7 +129,6 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
 
 
 def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
-    from mvrecon.kernels import padding
     from mvrecon.kernels.warps import cpu as warp_cpu
 
     assert (

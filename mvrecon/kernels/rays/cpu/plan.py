@@ -14,14 +14,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.box import Box, Three
-from mvrecon.kernels.padding import padded_shape
 from mvrecon.kernels.rays.cpu.columns import columnar
 from mvrecon.kernels.rays.cpu.footprint import spans_of
-from mvrecon.kernels.rays.cpu.lanes import LANES
-from mvrecon.kernels.rays.cpu.rig import Columns, Reads, Rig, bounds_of, rig_of
-from mvrecon.kernels.rays.lines import DIRECTION, START, shifted
+from mvrecon.kernels.rays.cpu.summation import LANES
+from mvrecon.kernels.rays.cpu.trace import Columns, Reads, Rig, bounds_of, rig_of
+from mvrecon.kernels.rays.lines import DIRECTION, START, TRILINEAR, shifted
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of, bricks_of_rig
-from mvrecon.kernels.rays.trace import TRILINEAR
+from mvrecon.kernels.rows import padded_shape
 
 #: Bytes of the copy of a piece of the volume.
 BUDGET = 24 * 2**20
@@ -101,7 +100,7 @@ class Plan:
 
     @property
     def units(self) -> int:
-        """How many units the oblique views have, see `loops.walk`."""
+        """How many units the oblique views have, see `loops.ray_span`."""
         return len(self.oblique) * max(self.rig.detector)
 
     @cached_property
@@ -150,17 +149,10 @@ def keyed_plan(key: Key) -> Plan:
 kept_plan = lru_cache(maxsize=PLANS)(keyed_plan)
 
 
-def ray_plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> Plan:
-    """The plan that goes ray by ray, volume by volume, for derivatives in the geometry."""
+def ray_plan_of(scene: Scene, occupancy: Occupancy, parts: int = 1) -> Plan:
+    """The plan that goes ray by ray and volume by volume, in so many pieces of the volumes."""
     rig = scene.rig(occupancy)
-    parts = parts_of(scene.method, occupancy.shape, volumes * itemsize)
     return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, parts)
-
-
-def whole_plan_of(scene: Scene, occupancy: Occupancy) -> Plan:
-    """The plan that goes ray by ray, a ray through all of the volume at once."""
-    rig = scene.rig(occupancy)
-    return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, 1)
 
 
 def _made(rig: Rig, occupancy: Occupancy, lanes: int, parts: int) -> Plan:

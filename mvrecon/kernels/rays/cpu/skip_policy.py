@@ -12,8 +12,8 @@ from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu.footprint import spans_of
 from mvrecon.kernels.rays.cpu.plan import Scene
 from mvrecon.kernels.rays.cpu.summation import empty
+from mvrecon.kernels.rays.cpu.trace import from_centre, main_axis, trace
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
-from mvrecon.kernels.rays.trace import from_centre, main_axis, trace
 from mvrecon.kernels.threads import parallel_for
 
 #: Bricks along an axis that are looked at to guess how many are empty.

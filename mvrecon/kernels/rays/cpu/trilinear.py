@@ -13,8 +13,8 @@ import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.rays.cpu.joseph import Cell, cell, course_of, face_at, hat
+from mvrecon.kernels.rays.cpu.trace import FAR, NEAR, OWN, Slopes, flat_index
 from mvrecon.kernels.rays.occupancy import EDGE
-from mvrecon.kernels.rays.trace import FAR, NEAR, OWN, Slopes, flat_index
 
 
 class Sample(NamedTuple):
@@ -76,7 +76,7 @@ def _local(flat, steps, sample):
 @scalar
 def slopes(store, n, ray, steps):
     """How a ray's sum changes with its place, its samples moving with its ends, as
-    `pose_gradient.Slopes`: the last two are what it gains when the ray's own ends move outwards.
+    `trace.Slopes`: the last two are what it gains when the ray's own ends move outwards.
     """
     flat, count = store.values[n * store.size : (n + 1) * store.size], steps.samples
     course, step = course_of(ray, np.float64), (ray.end - ray.begin) / count
@@ -115,14 +115,14 @@ def slopes(store, n, ray, steps):
 
 
 @scalar
-def cells(ray, span, steps, room):
+def cells(ray, span, steps, scratch):
     """Two of each sample: flat index of a bilinear cell, place in it towards b and c, weight; no
     weight beyond span.
 
     Returns:
         how many there are; where their terms begin, see `summation.fold`.
     """
-    index, y, z, share = room.index, room.one, room.two, room.three
+    index, y, z, share = scratch.index, scratch.one, scratch.two, scratch.three
     whole = index.dtype.type
     course, step = course_of(ray, np.float64), (ray.end - ray.begin) / steps.samples
     first, last = samples_in(ray, steps.samples)

@@ -14,7 +14,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.filtered.filters import Filter, filter_rows, ramp_response
 from mvrecon.methods.classical.filtered.scan_weights import (
     Scan,
@@ -25,7 +25,7 @@ from mvrecon.methods.classical.filtered.scan_weights import (
     scan_of,
 )
 from mvrecon.operators.checks import check_floating, check_views
-from mvrecon.operators.voxel_driven import Images, image_maps, looked
+from mvrecon.operators.voxel_driven import Images, backproject_images, image_maps
 
 
 def pixel_weights(
@@ -189,7 +189,9 @@ def filtered_backprojection(
         check_floating(views, "views")
         near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
         images = near.images._replace(maps=near.images.maps[part])
-        volume = looked(near.filtered(wide(views), part), images, weighted=True)
+        volume = backproject_images(
+            near.filtered(to_accumulation_dtype(views), part), images, weighted=True
+        )
         total = volume if total is None else total.add_(volume)
     assert total is not None  # a rig has at least one camera
     return total

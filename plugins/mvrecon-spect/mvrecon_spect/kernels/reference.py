@@ -1,7 +1,7 @@
-"""The oracle of attenuated rays: the operators of `attenuated_ops.py` in plain torch.
+"""The oracle of attenuated rays: the operators of `ops.py` in plain torch.
 
-It goes through the cells of `reference.py`; derivatives of any order, in the rays too, by torch
-itself.
+It goes through the cells of `mvrecon.kernels.rays.reference`; derivatives of any order, in the rays
+too, by torch itself.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,6 +13,8 @@ from torch import Tensor
 
 from mvrecon.kernels.rays.reference import directions, fractions, weights
 
+#: Behind the name of a method: leave out nothing.
+DENSE = ":dense"
 #: Cells that one segment of constant attenuation has.
 CELLS = {"joseph": 4, "siddon": 1}
 #: Below this optical depth (1 - exp(-m)) / m is its series.
@@ -38,7 +40,8 @@ def project(
         mu: linear attenuation in 1/mm on the same grid.
         layers: of every view, equal steps of 1 / w over which the integral is shared out, linearly
             between two; one: all of it.
-        lines, window, detector, method: as in `reference.project`, but for "trilinear".
+        lines, window, detector, method: as in `mvrecon.kernels.rays.reference.project`, but for
+            "trilinear".
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
     total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1], layers.shape[1])
