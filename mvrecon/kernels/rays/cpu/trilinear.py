@@ -137,4 +137,4 @@ def cells(ray, span, steps, scratch):
             y[count], z[count] = cell.y, cell.z
             share[count] = step * weight_in(sample, slab, np.float64) if counts else 0
             count += 1
-    return count, np.uint32(2 * first % EDGE)
+    return np.uint32(count), np.uint32(2 * first % EDGE)
