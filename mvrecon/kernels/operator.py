@@ -251,9 +251,14 @@ def differentiable(
                 return straight
             return straight + jvp_of(lambda *of: apply(*of, *rest), of, (None, moving[1]))
 
+    def forward(*inputs: Any) -> Tensor:
+        # below autograd an operator has no derivative of its own, which is that of compiled graphs
+        with torch._C._AutoDispatchBelowAutograd():
+            return operator(*inputs)
+
     rule = backward or partial(_pull_back, apply, count)
+    forward = forward if isinstance(operator, OpOverload) else operator
     # torch asks for it in every call, and looking for it takes nine times as long
-    forward = _below_autograd(operator) if isinstance(operator, OpOverload) else operator
     forward.__signature__ = signature(forward)
     vmap = batched(call) if linear else looped(call, tensors=count)
     rules = {
@@ -270,16 +275,6 @@ def differentiable(
         torch.library.register_autograd(operator.name(), rule, setup_context=keep)
         torch.library.register_vmap(operator.name(), vmap)
     return call
-
-
-def _below_autograd(operator: OpOverload) -> Any:
-    """An operator without its own derivative, which is that of compiled graphs."""
-
-    def forward(*inputs: Any) -> Tensor:
-        with torch._C._AutoDispatchBelowAutograd():
-            return operator(*inputs)
-
-    return forward
 
 
 def _pull_back(apply: Rule, count: int, ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:

@@ -15,9 +15,10 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import operator as operators
+from mvrecon.kernels.device_cache import tensors_of, writes
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays import ops, reference
-from mvrecon.kernels.rays.lines import lines_of, lines_of_rays, tensors_of, writes
+from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.operator import Projector

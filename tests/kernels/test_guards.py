@@ -58,7 +58,7 @@ def test_upright_columns_are_walked_once_for_all_of_their_rays(monkeypatch):
         # circle
         assert walked == {"project_columns": 8 * 48, "backproject_columns": 2 * slabs}
         walked.clear()
-        monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
+        monkeypatch.setattr(plan, "kept_plan", plan.plan_by_content)
         monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
         for one, other in zip((A(x), A.T(y)), results, strict=True):
             assert (one - other).norm() < 1e-12 * other.norm()

@@ -21,7 +21,7 @@ def oblique(monkeypatch):
     """Sends every view through the loops for any ray."""
 
     def send() -> None:
-        monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
+        monkeypatch.setattr(plan, "kept_plan", plan.plan_by_content)
         monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
 
     return send

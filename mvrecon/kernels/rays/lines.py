@@ -86,16 +86,6 @@ def _voxels(grid: Grid, like: Tensor) -> tuple[Float[Tensor, "3"], Float[Tensor,
     return beside(grid.centre, like), beside(torch.linalg.inv(grid.affine[:3, :3]), like)
 
 
-def tensors_of(rays: Cameras | ExplicitRays) -> list[Tensor]:
-    """The tensors that make rays."""
-    return [value for value in vars(rays).values() if isinstance(value, Tensor)]
-
-
-def writes(rays: Cameras | ExplicitRays) -> list[int]:
-    """How often the rays' tensors were written to; those of inference mode do not count it."""
-    return [tensor._version for tensor in tensors_of(rays) if not tensor.is_inference()]
-
-
 def shifted(lines: Float[np.ndarray, "m 4 3 k"], y: float) -> Float[np.ndarray, "m 4 3 k"]:
     """The same rays about a point that lies y voxels beyond the centre along the y axis."""
     if y == 0:

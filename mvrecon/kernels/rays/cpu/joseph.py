@@ -59,14 +59,6 @@ def course_of(ray, real):
 
 
 @scalar
-def overlap(begin, end, s, half):
-    """The length of a ray from begin to end in the slab about s, in voxels; half = 0.5 as a number
-    of their type.
-    """
-    return min(end, s + half) - max(begin, s - half)
-
-
-@scalar
 def split(place, real):
     """The lower neighbour of a padded place along an axis, and the weight of the upper one."""
     cell = np.int32(place)
@@ -79,12 +71,6 @@ def cell(course, s, real):
     iy, y = split(course.b + s * course.slope_b, real)
     iz, z = split(course.c + s * course.slope_c, real)
     return Cell(iy, iz, y, z)
-
-
-@scalar
-def hat(t, one):
-    """The weight of a voxel at the distance t along an axis, in voxels: that of `split`."""
-    return max(one - one, one - abs(t))
 
 
 @scalar
@@ -105,7 +91,7 @@ def face_at(flat, k, steps, y, z):
 
 
 @scalar
-def bent(sums, course, s, share, place):
+def with_slab(sums, course, s, share, place):
     """Slopes with those of one more slab, at s, of which the ray has a share; place as `face` has
     it.
     """
@@ -124,16 +110,6 @@ def bent(sums, course, s, share, place):
 
 
 @scalar
-def in_double(sums):
-    """Slopes in double precision, as those of the other methods are."""
-    return Slopes(
-        *(np.float64(sums.total), np.float64(sums.by_b), np.float64(sums.by_slope_b)),
-        *(np.float64(sums.by_c), np.float64(sums.by_slope_c)),
-        *(np.float64(sums.at_begin), np.float64(sums.at_end)),
-    )
-
-
-@scalar
 def cells(ray, count, steps, scratch):
     """Per slab that `summation.traverse` has chosen: flat index of a bilinear cell, place in it
     towards b and c, length.
@@ -144,7 +120,7 @@ def cells(ray, count, steps, scratch):
     for i in range(np.uint32(count)):
         s = slab[i]
         iy, iz, y[i], z[i] = cell(course, s, real)
-        share[i] = overlap(course.begin, course.end, s, half)
+        share[i] = min(course.end, s + half) - max(course.begin, s - half)
         index[i] = flat_index(steps, np.int32(s + course.centre), iy, iz, whole)
 
 
@@ -264,10 +240,14 @@ def slopes(store, n, steps, count, scratch, ray):
         scratch.low_parts,
         scratch.high_parts,
     )
-    real = y.dtype.type
-    course, none = course_of(ray, real), real(0)
+    course, none = course_of(ray, y.dtype.type), y.dtype.type(0)
     sums = Slopes(none, none, none, none, none, none, none)
     for i in range(np.uint32(count)):
         place = face(low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1], y[i], z[i])
-        sums = bent(sums, course, slab[i], share[i], place)
-    return in_double(sums)
+        sums = with_slab(sums, course, slab[i], share[i], place)
+    real = np.float64
+    return Slopes(
+        *(real(sums.total), real(sums.by_b), real(sums.by_slope_b)),
+        *(real(sums.by_c), real(sums.by_slope_c)),
+        *(real(sums.at_begin), real(sums.at_end)),
+    )

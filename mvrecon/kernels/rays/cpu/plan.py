@@ -46,22 +46,6 @@ class Scene(NamedTuple):
         return rig_of(self.lines, self.window, occupancy, self.detector, self.method)
 
 
-class Key(NamedTuple):
-    """All that a plan depends on, by its content; `lines` are the bytes of float64 numbers [m 4 3
-    k].
-    """
-
-    lines: bytes
-    shape: tuple[int, ...]
-    window: tuple[float, ...]
-    detector: tuple[int, ...]
-    method: str
-    volume: Three
-    box: Box
-    lanes: int
-    parts: int
-
-
 class Layout(NamedTuple):
     """The near axis of a store, and the main axes of the oblique rays that read it."""
 
@@ -130,23 +114,33 @@ def plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> 
         maps = np.ascontiguousarray(scene.lines.detach().numpy(), dtype=np.float64)
         first, last = map(float, scene.window)
         rows, columns = map(int, scene.detector)
-        key = Key(
+        return kept_plan(
             *(maps.tobytes(), maps.shape, (first, last), (rows, columns), scene.method),
             *(occupancy.shape, occupancy.box, lanes, parts),
         )
-        return kept_plan(key)
     return _made(scene.rig(occupancy), occupancy, lanes, parts)
 
 
-def keyed_plan(key: Key) -> Plan:
-    """The plan that belongs to a key."""
-    lines = torch.from_numpy(np.frombuffer(key.lines).reshape(key.shape).copy())
-    scene = Scene(lines, key.window, key.detector, key.method)
-    occupancy = Occupancy(key.volume, key.box)
-    return _made(scene.rig(occupancy), occupancy, key.lanes, key.parts)
+def plan_by_content(
+    lines: bytes,
+    shape: tuple[int, ...],
+    window: tuple[float, float],
+    detector: tuple[int, int],
+    method: str,
+    volume: Three,
+    box: Box,
+    lanes: int,
+    parts: int,
+) -> Plan:
+    """The plan that belongs to all that it depends on; `lines` are the bytes of float64 numbers of
+    a shape [m 4 3 k].
+    """
+    maps = torch.from_numpy(np.frombuffer(lines).reshape(shape).copy())
+    occupancy = Occupancy(volume, box)
+    return _made(Scene(maps, window, detector, method).rig(occupancy), occupancy, lanes, parts)
 
 
-kept_plan = lru_cache(maxsize=PLANS)(keyed_plan)
+kept_plan = lru_cache(maxsize=PLANS)(plan_by_content)
 
 
 def ray_plan_of(scene: Scene, occupancy: Occupancy, parts: int = 1) -> Plan:

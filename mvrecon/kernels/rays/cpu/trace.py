@@ -139,14 +139,6 @@ def faces(space, axis, reach):
 
 
 @scalar
-def reach_of(method):
-    """How far beyond its own cell a voxel's value is felt: hat functions reach one voxel from the
-    centre.
-    """
-    return 0.0 if method == SIDDON else 0.5
-
-
-@scalar
 def shortened(across, begin, end, from_, to):
     """The part of a ray between the faces across its far and near axis, and what bounds it; across
     as `transverse`.
@@ -157,16 +149,6 @@ def shortened(across, begin, end, from_, to):
     from_ = NEAR if lower > far_lower else FAR if far_lower > begin else from_
     to = NEAR if upper < far_upper else FAR if far_upper < end else to
     return lower, upper, from_, to
-
-
-@scalar
-def overlapped(method, first, last, begin, end):
-    """Slabs without those behind the ray's ends: a ray may end on a face, or so near that a rounded
-    sum is beyond.
-    """
-    if method == TRILINEAR:  # its samples belong to no slab alone
-        return first, last
-    return first + int(first + 0.5 <= begin), last - int(last - 1.5 >= end)
 
 
 @scalar
@@ -190,7 +172,8 @@ def trace(line, axis, near, pixel, space, method):
     value_b, value_c = crossing(line, axis, far, u, v), crossing(line, axis, near, u, v)
     one = at(line, 2, axis, u, v) + space.window[0] * D
     two = at(line, 2, axis, u, v) + space.window[1] * D
-    reach = reach_of(method)
+    # a voxel's values are felt in its own cell, or up to its neighbours' centres: hat functions
+    reach = 0.0 if method == SIDDON else 0.5
     half = space.sizes[axis] / 2.0 + (0.5 if method == TRILINEAR else 0.0)
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
     from_, to = OWN if begin > -half else FACE, OWN if end < half else FACE
@@ -210,7 +193,11 @@ def trace(line, axis, near, pixel, space, method):
     if begin < end and enter <= leave:
         first = max(space.box[axis], int(ceil(enter + centre - margin)))
         last = min(space.box[3 + axis], int(floor(leave + centre + margin)) + 1)
-        first, last = overlapped(method, first, last, begin + centre, end + centre)
+        # a ray may end on a face, or so near that a rounded sum is beyond; samples of "trilinear"
+        # belong to no slab alone
+        if method != TRILINEAR:
+            first += int(first + 0.5 <= begin + centre)
+            last -= int(last - 1.5 >= end + centre)
     b0, c0 = value_b + (space.sizes[far] - 1) / 2.0 + 1, value_c + (space.sizes[near] - 1) / 2.0 + 1
     return Ray(
         *(axis, far, near, b0, slope_b, c0, slope_c, slab_length(line, axis, u, v)),

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.cpu.joseph import Cell, cell, course_of, face_at, hat
+from mvrecon.kernels.rays.cpu.joseph import Cell, cell, course_of, face_at
 from mvrecon.kernels.rays.cpu.trace import FAR, NEAR, OWN, Slopes, flat_index
 from mvrecon.kernels.rays.occupancy import EDGE
 
@@ -33,12 +33,6 @@ def sample_at(course, s, real):
     x = s + course.centre
     # only rounding carries a sample in front of slab -1, where the volume's values end
     return Sample(x, max(np.int32(floor(x)), np.int32(-1)), cell(course, s, real))
-
-
-@scalar
-def weight_in(sample, slab, real):
-    """What the voxels of a slab get of a sample: what is left to the slab beside it."""
-    return hat(sample.x - real(slab), real(1))
 
 
 @scalar
@@ -135,6 +129,8 @@ def cells(ray, span, steps, scratch):
             counts = ray.enter <= s <= ray.leave and span[0] <= slab < span[1]
             index[count] = flat_index(steps, slab, cell.iy, cell.iz, whole) if counts else 0
             y[count], z[count] = cell.y, cell.z
-            share[count] = step * weight_in(sample, slab, np.float64) if counts else 0
+            # what is left to the slab beside it
+            weight = max(0.0, 1.0 - abs(sample.x - np.float64(slab)))
+            share[count] = step * weight if counts else 0
             count += 1
     return np.uint32(count), np.uint32(2 * first % EDGE)

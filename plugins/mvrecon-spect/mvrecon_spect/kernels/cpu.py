@@ -2,7 +2,7 @@
 for any number of threads, as those of `mvrecon.kernels.rays.cpu.operators`.
 
 A ray is read as a whole, since what lies near the detector attenuates what lies behind it: volumes
-are one piece, and a thread that owns some slabs of the adjoint goes through the rays that meet them.
+are one piece, and a thread that owns some slabs of the adjoint walks all rays that meet them.
 Rays beside the box of the emission, and what lies behind it on the others, change no bit and are
 left out, but for a method with the suffix `DENSE`.
 """

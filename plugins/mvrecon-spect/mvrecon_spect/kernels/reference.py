@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.rays.reference import directions, fractions, weights
+from mvrecon.kernels.rays.lines import DIRECTION, START
+from mvrecon.kernels.rays.reference import maps_at_pixels, weights
 
 #: Behind the name of a method: leave out nothing.
 DENSE = ":dense"
@@ -79,7 +80,8 @@ def _attenuated(
     depths = torch.stack([weight * flat[index] for index, weight in entries])
     depth = depths.unflatten(0, (-1, size)).sum(dim=1)
     # counts run along the ray's direction, to its end on the detector's side
-    upwards = directions(lines, detector) > 0
+    maps, main = maps_at_pixels(lines, detector)
+    upwards = maps[DIRECTION].gather(0, main[None])[0] > 0
     before = torch.where(upwards, _above(depth), _above(depth.flip(0)).flip(0))
     shares = torch.exp(-before) * mean_transmission(depth)
     for i, (index, weight) in enumerate(entries):
@@ -101,6 +103,19 @@ def _dealt(
             steps = torch.arange(last + 1, device=w.device)
             hats = (1 - (along.clamp(0, last)[:, None] - steps).abs()).clamp_min(0)
         yield from [hats] * per_slab
+
+
+def fractions(
+    lines: Tensor, detector: Sequence[int], shape: Sequence[int]
+) -> Iterator[Float[Tensor, " r"]]:
+    """The fraction w of the way from source to pixel at which rays stand in the middle of their
+    slabs.
+    """
+    maps, main = maps_at_pixels(lines, detector)
+    start, D = maps[START].gather(0, main[None])[0], maps[DIRECTION].gather(0, main[None])[0]
+    sizes = torch.tensor(shape[::-1], device=lines.device)[main]
+    for slab in range(max(shape)):
+        yield (torch.clamp(sizes - 1, max=slab) - (sizes - 1) / 2 - start) / D
 
 
 def _above(depth: Float[Tensor, "k r"]) -> Float[Tensor, "k r"]:
