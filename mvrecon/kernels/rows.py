@@ -93,6 +93,18 @@ def whole(part, half, count):
 
 
 @scalar
+def near(row, top, under, size, low, high, part):
+    """The part of a row that can touch the lines [low, high) of `size` along an axis of the source,
+    with half of one to spare for rounding.
+    """
+    centre = (size - 1) / 2
+    ends = (-row.half, row.half)
+    interval = between(top, under, low - 1.5 - centre, high + 0.5 - centre, ends)
+    first, last = whole(interval, row.half, row.count)
+    return max(part[0], first), min(part[1], last)
+
+
+@scalar
 def over(under, i):
     """One over a denominator at position i."""
     return 1.0 / max(under[0] + i * under[1], LEAST)

@@ -29,6 +29,7 @@ from mvrecon.kernels.rows import (
     cell,
     face,
     lay,
+    near,
     over,
     padded,
     positive,
@@ -69,19 +70,6 @@ def _seen(row, sight):
 
 
 @scalar
-def _near_rows(row, sight, low, high, part):
-    """The voxels that can touch the detector rows [low, high), with half a pixel to spare for
-    rounding.
-    """
-    centre = (sight.detector[1] - 1) / 2
-    interval = between(
-        row.v, row.under, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half)
-    )
-    first, last = whole(interval, row.half, row.count)
-    return max(part[0], first), min(part[1], last)
-
-
-@scalar
 def _cells(row, part, sight, at, weight):
     """Per voxel: flat index of its bilinear cell, the weights towards u and v, and that of the
     distance.
@@ -98,24 +86,6 @@ def _cells(row, part, sight, at, weight):
         weight[0, n], weight[1, n] = real(pu - iu), real(pv - iv)
         weight[2, n] = real(inverse * inverse) if sight.weighted else real(1)
         at[n] = number(number(iu) + number(number(iv) * sight.steps[1]))
-
-
-@scalar
-def _backproject_row(flat, across, count, at, weight, line):
-    image = face(flat, across)
-    for n in range(np.uint32(count)):
-        line[n] += weight[2, n] * bilinear(image, np.uint64(at[n]), weight[0, n], weight[1, n])
-
-
-@scalar
-def _project_row(flat, across, count, at, weight, line):
-    image, end = face(flat, across), np.uint64(len(flat) - across)
-    for n in range(np.uint32(count)):
-        k = np.uint64(at[n])
-        if (
-            k < end
-        ):  # voxels reach beyond these detector rows, and no unsigned index lies before them
-            lay(image, k, weight[0, n], weight[1, n], weight[2, n] * line[n])
 
 
 @compiled
@@ -135,9 +105,10 @@ def backproject_rows(flat, sight, scratch, volumes, first, last):
                     continue
                 _cells(row, part, sight, at, weight)
                 for n in range(len(volumes)):
-                    _backproject_row(
-                        flat[n, m], sight.steps[1], count, at, weight, volumes[n, z, y, part[0] :]
-                    )
+                    image, line = face(flat[n, m], sight.steps[1]), volumes[n, z, y, part[0] :]
+                    for i in range(np.uint32(count)):
+                        k = np.uint64(at[i])
+                        line[i] += weight[2, i] * bilinear(image, k, weight[0, i], weight[1, i])
 
 
 @compiled
@@ -154,7 +125,7 @@ def project_rows(volumes, sight, scratch, views, m, low, high):
         row = _row_of(sight.maps[m], (depth, height, width), z, y)
         part = _seen(row, sight)
         if high - low < sight.detector[1]:
-            part = _near_rows(row, sight, low, high, part)
+            part = near(row, row.v, row.under, sight.detector[1], low, high, part)
         count = part[1] - part[0]
         if count <= 0:
             continue
@@ -162,7 +133,13 @@ def project_rows(volumes, sight, scratch, views, m, low, high):
         for i in range(count):
             at[i] -= low * across
         for n in range(len(volumes)):
-            _project_row(own[n], across, count, at, weight, volumes[n, z, y, part[0] :])
+            image, end = face(own[n], across), np.uint64(len(own[n]) - across)
+            line = volumes[n, z, y, part[0] :]
+            for i in range(np.uint32(count)):
+                k = np.uint64(at[i])
+                # voxels reach beyond these detector rows, and no unsigned index lies before them
+                if k < end:
+                    lay(image, k, weight[0, i], weight[1, i], weight[2, i] * line[i])
     for n in range(len(volumes)):
         for v in range(low, high):
             begin = (v - low + 1) * across + 1
@@ -268,20 +245,10 @@ def _blend(image, columns, blend):
 
 
 @scalar
-def _take(scratch, start, line, count):
-    places, shares, taken, parts = scratch.places, scratch.shares, scratch.taken, scratch.parts
-    for k in range(count):
-        taken[k] = scratch.pairs[np.uint64(places[k]) + start]
-    for k in range(count):
-        lower = parts[2 * k]
-        line[k] += lower + shares[k] * (parts[2 * k + 1] - lower)
-
-
-@scalar
 def _add_tile(columns, sight, scratch, tile, volumes):
     """The sums of all views over the voxels tile = (y, first x, one behind the last x)."""
     depth, height, width = volumes.shape[1:]
-    y, start, end = tile
+    (y, start, end), taken, parts = tile, scratch.taken, scratch.parts
     scratch.sums[:] = 0
     for x in range(start, end):
         for m in range(len(sight.maps)):
@@ -294,7 +261,11 @@ def _add_tile(columns, sight, scratch, tile, volumes):
                 begin = n * columns.shape[3]
                 _blend(image, columns[n, m], scratch.blend[begin:])
                 line = scratch.sums[n, x - start, image.first :]
-                _take(scratch, np.uint64(begin), line, np.uint32(image.last - image.first))
+                for k in range(np.uint32(image.last - image.first)):
+                    taken[k] = scratch.pairs[np.uint64(scratch.places[k]) + np.uint64(begin)]
+                for k in range(np.uint32(image.last - image.first)):
+                    lower = parts[2 * k]
+                    line[k] += lower + scratch.shares[k] * (parts[2 * k + 1] - lower)
 
 
 @compiled

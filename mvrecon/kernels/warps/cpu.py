@@ -23,6 +23,7 @@ from mvrecon.kernels.rows import (
     cell,
     face,
     lay,
+    near,
     over,
     padded,
     positive,
@@ -59,19 +60,6 @@ def inside(row, sizes):
     part = between(row.y, row.across, -y, y, part)
     part = between(row.z, row.depth, -z, z, part)
     return whole(part, row.half, row.count)
-
-
-@scalar
-def near_slabs(row, sizes, low, high, part):
-    """The positions of a row that can touch the slabs [low, high), with half a voxel to spare for
-    rounding.
-    """
-    centre = (sizes[2] - 1) / 2
-    interval = between(
-        row.z, row.depth, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half)
-    )
-    first, last = whole(interval, row.half, row.count)
-    return max(part[0], first), min(part[1], last)
 
 
 @scalar
@@ -164,16 +152,6 @@ def warp_rows(flat, warp, scratch, out, first, last):
                 fetch(flat[n, s, c], warp.steps, count, at, weight, line[part[0] :])
 
 
-@scalar
-def _hand_over(own, warp, volume, low, high):
-    """Copy the slabs [low, high) of a volume out of the border around them."""
-    for z in range(low, high):
-        for y in range(warp.sizes[1]):
-            begin = (z - low + 1) * warp.steps[2] + (y + 1) * warp.steps[1] + 1
-            for x in range(warp.sizes[0]):
-                volume[z, y, x] = own[begin + x]
-
-
 @compiled
 def spread_slabs(values, warp, scratch, volumes, s, low, high):
     """Into the slabs [low, high) of volume s of [n s c d h w]: everything that values [n s k c d h
@@ -189,7 +167,7 @@ def spread_slabs(values, warp, scratch, volumes, s, low, high):
         row = row_of(warp.maps[s, k], warp.shape, z, y)
         part = inside(row, warp.sizes)
         if high - low < warp.sizes[2]:
-            part = near_slabs(row, warp.sizes, low, high, part)
+            part = near(row, row.z, row.depth, warp.sizes[2], low, high, part)
         count = part[1] - part[0]
         if count <= 0:
             continue
@@ -202,7 +180,11 @@ def spread_slabs(values, warp, scratch, volumes, s, low, high):
                 spread(own[n, c], warp.steps, count, at, weight, line[part[0] :])
     for n in range(batch):
         for c in range(channels):
-            _hand_over(own[n, c], warp, volumes[n, s, c], low, high)
+            for z in range(low, high):
+                for y in range(warp.sizes[1]):
+                    begin = (z - low + 1) * warp.steps[2] + (y + 1) * warp.steps[1] + 1
+                    for x in range(warp.sizes[0]):
+                        volumes[n, s, c, z, y, x] = own[n, c, begin + x]
 
 
 @scalar

@@ -198,12 +198,6 @@ ROWS = 4
 
 
 @scalar
-def _clear(scratch, group, lanes, span):
-    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
-        scratch.row[np.uint64((group * scratch.width + 1) * lanes) + z] = 0
-
-
-@scalar
 def rows_of(scratch, i, real, steps):
     """The two rows of voxels of piece i."""
     low, high = real(scratch.pieces[0, i]), real(scratch.pieces[1, i])
@@ -329,7 +323,9 @@ def project_columns(store, rig, scratch, reads, views, first, last):
                 places(rig, height, scratch.pieces[2, i], scratch.pieces[3, i], rays, scratch)
             for group in range(groups):
                 if rig.heights.size and (not level or i == 0):
-                    _clear(scratch, group, lanes, span)
+                    first_of_row = np.uint64((group * scratch.width + 1) * lanes)
+                    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+                        scratch.row[first_of_row + z] = 0
                 add = level and (i > 0 or rig.heights.size > 0)
                 _blend(scratch, store, group, rows, inside, add)
                 if not level or i == count - 1:
