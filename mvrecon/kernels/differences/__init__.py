@@ -84,15 +84,6 @@ def gradient_adjoint(
     return total
 
 
-def into_unit_balls(field: Float[Tensor, "3 b c d h w"]) -> Float[Tensor, "3 b c d h w"]:
-    """The field, in place, with vectors longer than 1 shortened to 1: the proximal map of the dual
-    of |D x|.
-    """
-    size = field[0].square()
-    size.addcmul_(field[1], field[1]).addcmul_(field[2], field[2])
-    return field.mul_(size.rsqrt_().clamp_max_(1))
-
-
 def primal(
     volume: Float[Tensor, "b c d h w"],
     dual: Float[Tensor, "3 b c d h w"],
@@ -125,7 +116,10 @@ def dual_step(
         rate: length of the step, in mm by the unit of the volume.
         steps: voxel size along (z, y, x), in mm.
     """
-    return into_unit_balls(dual.add_(gradient(volume, steps), alpha=rate))
+    dual.add_(gradient(volume, steps), alpha=rate)
+    size = dual[0].square()
+    size.addcmul_(dual[1], dual[1]).addcmul_(dual[2], dual[2])
+    return dual.mul_(size.rsqrt_().clamp_max_(1))
 
 
 def proximal_step(

@@ -51,7 +51,8 @@ def rays_of(
     start = maps[START].gather(0, order[:1])[0]
     sizes = torch.tensor(shape[::-1], device=lines.device)
     half = sizes[main] / 2 + reach
-    ends = [_end(start, D[0], w) for w in window]
+    # infinity carries no derivative
+    ends = [start + w * D[0] if abs(w) < torch.inf else w * D[0].detach().sign() for w in window]
     steps = torch.tensor([1, shape[2] + 2, (shape[2] + 2) * (shape[1] + 2)], device=lines.device)
     value = torch.stack([-M[2], M[1]]) / D[0]
     return Rays(
@@ -75,11 +76,6 @@ def maps_at_pixels(lines: Tensor, detector: Sequence[int]) -> tuple[Tensor, Int[
     preference = 1 + TIE * torch.arange(2, -1, -1, device=lines.device, dtype=lines.dtype)
     main = (direction.detach().abs() * preference[:, None]).argmax(dim=0)
     return maps, main
-
-
-def _end(start: Tensor, D: Tensor, w: float) -> Tensor:
-    """Where a ray ends along its main axis; infinity carries no derivative."""
-    return start + w * D if abs(w) < torch.inf else w * D.detach().sign()
 
 
 def _joseph(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

@@ -46,13 +46,6 @@ class Scene(NamedTuple):
         return rig_of(self.lines, self.window, occupancy, self.detector, self.method)
 
 
-class Layout(NamedTuple):
-    """The near axis of a store, and the main axes of the oblique rays that read it."""
-
-    near: int
-    axes: tuple[bool, bool, bool]
-
-
 @dataclass(frozen=True, eq=False)
 class Plan:
     """Which views are read how; nobody writes to its arrays, which several threads share.
@@ -76,11 +69,13 @@ class Plan:
     pieces: tuple[tuple[slice, Rig], ...]
 
     @property
-    def layouts(self) -> list[Layout]:
-        """The layouts of the volume that are needed."""
+    def layouts(self) -> list[tuple[int, tuple[bool, bool, bool]]]:
+        """The layouts of the volume that are needed: the near axis of a store, and the main axes of
+        the oblique rays that read it.
+        """
         x, y, z = self.axes
-        turned = [Layout(2, (x, y, False))] if x or y or len(self.upright.views) else []
-        return turned + ([Layout(0, (False, False, z))] if z else [])
+        turned = [(2, (x, y, False))] if x or y or len(self.upright.views) else []
+        return turned + ([(0, (False, False, z))] if z else [])
 
     @property
     def units(self) -> int:
