@@ -103,7 +103,7 @@ def pieces(rig, ray, span, steps, scratch):
     """Write the pieces of a column's way into its scratch, and count them.
 
     Joseph's and Siddon's method split here once more: their steps at one height, in two places,
-    instead of those of `methods/` cost 7 to 15 % of a projection at 128^3.
+    instead of those of the methods cost 7 to 15 % of a projection at 128^3.
     """
     count = 0
     for k in range(span[0], span[1]):
